@@ -8,14 +8,16 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+# Small matrices gain nothing from threads, which take the cores of other ranks and workers.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import petsc4py
 
+# Signals are the front door's: PETSc's own handler would print its trace and abort.
 petsc4py.init(["pytest", "-no_signal_handler"])
 
 from mpi4py import MPI
@@ -24,11 +26,16 @@ import h5py
 import hypothesis
 import numpy as np
 import pytest
+import xarray as xr
 
 from vipetsc import __version__
 from vipetsc.case import Case, Sweep
 from vipetsc.cli.main import main
+from vipetsc.dynamics import simulate
+from vipetsc.dynamics.observers import Observer
+from vipetsc.dynamics.run import Result
 from vipetsc.io.records import RecordFile
+from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest
 
 # A first call may have to load kernels, or compile them.
@@ -40,14 +47,20 @@ hypothesis.settings.load_profile("vipetsc")
 def folder():
     """A temporary folder that all ranks share."""
     comm = MPI.COMM_WORLD
-    path = comm.bcast(tempfile.mkdtemp(prefix="vipetsc-") if comm.rank == 0 else None)
+    path = None
+    if comm.rank == 0:
+        path = tempfile.mkdtemp(prefix="vipetsc-")
+    path = comm.bcast(path)
+
     yield Path(path)
+
+    # A rank that is slower may still read what rank 0 would remove.
     comm.Barrier()
     if comm.rank == 0:
         shutil.rmtree(path, ignore_errors=True)
 
 
-# What sites have that differ in their laws and stops: three, one on both sides.
+# Three sites that differ in their laws, damping and stops, of which one has stops on both sides.
 DIFFERING = {
     "law": ["hertz", "bilinear", "power"],
     "stiffness": [5e6, 2e4, 1e6],
@@ -59,7 +72,7 @@ DIFFERING = {
 
 
 def small_case(**sections) -> Case:
-    """A four-band lattice of 24 cells in which contacts begin early; sections update the table."""
+    """A four-band lattice of 24 cells in which contacts begin early; ``sections`` update its table."""
     table = {
         "name": "small",
         "lattice": {"preset": "four-band", "cells": 24},
@@ -70,6 +83,21 @@ def small_case(**sections) -> Case:
     for name, values in sections.items():
         table[name] = table.get(name, {}) | values
     return Case.from_table(table)
+
+
+def simulated(case: Case, observers: Sequence[type[Observer]] = ()) -> tuple[xr.Dataset, Result]:
+    """The dataset and the result of a run in memory on one rank, which comes to its end."""
+    memory = RunMemory(MPI.COMM_SELF)
+    result = simulate(case, memory, observers=observers)
+
+    assert result.complete, result.sentence
+    assert memory.dataset is not None
+    return memory.dataset, result
+
+
+def run_of(case: Case) -> xr.Dataset:
+    """The dataset of a run in memory on one rank, which comes to its end."""
+    return simulated(case)[0]
 
 
 def search_table(cells: int, sites: list[int], **sections: dict[str, Any]) -> dict[str, Any]:
@@ -94,8 +122,13 @@ TWO = "optimise.objective=[{measure='transmitted', amplitudes=[5.0]}, {measure='
 def datasets(path: Path) -> dict[str, np.ndarray]:
     """Every dataset of an HDF5 file by its path."""
     found = {}
+
+    def collect(name: str, item: h5py.Dataset | h5py.Group) -> None:
+        if isinstance(item, h5py.Dataset):
+            found[name] = item[...]
+
     with h5py.File(path) as file:
-        file.visititems(lambda name, item: found.update({name: item[...]}) if isinstance(item, h5py.Dataset) else None)
+        file.visititems(collect)
     return found
 
 
@@ -104,12 +137,18 @@ def assert_same_bits(first: dict[str, np.ndarray], second: dict[str, np.ndarray]
     assert first.keys() == second.keys()
     for name, values in first.items():
         assert values.shape == second[name].shape, name
-        texts = values.dtype == object  # whose bytes are addresses
-        assert values.tolist() == second[name].tolist() if texts else values.tobytes() == second[name].tobytes(), name
+        if values.dtype == object:  # texts, whose bytes are addresses
+            assert values.tolist() == second[name].tolist(), name
+        else:
+            assert values.tobytes() == second[name].tobytes(), name
 
 
-def put_members(folder: Path, plan: Sweep, told: Callable[[int, Case], dict[str, Any] | str], file: int = 0) -> None:
-    """A finished sweep whose members were not simulated: what is ``told`` of each, or why it failed, as its record."""
+def put_members(folder: Path, plan: Sweep, outcome: Callable[[int, Case], dict[str, Any] | str], file: int = 0) -> None:
+    """Write a finished sweep whose members were not simulated.
+
+    ``outcome`` of a member's number and case is what is recorded of it, or a sentence that says why it failed.
+    """
+    # Only few tests need these modules, whose import takes a noticeable part of a second.
     from vipetsc.studies.ensemble import Results
     from vipetsc.studies.sweep import conclude
 
@@ -117,16 +156,19 @@ def put_members(folder: Path, plan: Sweep, told: Callable[[int, Case], dict[str,
     (folder / "case.toml").write_text(plan.to_toml())
     records = RecordFile(folder / f"members-{file}.jsonl")
     for number, name in enumerate(plan.ids()):
-        row = told(number, plan.case(number))
+        row = outcome(number, plan.case(number))
+        if isinstance(row, str):
+            row = {"status": "failed", "reason": row}
         about = {"id": name, "vipetsc_version": __version__, "status": "complete", "reason": "complete"}
         about |= {"warnings": [], "cpu_seconds": 0.1, "rtol": 1e-10}
-        records.append(about | ({"status": "failed", "reason": row} if isinstance(row, str) else row))
+        records.append(about | row)
     records.close()
+
     conclude(Results(plan, folder))
 
 
 def modified(folder: Path) -> dict[Path, int]:
-    """When each file in a folder was written."""
+    """The time in ns at which each file in a folder was written."""
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
@@ -136,13 +178,15 @@ alone_and_on_two_ranks = pytest.mark.parametrize("ranks", [0, pytest.param(2, ma
 
 def on_two(*values: object) -> list:
     """Parameters that ``scripts/test`` takes on one rank and two: more ranks would say the same again."""
-    return [
-        pytest.param(*value if isinstance(value, tuple) else (value,), marks=pytest.mark.on_two) for value in values
-    ]
+    parameters = []
+    for value in values:
+        arguments = value if isinstance(value, tuple) else (value,)
+        parameters.append(pytest.param(*arguments, marks=pytest.mark.on_two))
+    return parameters
 
 
 class StopAt(StopRequest):
-    """A request that comes at the n-th look."""
+    """A request to stop that comes after a number of ``looks`` at it."""
 
     def __init__(self, looks: int) -> None:
         self.left = looks
@@ -154,7 +198,7 @@ class StopAt(StopRequest):
 
 
 # By these names Open MPI's mpirun, whose layers have been PMIx and PRRTE since 5, says which rank a process is.
-OF_A_RANK = re.compile(r"(OMPI|PMIX|PRTE)_(?!MCA_|ALLOW_RUN_AS_ROOT)")
+NAMES_OF_RANKS = re.compile(r"(OMPI|PMIX|PRTE)_(?!MCA_|ALLOW_RUN_AS_ROOT)")
 
 
 def clean_environment() -> dict[str, str]:
@@ -163,7 +207,7 @@ def clean_environment() -> dict[str, str]:
     Ranks of tests are on one machine; without its layer for TCP, Open MPI 5 writes no lines about network interfaces
     among those that the program prints.
     """
-    kept = {name: value for name, value in os.environ.items() if not OF_A_RANK.match(name)}
+    kept = {name: value for name, value in os.environ.items() if not NAMES_OF_RANKS.match(name)}
     as_root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     return {"OMPI_MCA_btl": "^tcp"} | kept | as_root
 
@@ -175,7 +219,9 @@ def vipetsc():
     def call(
         ranks: int, *arguments: object, timeout: float = 300, module: str = "vipetsc", **options
     ) -> subprocess.CompletedProcess:
-        launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks else []
+        launcher = []
+        if ranks:
+            launcher = ["mpirun", "--oversubscribe", "-n", str(ranks)]
         command = [*launcher, sys.executable, "-m", module, *map(str, arguments)]
         options = {"capture_output": True, "text": True, "env": clean_environment()} | options
         return subprocess.run(command, timeout=timeout, check=False, **options)
@@ -196,6 +242,7 @@ def in_process(capsys, monkeypatch):
         with monkeypatch.context() as context:
             if cwd:
                 context.chdir(cwd)
+
             try:
                 code = main(words)
             except SystemExit as end:
@@ -207,8 +254,14 @@ def in_process(capsys, monkeypatch):
 
 @pytest.fixture
 def on_ranks(vipetsc, in_process):
-    """Call the program on so many ranks of mpirun, or with 0 in this process: ``on_ranks(ranks, "run", ...)``."""
-    return lambda ranks, *arguments: vipetsc(ranks, *arguments) if ranks else in_process(*arguments)
+    """Call the program on a number of ranks of mpirun, or with 0 in this process: ``on_ranks(ranks, "run", ...)``."""
+
+    def call(ranks: int, *arguments: object) -> subprocess.CompletedProcess:
+        if ranks:
+            return vipetsc(ranks, *arguments)
+        return in_process(*arguments)
+
+    return call
 
 
 @pytest.fixture
@@ -225,7 +278,8 @@ def petsc_options():
     """Set PETSc options for one test."""
     from petsc4py import PETSc
 
-    options, given = PETSc.Options(), set()
+    options = PETSc.Options()
+    given = set()
 
     def put(**values: object) -> None:
         for name, value in values.items():
@@ -233,5 +287,7 @@ def petsc_options():
             given.add(name)
 
     yield put
+
+    # The database of options is the process's: what one test leaves in it, the next one runs with.
     for name in given:
         options.delValue(name)

@@ -18,6 +18,7 @@ COMM = MPI.COMM_WORLD
 def test_the_same_branch_on_any_number_of_ranks(folder):
     branches = follow_all(case(multipliers=2), folder, COMM)
     assert len(branches) == (COMM.rank == 0)
+
     if COMM.rank == 0:
         together = read_branch(folder / "branch-breather-1600.h5")
         (alone,) = follow_all(case(multipliers=2), folder, MPI.COMM_SELF)

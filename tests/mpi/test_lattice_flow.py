@@ -19,7 +19,9 @@ COMM = MPI.COMM_WORLD
 @pytest.mark.parametrize("restitution", [*on_two(1.0), 0.7])
 def test_variations_have_the_same_bits(restitution):
     """Clusters lie across the borders: 18 cells are cut after 9 or after 6 and 12."""
-    sites, cells, dofs = (5, 8, 9, 12), 18, 4
+    sites = (5, 8, 9, 12)
+    cells = 18
+    dofs = 4
     chain = Chain(four_band("calibrated"), cells, "fixed", sites, (10**-2.75,) * len(sites))
     contact = Contact("hertz", contact_stiffness(1e8, 0.005, 0.3), restitution)
     random = np.random.default_rng(3)
@@ -35,6 +37,7 @@ def test_variations_have_the_same_bits(restitution):
         ends.append((flow.gather(arc.end), flow.gather(arc.move(flow.scatter(changes.reshape(3, -1)))), arc.closed))
         arc.engine.destroy()
     (together, moved, closed), (alone, moved_alone, closed_alone) = ends
+
     assert together.tobytes() == alone.tobytes()
     assert moved.tobytes() == moved_alone.tobytes()
     assert closed == closed_alone > 0

@@ -36,7 +36,8 @@ def stencil(chain: Chain, u: np.ndarray) -> np.ndarray:
     rate = engine.state.duplicate()
     engine.ts.computeRHSFunction(0.0, engine.state, rate)
     engine.destroy()
-    d, n = layout.dofs, layout.owned
+    d = layout.dofs
+    n = layout.owned
     return -rate.array[d * n : 2 * d * n].reshape(d, n).T * np.asarray(chain.cell.masses)
 
 
@@ -52,7 +53,9 @@ def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells):
         mine = slice(matrices.start, matrices.stop)
         product = (matrices.stiffness * matrices.vector(u[mine])).array_r.reshape(u[mine].shape)
         expected = stencil(chain, u)
+
         assert np.abs(product - expected).max(initial=0) <= (0 if cell is WHOLE else 1e-10)
+
         momentum = (matrices.mass * matrices.vector(u[mine])).array_r.reshape(u[mine].shape)
         assert np.array_equal(momentum, u[mine] * np.asarray(cell.masses))
         # Exactly as many entries as were needed are there.
@@ -68,14 +71,18 @@ def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells):
 def test_modes_near_a_frequency_are_those_of_the_lattice_with_all_their_copies(ends, cells, near, count):
     chain = Chain(four_band("calibrated"), cells, ends)
     matrices = LatticeMatrices(chain, COMM)
-    taken, vector = [], matrices.vector
+    taken = []
+    vector = matrices.vector
     matrices.vector = lambda *cells: taken.append(1) or vector(*cells)
     modes = modes_near(matrices, count, near)
+
     assert len(taken) <= count + 3  # it ends with the first mode that is not nearer
+
     every = np.array([mode_frequency(chain, number) for number in range(1, matrices.rows + 1)])
     nearest = np.sort(every[np.argsort(np.abs(every**2 - near**2), kind="stable")[:count]])
     assert modes.frequency == pytest.approx(nearest, rel=1e-9, abs=1e-3)
     assert modes.residual.max() < 1e-9
+
     flat = modes.shapes.reshape(count, -1)
     masses = np.tile(chain.cell.masses, matrices.stop - matrices.start)
     gram = COMM.allreduce((flat * masses) @ flat.T)
@@ -88,6 +95,7 @@ def test_the_edge_modes_of_the_lattice_and_their_file(folder):
     case = small_case(lattice={"cells": 100}, contacts={"sites": [30]})
     found = find_modes(case, 3, 2034.0, folder, COMM)
     assert (found is None) == (COMM.rank > 0)
+
     COMM.Barrier()
     with xr.open_dataset(folder / "modes.h5", engine="h5netcdf") as data:
         assert data["frequency"].values[:2] == pytest.approx(2034.8251, abs=1e-4)
@@ -96,7 +104,9 @@ def test_the_edge_modes_of_the_lattice_and_their_file(folder):
         # Deep in the gap a mode sits in a cell or two of one end, or of both: they have one frequency.
         assert data["participation"].values[:2].max() < 4 < 50 < data["participation"].values[2]
         assert (data["left"] + data["right"]).values[:2] == pytest.approx(1.0, abs=1e-6)
-        bulk, shape = mode_shape(Chain(four_band("calibrated"), 100), 202), data["shape"].values[2]
+
+        bulk = mode_shape(Chain(four_band("calibrated"), 100), 202)
+        shape = data["shape"].values[2]
         assert np.abs(shape / np.abs(shape).max()) == pytest.approx(np.abs(bulk), abs=1e-6)
 
 
@@ -104,8 +114,11 @@ def test_the_edge_modes_of_the_lattice_and_their_file(folder):
 def test_where_energy_is_counts_with_the_masses_of_each_cell(folder):
     profiles = {"masses[1]": [0.005, 0.02], "springs[2].stiffness": [1e4, 3e4]}
     case = small_case(lattice={"cells": 2, "profiles": profiles}, contacts={"sites": [1]})
-    data, chain = find_modes(case, 8, 900.0, folder, COMM), case.model().chain
-    stiffness, masses = chain.stiffness_matrix().toarray(), chain.masses()
+    data = find_modes(case, 8, 900.0, folder, COMM)
+    chain = case.model().chain
+    stiffness = chain.stiffness_matrix().toarray()
+    masses = chain.masses()
+
     assert data["frequency"].values ** 2 == pytest.approx(eigvalsh(stiffness, np.diag(masses)), rel=1e-9)
     assert (data["left"] + data["right"]).values == pytest.approx(1.0, abs=1e-12)  # a tenth is one cell of two
 
@@ -116,9 +129,11 @@ def test_refused(monkeypatch, folder):
     for count, near, key in ((0, 1.0, "--modes"), (97, 1.0, "--modes"), (2, -1.0, "--near")):
         with pytest.raises(CaseError, match=key):
             find_modes(case, count, near, folder, COMM)
+
     pressed = small_case(contacts={"side": "plus", "precompression": 3e-4, "restitution": 1.0})
     with pytest.raises(CaseError, match="touch at rest"):
         find_modes(pressed, 2, 1.0, folder, COMM)
+
     monkeypatch.setattr(eigen, "RESTARTS", 1)
     with pytest.raises(CaseError, match="of 6 modes come out"):
         modes_near(LatticeMatrices(Chain(four_band("calibrated"), 2000), COMM), 6, 2034.0)

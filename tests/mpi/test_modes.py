@@ -63,7 +63,8 @@ def test_a_branch_that_fails_keeps_its_points_and_the_others_go_on(folder):
 def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
     """A request that one rank gets ends its branch at the next point, whole on disk; the other rank goes on."""
     comm = MPI.COMM_WORLD
-    case, stop = three_cells(points=20), StopRequest()
+    case = three_cells(points=20)
+    stop = StopRequest()
 
     def listener(branch, point):
         stop.requested = branch.name == "mode-1" and point.index == 13
@@ -81,5 +82,6 @@ def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
     follow_all(case, folder, comm, resume=True)
     follow_all(case, whole, comm)
     comm.Barrier()
+
     for name in ("branch-mode-1.h5", "branch-mode-2.h5"):
         assert_same_bits(datasets(folder / name), datasets(whole / name))

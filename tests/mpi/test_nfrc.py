@@ -7,21 +7,26 @@ from mpi4py import MPI
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
-from tests.verify.test_nfrc import case
+from tests.steady_states import nfrc_case
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.parallel import on_root
 
 
 @pytest.mark.parallel([2, 3])
 def test_curves_are_the_same_on_any_number_of_ranks(folder):
-    comm, of = (
-        MPI.COMM_WORLD,
-        case(harmonics=3, restitutions=[1.0, 0.7], range=[0.999, 1.0005], first_step=1e-3, points=3),
-    )
-    on_root(comm, lambda: [(folder / name).mkdir() for name in ("shared", "alone")] and None)
-    curves = follow_all(of, folder / "shared", comm)
+    """Two restitutions are two curves: ranks work on different ones, and one of three has none."""
+    comm = MPI.COMM_WORLD
+    case = nfrc_case(harmonics=3, restitutions=[1.0, 0.7], range=[0.999, 1.0005], first_step=1e-3, points=3)
+    together = folder / "together"
+    alone = folder / "alone"
+    if comm.rank == 0:
+        together.mkdir()
+        alone.mkdir()
+    comm.Barrier()
+
+    curves = follow_all(case, together, comm)
+
     assert len(curves) == (2 if comm.rank == 0 else 0)
-    on_root(comm, lambda: follow_all(of, folder / "alone", MPI.COMM_SELF) and None)
-    for name, *_ in of.curves():
-        paths = [folder / part / f"branch-{name}.h5" for part in ("shared", "alone")]
-        on_root(comm, lambda paths=paths: assert_same_bits(*map(datasets, paths)))
+    if comm.rank == 0:
+        follow_all(case, alone, MPI.COMM_SELF)
+        for name, *_ in case.curves():
+            assert_same_bits(datasets(together / f"branch-{name}.h5"), datasets(alone / f"branch-{name}.h5"))

@@ -53,6 +53,7 @@ def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder,
     with pytest.raises(StoppedError, match="the same command goes on"):
         run_search(plan(), folder, comm, stop=stop)
     assert not (folder / "optimum.h5").exists()
+
     comm.Barrier()
     run_search(plan(), folder, comm, resume=True)
     assert_same_bits(datasets(folder / "optimum.h5"), whole)

@@ -23,7 +23,8 @@ COMM = MPI.COMM_WORLD
 @pytest.mark.parametrize("writer", ["gather", "parallel"])
 def test_all_ranks_agree_on_what_is_told_in_the_file(folder, monkeypatch, writer):
     """HDF5 fails to close a file whose attributes, such as the seconds a run took, differ between ranks."""
-    finish, told = RunFolder.finish, []
+    finish = RunFolder.finish
+    told = []
 
     def watch(output, attributes, summary):
         told.append(dict(attributes))
@@ -33,6 +34,7 @@ def test_all_ranks_agree_on_what_is_told_in_the_file(folder, monkeypatch, writer
     result = simulate(small_case(output={"writer": writer}, time={"end": 0.01}), folder / "run")
     told.append([result.sentence, result.statistics, result.warnings])
     assert len(set(COMM.allgather(json.dumps(told)))) == 1
+
     with h5py.File(folder / "run" / "run.h5") as file:
         assert json.loads(file.attrs["statistics"]) == result.statistics
         assert file.attrs["ranks"] == COMM.size
@@ -49,6 +51,7 @@ def test_a_run_in_memory_is_gathered_on_rank_0(folder):
         return
     run = datasets(folder / "run" / "run.h5")
     held = memory.dataset.drop_vars(["end/displacement", "end/velocity"])  # of all cells, whatever is recorded
+
     assert_same_bits(run, {str(name): item.values for name, item in held.variables.items()})
 
 
@@ -61,6 +64,7 @@ def test_ranks_that_write_together_write_what_one_gathers(folder, monkeypatch):
         output = {"writer": writer, "window": [2, 20], "every": 2, "stride": 3}
         simulate(small_case(contacts=sites, output=output, time={"end": 0.04}), folder / writer)
     gathered, together = (datasets(folder / name / "run.h5") for name in ("gather", "parallel"))
+
     assert len(gathered["impacts/onset"]) > 20
     assert (gathered["energy/dissipated_by_site"][-1] > 0).sum() > 2
     assert_same_bits(gathered, together)
@@ -71,11 +75,13 @@ def test_rows_are_sorted_over_ranks_and_none_has_all():
     """Ranks begin with different numbers of rows, a third with none; of equal onset the lower site comes first."""
     random = np.random.default_rng(3)
     table = np.zeros(900, [("onset", float), ("site", np.int64)])
-    table["onset"], table["site"] = random.integers(300, size=900) / 7, random.permutation(900)
+    table["onset"] = random.integers(300, size=900) / 7
+    table["site"] = random.permutation(900)
     rows, first, total = sort_over_ranks(
         COMM, table[[slice(700), slice(700, 900), slice(0)][COMM.rank]], ("onset", "site")
     )
     expected = np.sort(table, order=("onset", "site"))
+
     assert total == len(expected)
     assert 0 < len(rows) < 1.1 * total / COMM.size + 10
     np.testing.assert_array_equal(rows, expected[first : first + len(rows)])
@@ -99,6 +105,7 @@ def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypa
     monkeypatch.setattr(chunks, "put_chunks", fails)
     with pytest.raises(OSError, match=r"run\.h5 could not be written"):
         simulate(case, path, force=True)
+
     COMM.Barrier()
     assert (path / "run.h5").read_bytes() == before
     assert {p.name for p in path.iterdir()} == {"case.toml", "run.h5", "summary.json", ".new"}
@@ -130,7 +137,8 @@ def test_a_request_that_one_rank_got_stops_all():
 
 @pytest.mark.parallel(2)
 def test_only_checkpoints_that_all_ranks_wrote_count(folder):
-    chunks, parts = RunFolder(folder, COMM), folder / "parts"
+    chunks = RunFolder(folder, COMM)
+    parts = folder / "parts"
     if COMM.rank == 0:
         parts.mkdir(parents=True)
     COMM.Barrier()
@@ -138,14 +146,17 @@ def test_only_checkpoints_that_all_ranks_wrote_count(folder):
         chunks.append({"x": np.array(number)})
         chunks.save_state({"number": np.array(number)})
     COMM.Barrier()
+
     assert sorted(path.name for path in parts.glob(f"state-*-{COMM.rank}-2.npy")) == [
         f"state-00000{number}-{COMM.rank}-2.npy" for number in (2, 3)
     ]
+
     COMM.Barrier()
     if COMM.rank == 1:
         (parts / "state-000003-1-2.npy").unlink()  # killed while it wrote the last one
     COMM.Barrier()
     again = RunFolder(folder, COMM)
+
     assert [share["number"] for share in again.last_state()] == [2, 2]
     assert again.count == 3
     assert not list(parts.glob("part-000003-*"))  # another number of ranks would leave them there
@@ -162,5 +173,6 @@ def test_a_checkpoint_that_one_rank_cannot_read_is_refused_on_all(folder):
         (state,) = (folder / "run" / "parts").glob("state-*-1-2.npy")
         state.write_bytes(state.read_bytes()[:20])
     COMM.barrier()
+
     with pytest.raises((OSError, ValueError)):
         RunFolder(folder / "run", COMM).last_state()

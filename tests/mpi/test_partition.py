@@ -27,6 +27,7 @@ def runs_alike(folder: Path, case: Case) -> None:
     def compare() -> None:
         alone = simulate(case, folder / "alone", MPI.COMM_SELF)
         assert alone.complete
+
         first, second = (datasets(folder / name / "run.h5") for name in ("together", "alone"))
         assert_same_bits(first, second)
         assert len(first["impacts/site"]) > 0
@@ -151,10 +152,12 @@ def test_a_step_that_fails_on_one_rank_ends_the_run_on_all(engine, stiffness, ob
         "time": {"end": 0.02, "engine": engine, "rtol": 1e-8},
     }
     result = simulate(Case.from_table(table), RunMemory(MPI.COMM_WORLD), observers=observers)
+
     assert not result.complete
     assert not result.resumable
     assert result.sentence.startswith(reason)
     assert "nearest site 1 in cell 5" in result.sentence
+
     told = MPI.COMM_WORLD.allgather((result.sentence, result.statistics, result.warnings))
     assert all(each == told[0] for each in told)
 
@@ -176,10 +179,13 @@ def test_a_stopped_run_goes_on_to_the_same_bits_on_any_number_of_ranks(folder, m
         simulate(case, folder / "straight", MPI.COMM_SELF)
         assert simulate(case, folder / "stopped", MPI.COMM_SELF, stop=StopAt(looks[0])).resumable
     comm.Barrier()
+
     assert simulate(case, folder / "stopped", resume=True, stop=StopAt(looks[1])).resumable
+
     comm.Barrier()
     if comm.rank:
         assert simulate(case, folder / "stopped", fewer, resume=True).complete
+
     comm.Barrier()
     fewer.Free()
     if comm.rank == 0:
@@ -195,7 +201,9 @@ def test_the_whole_builtin_run_has_the_same_bits(folder):
     result = simulate(case, folder / "two", comm)
     if comm.rank == 0:
         simulate(case, folder / "one", MPI.COMM_SELF)
-        one, two = datasets(folder / "one" / "run.h5"), datasets(folder / "two" / "run.h5")
+        one = datasets(folder / "one" / "run.h5")
+        two = datasets(folder / "two" / "run.h5")
         assert_same_bits(one, two)
         assert [int((one["impacts/site"] == s).sum()) for s in range(1, 6)] == [50, 43, 33, 37, 18]
+
     assert result.statistics["ledger_error"] < 1e-8

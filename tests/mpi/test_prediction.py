@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from tempfile import mkdtemp
-
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 
-from tests.verify.test_prediction import small
-from vipetsc.parallel import on_root
+from tests.one_site import prediction_case
 from vipetsc.studies.prediction import predict
-
-KEPT = "predicted/bands", "predicted/dissipated", "predicted/z", "simulated/bands"
 
 
 @pytest.mark.parallel([2])
-def test_ranks_predict_the_same():
+def test_ranks_predict_the_same(folder):
     comm = MPI.COMM_WORLD
-    case = small(lattice={"cells": 60}, contacts={"sites": [30], "clearance": [2e-3]},
-                 predict={"amplitudes": [20.0, 60.0], "points": 16})  # fmt: skip
-    shared, alone = (Path(on_root(comm, mkdtemp)) for _ in range(2))
-    together = predict(case, shared, comm)
-    single = on_root(comm, lambda: predict(case, alone, MPI.COMM_SELF))
-    for name in KEPT:
-        np.testing.assert_array_equal(together[name].values, single[name].values)
+    case = prediction_case(
+        lattice={"cells": 60},
+        contacts={"sites": [30], "clearance": [2e-3]},
+        predict={"amplitudes": [20.0, 60.0], "points": 16},
+    )
+    paths = [folder / "together", folder / "alone"]
+    if comm.rank == 0:
+        for path in paths:
+            path.mkdir()
+    comm.Barrier()
+
+    together = predict(case, paths[0], comm)
+
+    if comm.rank == 0:
+        alone = predict(case, paths[1], MPI.COMM_SELF)
+        for name in ("predicted/bands", "predicted/dissipated", "predicted/z", "simulated/bands"):
+            np.testing.assert_array_equal(together[name].values, alone[name].values)

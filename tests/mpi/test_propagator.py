@@ -36,7 +36,8 @@ def test_same_bits_where_the_band_is_wider_than_a_rank(folder):
 
 @pytest.mark.parallel(2)
 def test_same_bits_with_dashpots(folder):
-    damping, sites = {"mass": 10.0, "stiffness": 5e-6}, [1, 7, 12, 13, 16, 17]
+    damping = {"mass": 10.0, "stiffness": 5e-6}
+    sites = [1, 7, 12, 13, 16, 17]
     time = {"end": 0.02, "engine": "propagator"}
     runs_alike(folder, small_case(lattice={"damping": damping}, contacts={"sites": sites}, time=time))
 

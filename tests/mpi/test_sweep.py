@@ -58,7 +58,9 @@ def test_the_ensemble_does_not_depend_on_the_ranks(folder, whole, team):
     comm = MPI.COMM_WORLD
     plan = Sweep.from_table(tomllib.loads(TABLE), [f"sweep.ranks={team}"])
     result = run_sweep(plan, folder, comm)
-    assert result.complete and result.status.size == 6 and len(result.busy) == comm.size
+    assert result.complete
+    assert result.status.size == 6
+    assert len(result.busy) == comm.size
     assert_same_bits(datasets(folder / "ensemble.h5"), whole)
     assert {path.name for path in folder.glob("[!.]*")} == {"case.toml", "members.jsonl", "ensemble.h5", "index.json"}
     comm.Barrier()
@@ -77,7 +79,8 @@ def test_samples_differ_and_neither_ranks_nor_order_change_a_bit(folder):
         run_sweep(Sweep.from_table(table), folder / "alone", MPI.COMM_SELF)
         found, turned, alone = (datasets(folder / name / "ensemble.h5") for name in ("all", "turned", "alone"))
         assert_same_bits(found, alone)
-        assert turned["ibtet"].tolist() == found["ibtet"][[2, 0, 1]].tolist() and len({*turned["ibtet"]}) == 3
+        assert turned["ibtet"].tolist() == found["ibtet"][[2, 0, 1]].tolist()
+        assert len({*turned["ibtet"]}) == 3
         assert found["statistics/samples"] == 3
         assert (folder / "all" / "members.jsonl").read_bytes().count(b'"envelope"') == 1  # one linear run for all
     comm.Barrier()
@@ -94,6 +97,7 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
     # The first record is that of the linear run; a team's rank 0 measures and writes for it.
     if comm.rank == (0 if team == 2 else 1):
         injector.arm(phase, {"append": 3 - comm.rank, "step": 2, "analyse": 2}[phase], kind)
+
     if kind == "full-disk":
         with pytest.raises(OSError, match="No space left"):
             run_sweep(plan, folder / "out", comm)
@@ -101,7 +105,10 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
         result = run_sweep(plan, folder / "out", comm)
         ((reason),) = {row["reason"] for row in json.loads((folder / "out" / "index.json").read_text())["failed"]}
         assert ("a fault at analyse" if kind == "exception" else "MemoryError: Unable to allocate") in reason
-        assert not result.complete and not result.resumable and result.count(2) < 6
+        assert not result.complete
+        assert not result.resumable
+        assert result.count(2) < 6
+
     injector.disarm()
     comm.Barrier()
     assert run_sweep(plan, folder / "out", comm).complete
@@ -116,8 +123,11 @@ def test_one_rank_that_is_asked_to_stop_stops_all(folder, whole, team, looks):
     plan = Sweep.from_table(tomllib.loads(TABLE), [f"sweep.ranks={team}"])
     stop = StopAt(looks) if comm.rank == comm.size - 1 else StopRequest()
     stopped = run_sweep(plan, folder / "out", comm, stop=stop)
-    assert stopped.resumable and not (folder / "out" / "ensemble.h5").exists()
+
+    assert stopped.resumable
+    assert not (folder / "out" / "ensemble.h5").exists()
     assert stopped.newly_made == stopped.count(0) + stopped.count(1)
+
     comm.Barrier()
     assert run_sweep(plan, folder / "out", comm).complete
     assert_same_bits(datasets(folder / "out" / "ensemble.h5"), whole)
@@ -127,17 +137,20 @@ def test_one_rank_that_is_asked_to_stop_stops_all(folder, whole, team, looks):
 @pytest.mark.parallel([1, 2, 3])
 def test_every_number_is_drawn_once():
     comm = MPI.COMM_WORLD
-    counter, drawn = SharedCounter(comm), []
+    counter = SharedCounter(comm)
+    drawn = []
     while (number := counter.draw()) < 200:
         drawn.append(number)
     everything = [number for share in comm.allgather(drawn) for number in share]
+
     assert sorted(everything) == list(range(200))
     counter.free()
 
 
 @pytest.mark.parallel([2])
 def test_after_a_request_on_one_rank_no_rank_begins_another_job():
-    comm, stop = MPI.COMM_WORLD, StopRequest()
+    comm = MPI.COMM_WORLD
+    stop = StopRequest()
     pool = TaskPool(comm, MPI.COMM_SELF, stop)
 
     def work(job: int) -> None:
@@ -145,12 +158,15 @@ def test_after_a_request_on_one_rank_no_rank_begins_another_job():
         stop.requested = comm.rank == 1
 
     assert pool.run(list(range(100)), work) < 50
-    assert pool.stopped and pool.run([1, 2], work) == 0
+    assert pool.stopped
+    assert pool.run([1, 2], work) == 0
 
 
 @pytest.mark.parallel([1, 2, 3])
 def test_blocks_of_jobs_hold_every_job_once():
-    comm, done, failed = MPI.COMM_WORLD, list[int](), list[int]()
+    comm = MPI.COMM_WORLD
+    done = list[int]()
+    failed = list[int]()
 
     def work(job: int) -> None:
         done.append(job)

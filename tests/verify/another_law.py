@@ -21,9 +21,11 @@ from vipetsc.contact.law import (
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import Contact
 
-K, B = 2e5, 4e5
+K = 2e5
+B = 4e5
 # Of the stop in a steady state far below all modes, where nothing is large but its own force.
-SOFT, STEADY_B = 2e3, 2e6
+SOFT = 2e3
+STEADY_B = 2e6
 D = 1e-3
 
 
@@ -44,7 +46,8 @@ def relative(a, b):
 
 
 def twins() -> dict:
-    law, x = Contact("hardening", K, hardening=B), np.linspace(1e-4, 2e-3, 7)
+    law = Contact("hardening", K, hardening=B)
+    x = np.linspace(1e-4, 2e-3, 7)
     (record,) = elastic_records([law])
     compiled = np.array(
         [(*elastic_force_and_slope(record, s), elastic_force(record, s), elastic_energy(record, s)) for s in x]
@@ -56,7 +59,8 @@ def twins() -> dict:
         relative(compiled.T, [force(x), slope(x), force(x), energy(x)]),
     ]
 
-    mass, speed = 0.01, 2.0
+    mass = 0.01
+    speed = 2.0
     fall = solve_ivp(lambda t, y: [y[1], -force(y[0]) / mass], (0, 1), [0.0, speed], rtol=1e-11, atol=1e-14,
                      events=turning)  # fmt: skip
     site = create_contacts(law, [D], mass)[0]
@@ -75,7 +79,8 @@ STOPS = {"law": "hardening", "hardening": B, "stiffness": K, "sites": [4, 6], "c
 
 
 def engines() -> dict:
-    velocity, results = {}, {}
+    velocity = {}
+    results = {}
     for law, engine in (("hardening", "ts"), ("hardening", "propagator"), ("bilinear", "propagator")):
         stops = STOPS | {"law": law, "restitution": 0.6}
         if law != "hardening":
@@ -99,7 +104,8 @@ def engines() -> dict:
     }
 
 
-MASS, SPRING = 1.3, 4e4
+MASS = 1.3
+SPRING = 4e4
 
 
 def period(total: float) -> float:
@@ -162,7 +168,8 @@ contacts = [{{ host = 0, resonator = 1, clearance = {D} }}]
 
 def periodic(omega: float, amplitude: float, chain) -> float:
     """Largest |w| in m of the symmetric periodic orbit under amplitude cos(omega t) on the first mass."""
-    stiffness, masses = chain.stiffness_matrix().toarray(), chain.masses()
+    stiffness = chain.stiffness_matrix().toarray()
+    masses = chain.masses()
     pair = np.zeros(len(masses))
     pair[[chain.cell.host, chain.cell.resonator]] = -1, 1
 
@@ -189,14 +196,16 @@ def periodic(omega: float, amplitude: float, chain) -> float:
             lambda u, strength=strength: orbit(u, strength)[n:, -1] / (omega * D), u * strength / touching, tol=1e-9
         )
         assert solved.success, solved.message
-        u, touching = solved.x, strength
+        u = solved.x
+        touching = strength
     return float(np.abs(pair @ orbit(u, amplitude)[:n]).max())
 
 
 def steady() -> dict:
     lattice = {"preset": "four-band", "cells": 2}
     chain = Case.from_table({"lattice": lattice, "contacts": STOPS | {"sites": [1]}}).model().chain
-    stiffness, masses = chain.stiffness_matrix().toarray(), chain.masses()
+    stiffness = chain.stiffness_matrix().toarray()
+    masses = chain.masses()
     omega = round(0.7 * float(np.sqrt(eigh(stiffness, np.diag(masses), eigvals_only=True)[0])), 3)
     linear = np.linalg.solve(stiffness - omega**2 * np.diag(masses), np.eye(len(masses))[0])
     touching = D / abs(linear[chain.cell.resonator] - linear[chain.cell.host])
@@ -225,10 +234,13 @@ range = [{0.9 * touching}, {3 * touching}]
 harmonics = 31
 """
     Path("nfrc.toml").write_text(case)
+
     assert main(["nfrc", "nfrc.toml", "--out", "nfrc", "--force"], {}) == 0
+
     (path,) = Path("nfrc").glob("branch-*.h5")
     with open(path) as curve:
-        amplitude, largest = curve["amplitude"].values, curve["largest"].values
+        amplitude = curve["amplitude"].values
+        largest = curve["largest"].values
     expected = periodic(omega, amplitude[-1], chain)
     return {"steady": abs(float(largest[-1, 0]) / expected - 1), "steady_hardens": STEADY_B * (expected - D) ** 2}
 

@@ -27,7 +27,8 @@ def apply_chapter(package: Path) -> int:
     """Make the changes of the chapter's ``diff`` blocks in the files of ``package``; returns how many there are."""
     text = (package / "manual/extend.md").read_text(encoding="utf-8")
     section = text[text.index("**Another elastic force**") : text.index("A force that depends on more")]
-    path, count = None, 0
+    path = None
+    count = 0
     for name, block in re.findall(r"[Ii]n `vipetsc/([\w/]+\.py)`|```diff\n(.*?)```", section, flags=re.DOTALL):
         if name:
             path = package / name
@@ -36,7 +37,9 @@ def apply_chapter(package: Path) -> int:
         before = "".join(line[1:] for line in lines if line[0] in " -")
         after = "".join(line[1:] for line in lines if line[0] in " +")
         source = path.read_text(encoding="utf-8")
+
         assert source.count(before) == 1, f"{path.name} does not have once:\n{before}"
+
         path.write_text(source.replace(before, after), encoding="utf-8")
         count += 1
     return count
@@ -47,12 +50,14 @@ def found(tmp_path_factory) -> dict:
     folder = tmp_path_factory.mktemp("another-law")
     shutil.copytree(PACKAGE, folder / "vipetsc", ignore=shutil.ignore_patterns("__pycache__"))
     assert apply_chapter(folder / "vipetsc") == 10
+
     # Kernels are small here: what optimisation costs is more than it brings.
     environment = clean_environment() | {"PYTHONPATH": str(folder), "NUMBA_OPT": "1"}
     command = [sys.executable, str(SCRIPT)]
     ended = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=900, check=False
     )
+
     assert ended.returncode == 0, ended.stdout + ended.stderr
     return json.loads((folder / "found.json").read_text())
 

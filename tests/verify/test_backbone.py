@@ -36,15 +36,18 @@ def lattice(slope, divisor, floor, initiation, count=60):
 
 
 def test_energies_align_at_grazing(tmp_path):
-    slope, envelope = branch(), np.zeros(20)
+    slope = branch()
+    envelope = np.zeros(20)
     envelope[[16, 8]] = 2e-4, 1e-4
     case = Case.load(overrides=["lattice.cells=20", "contacts.sites=[17, 9]", "contacts.clearance=[1.8e-3, 2e-3]"])
     linear = LinearRun(envelope, np.zeros(20), {"work": 1.5e-3}, {})
     RecordFile(tmp_path / "members-0.jsonl").append(linear.record(linear_name(case)))
     initiation = initiation_of(tmp_path, case)
+
     assert initiation.amplitude == pytest.approx(20.0, rel=1e-14)
     assert initiation.onset == pytest.approx(9.0, rel=1e-14)
     assert initiation.energy == pytest.approx(1.5e-3 * 400, rel=1e-14)
+
     amplitude = np.array([1.0, initiation.amplitude, 300.0])
     found = align(1.5e-3 * amplitude**2, np.array([1e-4, 0.3, 0.1]), initiation.energy, 1e-4, slope)
     assert found["energy"].values[1] == pytest.approx(GRAZING, rel=1e-14)
@@ -59,7 +62,9 @@ def test_power_laws_are_found(divisor, initiation, exponent, seed):
     work = np.random.default_rng(seed).permutation(initiation * np.geomspace(1e-2, 1e6, 50))
     transfer = np.where(work < initiation, 1e-30, (work * GRAZING / initiation) ** exponent * 500.0 / divisor)
     found = align(work, transfer, initiation, 0.0, slope)
-    known, energy = slope["branch/energy"].values[slope["branch/region"].values == 3], found["energy"].values
+    known = slope["branch/energy"].values[slope["branch/region"].values == 3]
+    energy = found["energy"].values
+
     assert np.array_equal(found["fitted"].values, (energy >= known.min()) & (energy <= known.max()))
     assert found.attrs["divisor"] == pytest.approx(divisor, rel=1e-6)
     assert found.attrs["exponent"] == pytest.approx(exponent, abs=1e-9)
@@ -69,18 +74,22 @@ def test_power_laws_are_found(divisor, initiation, exponent, seed):
 
 @pytest.mark.parametrize("floor", [0.0, 1e-4, 1e-2])
 def test_floor_is_part_of_the_divisors_fit(floor):
-    slope, divisor = branch(), 4e3
+    slope = branch()
+    divisor = 4e3
     work, transfer = lattice(slope, divisor, floor, initiation=0.6)
     assert align(work, transfer, 0.6, floor, slope).attrs["divisor"] == pytest.approx(divisor, rel=1e-6)
 
 
 def test_divisor_is_the_least_squares_one():
-    slope, floor = branch(), 1e-3
+    slope = branch()
+    floor = 1e-3
     work, transfer = lattice(slope, 4e3, floor, initiation=0.6)
     transfer = transfer * np.exp(0.2 * np.sin(np.arange(len(transfer))))
     found = align(work, transfer, 0.6, floor, slope)
-    fitted, best = found["fitted"].values == 1, found.attrs["divisor"]
-    energy, seen = found["energy"].values[fitted], np.log(found["ibtet"].values[fitted])
+    fitted = found["fitted"].values == 1
+    best = found.attrs["divisor"]
+    energy = found["energy"].values[fitted]
+    seen = np.log(found["ibtet"].values[fitted])
 
     def misfit(divisor):
         return np.sum((np.log(500.0 * energy**EXPONENT / divisor + floor) - seen) ** 2)
@@ -95,7 +104,9 @@ def test_failed_members_and_points_before_the_peak_are_left_out():
     late = int(np.argmin(np.abs(work * GRAZING / 0.6 - 20 * GRAZING)))
     transfer[late] = 2 * np.nanmax(transfer)
     found = align(work, transfer, 0.6, 1e-4, slope)
-    energy, fitted = found["energy"].values, found["fitted"].values == 1
+    energy = found["energy"].values
+    fitted = found["fitted"].values == 1
+
     assert len(energy) == len(work) - 1
     assert energy[fitted].min() == pytest.approx(work[late] * GRAZING / 0.6)
 
@@ -104,7 +115,9 @@ def test_too_few_points_have_no_law_and_no_region_three_is_an_error():
     slope = branch()
     work = 0.6 * np.array([0.1, 3.0, 30.0])
     found = align(work, np.array([1e-4, 0.3, 0.1]), 0.6, 1e-4, slope)
-    assert found["fitted"].values.sum() < FEWEST and not found.attrs
+    assert found["fitted"].values.sum() < FEWEST
+    assert not found.attrs
+
     short = slope.isel(point=slope["branch/energy"].values < 1.5 * GRAZING)
     with pytest.raises(ValueError, match="region III"):
         align(work, np.array([1e-4, 0.3, 0.1]), 0.6, 1e-4, short)
@@ -127,6 +140,7 @@ def test_branch_is_read_at_its_regular_points(tmp_path):
     kinds = np.zeros(slope.sizes["point"], np.int8)
     kinds[9] = 6  # the located grazing point is not one of the continuation's own
     found = read_slope(write_branch(tmp_path / "b", slope, kinds))
+
     assert found.attrs.pop("grazing") == pytest.approx(GRAZING, rel=1e-12)
     assert found.sizes["point"] == slope.sizes["point"] - 1
     assert found.attrs == {"law": "hertz", "reading": "printed"}

@@ -43,13 +43,16 @@ def test_rayleigh_damping_has_its_closed_form(cell):
     lossy = damped(cell, alpha, beta)
     omega = bloch(cell, KAPPA).frequency
     point = damped_bloch(lossy, KAPPA)
+
     assert point.ratio == pytest.approx((alpha / omega + beta * omega) / 2, rel=1e-10)
     assert np.abs(point.rate) == pytest.approx(omega, rel=1e-10)
+
     weak = damped(cell, 1e-3 * alpha, 1e-3 * beta)
     _, frequency, speed = max_group_velocity(cell, 2)
     zeta = 1e-3 * (alpha / frequency + beta * frequency) / 2
     assert decay_length(weak, frequency) == pytest.approx(speed / (zeta * frequency), rel=1e-4)
     assert decay_length(cell, frequency) == np.inf
+
     waves = damped_waves(cell, frequency)
     for factor, shape in zip(waves.factor, waves.shape.T, strict=True):
         residual = cell.stiffness_matrix(np.angle(factor)) @ shape - frequency**2 * np.array(cell.masses) * shape
@@ -85,6 +88,7 @@ def test_bloch_waves_of_a_damped_ring_decay_as_the_bands_say(number):
         engine.advance(end)
         found = engine.state.array_r[: 4 * cells].reshape(4, cells).T
         there = (wave * np.exp(s * end)).real
+
         assert np.abs(found - there).max() < 1e-8 * np.abs(there).max()
         engine.destroy()
 
@@ -126,6 +130,7 @@ def test_a_packet_comes_back_as_computed():
     simulate(case, memory)
     energy = (memory.dataset["energy/kinetic"] + memory.dataset["energy/spring"]).values
     computed = reflection(absorber(cell, "fixed", 10, 400.0), omega, 10)
+
     assert 1e-3 < computed < 0.1
     assert energy[-1] / energy[0] == pytest.approx(computed, rel=0.1)
 
@@ -136,6 +141,7 @@ def test_an_absorbing_end_is_found_for_the_drive():
     drive = case.drive
     chain = case.model().chain
     section = absorber(chain.cell, "fixed", end.cells, end.strength)
+
     assert lobe_reflection(section, drive.frequency, drive.cycles) < 1e-4
     assert np.flatnonzero(chain.differs).tolist() == list(range(90 - end.cells, 90))
     assert reflection(chain, drive.frequency, end.cells + 1) < 1e-4
@@ -163,6 +169,7 @@ def test_profiles_defects_and_scatter_of_a_case():
     case = small_case(lattice=lattice, disorder=scattered)
     varied = case.model().chain.variation
     cell = case.model().chain.cell
+
     assert varied.masses[2, 1] == 2 * cell.masses[1]
     assert varied.stiffness[[0, -1], 0] == pytest.approx([2e4, 3e4])
     assert varied.damping[:, 3] == pytest.approx(0.1)
@@ -171,6 +178,7 @@ def test_profiles_defects_and_scatter_of_a_case():
     assert 0.005 < np.std(varied.masses[:, 0] / cell.masses[0]) < 0.04
     assert Case.from_toml(case.to_toml()) == case
     assert case.model().chain == small_case(lattice=lattice, disorder=scattered).model().chain
+
     other = small_case(lattice=lattice, disorder=scattered | {"seed": 4}).model().chain.variation
     assert np.all(other.masses[:, 0] != varied.masses[:, 0])
     assert np.array_equal(other.masses[:, 1], varied.masses[:, 1])
@@ -187,6 +195,7 @@ def test_what_differs_is_refused_by_name_and_stands_in_the_file():
     for kind, table in ((LawCase, {}), (Case, {"initial": {"kind": "mode", "number": 3, "amplitude": 1e-4}})):
         with pytest.raises(CaseError, match="whose cells"):
             kind.from_table({"lattice": {"profiles": {"masses[2]": {"cells": [3], "factor": 2.0}}}} | table)
+
     case = small_case(
         lattice={"profiles": {"masses[2]": {"cells": [3], "factor": 2.0}}},
         output={"window": [2, 4]},
@@ -194,6 +203,7 @@ def test_what_differs_is_refused_by_name_and_stands_in_the_file():
     )
     memory = RunMemory(MPI.COMM_SELF)
     simulate(case, memory)
+
     assert memory.dataset["lattice/masses"].sel(dof=2).values == pytest.approx([0.0025, 0.005, 0.0025])
     assert "lattice/stiffness" not in memory.dataset
 
@@ -220,6 +230,7 @@ def test_dashpots_fitted_to_a_loss_are_the_best_by_the_complex_dispersion(loss):
     if len(loss) == 1:
         assert ratios == pytest.approx(1.0, abs=4e-3)
     assert min(map(min, given)) >= 0
+
     for part, number in np.ndindex(2, 4):
         for step in (0.03, -0.03):
             values = [list(values) for values in given]
@@ -233,15 +244,19 @@ def test_a_loss_by_bands_is_resolved_to_dashpots():
     )
     resolved = case.lattice.damping
     chain = case.model().chain
+
     assert Case.from_toml(case.to_toml()) == case
     assert chain.cell == lossy(four_band("calibrated"), {2: 0.02})
     assert [*chain.cell.grounding] == resolved.grounding
     assert [s.damping for s in chain.cell.springs] == resolved.springs
     assert [name for name, _ in chain.variation.items()] == ["masses"] and chain.is_damped  # dashpots as in all cells
+
     asked, least, mean, most = losses(case.lattice)[1]
-    assert asked == 0.02 and 0.0199 < least < mean < most < 0.0201
+    assert asked == 0.02
+    assert 0.0199 < least < mean < most < 0.0201
     assert mean == pytest.approx(0.02, rel=1e-3)
     assert not any("loss" in sentence for sentence in case.warnings())
+
     flat = small_case(lattice={"damping": {"loss": {"1": 0.02, "2": 0.02}}})
     assert any("band 1 0.00" in sentence and "asked 0.02" in sentence for sentence in flat.warnings())
 
@@ -281,9 +296,11 @@ def test_nonsense_has_one_message(key, sections):
             "time": {"end": 1e-2, "sample_interval": 1e-4},
             "drive": {"frequency": 100.0} | sections.get("drive", {}),
         }
-        table, sections = {"contacts": TOUCHING}, sections | times
+        table = {"contacts": TOUCHING}
+        sections = sections | times
     for name, values in sections.items():
         table[name] = table.get(name, {}) | values
+
     with pytest.raises(CaseError, match=key) as error:
         Case.from_table(table)
     assert len(error.value.problems) == 1

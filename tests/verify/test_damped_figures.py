@@ -21,14 +21,17 @@ def test_the_ledger_has_the_dashpots(engine):
     memory = RunMemory(MPI.COMM_SELF)
     damping = {"mass": 10.0, "stiffness": 1e-5}
     assert simulate(small_case(lattice={"damping": damping}, time={"engine": engine, "end": 0.02}), memory).complete
+
     upper, lower = runs.ledger(memory.dataset, None).axes
     drawn = {line.get_label(): np.asarray(line.get_ydata()) for line in upper.lines}
     assert drawn["dissipated in dashpots"][-1] > 0.01 * drawn["work of the drive"][-1]
+
     residual = np.asarray(lower.lines[0].get_ydata())
     if engine == "ts":
         assert residual.max() < 1e-8
     else:
-        assert np.isnan(residual).all() and any("balance" in text.get_text() for text in lower.texts)
+        assert np.isnan(residual).all()
+        assert any("balance" in text.get_text() for text in lower.texts)
 
 
 def test_bands_of_a_damped_cell_show_its_decay():
@@ -37,6 +40,7 @@ def test_bands_of_a_damped_cell_show_its_decay():
     rates, omega = (np.asarray(values) for values in decay.lines[0].get_data())
     _, frequency, speed = max_group_velocity(cell, 2)
     there = np.interp(frequency / 1e3, omega, rates)
+
     assert there == pytest.approx(0.01 * frequency / speed, rel=1e-2)  # zeta omega / v_g
     assert rates[np.argmin(np.abs(omega - 0.65))] > 20 * there  # in a gap
     assert len(runs.bands(four_band(), 1000.0).axes) == 2
@@ -54,15 +58,23 @@ def impacts_of(sites: int, episodes: int, loss: float = 0.0):
 @pytest.mark.slow
 def test_impacts_that_markers_do_not_tell_apart_are_a_map():
     few = impact_panels.impacts(impacts_of(5, 20, 1e-6), None).axes
-    assert len(few[0].collections) == 2 and not few[0].images and few[1].get_title() == "(b) Loss, episodes"
+    assert len(few[0].collections) == 2
+    assert not few[0].images
+    assert few[1].get_title() == "(b) Loss, episodes"
+
     many = impact_panels.impacts(impacts_of(59, 35_400), None).axes
     (image,) = many[0].images
     largest = np.ma.filled(image.get_array(), np.nan)
-    assert largest.shape == (59, impact_panels.MAP_COLUMNS) and not many[0].collections
+    assert largest.shape == (59, impact_panels.MAP_COLUMNS)
+    assert not many[0].collections
+
     at = 4000  # of site 48, as is number 3941 in the same column
     assert largest[at % 59, int((at + 0.5) / 35_400 * impact_panels.MAP_COLUMNS)] == 1.0 + at
-    assert len(many[0].get_yticks()) <= 13 and many[0].get_yticklabels()[1].get_text() == "60"
-    assert many[1].get_title() == "(b) Episodes" and {p.get_width() for p in many[1].patches} == {600}
+    assert len(many[0].get_yticks()) <= 13
+    assert many[0].get_yticklabels()[1].get_text() == "60"
+    assert many[1].get_title() == "(b) Episodes"
+    assert {p.get_width() for p in many[1].patches} == {600}
+
     pooled = impact_panels.impacts(impacts_of(1000, 3000), None).axes[0].images[0]
     assert len(pooled.get_array()) <= impact_panels.MAP_ROWS
 
@@ -79,6 +91,10 @@ def test_contacts_that_touch_from_the_beginning_show_their_indentation():
         {**data, "time": np.arange(11) / 10, "cell": [1, 2, 3], "displacement": (("time", "cell", "dof"), u)}
     )
     depth = panels.indentations(data, case.model())
-    assert depth[1, 5] == 2e-6 and np.count_nonzero(depth) == 1
+
+    assert depth[1, 5] == 2e-6
+    assert np.count_nonzero(depth) == 1
+
     raster, bars, *_ = impact_panels.impacts(data.assign_attrs(case=case.to_toml()), None).axes
-    assert raster.get_title() == "(a) Indentation" and [bar.get_width() for bar in bars.patches] == [0.0, 3.0]
+    assert raster.get_title() == "(a) Indentation"
+    assert [bar.get_width() for bar in bars.patches] == [0.0, 3.0]

@@ -17,7 +17,8 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.store import RunMemory
 
-DRIVEN, SITE = 3, 4
+DRIVEN = 3
+SITE = 4
 
 
 def damped_case(**sections) -> Case:
@@ -36,14 +37,19 @@ def test_rates_and_energies_are_those_of_the_equations(ends, dashpots):
         cell = replace(chain.cell, grounding=(), springs=tuple(replace(s, damping=0.0) for s in chain.cell.springs))
         chain = replace(chain, cell=cell)
     model = replace(model, chain=chain)
-    layout, d = Layout(model, MPI.COMM_SELF, Integrator.dashpots), chain.cell.dofs
+    layout = Layout(model, MPI.COMM_SELF, Integrator.dashpots)
+    d = chain.cell.dofs
     engine = Integrator(model, layout)
-    t, (host, resonator) = 0.3 * model.drive.duration, (chain.cell.host, chain.cell.resonator)
+    t = 0.3 * model.drive.duration
+    (host, resonator) = (chain.cell.host, chain.cell.resonator)
     rng = np.random.default_rng(5)
-    u, v = 1e-5 * rng.normal(size=(CELLS, d)), 1e-2 * rng.normal(size=(CELLS, d))
+    u = 1e-5 * rng.normal(size=(CELLS, d))
+    v = 1e-2 * rng.normal(size=(CELLS, d))
     u[SITE - 1, [host, resonator]] = -2e-5, 1e-5  # indentation 2e-5 m
     sites = engine.lattice.contacts
-    sites["mode"][0], sites["clearance"][0], sites["approach"][0] = CLOSED, 1e-5, 0.02
+    sites["mode"][0] = CLOSED
+    sites["clearance"][0] = 1e-5
+    sites["approach"][0] = 0.02
     lost = 1e-3 * rng.uniform(size=CELLS * dashpots)
     engine.state.array[:] = np.concatenate([u.T.ravel(), v.T.ravel(), lost, [0.25], [0.5]])
     f = engine.state.duplicate()
@@ -51,7 +57,8 @@ def test_rates_and_energies_are_those_of_the_equations(ends, dashpots):
 
     k, c = (rows(0, CELLS).toarray() for rows in (chain.stiffness_rows, chain.damping_rows))
     force = -(k @ u.ravel() + c @ v.ravel()).reshape(CELLS, d)
-    drive, rate = float(model.drive.force(t)), float(v[SITE - 1, resonator] - v[SITE - 1, host])
+    drive = float(model.drive.force(t))
+    rate = float(v[SITE - 1, resonator] - v[SITE - 1, host])
     push = float(model.contact.force(3e-5, 1e-5, rate, 0.02))
     force[DRIVEN - 1, 1] += drive
     force[SITE - 1, host] += push
@@ -59,9 +66,11 @@ def test_rates_and_energies_are_those_of_the_equations(ends, dashpots):
     acceleration = force / chain.variation.masses
     powers = f.array[2 * CELLS * d :][: CELLS * dashpots]
     scale = np.abs(acceleration).max()
+
     np.testing.assert_allclose(f.array[CELLS * d :][: CELLS * d], acceleration.T.ravel(), atol=1e-13 * scale)
     assert powers.sum() == pytest.approx(v.ravel() @ c @ v.ravel(), rel=1e-12)
     assert f.array[-2] == pytest.approx(drive * v[DRIVEN - 1, 1])
+
     motion = np.empty((1, 3))
     engine.observe(motion, t)
     assert motion[0, 2] == pytest.approx(acceleration[SITE - 1, resonator] - acceleration[SITE - 1, host], rel=1e-12)
@@ -87,6 +96,7 @@ def test_cells_that_do_not_differ_give_the_bits_of_those_alike():
         f.append(engine.state.duplicate())
         engine.ts.computeRHSFunction(1e-3, engine.state, f[-1])
     rows = [part.array[: 2 * 4 * 24].reshape(8, 24)[:, 1:] for part in f]
+
     assert engine.lattice.stiffness.size > 0
     assert rows[0].tobytes() == rows[1].tobytes()
 
@@ -94,13 +104,17 @@ def test_cells_that_do_not_differ_give_the_bits_of_those_alike():
 def test_the_ledger_closes_with_dashpots():
     memory = RunMemory(MPI.COMM_SELF)
     result = simulate(damped_case(), memory)
-    run, statistics = memory.dataset, result.statistics
+    run = memory.dataset
+    statistics = result.statistics
+
     assert statistics["episodes"] > 0
     assert statistics["ledger_error"] < 1e-9
+
     lost = run["energy/dissipated_by_damping"].values
     assert np.all(np.diff(lost) >= 0)
     assert 0.05 < lost[-1] / statistics["work"] < 0.9
     assert statistics["dissipated_by_damping"] == lost[-1]
+
     plain = RunMemory(MPI.COMM_SELF)
     assert "dissipated_by_damping" not in simulate(small_case(time={"end": 1e-3}), plain).statistics
     assert "energy/dissipated_by_damping" not in plain.dataset

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from tests.verify.test_nfrc import case, start_of
+from tests.steady_states import motion_at, nfrc_case
 from vipetsc.lattice import Contact, DenseCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces
@@ -107,7 +107,7 @@ class ForcedCell:
 def test_stability_of_a_dissipative_state_is_that_of_its_period_map(force, last):
     """r = .7, two cells: an unstable and a stable state, after a state without contact at the same frequency."""
     omega = 1700.0
-    of = case({"cells": 2}, {"sites": [1], "restitution": 0.7}, source="force", infinite=False, harmonics=last,
+    of = nfrc_case({"cells": 2}, {"sites": [1], "restitution": 0.7}, source="force", infinite=False, harmonics=last,
               range=[force, 26.0], fixed=[omega], largest_step=0.5)  # fmt: skip
     states = SteadyStates(of, 0.7, omega)
     xi = first_state(states).xi
@@ -126,7 +126,7 @@ def test_stability_of_a_dissipative_state_is_that_of_its_period_map(force, last)
     phase = phases[np.argmin(np.abs(w))]
 
     motion = ForcedCell(states, omega, force)
-    start = np.concatenate([part.ravel() for part in start_of(states, xi, np.arange(2), phase)])
+    start = np.concatenate([part.ravel() for part in motion_at(states, xi, np.arange(2), phase)])
     scale = 1e-5 * states.clearance * np.repeat([1, omega], len(start) // 2)
     # Harmonics left out, of a force that jumps at the onsets, move the stronger contact's state by 6e-5 clearances.
     assert np.abs((motion.one_period(start, phase) - start) / scale).max() < 10

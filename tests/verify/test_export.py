@@ -43,7 +43,8 @@ def slab(item: ElementTree.Element, folder) -> np.ndarray:
     with h5py.File(folder / name) as file:
         dataset = file[path]
         assert [int(n) for n in source.get("Dimensions").split()] == list(dataset.shape)
-        assert source.get("NumberType") == "Float" and int(source.get("Precision")) == dataset.dtype.itemsize
+        assert source.get("NumberType") == "Float"
+        assert int(source.get("Precision")) == dataset.dtype.itemsize
         assert all(start + (count - 1) * stride < dataset.shape)
         part = dataset[tuple(slice(a, a + n * s, s) for a, n, s in zip(start, count, stride, strict=True))]
     return part.reshape([int(n) for n in item.get("Dimensions").split()])
@@ -56,8 +57,10 @@ def test_every_reference_of_the_mesh_leads_to_its_field(folder):
         velocity = run["velocity"].values
         times = run["field_time"].values
         cells = run["cell"].values
+
     assert len(grids) == len(times) == len(displacement)
     assert [float(grid.find("Time").get("Value")) for grid in grids] == times.tolist()
+
     for row, grid in enumerate(grids):
         fields = {item.get("Name"): slab(item.find("DataItem"), folder) for item in grid.findall("Attribute")}
         assert fields["displacement (m)"].tobytes() == displacement[row].tobytes()
@@ -74,7 +77,9 @@ def test_long_runs_show_every_nth_sample_to_the_end(folder, monkeypatch):
     with open_run(folder / "run.h5") as run:
         times = run["field_time"].values
     shown = [float(grid.find("Time").get("Value")) for grid in grids]
-    assert len(shown) <= 7 and shown == times[:: -(-len(times) // 7)].tolist()
+
+    assert len(shown) <= 7
+    assert shown == times[:: -(-len(times) // 7)].tolist()
 
 
 def test_a_run_without_fields_has_no_mesh(tmp_path):
@@ -89,7 +94,8 @@ def test_groups_carry_their_time_in_plain_xarray(folder):
         assert energy.work.time.values.tolist() == time.tolist()
         assert energy.time.attrs["units"] == "s"
     with xr.open_dataset(folder / "run.h5", engine="h5netcdf", group="impacts") as impacts:
-        assert "onset" in impacts.loss.coords and impacts.onset.attrs["units"] == "s"
+        assert "onset" in impacts.loss.coords
+        assert impacts.onset.attrs["units"] == "s"
         assert impacts.loss.sizes["episode"] > 2
 
 
@@ -103,15 +109,18 @@ def test_links_are_no_variables_and_give_way_to_one(tmp_path):
     write_netcdf(tmp_path / "x.h5", xr.Dataset(data))
     with open_netcdf(tmp_path / "x.h5", "file") as back:
         assert set(back.variables) == {"time", "site", "g/a", "g/site"}
-        assert back["g/site"].values.tolist() == [5.0, 6.0] and back["g/site"].dims == ("time",)
+        assert back["g/site"].values.tolist() == [5.0, 6.0]
+        assert back["g/site"].dims == ("time",)
         assert back["g/a"].dims == ("time", "site")
 
 
 def test_open_gives_units_and_the_case(folder):
     with package.open(folder) as run, package.open(folder / "run.h5") as same:
-        assert run["velocity"].attrs["units"] == "m/s" and run["energy/work"].coords["time"].attrs["units"] == "s"
+        assert run["velocity"].attrs["units"] == "m/s"
+        assert run["energy/work"].coords["time"].attrs["units"] == "s"
         assert "impacts/onset" in run["impacts/force"].coords
-        assert Case.of(run) == Case.of(same) and Case.of(run).lattice.cells == 16
+        assert Case.of(run) == Case.of(same)
+        assert Case.of(run).lattice.cells == 16
         assert set(run.variables) == set(datasets(folder / "run.h5"))
 
 
@@ -128,6 +137,7 @@ def test_curves_are_tables_with_units_and_every_digit(folder, in_process):
     before = datasets(folder / "run.h5")
     ended = in_process("export", folder)
     assert ended.returncode == 0, ended.stderr
+
     ledger = pd.read_csv(folder / "curves/run-time.csv", float_precision="round_trip")
     impacts = pd.read_csv(folder / "curves/run-episode.csv", float_precision="round_trip")
     with open_run(folder / "run.h5") as run:
@@ -135,6 +145,7 @@ def test_curves_are_tables_with_units_and_every_digit(folder, in_process):
         assert ledger["time (s)"].values.tobytes() == run["time"].values.tobytes()
         assert impacts["impacts/force (N)"].values.tobytes() == run["impacts/force"].values.tobytes()
         assert impacts["impacts/onset (s)"].values.tobytes() == run["impacts/onset"].values.tobytes()
+
     assert f"  {folder / 'run.xdmf'}" in ended.stdout.splitlines()
     assert_same_bits(before, datasets(folder / "run.h5"))
 
@@ -145,15 +156,19 @@ def test_a_sweep_is_one_table_of_members(tmp_path):
     axes = {"drive": {"amplitude": [1.0, 30.0]}, "contacts": {"restitution": [0.5, 1.0]}}
     plan = Sweep.from_table(table | {"drive": {"cycles": 3}, "time": {"end": 0.02}, "sweep": axes})
     run_sweep(plan, tmp_path, MPI.COMM_SELF)
+
     assert [path.name for path in export.write_curves(tmp_path) if "members" in path.name] == ["ensemble-members.csv"]
+
     members = pd.read_csv(tmp_path / "curves/ensemble-members.csv", float_precision="round_trip")
     with package.open(tmp_path) as ensemble:
         picked = ensemble.sel(amplitude=30.0, restitution=0.5)
         row = members[(members["amplitude (N)"] == 30.0) & (members["restitution"] == 0.5)]
-        assert len(members) == 4 and row["ibtet"].item() == picked["ibtet"].item()
+        assert len(members) == 4
+        assert row["ibtet"].item() == picked["ibtet"].item()
 
 
 def test_what_holds_no_results_is_refused(in_process, tmp_path):
     ended = in_process("export", tmp_path)
-    assert ended.returncode == 2 and "holds no results" in ended.stderr
+    assert ended.returncode == 2
+    assert "holds no results" in ended.stderr
     assert not any(tmp_path.iterdir())

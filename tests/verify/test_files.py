@@ -60,14 +60,17 @@ def test_impact_log_is_complete_and_ordered(made):
     run = datasets(made / "run.h5")
     log = {k.split("/")[1]: v for k, v in run.items() if k.startswith("impacts/")}
     assert np.all(np.diff(log["onset"]) >= 0)
+
     ended = np.isfinite(log["separation"])
     assert ended.sum() >= len(ended) - 3
     assert np.all(log["separation"][ended] > log["onset"][ended])
     assert np.all(log["side"] * log["approach_velocity"] > 0)
     assert np.all(log["indentation"] > 0)
     assert np.all(log["force"] > 0)
+
     losses = np.bincount(log["site"] - 1, weights=log["loss"], minlength=3)
     np.testing.assert_allclose(losses, run["energy/dissipated_by_site"][-1], rtol=1e-6, atol=1e-12)
+
     # Between samples the force cannot exceed the logged one.
     w = run["displacement"][..., 2] - run["displacement"][..., 1]
     for site, cell in enumerate((6, 12, 13)):
@@ -82,9 +85,11 @@ def test_a_stalled_run_says_when_and_where_and_keeps_its_samples(folder, monkeyp
     assert not result.resumable
     for text in ("stalled", "at t = ", "nearest site 1 in cell 6", "last good sample"):
         assert text in result.sentence
+
     run = datasets(folder / "run" / "run.h5")
     assert 10 < len(run["time"]) < small_case().model().samples
     assert np.isfinite(run["velocity"]).all()
+
     summary = json.loads((folder / "run" / "summary.json").read_text())
     assert not summary["complete"]
     assert summary["status"] == result.sentence
@@ -104,6 +109,7 @@ def test_a_state_that_is_not_finite_ends_the_run(folder, monkeypatch):
     result = simulate(small_case(time={"end": 0.0302}), folder / "run")
     assert "not finite" in result.sentence
     assert "cell 4, nearest site 1 in cell 6" in result.sentence
+
     run = datasets(folder / "run" / "run.h5")
     assert run["time"][-1] == pytest.approx(0.03)
     assert np.isfinite(run["displacement"]).all()
@@ -114,16 +120,20 @@ def test_another_analysis_of_the_same_run(made, folder):
     """It is measured anew, not refused and not simulated; anything else is another case."""
     shutil.copytree(made, folder / "run")
     assert is_measured(folder / "run")
+
     finer = small_case(analysis={"cell_stride": 1})
     assert simulate(finer, folder / "run").complete
     assert not is_measured(folder / "run")
+
     measure_run(folder / "run")
     assert is_measured(folder / "run")
+
     reanalyse_folders([folder / "run"], MPI.COMM_SELF, ["analysis.snapshot_stride=3"])
     with xarray.open_dataset(folder / "run/analysis.h5", engine="h5netcdf") as analysis:
         assert json.loads(analysis.attrs["analysis"]) | {"cell_stride": 1, "snapshot_stride": 3} == json.loads(
             analysis.attrs["analysis"]
         )
+
     for overrides in (["drive.amplitude=2.0"], ["output.stride=2"]):
         with pytest.raises(FolderError, match=r"only \[analysis\] can change"):
             reanalyse_folders([folder / "run"], MPI.COMM_SELF, overrides)
@@ -140,14 +150,18 @@ def test_the_default_analysis_is_near_the_full_one(lattice, amplitude):
     simulate(Case.from_table({"lattice": lattice, "drive": {"amplitude": amplitude}, "time": time}), memory)
     everything = AnalysisTable(band_stride=1, snapshot_stride=1, cell_stride=1)
     default, full = (analyse(memory.dataset, ("bands", "entropy"), options=some) for some in (None, everything))
+
     if np.isfinite(full["ibtet"]):
         assert default["ibtet"].item() == pytest.approx(full["ibtet"].item(), abs=5e-4)
         assert default["ibtet_whole"].item() == pytest.approx(full["ibtet_whole"].item(), abs=5e-4)
         np.testing.assert_allclose(default["bands/energy"][:-1], full["bands/energy"][:-1], rtol=1e-12)
+
     for name in ("energy_weighted", "masked", "joint"):
         measure = default[f"entropy/{name}"]
         assert measure.item() == pytest.approx(full[f"entropy/{name}"].item(), rel=1e-3)
         assert measure.attrs["snapshot_stride"] == measure.attrs["cell_stride"] == 2
         assert 0 < measure.attrs["sampling_error"] < 0.01 * measure.item()
-    assert default["ibtet"].attrs["band_stride"] == 10 and full["ibtet"].attrs["sampling_error"] == 0
+
+    assert default["ibtet"].attrs["band_stride"] == 10
+    assert full["ibtet"].attrs["sampling_error"] == 0
     assert json.loads(default.attrs["analysis"])["cell_stride"] == 2

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 from mpi4py import MPI
 
 import numpy as np
@@ -9,7 +12,8 @@ import pytest
 import xarray as xr
 from scipy.interpolate import CubicSpline
 
-from tests.conftest import StopAt, assert_same_bits, datasets
+from tests.conftest import StopAt, assert_same_bits, datasets, simulated
+from tests.models import CLEARANCE
 from vipetsc.case import Case, CaseError, NnmCase
 from vipetsc.dynamics import simulate
 from vipetsc.io.netcdf import variable, write_netcdf
@@ -31,162 +35,228 @@ def moving(initial: dict, **sections) -> Case:
 
 
 def run(case: Case) -> xr.Dataset:
-    memory = RunMemory()
-    result = simulate(case, memory)
-    assert result.complete
+    """A run in memory whose energy balance closes."""
+    data, result = simulated(case)
     assert result.statistics["ledger_error"] < 1e-8
-    return memory.dataset
+    return data
 
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_mode_stays_a_mode(engine, ends):
-    case = moving({"kind": "mode", "number": 50, "energy": 2e-3}, lattice={"ends": ends},
-                  time={"engine": engine, "end": 0.02, "rtol": 1e-13})  # fmt: skip
+    """A mode keeps its energy and swings as a cosine, which no other mode joins."""
+    end = 0.02
+    case = moving(
+        {"kind": "mode", "number": 50, "energy": 2e-3},
+        lattice={"ends": ends},
+        time={"engine": engine, "end": end, "rtol": 1e-13},
+    )
     chain = case.model().chain
     omega = mode_frequency(chain, 50)
+    # Nothing is driven: the frequency, which sets tolerances, is that of the motion.
     assert case.drive.frequency == omega
+
     data = run(case)
+
     work = data["energy/work"].values
     assert work == pytest.approx(2e-3, rel=1e-12)
     assert np.ptp(work) == 0.0
+
     modes = linear_modes(chain)
     energy = 0.5 * np.abs(modes.amplitudes(data["displacement"].values, data["velocity"].values)) ** 2
-    own = np.abs(modes.frequency - omega) < 1e-6 * omega  # on a ring, both ways
+    # On a ring the waves of both directions have one frequency.
+    own = np.abs(modes.frequency - omega) < 1e-6 * omega
     assert own.sum() == (2 if ends == "periodic" else 1)
     assert energy[:, own].sum(axis=1) == pytest.approx(2e-3, rel=1e-12)
+
     u = data["displacement"].values
     wave = u[:1] * np.cos(omega * data["time"].values)[:, None, None]
-    assert np.abs(u - wave).max() < 1e-12 * np.abs(u).max() * omega * 0.02
+    # The tolerance of the phase, times all radians of the run.
+    assert np.abs(u - wave).max() < 1e-12 * np.abs(u).max() * omega * end
     assert np.abs(u).max() == pytest.approx(case.initial.amplitude, rel=1e-12)
 
 
-@pytest.mark.parametrize("way", [1, -1])
+@pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_packet_travels_with_the_group_velocity_on_its_band(engine, way):
-    initial = {"kind": "packet", "band": 2, "wavenumber": "2pi/5", "cell": 120, "width": 8, "direction": way}
-    case = moving(initial | {"amplitude": 1e-4}, lattice={"cells": 240}, time={"engine": engine, "end": 0.1})
+def test_a_packet_travels_with_the_group_velocity_on_its_band(engine, direction):
+    """All of the energy is on band 2, and its middle moves with the packet's mean group velocity."""
+    kappa = 2 * np.pi / 5
+    width = 8
+    initial = {
+        "kind": "packet",
+        "band": 2,
+        "wavenumber": "2pi/5",
+        "cell": 120,
+        "width": width,
+        "direction": direction,
+        "amplitude": 1e-4,
+    }
+    case = moving(initial, lattice={"cells": 240}, time={"engine": engine, "end": 0.1})
     assert case.drive.cell == 120
+
     data = run(case)
-    model, v = case.model(), data["velocity"].values
+    model = case.model()
+    v = data["velocity"].values
     parts = ModalParts.of(model.chain)
     by_part = parts.energies(data["displacement"].values, v, [0, len(v) - 1]).sum(axis=1)
     assert by_part[parts.parts.names.index("band 2")] == pytest.approx(data["energy/work"][0].item(), rel=1e-9)
-    # The energy's middle moves with the mean of the group velocity over the packet's waves.
-    k = 2 * np.pi / 5 + np.linspace(-0.7, 0.7, 2001)
+
+    # Each wave weighs by its energy: the square of its frequency times its part in the Gaussian.
+    k = kappa + np.linspace(-0.7, 0.7, 2001)
     point = bloch(model.chain.cell, k)
-    weight = (point.frequency[:, 1] * np.exp(-0.5 * ((k - 2 * np.pi / 5) * 8) ** 2)) ** 2
+    weight = (point.frequency[:, 1] * np.exp(-0.5 * ((k - kappa) * width) ** 2)) ** 2
     speed = np.average(point.group_velocity[:, 1], weights=weight)
     energy = (v**2 @ np.asarray(model.chain.cell.masses)).astype(float)
     middle = (energy * data["cell"].values).sum(axis=1) / energy.sum(axis=1)
-    assert np.polyfit(data["time"].values, middle, 1)[0] == pytest.approx(way * speed, rel=2e-3)
+    measured = np.polyfit(data["time"].values, middle, 1)[0]
+    assert measured == pytest.approx(direction * speed, rel=2e-3)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_run_goes_on_from_a_sample_of_another_in_the_middle_of_a_contact(engine, tmp_path):
-    """Without loss the state is all there is to know."""
+    """Without loss a contact remembers nothing: from the state alone the run takes the same trajectory."""
     contacts = {"sites": [20, 22], "clearance": 1e-3, "stiffness": 1e4, "law": "bilinear", "restitution": 1.0}
     packet = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 12, "width": 3, "amplitude": 1e-3}
     first = moving(packet, contacts=contacts, time={"engine": engine, "end": 0.06, "rtol": 1e-12})
     simulate(first, tmp_path / "first")
     with xr.open_dataset(tmp_path / "first" / "run.h5", engine="h5netcdf") as file:
-        time, u = file["time"].values, file["displacement"].values
+        time = file["time"].values
+        u = file["displacement"].values
     impacts = datasets(tmp_path / "first" / "run.h5")
     inside = (time[:, None] > impacts["impacts/onset"]) & (time[:, None] < impacts["impacts/separation"])
-    at = int(np.flatnonzero(inside.any(axis=1))[2])
-    initial = {"kind": "file", "path": str(tmp_path / "first" / "run.h5"), "time": float(time[at])}
+    start = int(np.flatnonzero(inside.any(axis=1))[2])
+
+    initial = {"kind": "file", "path": str(tmp_path / "first" / "run.h5"), "time": float(time[start])}
     second = moving(initial, contacts=contacts, time={"engine": engine, "end": 0.02, "rtol": 1e-12})
     assert second.drive.frequency == first.drive.frequency
     data = run(second)
+
     later = data["displacement"].values
     assert data["impacts/onset"][0] == 0.0
-    assert np.abs(later - u[at : at + len(later)]).max() < 3e-8 * np.abs(u).max()
+    assert np.abs(later - u[start : start + len(later)]).max() < 3e-8 * np.abs(u).max()
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_contact_that_begins_closed_takes_the_approach_of_an_impact_without_loss(engine):
-    """One mode with w beyond the clearance: mu (w'_minus^2 - w'^2)/2 is the energy in the contact."""
-    contacts = {"sites": [20], "clearance": 1e-4, "stiffness": 2e5, "law": "hertz", "restitution": 0.6}
-    case = moving({"kind": "mode", "number": 70, "amplitude": 5e-4}, contacts=contacts,
-                  time={"engine": engine, "end": 0.01})  # fmt: skip
-    data, cell = run(case), case.model().chain.cell
+    """Of a mode with w beyond the clearance mu (w'_minus^2 - w'^2)/2 is the energy in the contact."""
+    clearance = 1e-4
+    stiffness = 2e5
+    contacts = {"sites": [20], "clearance": clearance, "stiffness": stiffness, "law": "hertz", "restitution": 0.6}
+    case = moving(
+        {"kind": "mode", "number": 70, "amplitude": 5e-4}, contacts=contacts, time={"engine": engine, "end": 0.01}
+    )
+    data = run(case)
+
+    cell = case.model().chain.cell
     u = data["displacement"][0, 19].values
-    depth = abs(u[cell.resonator] - u[cell.host]) - 1e-4
-    assert depth > 0
-    stored = 2e5 * depth**2.5 / 2.5
+    w = u[cell.resonator] - u[cell.host]
+    indentation = abs(w) - clearance
+    assert indentation > 0
+
+    stored = stiffness * indentation**2.5 / 2.5
     assert data["energy/contact"][0] == pytest.approx(stored, rel=1e-9)
-    side = np.sign(u[cell.resonator] - u[cell.host])
-    speed = side * np.sqrt(2 * stored / cell.reduced_mass)
+
+    # A mode begins at rest: w' = 0.
+    speed = np.sign(w) * np.sqrt(2 * stored / cell.reduced_mass)
     assert data["impacts/approach_velocity"][0] == pytest.approx(speed, rel=1e-12)
-    assert data["impacts/side"][0] == side
+    assert data["impacts/side"][0] == np.sign(w)
     assert data["impacts/loss"][0] > 0
 
 
-def test_the_engines_agree_from_closed_contacts_on():
-    initial = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 20, "width": 3, "amplitude": 2e-3}
-    contacts = {"sites": [19, 20, 21, 30], "clearance": 1e-3, "restitution": 0.7, "stiffness": 1e6}
-    for extra in ({}, {"adhesion": "clip", "restitution": 0.2}):
-        runs = [run(moving(initial, contacts=contacts | extra, time={"engine": e, "end": 0.004})) for e in ENGINES]
-        assert (runs[0]["impacts/onset"] == 0).sum() >= 2
-        first, second = (data["displacement"].values for data in runs)
-        assert np.abs(first - second).max() < 1e-7 * np.abs(first).max()
+CLOSED = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 20, "width": 3, "amplitude": 2e-3}
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_stopped_run_goes_on_to_the_same_bits(engine, tmp_path):
-    initial = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 20, "width": 3, "amplitude": 2e-3}
-    case = moving(initial, contacts={"sites": [19, 21], "clearance": 1e-3, "stiffness": 1e6, "restitution": 0.7},
-                  time={"engine": engine, "end": 0.06})  # fmt: skip
+@pytest.mark.parametrize("law", [{}, {"adhesion": "clip", "restitution": 0.2}])
+def test_the_engines_agree_from_closed_contacts_on(law):
+    contacts = {"sites": [19, 20, 21, 30], "clearance": 1e-3, "restitution": 0.7, "stiffness": 1e6} | law
+    stepped = run(moving(CLOSED, contacts=contacts, time={"engine": "ts", "end": 0.004}))
+    exact = run(moving(CLOSED, contacts=contacts, time={"engine": "propagator", "end": 0.004}))
+
+    assert (stepped["impacts/onset"] == 0).sum() >= 2
+    u = stepped["displacement"].values
+    assert np.abs(u - exact["displacement"].values).max() < 1e-7 * np.abs(u).max()
+
+
+# The time stepper looks after every step, the propagator after every block of samples.
+@pytest.mark.parametrize(("engine", "looks"), [("ts", 300), ("propagator", 0)])
+def test_a_stopped_run_goes_on_to_the_same_bits(engine, looks, tmp_path):
+    case = moving(
+        CLOSED,
+        contacts={"sites": [19, 21], "clearance": 1e-3, "stiffness": 1e6, "restitution": 0.7},
+        time={"engine": engine, "end": 0.06},
+    )
     simulate(case, tmp_path / "whole")
-    stopped = simulate(case, tmp_path / "parts", stop=StopAt(0 if engine == "propagator" else 300))
-    assert stopped.resumable
+
+    assert simulate(case, tmp_path / "parts", stop=StopAt(looks)).resumable
     assert simulate(case, tmp_path / "parts").complete
-    assert_same_bits(*(datasets(tmp_path / name / "run.h5") for name in ("whole", "parts")))
+
+    assert_same_bits(datasets(tmp_path / "whole" / "run.h5"), datasets(tmp_path / "parts" / "run.h5"))
 
 
-def put_state(path, chain, u, v) -> None:
-    cells, dofs = np.arange(11, 31), np.arange(1, 5)
-    data = {"cell": variable("cell", cells, "1", "cell"), "dof": variable("dof", dofs, "1", "mass"),
-            "displacement": variable(("cell", "dof"), u[10:30], "m", "displacement"),
-            "velocity": variable(("cell", "dof"), v[10:30], "m/s", "velocity")}  # fmt: skip
+def write_state(path: Path, u: np.ndarray, v: np.ndarray) -> None:
+    """Write displacements and velocities (cell, dof) of the cells 11 to 30."""
+    data = {
+        "cell": variable("cell", np.arange(11, 31), "1", "cell"),
+        "dof": variable("dof", np.arange(1, 5), "1", "mass"),
+        "displacement": variable(("cell", "dof"), u[10:30], "m", "displacement"),
+        "velocity": variable(("cell", "dof"), v[10:30], "m/s", "velocity"),
+    }
     write_netcdf(path, xr.Dataset(data))
 
 
 def test_a_file_that_changes_is_noticed(tmp_path):
+    """The state of a file begins the run, in its cells; another state in the same file is not taken for it."""
+    path = tmp_path / "state.h5"
     u, v = np.random.default_rng(0).standard_normal((2, 40, 4)) * 1e-4
-    put_state(tmp_path / "state.h5", None, u, v)
-    initial = {"kind": "file", "path": str(tmp_path / "state.h5")}
-    case = moving(initial, drive={"amplitude": 0.0, "frequency": 900.0}, time={"end": 0.01})
+    write_state(path, u, v)
+    case = moving({"kind": "file", "path": str(path)}, drive={"amplitude": 0.0, "frequency": 900.0}, time={"end": 0.01})
     data = run(case)
+
     assert np.array_equal(data["displacement"][0].values[10:30], u[10:30])
     assert not data["velocity"][0].values[[*range(10), *range(30, 40)]].any()
+    # The recorded displacements leave with the velocities of the file, as far as three samples tell.
     spline = CubicSpline(data["time"].values[:3], data["displacement"].values[:3])
     assert spline(0.0, 1)[10:30] == pytest.approx(v[10:30], abs=0.2)
-    put_state(tmp_path / "state.h5", None, u, 2 * v)
+
+    write_state(path, u, 2 * v)
     with pytest.raises(CaseError, match="has changed since"):
         simulate(case, RunMemory())
-    assert Case.from_toml(case.to_toml()) == case  # results are read where the file is another, or gone
-    (tmp_path / "state.h5").unlink()
+    # Results can be read where the file is another, or gone.
+    assert Case.from_toml(case.to_toml()) == case
+
+    path.unlink()
     assert Case.from_toml(case.to_toml()) == case
     with pytest.raises(CaseError, match=r"initial\.path"):
         simulate(case, RunMemory())
 
 
-@pytest.mark.slow
-def test_a_breather_comes_back_after_its_period_on_both_engines(tmp_path):
-    """From the file of a condensed branch, whose harmonics left out are 1e-8 of the motion."""
-    lattice = {"preset": "four-band", "reading": "calibrated", "cells": 14}
-    contacts = {"law": "hertz", "sites": [6], "clearance": 10**-2.75, "restitution": 1.0}
+@pytest.fixture(scope="module")
+def breather(tmp_path_factory) -> tuple[dict[str, Any], Path]:
+    """Tables of a lattice, and the file of its breather at 1600 rad/s: harmonics left out are 1e-8 of the motion."""
+    folder = tmp_path_factory.mktemp("breather")
+    table = {
+        "lattice": {"preset": "four-band", "reading": "calibrated", "cells": 14},
+        "contacts": {"law": "hertz", "sites": [6], "clearance": CLEARANCE, "restitution": 1.0},
+    }
     nnm = {"system": "condensed", "start_frequency": [1600.0], "truncation": 1e-8, "tolerance": 1e-12, "points": 1}
-    case = NnmCase.from_table({"name": "b", "lattice": lattice, "contacts": contacts, "nnm": nnm})
-    follow_all(case, tmp_path, MPI.COMM_SELF)
+    follow_all(NnmCase.from_table(table | {"name": "b", "nnm": nnm}), folder, MPI.COMM_SELF)
+    return table, folder / "branch-breather-1600.h5"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_breather_comes_back_after_its_period(engine, breather):
+    table, path = breather
     period = 2 * np.pi / 1600
-    initial = {"kind": "file", "path": str(tmp_path / "branch-breather-1600.h5"), "orbit": 1}
-    for engine in ENGINES:
-        time = {"engine": engine, "end": period, "sample_interval": period / 16, "rtol": 1e-13}
-        data = run(moving(initial, lattice=lattice, contacts=contacts, time=time))
-        u, w = data["displacement"].values, np.abs(np.diff(data["displacement"].values[:, 5, 1:3])).max()
-        assert w == pytest.approx(1.286 * 10**-2.75, rel=1e-3)
-        assert len(data["impacts/onset"]) == 3  # closed at the start, the other side, and closed again
-        assert np.abs(u[-1] - u[0]).max() < 1e-7 * np.abs(u[0]).max()
-        assert np.abs(u[8] + u[0]).max() < 1e-7 * np.abs(u[0]).max()
+    time = {"engine": engine, "end": period, "sample_interval": period / 16, "rtol": 1e-13}
+    data = run(moving({"kind": "file", "path": str(path), "orbit": 1}, **table, time=time))
+
+    u = data["displacement"].values
+    w = np.diff(u[:, 5, 1:3])
+    assert np.abs(w).max() == pytest.approx(1.286 * CLEARANCE, rel=1e-3)  # SPEC section 15
+    # Closed at the start, on the other side, and closed again.
+    assert len(data["impacts/onset"]) == 3
+
+    assert np.abs(u[-1] - u[0]).max() < 1e-7 * np.abs(u[0]).max()
+    # An orbit of odd harmonics is turned over after half a period.
+    assert np.abs(u[8] + u[0]).max() < 1e-7 * np.abs(u[0]).max()

@@ -44,14 +44,15 @@ def test_shares_of_the_work_sum_to_one():
     values, run = judged(case, objective("upper_share_at_end"), objective("band_share", band=4), *parts)
     of_ends = 1 - sum(values["bands"]) - values["dissipated"]
     held = float(run["energy/contact"][-1] / run["energy/work"][-1])
-    assert len(gaps(bands)) == 3 and 0 <= of_ends - held < 0.01
+
+    assert len(gaps(bands)) == 3
+    assert 0 <= of_ends - held < 0.01
     assert values["dissipated"] == pytest.approx(float(run["energy/dissipated"][-1] / run["energy/work"][-1]))
     assert values["band_share 4"] == pytest.approx(values["bands"][3], rel=1e-12)
     assert sum(values[part.name] for part in parts) == pytest.approx(values["bands"][3], rel=1e-12)
     assert all(values[part.name] > 0 for part in parts)
-    assert (
-        values["upper_share_at_end"] == pytest.approx(sum(values["bands"][2:]), rel=1e-12) and values["episodes"] > 10
-    )
+    assert values["upper_share_at_end"] == pytest.approx(sum(values["bands"][2:]), rel=1e-12)
+    assert values["episodes"] > 10
 
 
 @pytest.mark.parametrize("drive", [1, 24])
@@ -61,11 +62,15 @@ def test_what_is_beyond_the_last_site_is_what_came_through(drive):
     case = small_case(contacts=contacts, drive={"cell": drive, "cycles": 2}, time={"end": 0.045, "engine": "auto"})
     values, run = judged(case, objective("transmitted"))
     energy = run["energy/kinetic"][-1] + run["energy/spring"][-1]
-    assert values["episodes"] == 0 and float(energy / run["energy/work"][-1]) == pytest.approx(1, rel=1e-6)
+
+    assert values["episodes"] == 0
+    assert float(energy / run["energy/work"][-1]) == pytest.approx(1, rel=1e-6)
+
     u, v = (run[name].values[-1] for name in ("displacement", "velocity"))
     chain = case.model().chain
     local = 0.5 * (u.ravel() * (chain.stiffness_matrix() @ u.ravel()) + chain.masses() * v.ravel() ** 2).reshape(24, 4)
     side = slice(11, None) if drive == 1 else slice(None, 13)
+
     assert values["transmitted"] == pytest.approx(local[side].sum() / float(run["energy/work"][-1]), rel=1e-9)
     assert 0.3 < values["transmitted"] < 1
 
@@ -75,15 +80,24 @@ def test_a_search_finds_a_better_case_whose_run_has_its_value(tmp_path):
     plan = OptimiseCase.from_table(TABLE)
     optimum_search.run_search(plan, tmp_path)
     found = datasets(tmp_path / "optimum.h5")
-    value, best = found["value"][:, 0], int(found["comparison/number"][1])
-    assert len(value) == 30 and np.isfinite(value).all() and best == np.argmax(value)
+    value = found["value"][:, 0]
+    best = int(found["comparison/number"][1])
+
+    assert len(value) == 30
+    assert np.isfinite(value).all()
+    assert best == np.argmax(value)
     assert value[best] > 2 * value[0]
+
     case = Case.load(tmp_path / "best.toml")
-    assert case.name == "small-best" and case.contacts.clearance == pytest.approx(found["parameter"][best], rel=1e-15)
+    assert case.name == "small-best"
+    assert case.contacts.clearance == pytest.approx(found["parameter"][best], rel=1e-15)
+
     values, _ = judged(case)
     assert values["upper_share_at_end"] == pytest.approx(value[best], rel=1e-12)
+
     at = list(found["amplitude"]).index(24.33)
-    assert found["curve/value"][1, at, 0] == value[best] and found["curve/value"][0, at, 0] == value[0]
+    assert found["curve/value"][1, at, 0] == value[best]
+    assert found["curve/value"][0, at, 0] == value[0]
     assert found["upper_share_at_end"].tolist() == value.tolist()
 
 
@@ -101,11 +115,16 @@ def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, mo
     table["contacts"]["sites"] = [12, 6, 13]
     optimum_search.run_search(OptimiseCase.from_table(table), tmp_path)
     ((law, folder, _),) = asked
-    assert law.drive.amplitude == 24.33 and folder == tmp_path / "law"
+
+    assert law.drive.amplitude == 24.33
+    assert folder == tmp_path / "law"
+
     memory = RunMemory()
     result = simulate(linear_case(small_case()), memory, MPI.COMM_SELF)
     envelope = LinearRun.of(memory.dataset, result.statistics, (), ()).envelope
     met = 24.33 * envelope[np.array([6, 12, 13]) - 1] / 1.25 * [1, 0.8, 0.64]
     found = datasets(tmp_path / "optimum.h5")["parameter"]
-    assert found.shape == (2, 3) and found[0] == pytest.approx(2e-4)
+
+    assert found.shape == (2, 3)
+    assert found[0] == pytest.approx(2e-4)
     assert found[1][[1, 0, 2]] == pytest.approx(met, rel=1e-3)

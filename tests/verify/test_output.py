@@ -36,6 +36,7 @@ def test_a_run_in_memory_is_the_run_of_the_file(folder, sections):
     memory = RunMemory()
     assert simulate(case, memory).folder is None
     assert memory.dataset is not None
+
     held = memory.dataset.drop_vars(["end/displacement", "end/velocity"])  # of all cells, whatever is recorded
     with open_netcdf(folder / "run" / "run.h5", "run") as run:
         assert held.variables.keys() == run.variables.keys()
@@ -46,6 +47,7 @@ def test_a_run_in_memory_is_the_run_of_the_file(folder, sections):
         assert memory.dataset.attrs.keys() == run.attrs.keys()
         assert json.loads(run.attrs["statistics"]) == result.statistics
     write_netcdf(folder / "saved.h5", held)
+
     assert_same_bits(datasets(folder / "run" / "run.h5"), datasets(folder / "saved.h5"))
 
 
@@ -70,8 +72,10 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
         simulate(case, path, force=True)
     assert (path / "run.h5").read_bytes() == before
     assert {p.name for p in path.iterdir()} == {"run.h5", "case.toml", "summary.json", ".new"}
+
     monkeypatch.undo()
     assert simulate(case, path, resume=True).complete
+
     simulate(case, folder / "straight")
     assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("straight", "run")))
 
@@ -89,7 +93,9 @@ def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch
         context.setattr("shutil.rmtree", killed)
         with pytest.raises(InterruptedError):
             simulate(case, folder / "run")
+
     assert (folder / "run" / ".parts.old").exists()
+
     run = datasets(folder / "run" / "run.h5")
     for resume in (True, False):
         assert simulate(case, folder / "run", resume=resume).complete
@@ -105,11 +111,14 @@ def test_episodes_stand_in_the_order_of_their_onsets():
     memory.recording = Recording(given, (), False, 2)
     for sites, onsets in (([3, 1], [0.5, 0.1]), ([2, 1, 1], [0.2, 0.5, 0.3])):
         log = np.zeros(len(sites), EPISODE)
-        log["site"], log["onset"], log["loss"] = sites, onsets, np.arange(len(sites))
+        log["site"] = sites
+        log["onset"] = onsets
+        log["loss"] = np.arange(len(sites))
         chunk = dict.fromkeys(SAMPLED, np.zeros(1)) | {LOSSES: np.zeros((1, 3)), "impacts": log}
         memory.append(chunk)
     memory.finish({}, {})
     run = memory.dataset
+
     assert run["impacts/onset"].values.tolist() == [0.1, 0.2, 0.3, 0.5, 0.5]
     assert run["impacts/site"].values.tolist() == [1, 2, 1, 1, 3]
     assert run["impacts/loss"].values.tolist() == [1, 0, 2, 1, 0]
@@ -124,11 +133,13 @@ def test_arrays_come_back_as_they_were(tmp_path):
     }
     save_arrays(tmp_path / "x.npy", arrays)
     back = load_arrays(tmp_path / "x.npy")
+
     assert list(back) == list(arrays)
     for name, values in arrays.items():
         assert back[name].dtype == values.dtype
         np.testing.assert_array_equal(back[name], values)
     assert load_arrays(tmp_path / "x.npy", ["d"]).keys() == {"d"}
+
     mapped = load_arrays(tmp_path / "x.npy", copy=False)["a"]  # a rank reads only its own part of the others' states
     assert not mapped.flags.writeable
     np.testing.assert_array_equal(mapped, arrays["a"])
@@ -138,13 +149,15 @@ def test_arrays_come_back_as_they_were(tmp_path):
 def test_contacts_that_still_last_at_the_end_are_logged(folder):
     simulate(small_case(), folder / "whole")
     log = datasets(folder / "whole" / "run.h5")
-    onset, separation = log["impacts/onset"], log["impacts/separation"]
+    onset = log["impacts/onset"]
+    separation = log["impacts/separation"]
     interval = small_case().model().sample_interval
     lasting = np.flatnonzero(np.floor(separation / interval) > np.ceil(onset / interval))
     end = float(np.ceil(onset[lasting[0]] / interval) * interval)  # the first sample in a contact
     result = simulate(small_case(time={"end": end}), folder / "cut")
     cut = datasets(folder / "cut" / "run.h5")
     expected = onset <= end
+
     assert cut["impacts/onset"].tolist() == onset[expected].tolist()
     assert np.isnan(cut["impacts/separation"]).tolist() == (separation[expected] > end).tolist()
     assert np.isnan(cut["impacts/separation"]).any()
@@ -153,14 +166,19 @@ def test_contacts_that_still_last_at_the_end_are_logged(folder):
 
 def test_engines_are_given_contiguous_room_whatever_is_kept_already(monkeypatch):
     """For other arrays kernels would be compiled once more; blocks of samples do not show in what is recorded."""
-    given, runs, room = [], [], Recorder.room
+    given = []
+    runs = []
+    room = Recorder.room
     monkeypatch.setattr(Recorder, "room", lambda *arguments: given.append(room(*arguments)) or given[-1])
     case = small_case(time={"end": 0.004, "engine": "propagator"}, output={"stride": 2})
     for cells in (1_000_000, 24 * 6):  # a block of all samples, and of six
         monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", cells)
         runs.append(RunMemory())
         simulate(case, runs[-1])
-    assert len(given) == 1 + 4 and all(samples.fields.flags.c_contiguous for samples in given)
+
+    assert len(given) == 1 + 4
+    assert all(samples.fields.flags.c_contiguous for samples in given)
+
     for name in ("displacement", "velocity", "field_time"):
         whole, blocks = (run.dataset[name].values for run in runs)
         assert len(whole) == 11 and whole[-1].any() and whole.tobytes() == blocks.tobytes(), name

@@ -67,6 +67,7 @@ def test_what_petsc_does_not_know_is_refused_before_anything_is_written(folder, 
     value = value or "true"  # as the front door reads it
     code = main(["run", "--out", str(out)], {"ts_adapt_clip": "0.1,5", name: value})
     assert code == 2
+
     message = capsys.readouterr().err
     assert f"petsc.{name} = '{value}': ".lower() in message.lower()
     assert reason in message

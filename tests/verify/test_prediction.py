@@ -1,166 +1,189 @@
 """Sites composed from the answer of one: limits, energy, order, first contact, resuming, bad input."""
 
-import json
+from __future__ import annotations
 
-from mpi4py import MPI
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import xarray as xr
 
+from tests.conftest import simulated
+from tests.one_site import prediction_case
 from vipetsc.case import Case, CaseError
 from vipetsc.case.predict import PredictCase
-from vipetsc.dynamics import simulate
 from vipetsc.io.records import read_records
-from vipetsc.io.store import RunMemory
 from vipetsc.studies.composition import Network
 from vipetsc.studies.prediction import LINEAR, SITE, Records, amplitudes_of, composed, predict, site_points
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.response import BINS, SiteResponse, in_contact
 
-SMALL = {
-    "name": "small",
-    "lattice": {"preset": "four-band", "cells": 120},
-    "contacts": {"sites": [40, 70], "clearance": [2e-3, 1.8e-3]},
-    "drive": {"cycles": 15, "band": 2, "at": "max-group-velocity"},
-    "predict": {"points": 16, "amplitudes": [5.0, 30.0, 120.0, 600.0]},
-}
 
+class Prediction(NamedTuple):
+    """A prediction as it was made: its folder, its case and its content."""
 
-def small(**sections):
-    return PredictCase.from_table({k: SMALL.get(k, {}) | sections.get(k, {}) if k != "name" else "small"
-                                   for k in SMALL | sections})  # fmt: skip
+    folder: Path
+    case: PredictCase
+    data: xr.Dataset
+
+    def records(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        """The record of the linear run, and those of one site alone; tests may change them."""
+        records = [record for record, _ in read_records(self.folder / "prediction-runs.jsonl", pytest.fail)]
+        linear = next(record for record in records if record["kind"] == LINEAR)
+        return linear, [record for record in records if record["kind"] == SITE]
+
+    def site(self) -> SiteResponse:
+        """What one site does to the waves that meet it."""
+        _, answers = self.records()
+        frequency = self.case.model().drive.frequency
+        return SiteResponse.of(answers, self.case.lattice.unit_cell(), frequency, answers[0]["largest"])
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """The folder of a small prediction, its case and its content."""
+def made(tmp_path_factory) -> Prediction:
+    """A small prediction, for which all runs were made."""
     folder = tmp_path_factory.mktemp("prediction")
-    case = small()
-    return folder, case, predict(case, folder)
+    case = prediction_case()
+    return Prediction(folder, case, predict(case, folder))
 
 
-def response(made, **sections):
-    """The linear record and the answer of one site of the small case, with other sections for a network."""
-    folder = made[0]
-    records = [record for record, _ in read_records(folder / "prediction-runs.jsonl", pytest.fail)]
-    linear = next(record for record in records if record["kind"] == LINEAR)
-    answers = [record for record in records if record["kind"] == SITE]
-    return linear, answers, small(**sections)
-
-
-def compose_case(case, linear, answers):
-    """The prediction of a case from these records, without simulations beside it."""
+def composed_from(case: PredictCase, linear: dict[str, Any], answers: list[dict[str, Any]]) -> xr.Dataset:
+    """The prediction of a case from these records, without simulations to compare with."""
     return composed(case, Records(linear, answers, [], answers[0]["largest"]))
-
-
-def answer(made):
-    _, answers, case = response(made)
-    return SiteResponse.of(answers, case.lattice.unit_cell(), case.model().drive.frequency, answers[0]["largest"])
 
 
 @pytest.mark.slow
 def test_energy_is_whole_and_no_share_is_negative(made):
-    data = made[2]
-    total = data["predicted/bands"].sum("band") + data["predicted/dissipated"]
-    np.testing.assert_allclose(total, 1, atol=1e-12)
+    data = made.data
+
+    predicted = data["predicted/bands"].sum("band") + data["predicted/dissipated"]
+    np.testing.assert_allclose(predicted, 1, atol=1e-12)
     assert float(data["predicted/bands"].min()) >= 0
+    # At the end of a simulation the contacts hold a little.
     simulated = data["simulated/bands"].sum("band") + data["simulated/dissipated"]
-    np.testing.assert_allclose(simulated, 1, atol=5e-3)  # the contacts hold the rest
+    np.testing.assert_allclose(simulated, 1, atol=5e-3)
 
 
 def test_below_the_onset_the_run_is_linear(made):
-    data = made[2]
+    data = made.data
     assert data["amplitude"][0] < data.attrs["onset_amplitude"] < data["amplitude"][1]
+
     np.testing.assert_allclose(data["predicted/bands"][0], data["simulated/bands"][0], atol=1e-9)
     assert float(data["predicted/dissipated"][0]) == 0
 
 
 def test_the_small_prediction_is_near_the_simulation(made):
-    data = made[2]
+    """Nothing is fitted: upper bands are met within .15 decades, what is dissipated within .05 of the energy."""
+    data = made.data
+
     assert data.attrs["rms_upper"] < 0.15
     assert data.attrs["worst_dissipated"] < 0.05
     assert float(data["predicted/change"].max()) < 1e-3
 
 
-def test_the_first_contact_is_exact(made):
-    _, case, data = made
-    table = case.model_dump(by_alias=True, exclude_none=True)
-    del table["law"], table["predict"]
-    for share, contacts in ((0.9999, False), (1.0001, True)):
-        table["drive"]["amplitude"] = share * data.attrs["onset_amplitude"]
-        result = simulate(Case.from_table(table), RunMemory(MPI.COMM_SELF))
-        assert (result.statistics["episodes"] > 0) == contacts
+@pytest.mark.parametrize(("factor", "touches"), [(0.9999, False), (1.0001, True)])
+def test_the_first_contact_is_exact(made, factor, touches):
+    table = made.case.model_dump(by_alias=True, exclude_none=True)
+    # A case has no sections of other verbs.
+    del table["law"]
+    del table["predict"]
+    table["drive"]["amplitude"] = factor * made.data.attrs["onset_amplitude"]
+
+    _, result = simulated(Case.from_table(table))
+
+    assert (result.statistics["episodes"] > 0) == touches
 
 
 def test_one_site_alone_is_what_its_run_gave(made):
-    """A lattice from whose ends nothing returns: energies are those of the run of one site at the same z."""
-    _, answers, small_case = response(made)
-    clearance, site = small_case.law.clearance, answer(made)
+    """In a lattice from whose ends nothing returns energies are those of the run of one site at the same z."""
+    _, answers = made.records()
+    clearance = made.case.law.clearance
+    site = made.site()
     contacts = {"sites": [200], "clearance": [clearance]}
-    network = Network(small(lattice={"cells": 400}, contacts=contacts, time={"end": 0.75}).model())
+    long = prediction_case(lattice={"cells": 400}, contacts=contacts, time={"end": 0.75})
+    network = Network(long.model())
+
     for record in answers[6::4]:
-        got = network.compose(record["z"] * clearance / np.abs(network.linear).max(), site)
-        lost, *into = np.array(record["totals"]) * small_case.model().sample_interval
-        assert got.dissipated == pytest.approx(lost, rel=0.2)
-        assert got.into[2:].sum() == pytest.approx(sum(into[2:]), rel=0.2)
+        amplitude = record["z"] * clearance / np.abs(network.linear).max()
+        outcome = network.compose(amplitude, site)
+        lost, *into = np.array(record["totals"]) * made.case.model().sample_interval
+        assert outcome.dissipated == pytest.approx(lost, rel=0.2)
+        assert outcome.into[2:].sum() == pytest.approx(sum(into[2:]), rel=0.2)
 
 
 def test_without_loss_nothing_is_lost(made):
-    """Records of r = 1 dissipate nothing: neither does what is composed of them."""
-    linear, answers, case = response(made)
+    """Records of r = 1 dissipate nothing, and neither does what is composed of them."""
+    linear, answers = made.records()
     for record in answers:
-        record["sums"][6], record["totals"][0] = [0.0] * BINS, 0.0
-    data = compose_case(case, linear, answers)
+        record["sums"][6] = [0.0] * BINS
+        record["totals"][0] = 0.0
+
+    data = composed_from(made.case, linear, answers)
+
     assert float(np.abs(data["predicted/dissipated"]).max()) == 0
     assert float(data["predicted/upper"].max()) > 0.05
 
 
 def test_the_order_of_the_sites_in_the_file_does_not_matter(made):
-    linear, answers, _ = response(made)
-    swapped = small(contacts={"sites": [70, 40], "clearance": [1.8e-3, 2e-3]})
-    ways = []
-    for case, reached in ((small(), linear["reached"]), (swapped, linear["reached"][::-1])):
-        ways.append(compose_case(case, linear | {"reached": reached}, answers))
-    np.testing.assert_allclose(ways[0]["predicted/bands"], ways[1]["predicted/bands"], atol=2e-4)
+    linear, answers = made.records()
+    swapped = prediction_case(contacts={"sites": [70, 40], "clearance": [1.8e-3, 2e-3]})
+
+    first = composed_from(made.case, linear, answers)
+    second = composed_from(swapped, linear | {"reached": linear["reached"][::-1]}, answers)
+
+    np.testing.assert_allclose(first["predicted/bands"], second["predicted/bands"], atol=2e-4)
 
 
 def test_a_site_that_nothing_reaches_changes_nothing(made):
-    linear, answers, _ = response(made)
-    more = small(contacts={"sites": [40, 70, 100], "clearance": [2e-3, 1.8e-3, 1.0]})
-    data = compose_case(more, linear | {"reached": [*linear["reached"], 1e-4]}, answers)
-    np.testing.assert_allclose(data["predicted/bands"], made[2]["predicted/bands"], atol=2e-3)
+    linear, answers = made.records()
+    more = prediction_case(contacts={"sites": [40, 70, 100], "clearance": [2e-3, 1.8e-3, 1.0]})
+
+    data = composed_from(more, linear | {"reached": [*linear["reached"], 1e-4]}, answers)
+
+    np.testing.assert_allclose(data["predicted/bands"], made.data["predicted/bands"], atol=2e-3)
 
 
 def test_contact_goes_on_until_release():
+    """Contact begins above z = 1 and ends where z falls below the release, which differs from site to site."""
     z = np.array([[0.9, 1.1, 0.9, 0.41, 0.39, 0.9]] * 2)
-    on = in_contact(z, np.array([0.4, 0.6]))
-    assert on.tolist() == [[False, True, True, True, False, False], [False, True, True, False, False, False]]
+
+    is_in_contact = in_contact(z, np.array([0.4, 0.6]))
+
+    assert is_in_contact[0].tolist() == [False, True, True, True, False, False]
+    assert is_in_contact[1].tolist() == [False, True, True, False, False, False]
 
 
 def test_the_release_is_where_the_last_contact_of_a_run_ended(made):
-    """Records tell it, and the response interpolates it over the largest z; without contacts it is the onset."""
-    _, answers, _ = response(made)
-    site = answer(made)
+    """Records hold it, and the response interpolates it over the largest z; without contacts it is the onset."""
+    _, answers = made.records()
     assert all(0 < record["release"] < 1 for record in answers[4:])
-    z = [record["z"] for record in answers]
-    np.testing.assert_allclose(site.over_bursts(np.array(z)).release, [record["release"] for record in answers])
+
+    z = np.array([record["z"] for record in answers])
+    release = made.site().over_bursts(z).release
+    np.testing.assert_allclose(release, [record["release"] for record in answers])
 
 
 def test_runs_that_are_there_are_not_made_again(made, tmp_path, monkeypatch):
-    folder, case, data = made
-    (tmp_path / "prediction-runs.jsonl").write_bytes((folder / "prediction-runs.jsonl").read_bytes())
-    (tmp_path / "case.toml").write_text(case.to_toml())
+    (tmp_path / "prediction-runs.jsonl").write_bytes((made.folder / "prediction-runs.jsonl").read_bytes())
+    (tmp_path / "case.toml").write_text(made.case.to_toml())
     monkeypatch.setattr(RecordedRuns, "run_in_memory", lambda *_: pytest.fail("a run was made"))
-    again = predict(case, tmp_path)
+
+    again = predict(made.case, tmp_path)
+
     for name in ("predicted/bands", "simulated/bands"):
-        np.testing.assert_array_equal(again[name], data[name])
+        np.testing.assert_array_equal(again[name], made.data[name])
 
 
 def test_amplitudes_and_points_by_default():
-    case = small(predict={"amplitudes": [], "count": 3, "span": 4.0})
+    case = prediction_case(predict={"amplitudes": [], "count": 3, "span": 4.0})
+    # A wave of 1 N reaches a tenth of the first clearance: contacts begin at 10 N.
     np.testing.assert_allclose(amplitudes_of(case, {"reached": [0.1, 0.05]}), [10, 20, 40])
+
     points = site_points(case, 50.5)
-    assert points == sorted(points) and points[0] == 1.0005 and points[-1] == pytest.approx(50)
+    assert points == sorted(points)
+    assert points[0] == 1.0005
+    assert points[-1] == pytest.approx(50)
 
 
 @pytest.mark.parametrize(
@@ -172,8 +195,9 @@ def test_amplitudes_and_points_by_default():
         ({"predict": {"spam": 1}}, "predict.spam"),
     ],
 )
-def test_what_cannot_be_predicted_is_said_before_any_run(sections, key):
+def test_what_cannot_be_predicted_is_refused_before_any_run(sections, key):
     with pytest.raises(CaseError) as error:
-        small(**sections)
+        prediction_case(**sections)
+
     assert key in str(error.value)
-    assert json.dumps(str(error.value)).count("problem") >= 1
+    assert error.value.problems

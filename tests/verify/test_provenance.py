@@ -44,9 +44,12 @@ def test_every_output_says_when_where_and_from_what(tmp_path, monkeypatch, in_pr
         assert about.keys() >= WANTED, name
         assert before <= datetime.fromisoformat(about["date"]) <= datetime.now(UTC)
         assert about["host"] == platform.node()
+
     assert json.loads((tmp_path / "run/summary.json").read_text()).keys() >= WANTED
+
     in_process("bands", "--out", tmp_path / "bands")
     assert json.loads((tmp_path / "bands/bands.json").read_text()).keys() >= WANTED
+
     # Another time, place and revision, the same bits.
     monkeypatch.setattr(io_folder, "revision", lambda: "other")
     monkeypatch.setattr(platform, "node", lambda: "elsewhere")
@@ -72,7 +75,9 @@ def test_the_revision_is_that_of_git(tmp_path, monkeypatch):
         subprocess.run(["git", "-C", tmp_path, *words.split()], check=True)
     head = subprocess.run(["git", "-C", tmp_path, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
     monkeypatch.setattr(package, "__file__", str(tmp_path / "vipetsc/__init__.py"))
+
     assert io_folder.revision.__wrapped__() == head.stdout[:12]
+
     (tmp_path / "pyproject.toml").write_text("changed")
     assert io_folder.revision.__wrapped__() == head.stdout[:12] + "+"
 

@@ -123,17 +123,21 @@ def test_suffixes_tell_figures_apart(curves):
 def test_amplitudes_share_scales_and_show_what_was_measured(whole):
     figure = only("amplitudes", [whole])
     assert figure._suptitle.get_text() == "Calibrated reading, 2 sites, κ* = 5π/9"
+
     panels = [axes for axes in figure.axes if axes.images and axes.get_title(loc="left")]
     assert len(panels) == 9
+
     for row, name in enumerate(("kinetic_energy", "wavenumber_content", "dispersion")):
         images = [axes.images[0] for axes in panels[3 * row : 3 * row + 3]]
         assert len(limits(images)) == 1
+
         largest = 0.0
         for image, folder, amplitude in zip(images, members(whole), (0.1, 2.0, 20.0), strict=True):
             with h5py.File(folder / "analysis.h5") as file:
                 expected = file[name][...].T / amplitude**2
             np.testing.assert_allclose(image.get_array(), expected, rtol=1e-12)
             largest = max(largest, expected.max())
+
         assert images[0].get_clim()[1] == pytest.approx(largest)
     case = Sweep.of(whole).case(0)
     cell = case.model().chain.cell
@@ -152,13 +156,16 @@ def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
     figure = only("wavelets", [whole])
     panels = np.reshape([axes for axes in figure.axes if axes.images], (4, 3))
     assert len(limits([axes.images[0] for axes in panels.flat])) == 1
+
     for axes in panels.flat:
         black = next(line for line in axes.lines if to_rgba(line.get_color()) == (0, 0, 0, 1))
         np.testing.assert_allclose(black.get_ydata(), 5 / 9, rtol=1e-9)
     for row in panels:
         assert len({axes.texts[0].get_text() for axes in row}) == 1
+
     (series,) = [series.snapshot_times() for series in series_of(Sweeps([whole], Files()))]
     assert np.all(np.diff(series) > 0)
+
     with open_run(members(whole)[2] / "run.h5") as run:
         site = np.min(run["sites/cell"].values)
         wave = DrivenWave.of(Case.of(run))
@@ -167,6 +174,7 @@ def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
         host = run["velocity"][at, :, 0].values
     kappa = np.pi * np.arange(1, 121) / 120
     expected = np.abs(transform(host, kappa, KC)[:, :CELLS]) / 20.0
+
     np.testing.assert_allclose(panels[1, 2].images[0].get_array(), expected, rtol=1e-12)
 
 
@@ -181,6 +189,7 @@ def test_bins_shown_hold_the_driven_ones(share, count, shown):
     assert bins == sorted(set(bins))
     assert bins[0] >= 0
     assert bins[-1] < count
+
     own = min(int(share * count), count - 1)
     assert own in bins
     assert own - 1 in bins or own + 1 in bins
@@ -193,11 +202,13 @@ def test_partition_shows_seven_bins_and_all_colours(whole):
         field = file["partition/kinetic_energy"][...]
     bins = shown_bins(5 * np.pi / 9, 12)
     images = maps(figure)[:7]
+
     assert len(limits(images)) == 1
     assert images[0].get_clim()[1] == pytest.approx(field[bins].max())
     for b, image in zip(bins, images, strict=True):
         assert image.axes.get_title(loc="left").endswith(f"$K_{{{b + 1}}}$")
         np.testing.assert_array_equal(image.get_array(), field[b].T)
+
     (band,) = [axes for axes in figure.axes if "Band 2" in axes.get_title(loc="left")]
     segments = [line for line in band.lines if line.get_linewidth() == 3]
     for line, colour in zip(segments, bin_colours(12), strict=True):
@@ -206,6 +217,7 @@ def test_partition_shows_seven_bins_and_all_colours(whole):
         expected = bloch(Sweep.of(whole).case(0).model().chain.cell, np.pi * kappa).frequency[:, 1]
         np.testing.assert_allclose(1e3 * frequency, expected)
     panels = [axes for axes in figure.axes if axes.get_title(loc="left").startswith("(b.")]
+
     assert [bool(axes.collections) for axes in panels] == [True] * 3
 
 
@@ -231,14 +243,17 @@ def test_reconstruction_shows_energies_error_and_cross_terms(whole):
             found = {name: data[...] for name, data in file["partition"].items()}
         energy, error, cross = grid[:, column]
         lines = [line.get_ydata() * amplitude**2 for line in energy.lines]
+
         for line, expected in zip(
             lines, (found["kinetic"], found["reconstructed"], found["energy"].sum(0)), strict=True
         ):
             np.testing.assert_allclose(line, expected, rtol=1e-12)
+
         moving = found["error"] > 0
         np.testing.assert_array_equal(error.lines[0].get_ydata()[moving], found["error"][moving])
         assert list(error.lines[1].get_ydata()) == [0.01, 0.01]
         np.testing.assert_array_equal(cross.lines[0].get_ydata(), found["cross_share"])
+
         late = found["kinetic"] > 0.5 * found["kinetic"].max()
         share = 1 - found["energy"].sum(0)[late] / found["kinetic"][late]
         np.testing.assert_allclose(cross.lines[0].get_ydata()[late], share, rtol=1e-9)
@@ -249,12 +264,14 @@ def test_reconstruction_shows_energies_error_and_cross_terms(whole):
 def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
     figures = offered_figures("entropy", [curves])
     assert len(figures) == 2 * 2 * len(AVERAGES)
+
     figure = figures[f"calibrated-5pi-9-{average}"]
     grid = np.reshape(figure.axes, (2, 2))
     fixed = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9}
     for column, sites in enumerate((2, 3)):
         row = select(curves, sites=sites, **fixed)
-        raw, error = row[f"entropy/{average}"].values, row["entropy/error"].values
+        raw = row[f"entropy/{average}"].values
+        error = row["entropy/error"].values
         names = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r2_nonlinear")
         fit = {name: row[f"fits/entropy/{average}/{name}"].item() for name in names}
         for axes in grid[:, column]:
@@ -266,8 +283,10 @@ def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
             halves = [0.5 * np.ptp(segment[:, 1]) for segment in sticks.get_segments()]
             np.testing.assert_allclose(halves, 0.99 * error / np.ptp(raw))
         upper, lower = grid[:, column]
+
         assert (upper.get_yscale(), lower.get_xscale(), lower.get_yscale()) == ("linear", "log", "log")
         assert upper.get_title(loc="left") == f"{sites} sites"
+
         thick = [line for line in lower.lines if line.get_linewidth() == 2]
         if fit["points"] >= 4 and fit["r2_log_log"] >= 0:
             x, y = thick[0].get_data()
@@ -284,7 +303,9 @@ def test_entropy_curves_fits_and_errors_are_the_ensembles(curves, average):
             )
         printed = select(curves, sites=sites, **fixed | {"reading": "printed"})[f"entropy/{average}"].values
         grey = [line for line in lower.lines if line.get_color() == GREY]
+
         np.testing.assert_allclose(grey[0].get_ydata(), normalised(printed))
+
         faint = {line.get_color() for line in upper.lines if line.get_alpha() == 0.5}
         assert faint == {colour for name, colour in COLOURS.items() if name != average}
 
@@ -297,8 +318,10 @@ def test_some_configuration_has_a_power_law(curves):
 def test_all_panels_by_wavenumber_and_configuration(curves):
     figures = offered_figures("entropy_all", [curves])
     assert len(figures) == 2 * len(AVERAGES)
+
     grid = np.reshape(figures["printed-masked"].axes, (2, 2))
     assert [axes.get_ylabel() for axes in grid[:, 0]] == ["κ* = 4π/9", "κ* = 5π/9"]
+
     for row, wavenumber in enumerate(curves["wavenumber"].values):
         for column, sites in enumerate((2, 3)):
             chosen = select(curves, reading="printed", wavenumber=wavenumber, sites=sites)
@@ -311,16 +334,21 @@ def test_entropy_maps_leave_quiet_cells_blank(whole):
     figure = only("entropy_maps", [whole])
     images = maps(figure)
     assert len(limits(images)) == 1
+
     overs = [axes for axes in figure.axes if any(line.get_label() == "H(t)" for line in axes.lines)]
     for image, over, folder in zip(images, overs, members(whole), strict=True):
         with h5py.File(folder / "analysis.h5") as file:
-            local, weight = file["entropy/local"][...].T, file["entropy/weight"][...].T
-            history, start = file["entropy/history"][...], file["entropy"].attrs["start"]
+            local = file["entropy/local"][...].T
+            weight = file["entropy/weight"][...].T
+            history = file["entropy/history"][...]
+            start = file["entropy"].attrs["start"]
         shown = np.ma.filled(image.get_array(), np.nan)
         above_threshold = weight > LEAST_WEIGHT * weight.max()
+
         np.testing.assert_array_equal(shown[above_threshold], local[above_threshold])
         assert np.isnan(shown[~above_threshold]).all()
         assert (~above_threshold).any()
+
         lines = {line.get_label(): line for line in over.lines}
         np.testing.assert_array_equal(lines["H(t)"].get_ydata(), history)
         assert list(lines["averages begin"].get_xdata()) == [start, start]
@@ -334,8 +362,10 @@ def test_entropy_history_is_an_image_over_amplitude(curves):
         fixed = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9, "sites": sites}
         row = select(curves, **fixed)
         expected = row["entropy/history"].values
+
         np.testing.assert_array_equal(np.reshape(mesh.get_array(), expected.shape), expected)
         assert mesh.get_rasterized()
+
         touched = curves["amplitude"].values[row["contact_episodes"].values > 0].min()
         onset = next(line for line in axes.lines if line.get_linestyle() == ":")
         assert 0.1 < onset.get_ydata()[0] < touched

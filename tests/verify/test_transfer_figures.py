@@ -48,10 +48,13 @@ def reduced(tmp_path_factory):
     energy = GRAZING * np.concatenate([[0.1, 1.0], np.geomspace(1.001, 1e6, 60)])
     region = np.select([energy <= GRAZING, energy < 1.2 * GRAZING, energy < 1e5], [1, 2, 3], 4)
     with h5py.File(branch / BRANCH, "w") as file:
-        file["energy"], file["region"] = energy, region
+        file["energy"] = energy
+        file["region"] = region
         file["slope"] = np.where(region == 1, 0.0, 700.0 / energy)
-        file["contacts"], file["kind"] = (region > 1).astype(int), np.zeros(len(energy), np.int8)
+        file["contacts"] = (region > 1).astype(int)
+        file["kind"] = np.zeros(len(energy), np.int8)
         file.attrs["case"] = '[lattice]\nreading = "printed"\n[contacts]\nlaw = "hertz"\n'
+
     assert relate_folders([folder, branch]) == [folder / "backbone.h5"]
     return folder
 
@@ -109,6 +112,7 @@ def test_ibtet_shows_the_ensembles_values(reduced):
             x, y = lines(axes)["1 site, 4 cycles"]
             np.testing.assert_array_equal(x, AMPLITUDES)
             np.testing.assert_array_equal(y, select(open_ensemble(reduced), law=law)["ibtet"])
+
     assert panel(figure, "(a.1)").get_xscale() == panel(figure, "(a.1)").get_yscale() == "linear"
     assert panel(figure, "(a.2)").get_xscale() == panel(figure, "(a.2)").get_yscale() == "log"
 
@@ -116,19 +120,24 @@ def test_ibtet_shows_the_ensembles_values(reduced):
 def test_floor_is_that_of_members_without_contact(reduced):
     found = list(transfer_curves.transfer_curves([open_ensemble(reduced)]))
     assert [c.case.contacts.law for c in found] == ["hertz", "bilinear"]
+
     for curve in found:
-        transfer, peak = curve.data["ibtet"].values, curve.data["peak"]
+        transfer = curve.data["ibtet"].values
+        peak = curve.data["peak"]
         assert curve.data["floor"] == pytest.approx(transfer[0], rel=1e-9)
-        assert peak == int(np.argmax(transfer)) and peak > 1
+        assert peak == int(np.argmax(transfer))
+        assert peak > 1
 
 
 def test_shares_are_the_ensembles_and_sum_to_one(reduced):
     figures = offered_figures("band_energies", reduced)
     assert list(figures) == ["shares-calibrated-1-site-4-cycles"]
+
     (figure,) = figures.values()
     share = select(open_ensemble(reduced), law="bilinear")["bands/share"]
     names = share.attrs["parts"]
     shown = lines(panel(figure, "Bilinear"))
+
     for name, values in zip(names, share.values.T, strict=True):
         np.testing.assert_allclose(shown[name][1], values, rtol=0, atol=1e-299)
     np.testing.assert_allclose(shown["sum"][1], 1.0, rtol=1e-12)
@@ -137,8 +146,10 @@ def test_shares_are_the_ensembles_and_sum_to_one(reduced):
 def test_backbone_is_aligned_exactly(reduced):
     figures = offered_figures("ibtet_backbone", reduced)
     assert list(figures) == ["calibrated-1-site-4-cycles"]  # no branch of the bilinear law was given
+
     (axes,) = all_axes(figures["calibrated-1-site-4-cycles"])
     assert "branch of the printed reading" in axes.get_title(loc="left")
+
     with h5py.File(reduced / "backbone.h5") as file:
         assert "bilinear" in file.attrs["left_out"]
         (group,) = file.values()
@@ -146,20 +157,29 @@ def test_backbone_is_aligned_exactly(reduced):
     _, number = next(curves(open_ensemble(reduced)))
     start = initiation_of(reduced, Sweep.load(reduced / "case.toml").case(number))
     curve = select(open_ensemble(reduced), law="hertz")
-    work, touched = curve["work"].values, curve["contact_episodes"] > 0
+    work = curve["work"].values
+    touched = curve["contact_episodes"] > 0
+
     np.testing.assert_array_equal(touched, np.array(AMPLITUDES) > start.amplitude)
-    assert about["initiation_energy"] == start.energy and about["onset_amplitude"] == start.amplitude
+    assert about["initiation_energy"] == start.energy
+    assert about["onset_amplitude"] == start.amplitude
     # Work grows with the amplitude's square until the first contact comes back to the drive.
     assert start.energy / start.amplitude**2 == pytest.approx(work[0], rel=1e-6)
+
     shown = lines(axes)
     np.testing.assert_allclose(shown["lattice"][0], work * GRAZING / start.energy, rtol=1e-12)
-    grey, floor = shown["slope + floor"], about["floor"]
+
+    grey = shown["slope + floor"]
+    floor = about["floor"]
     assert np.all(grey[1][grey[0] <= GRAZING] == floor)
+
     moving = grey[0] > GRAZING
     np.testing.assert_allclose(grey[1][moving], 700.0 / grey[0][moving] / about["divisor"] + floor, rtol=1e-12)
+
     red = shown["in region III"]
     (green,) = [xy for label, xy in shown.items() if "adj." in label]
     np.testing.assert_allclose(green[1], about["factor"] * red[0] ** about["exponent"], rtol=1e-12)
+
     residual = np.log(red[1] / green[1])
     assert abs(residual.sum()) < 1e-9 and abs(residual @ np.log(red[0])) < 1e-8  # least squares in logarithms
 
@@ -191,16 +211,20 @@ def test_nothing_to_draw_from_nothing():
 def test_transfer_has_a_panel_a_band_and_both_segments(whole):
     figures = offered_figures("transfer", whole)
     assert list(figures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
+
     figure = figures["hertz-calibrated-1-site-4-cycles-60N"]
     heading = figure.get_suptitle() if hasattr(figure, "get_suptitle") else figure._suptitle.get_text()
     assert heading == "Hertz, calibrated, 1 site, 4 cycles, 60 N"
+
     titles = [a.get_title(loc="left") for a in all_axes(figure) if a.get_title(loc="left")]
     assert [t.split()[0] for t in titles] == [f"({x})" for x in "abcdefghi"]
     assert [t[4:] for t in titles[1:5]] == ["Band 1", "Band 2", "Band 3", "Band 4"]
     assert titles[7:] == ["(h) Velocity spectra, cell 5", "(i) Velocity spectra, cell 10"]
+
     # One scale of colours for the whole and its parts.
     (norm,) = {id(a.images[0].norm) for a in all_axes(figure) if a.get_title(loc="left")[:3] in ("(a)", "(b)", "(e)")}
     assert norm
+
     with h5py.File(member_folder(open_ensemble(whole).isel(law=0, amplitude=1)) / "analysis.h5") as file:
         for band, tag in enumerate("bcde"):
             shown = panel(figure, f"({tag})").images[0]
@@ -213,10 +237,13 @@ def test_transfer_spectrum_is_that_of_the_cells_velocity(whole):
     figure = offered_figures("transfer", whole)["hertz-calibrated-1-site-4-cycles-60N"]
     axes = panel(figure, "cell 10")
     with open_run(member_folder(open_ensemble(whole).isel(law=0, amplitude=1)) / "run.h5") as run:
-        velocity, driven = run["velocity"][:, 9].values, 1e-3 * Case.of(run).model().drive.frequency
+        velocity = run["velocity"][:, 9].values
+        driven = 1e-3 * Case.of(run).model().drive.frequency
     (inset,) = axes.child_axes
+
     for j, line in enumerate(inset.lines):
         np.testing.assert_array_equal(line.get_ydata(), velocity[:, j])
+
     x, y = lines(panel(figure, "cell 5"))["mass 1"]
     assert abs(x[np.argmax(y)] - driven) < 0.2 * driven
 
@@ -236,12 +263,15 @@ def test_band_energies_sum_to_the_total(whole):
     """Over the whole record the parts are orthogonal; the running mean differs from the total by cross terms."""
     figures = offered_figures("band_energies", whole)
     assert list(figures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
+
     for _, folder in whole_members(open_ensemble(whole)):
         with h5py.File(folder / "analysis.h5") as file:
-            energy, total = file["bands/energy"][...], file["bands/total"][...]
+            energy = file["bands/energy"][...]
+            total = file["bands/total"][...]
         assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=0.01)
     shown = lines(panel(figures["hertz-calibrated-1-site-4-cycles-60N"], "(a)"))
     parts = sum(y for label, (_, y) in shown.items() if label.startswith(("band", "gap", "above")))
+
     np.testing.assert_allclose(shown["sum of parts"][1], parts, rtol=1e-9)
 
 
@@ -261,18 +291,24 @@ def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
     curve, first, second = (a for a in all_axes(figure) if a.get_title(loc="left"))
     grey = curve.lines[0].get_xydata().T
     np.testing.assert_array_equal(grey[1], select(open_ensemble(reduced), law="hertz")["ibtet"])
+
     ensemble = open_ensemble(whole)
     points = np.array([line.get_xydata()[0] for line in curve.lines[1:]])
     np.testing.assert_array_equal(points[:, 0], ensemble["amplitude"])
     np.testing.assert_array_equal(points[:, 1], ensemble["ibtet"].values.ravel())
+
     folder = member_folder(ensemble.isel(law=0, amplitude=1))
     motion = contact_motion(folder)
     with open_run(folder / "run.h5") as run:
         u = run["displacement"].sel(cell=run["sites/cell"].values[0]).values
-        w, clearance = u[:, 2] - u[:, 1], run["sites/clearance"].values[0]
+        w = u[:, 2] - u[:, 1]
+        clearance = run["sites/clearance"].values[0]
+
     assert [a.get_title(loc="left") for a in (first, second)] == ["1: 1 N", "2: 60 N"]
+
     shown = np.diff(motion.displacement, axis=1)
     assert np.abs(shown).max() >= np.abs(w).max() > clearance
+
     resonator, host = (line.get_xydata().T for line in second.lines)
     np.testing.assert_array_equal(resonator[0], 1e3 * motion.displacement[:, 1])
     np.testing.assert_array_equal(host[1], motion.velocity[:, 0])
@@ -285,6 +321,7 @@ def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatc
     with open_run(folder / "run.h5") as run:
         u = run["displacement"].sel(cell=run["sites/cell"].values[0]).values
     shown = contact_motion(folder).displacement
+
     assert np.abs(shown[:, 1] - shown[:, 0]).max() >= np.abs(u[:, 2] - u[:, 1]).max()
     assert len(shown) < 0.1 * len(u) * runs.REFINE
 

@@ -56,8 +56,10 @@ def test_an_energy_balance_that_does_not_close(folder, petsc_options, capsys):
     petsc_options(ts_rk_type="3bs", ts_adapt_type="none", ts_dt=1e-4)
     result = simulate(small_case(**HALF), folder / "run")
     assert result.complete
+
     (warning,) = (text for text in told(result) if text.startswith("the energy balance misses "))
     assert f"{result.statistics['ledger_error']:.2g} of the work, more than 1e-08" in warning
+
     sets = ["lattice.cells=24", "contacts.sites=[6]", "time.end=0.02", "output.figures=false"]
     assert main(["run", "--out", str(folder / "out"), *(word for text in sets for word in ("--set", text))]) == 0
     assert "vipetsc: warning: the energy balance misses" in capsys.readouterr().err

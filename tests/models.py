@@ -1,0 +1,45 @@
+"""Systems that many tests share: the paper's contact and reduced model, and the benchmark of Kerschen and Peeters."""
+
+from __future__ import annotations
+
+from vipetsc.lattice import Contact, contact_stiffness, four_band
+from vipetsc.modes.system import SmoothSpring, System
+
+# SPEC section 9: the clearance, the radius and Poisson's ratio of the four-band lattice's contacts.
+CLEARANCE = 10**-2.75
+RADIUS = 0.005
+POISSON = 0.3
+
+IN_PHASE = 0
+OUT_OF_PHASE = 1
+
+# Energies in J at which the linear modes of the reduced model touch the stops (SPEC section 9).
+GRAZING_ENERGY = {OUT_OF_PHASE: 0.0293434562302, IN_PHASE: 0.0035442314356}
+
+
+def four_band_contact(law: str = "hertz", modulus: float = 1e8, exponent: float | None = None) -> Contact:
+    """The conservative contact of the four-band lattice; its ``modulus`` is 100 MPa in the paper."""
+    return Contact(law, contact_stiffness(modulus, RADIUS, POISSON), exponent=exponent)
+
+
+def reduced_model(law: str = "bilinear", modulus: float = 1e8, exponent: float | None = None) -> System:
+    """The paper's two masses with one contact between them (SPEC section 9)."""
+    return System.reduced(four_band(), CLEARANCE, four_band_contact(law, modulus, exponent))
+
+
+def kerschen_system() -> System:
+    """x1'' + 2 x1 - x2 + x1^3/2 = 0, x2'' + 2 x2 - x1 = 0: the benchmark of Kerschen and Peeters (2009)."""
+    springs = [(None, 0, 1.0), (0, 1, 1.0), (None, 1, 1.0)]
+    return System.assemble([1.0, 1.0], springs, smooth=[SmoothSpring.between(None, 0, cubic=0.5)])
+
+
+# A cell that no preset has: three masses in a row, of which the first is joined to the next cell's.
+THREE_MASS_CELL = {
+    "masses": [0.010, 0.004, 0.002],
+    "springs": [
+        {"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True},
+        {"start": 1, "end": 2, "stiffness": 6e3},
+        {"start": 2, "end": 3, "stiffness": 1e3},
+    ],
+    "contact": [2, 3],
+}

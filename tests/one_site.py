@@ -1,0 +1,51 @@
+"""Cases of the scattering law of one site and of predictions that tests share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tests.models import THREE_MASS_CELL
+from vipetsc.case import LawCase
+from vipetsc.case.predict import PredictCase
+
+LATTICES = {
+    "four-band": {"preset": "four-band"},
+    "diatomic": {"preset": "diatomic"},
+    "three-mass": {"cell": THREE_MASS_CELL},
+}
+# A table of few points, each of one run.
+COARSE = {"largest": 2.0, "samples": 1, "tolerance": 0.3, "finest": 0.2}
+
+PREDICTION = {
+    "name": "small",
+    "lattice": {"preset": "four-band", "cells": 120},
+    "contacts": {"sites": [40, 70], "clearance": [2e-3, 1.8e-3]},
+    "drive": {"cycles": 15, "band": 2, "at": "max-group-velocity"},
+    "predict": {"points": 16, "amplitudes": [5.0, 30.0, 120.0, 600.0]},
+}
+
+
+def law_case(lattice: str = "four-band", law: dict[str, Any] = COARSE, **sections: dict[str, Any]) -> LawCase:
+    """The law of a site without loss under a short burst; ``sections`` update the table of the case."""
+    contacts: dict[str, Any] = {"sites": [2], "clearance": 1e-3, "restitution": 1.0}
+    if lattice == "three-mass":
+        # Only presets have a stiffness of their own.
+        contacts["stiffness"] = 5e6
+    table = {
+        "lattice": LATTICES[lattice],
+        "contacts": contacts,
+        "drive": {"cycles": 8, "band": 2, "at": "max-group-velocity"},
+        "time": {"rtol": 1e-9},
+        "law": law,
+    }
+    for name, values in sections.items():
+        table[name] = table.get(name, {}) | values
+    return LawCase.from_table(table)
+
+
+def prediction_case(**sections: dict[str, Any]) -> PredictCase:
+    """Two sites of a four-band lattice at four amplitudes; ``sections`` update the table of the case."""
+    table: dict[str, Any] = dict(PREDICTION)
+    for name, values in sections.items():
+        table[name] = table.get(name, {}) | values
+    return PredictCase.from_table(table)

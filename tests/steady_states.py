@@ -1,0 +1,65 @@
+"""Cases of frequency response curves that tests share, and the motion that a point of a curve stands for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from tests.models import CLEARANCE
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.response.steady import SteadyStates
+
+LATTICE = {"preset": "four-band", "cells": 30}
+CONTACTS = {"sites": [10], "clearance": CLEARANCE, "restitution": 1.0}
+# The range holds the jump up at amplitude/clearance = 1.0014 (SPEC section 15).
+NFRC = {"harmonics": 11, "range": [0.98, 1.01]}
+
+
+def nfrc_case(lattice: dict[str, Any] | None = None, contacts: dict[str, Any] | None = None, **nfrc: Any) -> NfrcCase:
+    """One site of a four-band lattice under a wave; arguments update the tables of the case."""
+    table = {"name": "x", "lattice": LATTICE | (lattice or {}), "contacts": CONTACTS | (contacts or {})}
+    return NfrcCase.from_table(table | {"nfrc": NFRC | nfrc})
+
+
+def curve_of(case: NfrcCase, folder: Path):
+    """The only curve of a ``case``, followed on this rank; its file lies in ``folder``."""
+    folder.mkdir(exist_ok=True)
+    (curve,) = follow_all(case, folder, MPI.COMM_SELF)
+    return curve
+
+
+def refined(few: SteadyStates, many: SteadyStates, xi: np.ndarray) -> np.ndarray:
+    """The solution near ``xi``, which has the harmonics of ``few``, with those of ``many``."""
+    missing = many.options.harmonics - few.options.harmonics
+    harmonics = np.pad(few.balance.unpack(xi[:-1]), ((0, 0), (0, missing)))
+    guess = np.append(many.balance.pack(harmonics), xi[-1])
+    return many.at(guess, xi[-1])
+
+
+def motion_at(states: SteadyStates, xi: np.ndarray, cells: np.ndarray, phase: float = 0.0):
+    """Displacement and velocity (cell, dof) of a steady state at a ``phase`` of its drive."""
+    omega, amplitude = states.drive(xi[-1])
+    unknowns = xi[:-1] * states.clearance
+    orders = np.arange(1, states.balance.unpack(unknowns).shape[1])
+
+    # Forces on the lattice, harmonic by harmonic: of its contacts, and of the drive at the first one.
+    forces = states.balance.series(unknowns, omega).forces
+    displacement = 0.0
+    velocity = 0.0
+    for order in orders:
+        acting = forces[:, order]
+        if order == 1 and not states.wave:
+            acting = np.append(acting, amplitude)
+        field = states.compliance.field(order * omega, acting, cells)
+        if order == 1 and states.wave:
+            field = field + states.linear_motion(omega).wave.field(cells) * amplitude * states.clearance
+
+        field = field * np.exp(1j * order * phase)
+        displacement = displacement + field.real
+        velocity = velocity + (1j * order * omega * field).real
+    return displacement, velocity

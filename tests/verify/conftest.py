@@ -1,0 +1,93 @@
+"""Branches of the paper's reduced model that several modules read, each followed once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from tests.models import IN_PHASE, OUT_OF_PHASE, reduced_model
+from vipetsc.case.nnm import NnmTable
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.point import Point
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.system import System
+
+
+class Branch(NamedTuple):
+    """A branch as it was followed: its problem, its points in order, and its special points."""
+
+    problem: Shooting
+    points: list[Point]
+    special: list[Point]
+
+    def of_kind(self, kind: str) -> list[Point]:
+        """The special points of one ``kind``."""
+        return [point for point in self.special if point.kind == kind]
+
+    def at_energy(self, energy: float) -> Point:
+        """The point at an ``energy``, corrected there; of a branch that turns, on the last stretch that passes it."""
+        before = [
+            number
+            for number, (a, b) in enumerate(zip(self.points[:-1], self.points[1:], strict=True))
+            if a.energy <= energy < b.energy
+        ]
+        point = self.points[before[-1]]
+
+        # Newton's method in the energy along the branch.
+        for _ in range(8):
+            length = (energy - point.energy) / point.energy_tangent
+            frame = self.problem.frame(point, "relative")
+            guess = frame.xi + length * frame.direction(point)
+            attempt = frame.solve(guess, frame.tangent, frame.tangent @ guess)
+            assert attempt.converged, attempt.history
+            tangent = np.linalg.svd(frame.jacobian(attempt.xi))[2][-1]
+            point = frame.measures(attempt, tangent)
+
+        assert point.energy == pytest.approx(energy, rel=1e-12)
+        return point
+
+
+def follow(system: System, mode: int, start: float, **control) -> Branch:
+    """Follow a linear ``mode`` from the energy ``start`` (J) in quarter periods; ``control`` is the table [nnm]."""
+    problem = Shooting(Dop853Flow(system), MAPS["quarter"])
+    first = linear_start(problem, mode, start)
+    continuation = Continuation(problem, first, NnmTable(**{"points": 20000} | control))
+    chart = control.get("chart", "relative")
+
+    points = [continuation.point]
+    special = []
+    for point in continuation:
+        special += locate(problem, points[-1], point, chart, grazing=True)
+        points.append(point)
+    return Branch(problem, points, special)
+
+
+@pytest.fixture(scope="session")
+def bilinear() -> Branch:
+    """The out-of-phase branch of linear stops over thirteen decades of energy."""
+    return follow(reduced_model("bilinear"), OUT_OF_PHASE, 3e-4, energy=[1e-4, 1e9], chart="auto")
+
+
+@pytest.fixture(scope="session")
+def hertz() -> Branch:
+    """The out-of-phase branch of Hertz contacts over thirteen decades of energy."""
+    return follow(reduced_model("hertz"), OUT_OF_PHASE, 3e-4, energy=[1e-4, 1e9], chart="auto")
+
+
+@pytest.fixture(scope="session")
+def in_phase() -> Branch:
+    """The in-phase branch of linear stops from the linear mode past the 7:1 tongue, without special points."""
+    problem = Shooting(Dop853Flow(reduced_model("bilinear")), MAPS["quarter"])
+    start = linear_start(problem, IN_PHASE, 1e-3)
+    continuation = Continuation(problem, start, NnmTable(energy=[0.0, 25.0], points=20000))
+
+    points = [continuation.point, *continuation]
+
+    assert continuation.finished
+    return Branch(problem, points, [])

@@ -1,0 +1,158 @@
+"""Continuation of branches: guards against jumps, special points, switching, failures, a published benchmark."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from tests.models import IN_PHASE, OUT_OF_PHASE, kerschen_system, reduced_model
+from tests.verify.conftest import follow
+from vipetsc.case.nnm import Guards, NnmTable
+from vipetsc.modes.branches.branch_checks import is_jump, suspects
+from vipetsc.modes.continuation import segment as segments
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.continuation.segment import Segment
+from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.continuation.switching import switch
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import ContinuationError
+from vipetsc.modes.shooting import shooting as shooting_problem
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.orbit import resonance
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.system import System
+
+
+def test_degenerate_tangent_is_named():
+    """Two equal oscillators without coupling have no tangent: every combination of them is an orbit."""
+    system = System.assemble([1.0, 1.0], [(None, 0, 1.0), (None, 1, 1.0)])
+    problem = Shooting(Dop853Flow(system), MAPS["half"])
+    frame = problem.relative_frame(np.array([1.0, 0.5]), 2 * np.pi)
+    attempt = frame.solve(frame.xi, np.array([1.0, 0.0, 0.0]), frame.xi[0])
+
+    # E = (1^2 + 0.5^2)/2.
+    with pytest.raises(ContinuationError, match=r"degenerate tangent at E = 0.625 J"):
+        Continuation(problem, frame.measures(attempt), NnmTable())
+
+
+def test_without_guards_the_branch_jumps_and_the_detector_finds_it():
+    problem = Shooting(Dop853Flow(reduced_model()), MAPS["quarter"])
+    start = linear_start(problem, IN_PHASE, 3e-3)
+    control = NnmTable(points=150, guards=Guards(half_trace=0, contacts=0, corrector=0, turn=0, turn_relative=0))
+
+    points = [start, *Continuation(problem, start, control)]
+
+    # Both ends of a jump are orbits: residuals do not show it.
+    assert max(point.residual for point in points) <= 1e-12
+    assert any(is_jump(problem, points[number], points[number + 1], control) for number, _ in suspects(problem, points))
+
+    guarded = [start, *Continuation(problem, start, NnmTable(points=150))]
+    assert not list(suspects(problem, guarded))
+    # What the detector doubts is followed again with the guards on: a point left out is no jump.
+    assert not is_jump(problem, guarded[60], guarded[62], control)
+
+
+@pytest.mark.slow
+def test_kerschen_benchmark():
+    """Both modes of Kerschen and Peeters (2009) reach E = 1e6 J, the in-phase one through its tongues 3:1 and 5:1."""
+    system = kerschen_system()
+    assert system.linear_modes()[0] == pytest.approx([1.0, np.sqrt(3)], rel=1e-14)
+
+    in_phase = follow(system, IN_PHASE, 1e-3, energy=[0.0, 1e6])
+    assert in_phase.points[0].frequency == pytest.approx(1 / (2 * np.pi), rel=1e-3)
+    assert in_phase.points[-1].energy > 1e6
+    assert max(point.residual for point in in_phase.points) <= 1e-12
+
+    tips = {resonance(in_phase.problem, point) for point in in_phase.of_kind("fold-energy")}
+    assert {3, 5} <= tips
+
+    out_of_phase = follow(system, OUT_OF_PHASE, 1e-3, energy=[0.0, 1e6])
+    assert out_of_phase.points[-1].energy > 1e6
+
+    # At high energy mass 1 moves on its cubic spring alone, for which f ~ E^(1/4).
+    high = [point for point in out_of_phase.points if point.energy > 1e4]
+    energy = np.array([point.energy for point in high])
+    frequency = np.array([point.frequency for point in high])
+    exponent = np.polyfit(np.log(energy), np.log(frequency), 1)[0]
+    assert exponent == pytest.approx(0.25, abs=0.01)
+
+
+@pytest.fixture(scope="module")
+def kerschen_in_phase():
+    """The in-phase branch of the benchmark as far as its first crossings of both kinds."""
+    return follow(kerschen_system(), IN_PHASE, 1e-3, energy=[0.0, 4500.0], frequency=[0.0, 0.2229])
+
+
+@pytest.mark.parametrize(("kind", "periods"), [("symmetry-breaking", 1), ("period-doubling", 2)])
+def test_branch_switching(kind, periods, kerschen_in_phase):
+    """The crossing branch starts at the special point, and its orbits have lost the symmetry of the first one."""
+    point = kerschen_in_phase.of_kind(kind)[0]
+
+    problem, first = switch(kerschen_in_phase.problem, point, amplitude=1e-3)
+    assert first.energy == pytest.approx(point.energy, rel=1e-3)
+    assert first.period == pytest.approx(periods * point.period, rel=1e-3)
+
+    *_, far = Continuation(problem, first, NnmTable(points=10))
+    assert far.residual <= 1e-11
+
+    # After a quarter period an orbit of the first branch that began at rest passes through zero, and the other way.
+    arc = problem.arc(far.x, far.period)
+    quarter = problem.flow.arc(arc.start, far.period / 4, far.period).end
+    dofs = problem.system.dofs
+    vanishing = quarter[:dofs] if problem.map.start == "rest" else quarter[dofs:]
+    assert np.abs(vanishing).max() > 1e-4 * np.abs(quarter).max()
+
+
+def test_a_failure_states_where_it_stopped_why_and_what_to_change():
+    problem = Shooting(Dop853Flow(reduced_model()), MAPS["quarter"], max_newton=1)
+    start = linear_start(problem, OUT_OF_PHASE, 2.9e-2)
+
+    points = []
+    with pytest.raises(ContinuationError) as caught:
+        for point in Continuation(problem, start, NnmTable(smallest_step=1e-6, first_step=1e-2)):
+            points.append(point)
+
+    text = str(caught.value)
+    assert points
+    assert f"E = {points[-1].energy:.9g} J" in text
+    assert "residuals of the last attempt" in text
+    assert "turn nnm." in text
+
+
+def test_contacts_change_at_grazing_points(in_phase, monkeypatch):
+    """On either side of a grazing point the contacts are those of that end; bisection finds the same points."""
+    problem = in_phase.problem
+    # A dozen of them lie in the grazing cascade, where contacts follow each other most closely.
+    steps = [(a, b) for a, b in itertools.pairwise(in_phase.points) if a.episodes != b.episodes][:12]
+
+    def grazing_points(segment_ends: list[tuple[Point, Point]]) -> list[Point]:
+        special = [point for a, b in segment_ends for point in locate(problem, a, b, grazing=True)]
+        return [point for point in special if point.kind == "grazing"]
+
+    def fail(*_, **__):
+        raise ArithmeticError("this method fails")
+
+    # Points of other kinds, which are bisected, are left out where bisection fails.
+    with monkeypatch.context() as patch:
+        patch.setattr(segments, "brentq", fail)
+        touching = grazing_points(steps)
+
+    assert len(touching) == len(steps)
+    for (a, b), point in zip(steps, touching, strict=True):
+        segment = Segment(problem, "relative", a, b)
+        before = segment.at(point.step - 1e-4 * segment.length)
+        after = segment.at(point.step + 1e-4 * segment.length)
+        assert before.episodes == a.episodes
+        assert after.episodes == b.episodes
+        assert point.episodes == min(a.episodes, b.episodes)
+
+    # Bisection costs many orbits a point: three are enough.
+    monkeypatch.setattr(shooting_problem, "graze", fail)
+    bisected = grazing_points(steps[:3])
+    assert len(bisected) == 3
+    for point, same in zip(touching[:3], bisected, strict=True):
+        assert point.energy == pytest.approx(same.energy, rel=1e-9)

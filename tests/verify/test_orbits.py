@@ -1,0 +1,145 @@
+"""Arcs and periodic orbits of the reduced model: exact solutions, conservation, sensitivities, other flows and maps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.models import CLEARANCE, OUT_OF_PHASE, reduced_model
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.reference import FiniteDifferences, Newmark, Tsrk
+from vipetsc.modes.shooting.shooting import Shooting
+
+
+def superposed(stiffness, masses, centre, displacement, velocity, duration):
+    """Displacement and velocity of a linear system about its ``centre`` after a ``duration``, mode by mode."""
+    root = np.sqrt(masses)
+    squared, modes = np.linalg.eigh(stiffness / np.outer(root, root))
+    omega = np.sqrt(squared)
+
+    amplitude = modes.T @ (root * (displacement - centre))
+    rate = modes.T @ (root * velocity)
+    cosine = np.cos(omega * duration)
+    sine = np.sin(omega * duration)
+
+    later = modes @ (cosine * amplitude + sine / omega * rate)
+    later_rate = modes @ (cosine * rate - omega * sine * amplitude)
+    return later / root + centre, later_rate / root
+
+
+def test_bilinear_orbit_is_the_exact_piecewise_solution(bilinear):
+    """A quarter period is modal superposition with the contact closed, then open, with one separation between."""
+    problem = bilinear.problem
+    system = problem.system
+    point = bilinear.at_energy(1.0)
+    (separation,) = problem.arc(point.x, point.period).events
+
+    # The quarter begins at rest with the contact closed: its stop shifts the centre of the motion.
+    row = np.array([-1.0, 1.0])
+    side = np.sign(row @ point.x)
+    contact_stiffness = system.contacts[0].law.stiffness
+    closed = system.stiffness + contact_stiffness * np.outer(row, row)
+    centre = np.linalg.solve(closed, contact_stiffness * CLEARANCE * side * row)
+
+    u, v = superposed(closed, system.masses, centre, point.x, np.zeros(2), separation[0])
+    assert side * (row @ u) == pytest.approx(CLEARANCE, rel=1e-12)
+
+    u, _ = superposed(system.stiffness, system.masses, np.zeros(2), u, v, point.period / 4 - separation[0])
+    assert np.abs(u).max() <= 1e-12 * np.abs(point.x).max()
+
+
+@pytest.mark.parametrize("law", ["bilinear", "hertz"])
+@pytest.mark.parametrize(("flow", "accuracy"), [(Tsrk, 1e-11), (Newmark, 1e-4)])
+def test_other_flows_agree(flow, accuracy, law, request):
+    """TSRK is as exact as the compiled flow; Newmark has its own error, at the same amplitude."""
+    branch = request.getfixturevalue(law)
+    other = Shooting(flow(branch.problem.system), MAPS["quarter"], tolerance=1e-12)
+
+    for energy in (0.1, 10.0, 1e4, 1e8):
+        point = branch.at_energy(energy)
+        frame = other.relative_frame(point.x, point.period)
+        # The second unknown stays, and the search begins off the orbit: it has something to correct.
+        row = np.array([0.0, 1.0, 0.0])
+        attempt = frame.solve(frame.xi + 1e-6 * (1 - row), row, row @ frame.xi)
+        assert attempt.converged, attempt.history
+
+        found = frame.measures(attempt)
+        assert found.energy == pytest.approx(point.energy, rel=accuracy)
+        assert found.frequency == pytest.approx(point.frequency, rel=accuracy)
+        assert found.episodes == point.episodes
+
+
+@pytest.mark.parametrize("shooting", ["half", "whole"])
+def test_maps_agree(shooting, bilinear):
+    """Half and whole periods find the orbits of the quarter period, with the same multipliers."""
+    stable = next(point for point in bilinear.points if point.energy > 1.0)
+    unstable = max(bilinear.points, key=lambda point: point.multiplier)
+
+    for point in (stable, unstable):
+        # Longer arcs amplify rounding: the whole period is 1e6 times worse conditioned than the quarter.
+        other = Shooting(bilinear.problem.flow, MAPS[shooting], tolerance=1e-11)
+        frame = other.relative_frame(point.x, point.period)
+        row = np.append(point.x / np.linalg.norm(point.x), 0.0)
+        attempt = frame.solve(frame.xi + 1e-7, row, row @ frame.xi)
+        assert attempt.converged, attempt.history
+
+        found = frame.measures(attempt)
+        assert found.frequency == pytest.approx(point.frequency, rel=1e-9)
+        assert found.multiplier == pytest.approx(point.multiplier, rel=1e-3)
+
+
+@pytest.mark.parametrize("law", ["bilinear", "hertz"])
+def test_sensitivities(law):
+    """Variational equations agree with central differences and are symplectic, on an arc with many contacts."""
+    system = reduced_model(law)
+    start = np.array([3 * CLEARANCE, 1.2 * CLEARANCE, 0.1, -0.2])
+    flow = Dop853Flow(system)
+
+    arc = flow.arc(start, 3e-3, 3e-3)
+    differences = FiniteDifferences(flow, 1e-7).arc(start, 3e-3, 3e-3).sensitivity
+
+    assert len(arc.events) >= 8
+    largest = np.abs(arc.sensitivity).max()
+    assert arc.sensitivity == pytest.approx(differences, rel=1e-4, abs=1e-4 * largest)
+
+    # S^T J S = J of displacements and momenta; terms that cancel in it set the rounding.
+    masses = np.diag(system.masses)
+    zero = np.zeros((2, 2))
+    form = np.block([[zero, masses], [-masses, zero]])
+    size = np.abs(arc.sensitivity.T) @ np.abs(form) @ np.abs(arc.sensitivity)
+    defect = np.abs(arc.sensitivity.T @ form @ arc.sensitivity - form)
+    assert defect.max() <= 1e-7 * size.max()
+
+
+def test_flow_conserves_energy_and_reverses():
+    """After more than 50 changes of contact the energy is the same, and the reversed motion leads back."""
+    system = reduced_model()
+    flow = Dop853Flow(system)
+    start = np.array([30 * CLEARANCE, 10 * CLEARANCE, 0.0, 0.0])
+
+    arc = flow.arc(start, 7e-3, 7e-3)
+    assert len(arc.events) > 50
+
+    u = arc.end[:2]
+    v = arc.end[2:]
+    assert system.energy(u, v) == pytest.approx(system.energy(start[:2], start[2:]), rel=1e-12)
+
+    back = flow.arc(np.append(u, -v), 7e-3, 7e-3)
+    assert np.abs(back.end[:2] - start[:2]).max() <= 1e-11 * np.abs(start).max()
+
+
+# A contact of depth 1e-12 D lasts about 1e-6 of the period; the same distance short of the stop is a miss.
+@pytest.mark.parametrize(("excess", "changes"), [(1e-12, 2), (-1e-12, 0)])
+def test_short_contacts_inside_a_step_are_found(excess, changes):
+    """A pair of changes 1e-6 of the period apart is found, and a near miss does not count."""
+    system = reduced_model()
+    omega, shapes = system.linear_modes()
+    shape = shapes[:, OUT_OF_PHASE]
+    touching = shape * CLEARANCE / abs(shape[1] - shape[0])
+    period = 2 * np.pi / omega[OUT_OF_PHASE]
+    centre = np.append(np.zeros(2), omega[OUT_OF_PHASE] * (1 + excess) * touching)
+
+    arc = Dop853Flow(system).arc(centre, period / 2, period)
+
+    assert len(arc.events) == changes
