@@ -1,4 +1,6 @@
-"""What each room makes of hardening stops, against formulas written out here: a script of ``test_another_law``."""
+"""Compares hardening stops in each room with formulas written out here: the script of ``test_another_law``."""
+
+from __future__ import annotations
 
 import json
 from pathlib import Path
@@ -30,108 +32,123 @@ D = 1e-3
 
 
 def force(x, k=K, b=B):
+    """F = k x (1 + b x^2) of an indentation."""
     return k * x * (1 + b * x**2)
 
 
 def slope(x):
+    """dF/dx."""
     return K * (1 + 3 * B * x**2)
 
 
 def energy(x):
+    """The integral of F."""
     return K * x**2 / 2 + K * B * x**4 / 4
 
 
 def relative(a, b):
+    """The largest difference over the largest of ``b``."""
     return float(np.abs(np.subtract(a, b)).max() / np.abs(b).max())
 
 
-def twins() -> dict:
-    law = Contact("hardening", K, hardening=B)
-    x = np.linspace(1e-4, 2e-3, 7)
-    (record,) = elastic_records([law])
-    compiled = np.array(
-        [(*elastic_force_and_slope(record, s), elastic_force(record, s), elastic_energy(record, s)) for s in x]
-    )
-    differences = [
-        relative(law.elastic_force(x), force(x)),
-        relative(law.elastic_slope(x), slope(x)),
-        relative(law.elastic_energy(x), energy(x)),
-        relative(compiled.T, [force(x), slope(x), force(x), energy(x)]),
-    ]
-
-    mass = 0.01
-    speed = 2.0
-    fall = solve_ivp(lambda t, y: [y[1], -force(y[0]) / mass], (0, 1), [0.0, speed], rtol=1e-11, atol=1e-14,
-                     events=turning)  # fmt: skip
-    site = create_contacts(law, [D], mass)[0]
-    durations = [law.impact_time(speed, mass), impact_time(site, speed)]
-    return {"twins": max(differences), "duration": relative(durations, [2 * fall.t[-1]] * 2)}
-
-
 def turning(t, y):
+    """Where a mass in contact comes to rest."""
     return y[1]
 
 
 turning.terminal = True
 
+
+def twins() -> dict:
+    """The law on arrays, its compiled twin, and the duration of an impact that both compute."""
+    law = Contact("hardening", K, hardening=B)
+    x = np.linspace(1e-4, 2e-3, 7)
+    on_arrays = [law.elastic_force(x), law.elastic_slope(x), law.elastic_energy(x)]
+
+    (record,) = elastic_records([law])
+    compiled = []
+    for indentation in x:
+        push, stiffness = elastic_force_and_slope(record, indentation)
+        compiled.append([push, stiffness, elastic_energy(record, indentation), elastic_force(record, indentation)])
+
+    expected = [force(x), slope(x), energy(x)]
+    differences = [relative(ours, formula) for ours, formula in zip(on_arrays, expected, strict=True)]
+    differences.append(relative(np.transpose(compiled), [*expected, force(x)]))
+
+    # An impact without loss takes twice the time to its turning point.
+    mass = 0.01
+    speed = 2.0
+    approach = solve_ivp(
+        lambda t, y: [y[1], -force(y[0]) / mass], (0, 1), [0.0, speed], rtol=1e-11, atol=1e-14, events=turning
+    )
+    site = create_contacts(law, [D], mass)[0]
+    durations = [law.impact_time(speed, mass), impact_time(site, speed)]
+    return {"twins": max(differences), "duration": relative(durations, [2 * approach.t[-1]] * 2)}
+
+
 LATTICE = {"preset": "four-band", "cells": 12}
 STOPS = {"law": "hardening", "hardening": B, "stiffness": K, "sites": [4, 6], "clearance": D}
 
 
+def stopped_run(engine: str, contacts: dict) -> tuple[np.ndarray, dict]:
+    """Velocities and statistics of a short run of a lattice with two sites."""
+    table = {
+        "lattice": LATTICE,
+        "contacts": contacts | {"restitution": 0.6},
+        "drive": {"amplitude": 300.0, "cycles": 5, "cell": 5},
+        "time": {"end": 0.03, "engine": engine, "rtol": 1e-10},
+    }
+    memory = RunMemory()
+    result = simulate(Case.from_table(table), memory)
+    return memory.dataset["velocity"].values, result.statistics
+
+
 def engines() -> dict:
-    velocity = {}
-    results = {}
-    for law, engine in (("hardening", "ts"), ("hardening", "propagator"), ("bilinear", "propagator")):
-        stops = STOPS | {"law": law, "restitution": 0.6}
-        if law != "hardening":
-            del stops["hardening"]
-        table = {
-            "lattice": LATTICE,
-            "contacts": stops,
-            "drive": {"amplitude": 300.0, "cycles": 5, "cell": 5},
-            "time": {"end": 0.03, "engine": engine, "rtol": 1e-10},
-        }
-        memory = RunMemory()
-        results[law, engine] = simulate(Case.from_table(table), memory).statistics
-        velocity[law, engine] = memory.dataset["velocity"].values
-    ours, exact, linear = velocity.values()
-    pair = list(results.values())[:2]
+    """Both engines' runs, and one with a linear stop of the same stiffness."""
+    linear_stops = STOPS | {"law": "bilinear"}
+    del linear_stops["hardening"]
+    stepped, by_ts = stopped_run("ts", STOPS)
+    exact, by_propagator = stopped_run("propagator", STOPS)
+    linear, _ = stopped_run("propagator", linear_stops)
     return {
-        "engines": relative(ours, exact),
+        "engines": relative(stepped, exact),
         "hardens": relative(linear, exact),
-        "episodes": [statistics["episodes"] for statistics in pair],
-        "ledgers": [statistics["ledger_error"] for statistics in pair],
+        "episodes": [by_ts["episodes"], by_propagator["episodes"]],
+        "ledgers": [by_ts["ledger_error"], by_propagator["ledger_error"]],
     }
 
 
+# One mass on a spring to ground, between two stops.
 MASS = 1.3
 SPRING = 4e4
 
 
 def period(total: float) -> float:
-    """Four times the way from rest to the farthest point of a mass on a spring between two stops."""
+    """Four times the duration from the middle to the farthest point of a mass on a spring between two stops."""
 
     def potential(x):
         return SPRING * x**2 / 2 + energy(max(x - D, 0.0))
 
     farthest = brentq(lambda x: potential(x) - total, 0, 1, xtol=1e-16)
 
+    # With x = farthest sin(s) the time is a smooth integral on either side of the stop.
     def slowness(s):
         x = farthest * np.sin(s)
         return farthest * np.cos(s) / np.sqrt(2 * (total - potential(x)) / MASS)
 
-    touch = np.arcsin(min(D / farthest, 1.0))
+    touching = np.arcsin(min(D / farthest, 1.0))
     nodes, weights = np.polynomial.legendre.leggauss(60)
-    total_time = 0.0
-    for low, high in ((0.0, touch), (touch, np.pi / 2)):
+    quarter = 0.0
+    for low, high in ((0.0, touching), (touching, np.pi / 2)):
         if low == high:
             continue
         phases = 0.5 * (low + high) + 0.5 * (high - low) * nodes
-        total_time += 0.5 * (high - low) * sum(w * slowness(s) for s, w in zip(phases, weights, strict=True))
-    return 4 * total_time
+        quarter += 0.5 * (high - low) * sum(w * slowness(s) for s, w in zip(phases, weights, strict=True))
+    return 4 * quarter
 
 
 def normal_modes() -> dict:
+    """Periods of a branch of either method against those of the energy integral."""
     touching = SPRING * D**2 / 2
     highest = 20 * touching
     case = f"""
@@ -171,7 +188,8 @@ def periodic(omega: float, amplitude: float, chain) -> float:
     stiffness = chain.stiffness_matrix().toarray()
     masses = chain.masses()
     pair = np.zeros(len(masses))
-    pair[[chain.cell.host, chain.cell.resonator]] = -1, 1
+    pair[chain.cell.host] = -1
+    pair[chain.cell.resonator] = 1
 
     def rate(t, y, strength):
         u, v = np.split(y, 2)
@@ -189,24 +207,29 @@ def periodic(omega: float, amplitude: float, chain) -> float:
 
     n = len(masses)
     linear = np.linalg.solve(stiffness - omega**2 * np.diag(masses), np.eye(n)[0])
-    touching = D / abs(pair @ linear)
-    u = linear * touching
-    for strength in np.linspace(touching, amplitude, 4)[1:]:
-        solved = root(
-            lambda u, strength=strength: orbit(u, strength)[n:, -1] / (omega * D), u * strength / touching, tol=1e-9
-        )
+    last = D / abs(pair @ linear)
+    u = linear * last
+    # From the linear motion that touches in three steps: Newton's method does not reach the orbit in one.
+    for strength in np.linspace(last, amplitude, 4)[1:]:
+
+        def speeds_after_half_a_period(u, strength=strength):
+            return orbit(u, strength)[n:, -1] / (omega * D)
+
+        solved = root(speeds_after_half_a_period, u * strength / last, tol=1e-9)
         assert solved.success, solved.message
         u = solved.x
-        touching = strength
+        last = strength
     return float(np.abs(pair @ orbit(u, amplitude)[:n]).max())
 
 
 def steady() -> dict:
+    """The largest |w| of a steady state of ``nfrc`` against a periodic orbit, and how much the stop hardens in it."""
     lattice = {"preset": "four-band", "cells": 2}
     chain = Case.from_table({"lattice": lattice, "contacts": STOPS | {"sites": [1]}}).model().chain
     stiffness = chain.stiffness_matrix().toarray()
     masses = chain.masses()
-    omega = round(0.7 * float(np.sqrt(eigh(stiffness, np.diag(masses), eigvals_only=True)[0])), 3)
+    lowest = np.sqrt(eigh(stiffness, np.diag(masses), eigvals_only=True)[0])
+    omega = round(0.7 * float(lowest), 3)
     linear = np.linalg.solve(stiffness - omega**2 * np.diag(masses), np.eye(len(masses))[0])
     touching = D / abs(linear[chain.cell.resonator] - linear[chain.cell.host])
     case = f"""

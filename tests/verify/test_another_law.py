@@ -33,13 +33,13 @@ def apply_chapter(package: Path) -> int:
         if name:
             path = package / name
             continue
+
+        # Lines of a block begin with a blank, a minus or a plus.
         lines = block.splitlines(keepends=True)
         before = "".join(line[1:] for line in lines if line[0] in " -")
         after = "".join(line[1:] for line in lines if line[0] in " +")
         source = path.read_text(encoding="utf-8")
-
         assert source.count(before) == 1, f"{path.name} does not have once:\n{before}"
-
         path.write_text(source.replace(before, after), encoding="utf-8")
         count += 1
     return count
@@ -47,17 +47,22 @@ def apply_chapter(package: Path) -> int:
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory) -> dict:
+    """What the script finds in a copy of the package with the chapter's law."""
     folder = tmp_path_factory.mktemp("another-law")
     shutil.copytree(PACKAGE, folder / "vipetsc", ignore=shutil.ignore_patterns("__pycache__"))
     assert apply_chapter(folder / "vipetsc") == 10
 
     # Kernels are small here: what optimisation costs is more than it brings.
     environment = clean_environment() | {"PYTHONPATH": str(folder), "NUMBA_OPT": "1"}
-    command = [sys.executable, str(SCRIPT)]
     ended = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=900, check=False
+        [sys.executable, str(SCRIPT)],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
     )
-
     assert ended.returncode == 0, ended.stdout + ended.stderr
     return json.loads((folder / "found.json").read_text())
 
@@ -71,13 +76,15 @@ def test_both_engines_follow_the_same_trajectory(found):
     assert found["episodes"][0] == found["episodes"][1] > 4
     assert found["engines"] < 1e-6
     assert max(found["ledgers"]) < 1e-7
-    assert found["hardens"] > 1e-3  # against a linear stop of the same stiffness
+    # The run differs from that with a linear stop of the same stiffness.
+    assert found["hardens"] > 1e-3
 
 
-@pytest.mark.parametrize("method", ["shooting", "condensed"])
-def test_normal_modes_have_the_period_of_the_energy_integral(found, method):
+# Harmonics that the condensed method leaves out are 1e-4 of the motion.
+@pytest.mark.parametrize(("method", "error"), [("shooting", 1e-8), ("condensed", 1e-5)])
+def test_normal_modes_have_the_period_of_the_energy_integral(found, method, error):
     assert found["reached"][method] > 0.5
-    assert found["periods"][method] < {"shooting": 1e-8, "condensed": 1e-5}[method]
+    assert found["periods"][method] < error
 
 
 def test_a_steady_state_is_a_periodic_orbit(found):

@@ -1,4 +1,6 @@
-"""The transfer beside the slope of a branch: alignment, divisor and exponents against closed forms."""
+"""Transfers compared with the slope of a branch: alignment, divisor and exponents against closed forms."""
+
+from __future__ import annotations
 
 import h5py
 import numpy as np
@@ -16,42 +18,49 @@ from vipetsc.studies.linear_run import LinearRun, linear_name
 
 GRAZING = 0.03
 EXPONENT = -0.9
+FACTOR = 500.0
+INITIATION = 0.6
 
 
-def branch(exponent=EXPONENT, factor=500.0, count=120):
+def branch(exponent: float = EXPONENT, count: int = 120) -> xr.Dataset:
     """A branch that is linear up to GRAZING, has a peak of its slope behind it and then a power law."""
     energy = GRAZING * np.concatenate([np.geomspace(0.01, 1.0, 10), np.geomspace(1.001, 1e7, count)])
     region = np.select([energy <= GRAZING, energy < 2 * GRAZING, energy < 1e4 * GRAZING], [1, 2, 3], 4)
-    slope = np.where(region == 1, 0.0, factor * energy**exponent)
+    slope = np.where(region == 1, 0.0, FACTOR * energy**exponent)
+
     values = {"branch/energy": energy, "branch/slope": slope, "branch/region": region}
-    about = {"law": "hertz", "reading": "printed", "grazing": GRAZING}
-    return xr.Dataset(tabulated(LAYOUT, {"point": np.arange(len(energy))} | values), attrs=about)
+    attributes = {"law": "hertz", "reading": "printed", "grazing": GRAZING}
+    return xr.Dataset(tabulated(LAYOUT, {"point": np.arange(len(energy))} | values), attrs=attributes)
 
 
-def lattice(slope, divisor, floor, initiation, count=60):
-    """The transfer that follows the branch exactly, over the work of the drive in the lattice's own energies."""
-    work = initiation * np.geomspace(1e-3, 1e6, count)
-    law = 500.0 * (work * GRAZING / initiation) ** EXPONENT / divisor + floor
-    return work, np.where(work < initiation, floor, law)
+def exact_transfer(divisor: float, floor: float, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """Work of the drive, in the lattice's own energies, and the transfer that follows the branch exactly."""
+    work = INITIATION * np.geomspace(1e-3, 1e6, count)
+    transfer = FACTOR * (work * GRAZING / INITIATION) ** EXPONENT / divisor + floor
+    return work, np.where(work < INITIATION, floor, transfer)
 
 
 def test_energies_align_at_grazing(tmp_path):
-    slope = branch()
+    """The energy at which the first site is touched is that at which the branch grazes."""
     envelope = np.zeros(20)
-    envelope[[16, 8]] = 2e-4, 1e-4
+    envelope[16] = 2e-4
+    envelope[8] = 1e-4
     case = Case.load(overrides=["lattice.cells=20", "contacts.sites=[17, 9]", "contacts.clearance=[1.8e-3, 2e-3]"])
     linear = LinearRun(envelope, np.zeros(20), {"work": 1.5e-3}, {})
     RecordFile(tmp_path / "members-0.jsonl").append(linear.record(linear_name(case)))
+
     initiation = initiation_of(tmp_path, case)
 
+    # Of 1 N cell 17 moves by a ninth of its clearance, cell 9 by a twentieth; the site met first is the nearer one.
     assert initiation.amplitude == pytest.approx(20.0, rel=1e-14)
     assert initiation.onset == pytest.approx(9.0, rel=1e-14)
-    assert initiation.energy == pytest.approx(1.5e-3 * 400, rel=1e-14)
+    assert initiation.energy == pytest.approx(1.5e-3 * 20**2, rel=1e-14)
 
     amplitude = np.array([1.0, initiation.amplitude, 300.0])
-    found = align(1.5e-3 * amplitude**2, np.array([1e-4, 0.3, 0.1]), initiation.energy, 1e-4, slope)
-    assert found["energy"].values[1] == pytest.approx(GRAZING, rel=1e-14)
-    np.testing.assert_allclose(found["energy"].values / found["energy"].values[0], amplitude**2, rtol=1e-13)
+    aligned = align(1.5e-3 * amplitude**2, np.array([1e-4, 0.3, 0.1]), initiation.energy, 1e-4, branch())
+    energy = aligned["energy"].values
+    assert energy[1] == pytest.approx(GRAZING, rel=1e-14)
+    np.testing.assert_allclose(energy / energy[0], amplitude**2, rtol=1e-13)
 
 
 @settings(deadline=None, max_examples=25)
@@ -60,12 +69,14 @@ def test_power_laws_are_found(divisor, initiation, exponent, seed):
     """A transfer that is slope/divisor gives back divisor and exponent, whatever the lattice's energies and order."""
     slope = branch(exponent)
     work = np.random.default_rng(seed).permutation(initiation * np.geomspace(1e-2, 1e6, 50))
-    transfer = np.where(work < initiation, 1e-30, (work * GRAZING / initiation) ** exponent * 500.0 / divisor)
-    found = align(work, transfer, initiation, 0.0, slope)
-    known = slope["branch/energy"].values[slope["branch/region"].values == 3]
-    energy = found["energy"].values
+    law = (work * GRAZING / initiation) ** exponent * FACTOR / divisor
+    transfer = np.where(work < initiation, 1e-30, law)
 
-    assert np.array_equal(found["fitted"].values, (energy >= known.min()) & (energy <= known.max()))
+    found = align(work, transfer, initiation, 0.0, slope)
+
+    region_three = slope["branch/energy"].values[slope["branch/region"].values == 3]
+    energy = found["energy"].values
+    assert np.array_equal(found["fitted"].values, (energy >= region_three.min()) & (energy <= region_three.max()))
     assert found.attrs["divisor"] == pytest.approx(divisor, rel=1e-6)
     assert found.attrs["exponent"] == pytest.approx(exponent, abs=1e-9)
     assert found.attrs["slope_exponent"] == pytest.approx(exponent, abs=1e-9)
@@ -76,61 +87,72 @@ def test_power_laws_are_found(divisor, initiation, exponent, seed):
 def test_floor_is_part_of_the_divisors_fit(floor):
     slope = branch()
     divisor = 4e3
-    work, transfer = lattice(slope, divisor, floor, initiation=0.6)
-    assert align(work, transfer, 0.6, floor, slope).attrs["divisor"] == pytest.approx(divisor, rel=1e-6)
+    work, transfer = exact_transfer(divisor, floor)
+
+    found = align(work, transfer, INITIATION, floor, slope)
+
+    assert found.attrs["divisor"] == pytest.approx(divisor, rel=1e-6)
 
 
 def test_divisor_is_the_least_squares_one():
     slope = branch()
     floor = 1e-3
-    work, transfer = lattice(slope, 4e3, floor, initiation=0.6)
+    work, transfer = exact_transfer(4e3, floor)
+    # Off the law, so that no divisor meets all points.
     transfer = transfer * np.exp(0.2 * np.sin(np.arange(len(transfer))))
-    found = align(work, transfer, 0.6, floor, slope)
+
+    found = align(work, transfer, INITIATION, floor, slope)
     fitted = found["fitted"].values == 1
-    best = found.attrs["divisor"]
     energy = found["energy"].values[fitted]
-    seen = np.log(found["ibtet"].values[fitted])
+    measured = np.log(found["ibtet"].values[fitted])
 
     def misfit(divisor):
-        return np.sum((np.log(500.0 * energy**EXPONENT / divisor + floor) - seen) ** 2)
+        return np.sum((np.log(FACTOR * energy**EXPONENT / divisor + floor) - measured) ** 2)
 
+    best = found.attrs["divisor"]
     assert misfit(best) < min(misfit(best * 1.01), misfit(best / 1.01))
 
 
 def test_failed_members_and_points_before_the_peak_are_left_out():
     slope = branch()
-    work, transfer = lattice(slope, 4e3, 1e-4, initiation=0.6)
+    work, transfer = exact_transfer(4e3, 1e-4)
     transfer[5] = np.nan
-    late = int(np.argmin(np.abs(work * GRAZING / 0.6 - 20 * GRAZING)))
-    transfer[late] = 2 * np.nanmax(transfer)
-    found = align(work, transfer, 0.6, 1e-4, slope)
+    peak = int(np.argmin(np.abs(work / INITIATION - 20)))
+    transfer[peak] = 2 * np.nanmax(transfer)
+
+    found = align(work, transfer, INITIATION, 1e-4, slope)
+
     energy = found["energy"].values
     fitted = found["fitted"].values == 1
 
     assert len(energy) == len(work) - 1
-    assert energy[fitted].min() == pytest.approx(work[late] * GRAZING / 0.6)
+    assert energy[fitted].min() == pytest.approx(work[peak] * GRAZING / INITIATION)
 
 
 def test_too_few_points_have_no_law_and_no_region_three_is_an_error():
     slope = branch()
-    work = 0.6 * np.array([0.1, 3.0, 30.0])
-    found = align(work, np.array([1e-4, 0.3, 0.1]), 0.6, 1e-4, slope)
+    work = INITIATION * np.array([0.1, 3.0, 30.0])
+    transfer = np.array([1e-4, 0.3, 0.1])
+
+    found = align(work, transfer, INITIATION, 1e-4, slope)
     assert found["fitted"].values.sum() < FEWEST
     assert not found.attrs
 
     short = slope.isel(point=slope["branch/energy"].values < 1.5 * GRAZING)
     with pytest.raises(ValueError, match="region III"):
-        align(work, np.array([1e-4, 0.3, 0.1]), 0.6, 1e-4, short)
+        align(work, transfer, INITIATION, 1e-4, short)
 
 
 def write_branch(folder, slope, kinds=None):
     """``branch-out-of-phase.h5`` with what the comparison reads of it."""
     folder.mkdir(exist_ok=True)
+    if kinds is None:
+        kinds = np.zeros(slope.sizes["point"], np.int8)
     with h5py.File(folder / BRANCH, "w") as file:
         for name in ("energy", "slope", "region"):
             file[name] = slope[f"branch/{name}"].values
         file["contacts"] = (slope["branch/region"].values > 1).astype(int)
-        file["kind"] = np.zeros(slope.sizes["point"], np.int8) if kinds is None else kinds
+        file["kind"] = kinds
         file.attrs["case"] = '[lattice]\nreading = "{reading}"\n[contacts]\nlaw = "{law}"\n'.format(**slope.attrs)
     return folder / BRANCH
 
@@ -138,7 +160,9 @@ def write_branch(folder, slope, kinds=None):
 def test_branch_is_read_at_its_regular_points(tmp_path):
     slope = branch()
     kinds = np.zeros(slope.sizes["point"], np.int8)
-    kinds[9] = 6  # the located grazing point is not one of the continuation's own
+    # The located grazing point is not one of the continuation's own.
+    kinds[9] = 6
+
     found = read_slope(write_branch(tmp_path / "b", slope, kinds))
 
     assert found.attrs.pop("grazing") == pytest.approx(GRAZING, rel=1e-12)

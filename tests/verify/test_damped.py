@@ -1,4 +1,6 @@
-"""Complex bands of damped cells, absorbing ends, and cells that differ as case files say it."""
+"""Complex bands of damped cells, absorbing ends, and cells that differ by keys of a case file."""
+
+from __future__ import annotations
 
 from dataclasses import replace
 
@@ -7,14 +9,12 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.conftest import small_case
+from tests.conftest import run_of, small_case
 from vipetsc.case import Case, CaseError, LawCase
 from vipetsc.case.inhomogeneity import lobe_reflection
 from vipetsc.case.warnings import losses
-from vipetsc.dynamics import simulate
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
-from vipetsc.io.store import RunMemory
 from vipetsc.lattice import Chain, Variation, bloch, diatomic, four_band, max_group_velocity
 from vipetsc.lattice.damped import (
     KAPPAS,
@@ -40,67 +40,83 @@ def test_rayleigh_damping_has_its_closed_form(cell):
     """zeta = (alpha/omega + beta omega)/2, and a wave of real frequency decays over v_g/(zeta omega) cells."""
     alpha = 20.0
     beta = 2e-5
-    lossy = damped(cell, alpha, beta)
     omega = bloch(cell, KAPPA).frequency
-    point = damped_bloch(lossy, KAPPA)
-
+    point = damped_bloch(damped(cell, alpha, beta), KAPPA)
     assert point.ratio == pytest.approx((alpha / omega + beta * omega) / 2, rel=1e-10)
     assert np.abs(point.rate) == pytest.approx(omega, rel=1e-10)
 
+    # The decay of weak damping is of first order in it.
     weak = damped(cell, 1e-3 * alpha, 1e-3 * beta)
     _, frequency, speed = max_group_velocity(cell, 2)
     zeta = 1e-3 * (alpha / frequency + beta * frequency) / 2
     assert decay_length(weak, frequency) == pytest.approx(speed / (zeta * frequency), rel=1e-4)
     assert decay_length(cell, frequency) == np.inf
 
+
+@pytest.mark.parametrize("cell", [four_band(), diatomic()])
+def test_waves_of_a_real_frequency_solve_the_bloch_equation(cell):
+    _, frequency, _ = max_group_velocity(cell, 2)
+
     waves = damped_waves(cell, frequency)
+
     for factor, shape in zip(waves.factor, waves.shape.T, strict=True):
-        residual = cell.stiffness_matrix(np.angle(factor)) @ shape - frequency**2 * np.array(cell.masses) * shape
+        inertia = frequency**2 * np.array(cell.masses) * shape
+        residual = cell.stiffness_matrix(np.angle(factor)) @ shape - inertia
         assert np.abs(residual).max() < 1e-8 * frequency**2
 
 
 def test_overdamped_waves_are_the_slow_ones():
-    cell = damped(diatomic(), alpha=1e5)
-    rate = damped_bloch(cell, 1.0).rate
+    """Of s^2 + alpha s + omega^2 = 0 with alpha > 2 omega the root nearer to zero is given."""
+    alpha = 1e5
     omega = bloch(diatomic(), 1.0).frequency
-    assert np.sort(rate.real) == pytest.approx(np.sort(-5e4 + np.sqrt(25e8 - omega**2)), rel=1e-8)
+
+    rate = damped_bloch(damped(diatomic(), alpha=alpha), 1.0).rate
+
+    slow = -alpha / 2 + np.sqrt(alpha**2 / 4 - omega**2)
+    assert np.sort(rate.real) == pytest.approx(np.sort(slow), rel=1e-8)
     assert rate.imag == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("number", [1, 3])
-def test_bloch_waves_of_a_damped_ring_decay_as_the_bands_say(number):
+def test_bloch_waves_of_a_damped_ring_decay_with_their_complex_rates(number):
     """Each wave u = Re(phi exp(i kappa n + s t)) of a cell whose damping is not proportional, by ``ts``, to 1e-8."""
     cells = 8
+    half = 4 * cells
     cell = damped(four_band(), 30.0, 1e-5, (0.3, 0.0, 0.1, 0.02))
     model = small_case(contacts={"sites": 0}, lattice={"cells": cells, "ends": "periodic"}).model()
-    still = replace(model.drives[0], waveform=replace(model.drive, amplitude=0.0))
-    model = replace(model, chain=Chain(cell, cells, "periodic"), drives=(still,))
+    silent = replace(model.drives[0], waveform=replace(model.drive, amplitude=0.0))
+    model = replace(model, chain=Chain(cell, cells, "periodic"), drives=(silent,))
     kappa = 2 * np.pi * number / cells
     point = damped_bloch(cell, kappa)
     end = 0.01
+
     for s, phi in zip(point.rate, point.vectors.T, strict=True):
         wave = phi * np.exp(1j * kappa * np.arange(cells))[:, None]
-        engine = Integrator(
-            replace(model, rtol=1e-12, atol=(1e-12, 1e-12 * abs(s))), Layout(model, MPI.COMM_SELF, True)
-        )
-        start = [u.real.T.ravel() for u in (wave, s * wave)]
-        engine.state.array[: 8 * cells] = np.concatenate(start)
-        engine.advance(end)
-        found = engine.state.array_r[: 4 * cells].reshape(4, cells).T
-        there = (wave * np.exp(s * end)).real
+        # Velocities are larger than displacements by |s|.
+        tight = replace(model, rtol=1e-12, atol=(1e-12, 1e-12 * abs(s)))
+        engine = Integrator(tight, Layout(model, MPI.COMM_SELF, True))
+        engine.state.array[:half] = wave.real.T.ravel()
+        engine.state.array[half : 2 * half] = (s * wave).real.T.ravel()
 
-        assert np.abs(found - there).max() < 1e-8 * np.abs(there).max()
+        engine.advance(end)
+
+        u = engine.state.array_r[:half].reshape(4, cells).T
+        expected = (wave * np.exp(s * end)).real
+        assert np.abs(u - expected).max() < 1e-8 * np.abs(expected).max()
         engine.destroy()
 
 
 @pytest.mark.parametrize("ends", ["fixed", "free"])
 def test_ends_without_dashpots_send_all_back(ends):
+    """However cells differ, a lattice without dashpots reflects all; in a gap there is no wave to reflect."""
     omega = max_group_velocity(four_band(), 2)[1]
     masses = np.tile(four_band().masses, (12, 1))
     masses[4:8] *= 1.3
     chain = Chain(four_band(), 12, ends, variation=Variation(masses))
-    assert [reflection(chain, omega, 9, "right"), reflection(chain, omega, 9, "left")] == pytest.approx([1, 1])
-    assert np.isnan(reflection(chain, 890.0, 9))  # in a gap
+
+    assert reflection(chain, omega, 9, "right") == pytest.approx(1)
+    assert reflection(chain, omega, 9, "left") == pytest.approx(1)
+    assert np.isnan(reflection(chain, 890.0, 9))
 
 
 def test_an_absorbing_end_reflects_alike_on_either_side():
@@ -114,28 +130,29 @@ def test_an_absorbing_end_reflects_alike_on_either_side():
 
 
 def test_a_packet_comes_back_as_computed():
-    """What is left of a packet's energy after an end that absorbs little."""
+    """An end that absorbs little leaves the computed part of a packet's energy.
+
+    A packet has waves of several frequencies, which the end reflects differently: within ten per cent.
+    """
     cell = four_band("calibrated")
     kappa = 1.8
-    width = 8
-    omega = float(bloch(cell, kappa).frequency[1])
     table = {
         "lattice": {"preset": "four-band", "cells": 130, "absorbing": {"cells": 10, "strength": 400.0}},
         "contacts": {"sites": 0},
-        "initial": {"kind": "packet", "band": 2, "wavenumber": kappa, "cell": 70, "width": width, "amplitude": 1e-3},
+        "initial": {"kind": "packet", "band": 2, "wavenumber": kappa, "cell": 70, "width": 8, "amplitude": 1e-3},
         "time": {"end": 0.26, "engine": "propagator"},
     }
-    case = Case.from_table(table)
-    memory = RunMemory(MPI.COMM_SELF)
-    simulate(case, memory)
-    energy = (memory.dataset["energy/kinetic"] + memory.dataset["energy/spring"]).values
-    computed = reflection(absorber(cell, "fixed", 10, 400.0), omega, 10)
+    run = run_of(Case.from_table(table))
 
+    energy = (run["energy/kinetic"] + run["energy/spring"]).values
+    omega = float(bloch(cell, kappa).frequency[1])
+    computed = reflection(absorber(cell, "fixed", 10, 400.0), omega, 10)
     assert 1e-3 < computed < 0.1
     assert energy[-1] / energy[0] == pytest.approx(computed, rel=0.1)
 
 
 def test_an_absorbing_end_is_found_for_the_drive():
+    """A case that asks for a reflection alone gets the cells and the strength that keep it over the drive's lobe."""
     case = small_case(lattice={"cells": 90, "absorbing": {"reflection": 1e-4}}, drive={"cycles": 30})
     end = case.lattice.absorbing
     drive = case.drive
@@ -146,6 +163,9 @@ def test_an_absorbing_end_is_found_for_the_drive():
     assert np.flatnonzero(chain.differs).tolist() == list(range(90 - end.cells, 90))
     assert reflection(chain, drive.frequency, end.cells + 1) < 1e-4
     assert Case.from_toml(case.to_toml()) == case
+
+
+def test_an_absorbing_end_is_refused_where_it_cannot_be():
     for wrong, key in (({"absorbing": {"end": "left"}}, "absorbing.end"), ({"ends": "periodic"}, "lattice.absorbing")):
         with pytest.raises(CaseError, match=key):
             small_case(lattice={"cells": 90, "absorbing": {}} | wrong, drive={"cycles": 30})
@@ -174,7 +194,8 @@ def test_profiles_defects_and_scatter_of_a_case():
     assert varied.stiffness[[0, -1], 0] == pytest.approx([2e4, 3e4])
     assert varied.damping[:, 3] == pytest.approx(0.1)
     assert varied.grounding == pytest.approx(5.0 * varied.masses)
-    assert np.all(varied.masses[:, 0] != varied.masses[:, 3])  # as much, but each quantity by itself
+    # As much as the fourth one's, but each quantity is scattered by itself.
+    assert np.all(varied.masses[:, 0] != varied.masses[:, 3])
     assert 0.005 < np.std(varied.masses[:, 0] / cell.masses[0]) < 0.04
     assert Case.from_toml(case.to_toml()) == case
     assert case.model().chain == small_case(lattice=lattice, disorder=scattered).model().chain
@@ -184,7 +205,7 @@ def test_profiles_defects_and_scatter_of_a_case():
     assert np.array_equal(other.masses[:, 1], varied.masses[:, 1])
 
 
-def test_what_differs_is_refused_by_name_and_stands_in_the_file():
+def test_bad_profiles_are_refused_by_name():
     profiles = {"masses[9]": [1.0], "springs[1].stiffness": [1.0], "masses[2]": {"cells": [99], "value": 1.0}}
     profiles |= {"masses[3]": {"first": -1.0, "last": 1.0}, "masses[4]": {"cells": [1], "value": 1.0, "factor": 1.0}}
     with pytest.raises(CaseError) as error:
@@ -196,46 +217,52 @@ def test_what_differs_is_refused_by_name_and_stands_in_the_file():
         with pytest.raises(CaseError, match="whose cells"):
             kind.from_table({"lattice": {"profiles": {"masses[2]": {"cells": [3], "factor": 2.0}}}} | table)
 
+
+def test_what_differs_stands_in_the_file():
+    """A run has the quantities that differ, of the cells that it records."""
     case = small_case(
         lattice={"profiles": {"masses[2]": {"cells": [3], "factor": 2.0}}},
         output={"window": [2, 4]},
         time={"end": 1e-3},
     )
-    memory = RunMemory(MPI.COMM_SELF)
-    simulate(case, memory)
+    run = run_of(case)
 
-    assert memory.dataset["lattice/masses"].sel(dof=2).values == pytest.approx([0.0025, 0.005, 0.0025])
-    assert "lattice/stiffness" not in memory.dataset
+    assert run["lattice/masses"].sel(dof=2).values == pytest.approx([0.0025, 0.005, 0.0025])
+    assert "lattice/stiffness" not in run
 
 
 def lossy(cell, loss):
     """``cell`` with dashpots fitted to a ``loss`` by band."""
-    ground, beside = fitted_dashpots(cell, tuple(loss.items()))
-    return replace(damped(cell, extra=beside.tolist()), grounding=tuple(ground.tolist()))
+    grounding, springs = fitted_dashpots(cell, tuple(loss.items()))
+    return replace(damped(cell, extra=springs.tolist()), grounding=tuple(grounding.tolist()))
 
 
 @pytest.mark.parametrize("loss", [{2: 0.02}, {2: 0.002, 4: 0.003}, {1: 0.001, 2: 0.001, 3: 0.001, 4: 0.001}])
 def test_dashpots_fitted_to_a_loss_are_the_best_by_the_complex_dispersion(loss):
+    """No dashpot that is 3 % larger or smaller comes nearer to the loss, and none is negative."""
     cell = four_band("calibrated")
     bands = np.array([*loss]) - 1
+
+    def ratios(grounding, springs):
+        varied = replace(damped(cell, extra=springs), grounding=tuple(grounding))
+        return 2 * damped_bloch(varied, KAPPAS).ratio[:, bands] / [*loss.values()]
+
+    def misfit(grounding, springs):
+        return float(((ratios(grounding, springs) - 1) ** 2).sum())
+
     fitted = lossy(cell, loss)
-
-    def misses(ground, beside):
-        varied = replace(damped(cell, extra=beside), grounding=tuple(ground))
-        ratios = 2 * damped_bloch(varied, KAPPAS).ratio[:, bands] / [*loss.values()]
-        return float(((ratios - 1) ** 2).sum()), ratios
-
-    given = [*fitted.grounding], [s.damping for s in fitted.springs]
-    least, ratios = misses(*given)
+    dashpots = np.array([fitted.grounding, [spring.damping for spring in fitted.springs]])
+    assert dashpots.min() >= 0
     if len(loss) == 1:
-        assert ratios == pytest.approx(1.0, abs=4e-3)
-    assert min(map(min, given)) >= 0
+        # Of one band the loss can be met everywhere.
+        assert ratios(*dashpots) == pytest.approx(1.0, abs=4e-3)
 
-    for part, number in np.ndindex(2, 4):
+    least = misfit(*dashpots)
+    for place in np.ndindex(dashpots.shape):
         for step in (0.03, -0.03):
-            values = [list(values) for values in given]
-            values[part][number] = max(values[part][number] + step * max(map(max, given)), 0.0)
-            assert misses(*values)[0] >= least * (1 - 1e-3)
+            changed = dashpots.copy()
+            changed[place] = max(changed[place] + step * dashpots.max(), 0.0)
+            assert misfit(*changed) >= least * (1 - 1e-3)
 
 
 def test_a_loss_by_bands_is_resolved_to_dashpots():
@@ -249,7 +276,9 @@ def test_a_loss_by_bands_is_resolved_to_dashpots():
     assert chain.cell == lossy(four_band("calibrated"), {2: 0.02})
     assert [*chain.cell.grounding] == resolved.grounding
     assert [s.damping for s in chain.cell.springs] == resolved.springs
-    assert [name for name, _ in chain.variation.items()] == ["masses"] and chain.is_damped  # dashpots as in all cells
+    # A factor of one mass leaves the dashpots as in all cells.
+    assert [name for name, _ in chain.variation.items()] == ["masses"]
+    assert chain.is_damped
 
     asked, least, mean, most = losses(case.lattice)[1]
     assert asked == 0.02

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 
 import pytest
 
-from tests.conftest import StopAt, small_case
+from tests.conftest import StopAt, simulated, small_case
 from vipetsc.case import Case, CaseError
 from vipetsc.case.schema import only_looks
 from vipetsc.cli.main import main
@@ -19,32 +19,41 @@ SHORT = {"time": {"end": 0.01}}
 
 
 def test_options_are_stored_and_go_with_the_case(folder):
+    """A run with options, stopped and gone on with, has them; the next run of the process has none of them."""
     case = small_case(**SHORT, petsc={"ts_rk_type": "5dp", "ts_adapt_clip": "0.2,5"})
     assert Case.from_toml(case.to_toml()) == case
+
     assert simulate(case, folder / "run", stop=StopAt(20)).resumable
     assert simulate(case, folder / "run", resume=True).statistics["method"] == "5dp"
-    assert json.loads((folder / "run" / "summary.json").read_text())["case"]["petsc"]["ts_rk_type"] == "5dp"
+    summary = json.loads((folder / "run" / "summary.json").read_text())
+    assert summary["case"]["petsc"]["ts_rk_type"] == "5dp"
+
     assert not {name for name in PETSc.Options().getAll() if name.startswith("ts_")}
     assert simulate(small_case(**SHORT), folder / "plain").statistics["method"] == "8vr"
 
 
 def test_a_case_without_options_reads_and_writes_as_before():
     assert "petsc" not in small_case().to_toml()
-    assert small_case(petsc={"ts_rtol": 1e-9, "ts_max_reject": 3}).petsc.model_dump() == {
-        "ts_rtol": "1e-09",
-        "ts_max_reject": "3",
-    }
+
+    # PETSc's database holds texts.
+    options = small_case(petsc={"ts_rtol": 1e-9, "ts_max_reject": 3}).petsc.model_dump()
+    assert options == {"ts_rtol": "1e-09", "ts_max_reject": "3"}
 
 
 def test_a_run_does_not_go_on_with_other_options(folder):
-    assert simulate(small_case(**SHORT, petsc={"ts_rk_type": "5dp"}), folder / "run", stop=StopAt(20)).resumable
+    case = small_case(**SHORT, petsc={"ts_rk_type": "5dp"})
+    assert simulate(case, folder / "run", stop=StopAt(20)).resumable
+
     with pytest.raises(FolderError, match="ts_rk_type = 5dp there, nothing here"):
         simulate(small_case(**SHORT), folder / "run", resume=True)
 
 
 def test_options_in_the_database_become_part_of_the_case(folder, petsc_options):
+    """An option that only shows something is left out."""
     petsc_options(ts_rk_type="3bs", ts_monitor_draw="")
+
     simulate(small_case(**SHORT), folder / "run")
+
     assert Case.from_toml((folder / "run" / "case.toml").read_text()).petsc.model_dump() == {"ts_rk_type": "3bs"}
 
 
@@ -64,15 +73,18 @@ def test_options_in_the_database_become_part_of_the_case(folder, petsc_options):
 )
 def test_what_petsc_does_not_know_is_refused_before_anything_is_written(folder, capsys, name, value, reason):
     out = folder / "out"
-    value = value or "true"  # as the front door reads it
-    code = main(["run", "--out", str(out)], {"ts_adapt_clip": "0.1,5", name: value})
-    assert code == 2
+    # The front door reads an option without a value so.
+    value = value or "true"
 
+    code = main(["run", "--out", str(out)], {"ts_adapt_clip": "0.1,5", name: value})
+
+    assert code == 2
     message = capsys.readouterr().err
     assert f"petsc.{name} = '{value}': ".lower() in message.lower()
     assert reason in message
     assert message.count("petsc.") == 1
     assert not out.exists()
+
     assert main(["validate", "--set", f"petsc.{name}={value}"]) == 2
     with pytest.raises(CaseError):
         simulate(small_case(petsc={name: value}), out)
@@ -90,9 +102,11 @@ def test_verbs_without_time_stepping_take_no_options(capsys):
     assert "-ts_rk_type: bands takes no PETSc options" in capsys.readouterr().err
 
 
-def test_a_case_with_options_is_stepped(folder):
-    result = simulate(
-        small_case(time={"end": 0.01, "engine": "propagator"}, petsc={"ts_rk_type": "5dp"}), folder / "run"
-    )
+def test_a_case_with_options_is_stepped():
+    """The propagator has no use for options: what asks for both gets the engine that obeys them, and a note."""
+    case = small_case(time={"end": 0.01, "engine": "propagator"}, petsc={"ts_rk_type": "5dp"})
+
+    _, result = simulated(case)
+
     assert result.statistics["engine"] == "ts"
     assert "PETSc options" in result.statistics["engine_note"]

@@ -1,4 +1,4 @@
-"""When, where and from what a result was made: in every file, and never compared."""
+"""Date, host and sources of a result stand in every file, and are never compared."""
 
 from __future__ import annotations
 
@@ -22,28 +22,34 @@ from vipetsc.studies.reanalysis import measure_run
 from vipetsc.studies.sweep import run_sweep
 
 WANTED = {"vipetsc_version", "petsc_version", "revision", "command", "petsc_options", "date", "host"}
-SHORT = {"lattice": {"preset": "four-band", "cells": 12}, "contacts": {"sites": [4], "clearance": 2e-4},
-         "drive": {"cycles": 3}, "time": {"end": 0.02, "engine": "propagator"}}  # fmt: skip
+SHORT = {
+    "lattice": {"preset": "four-band", "cells": 12},
+    "contacts": {"sites": [4], "clearance": 2e-4},
+    "drive": {"cycles": 3},
+    "time": {"end": 0.02, "engine": "propagator"},
+}
 
 
 def attributes(path: Path) -> dict:
+    """The global attributes of a result file."""
     with open_netcdf(path, "result") as data:
         return data.attrs
 
 
 @pytest.mark.slow
 def test_every_output_says_when_where_and_from_what(tmp_path, monkeypatch, in_process):
+    # Dates are written in whole seconds.
     before = datetime.now(UTC).replace(microsecond=0)
     simulate(small_case(**SHORT), tmp_path / "run")
     measure_run(tmp_path / "run")
-    run_sweep(
-        Sweep.from_table(SHORT | {"sweep": {"drive": {"amplitude": [1.0, 30.0]}}}), tmp_path / "sweep", MPI.COMM_SELF
-    )
+    plan = Sweep.from_table(SHORT | {"sweep": {"drive": {"amplitude": [1.0, 30.0]}}})
+    run_sweep(plan, tmp_path / "sweep", MPI.COMM_SELF)
+
     for name in ("run/run.h5", "run/analysis.h5", "sweep/ensemble.h5"):
-        about = attributes(tmp_path / name)
-        assert about.keys() >= WANTED, name
-        assert before <= datetime.fromisoformat(about["date"]) <= datetime.now(UTC)
-        assert about["host"] == platform.node()
+        given = attributes(tmp_path / name)
+        assert given.keys() >= WANTED, name
+        assert before <= datetime.fromisoformat(given["date"]) <= datetime.now(UTC)
+        assert given["host"] == platform.node()
 
     assert json.loads((tmp_path / "run/summary.json").read_text()).keys() >= WANTED
 
@@ -64,7 +70,7 @@ def test_the_format_of_a_file_is_its_own(tmp_path):
     assert attributes(tmp_path / "ensemble.h5")["format_version"] == 2
 
 
-def test_petsc_options_are_told(petsc_options):
+def test_petsc_options_stand_in_the_origin(petsc_options):
     petsc_options(ts_monitor="ascii:nowhere.txt")
     assert "-ts_monitor ascii:nowhere.txt" in io_folder.origin()["petsc_options"]
 

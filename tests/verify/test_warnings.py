@@ -1,4 +1,4 @@
-"""What is wrong with a result is said in it: in what ``simulate`` returns, in the summary and in the file."""
+"""Warnings of a run stand in what ``simulate`` returns, in the summary and in the file."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from tests.conftest import small_case
 from vipetsc.case import Case
 from vipetsc.cli.main import main
 from vipetsc.dynamics import simulate
+from vipetsc.dynamics.run import Result
 
 HALF = {"time": {"end": 0.04}}
 
 
-def told(result) -> list[str]:
+def warnings_of(result: Result) -> list[str]:
     """The warnings of a result, which are those of its files."""
     summary = json.loads((result.folder / "summary.json").read_text())
     with h5py.File(result.folder / "run.h5") as file:
@@ -23,21 +24,23 @@ def told(result) -> list[str]:
     return result.warnings
 
 
-def test_a_run_as_it_should_be_warns_of_nothing(folder):
-    assert told(simulate(small_case(**HALF), folder / "run")) == []
-    assert told(simulate(small_case(**HALF, contacts={"sites": []}), folder / "without-sites")) == []
+def test_a_sound_run_warns_of_nothing(folder):
+    assert warnings_of(simulate(small_case(**HALF), folder / "run")) == []
+    assert warnings_of(simulate(small_case(**HALF, contacts={"sites": []}), folder / "without-sites")) == []
 
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_sites_that_nothing_reaches(folder, engine):
     case = small_case(drive={"amplitude": 0.1}, time={"end": 0.04, "engine": engine})
-    assert told(simulate(case, folder / "run")) == ["no contact: nothing reached one of the 3 sites"]
+    assert warnings_of(simulate(case, folder / "run")) == ["no contact: nothing reached one of the 3 sites"]
 
 
 def test_indentations_beyond_the_radius(folder):
+    """Hertz's law asks for small indentations: soft spheres are warned of, larger or linear ones are not."""
+
     def warnings(name, **contacts):
         case = small_case(**HALF, drive={"amplitude": 400.0}, contacts={"modulus": 1e5} | contacts)
-        return told(simulate(case, folder / name))
+        return warnings_of(simulate(case, folder / name))
 
     (warning,) = warnings("soft")
     assert "beyond the contacts' radius of 0.005 m: Hertz" in warning
@@ -53,23 +56,27 @@ def test_the_radius_stays_with_the_case():
 
 
 def test_an_energy_balance_that_does_not_close(folder, petsc_options, capsys):
+    """Fixed steps that are too long for the tolerance are warned of, by the front door too."""
     petsc_options(ts_rk_type="3bs", ts_adapt_type="none", ts_dt=1e-4)
     result = simulate(small_case(**HALF), folder / "run")
     assert result.complete
 
-    (warning,) = (text for text in told(result) if text.startswith("the energy balance misses "))
+    (warning,) = (text for text in warnings_of(result) if text.startswith("the energy balance misses "))
     assert f"{result.statistics['ledger_error']:.2g} of the work, more than 1e-08" in warning
 
-    sets = ["lattice.cells=24", "contacts.sites=[6]", "time.end=0.02", "output.figures=false"]
-    assert main(["run", "--out", str(folder / "out"), *(word for text in sets for word in ("--set", text))]) == 0
+    words = ["run", "--out", str(folder / "out")]
+    for override in ("lattice.cells=24", "contacts.sites=[6]", "time.end=0.02", "output.figures=false"):
+        words += ["--set", override]
+    assert main(words) == 0
     assert "vipetsc: warning: the energy balance misses" in capsys.readouterr().err
 
 
 def test_a_record_that_ends_early(folder, petsc_options):
+    """Euler's method with steps of a sample is unstable: the record holds the samples before the energy runs away."""
     petsc_options(ts_rk_type="1fe", ts_adapt_type="none")
     result = simulate(small_case(contacts={"sites": []}), folder / "run")
     assert not result.complete
-    warning = told(result)[-1]
+    warning = warnings_of(result)[-1]
     assert warning.startswith(f"the record ends at sample {result.statistics['samples']} of 251: the energy runs away")
 
 
