@@ -1,9 +1,11 @@
-"""Files that are whole or not there, whatever writes them and whatever happens."""
+"""Files are whole or not there, whatever writes them and whatever happens."""
 
 import errno
 import os
 import resource
+from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +19,8 @@ from vipetsc.io.read import open_ensemble, open_run
 
 
 @contextmanager
-def full_disk(limit):
-    """No file of this process grows beyond ``limit`` bytes."""
+def full_disk(limit: int) -> Iterator[None]:
+    """Let no file of this process grow beyond ``limit`` bytes."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
     try:
@@ -27,6 +29,7 @@ def full_disk(limit):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+# Each writes more than the limits below.
 NUMBERS = np.arange(10_000.0)
 WRITERS = {
     "a.txt": lambda path: write_text(path, "long " * 20_000),
@@ -38,28 +41,34 @@ WRITERS = {
 
 @pytest.mark.parametrize("limit", [0, 1000])
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_full_disk_leaves_what_was_there_and_names_the_file(tmp_path, name, limit):
-    (tmp_path / name).write_text("earlier")
+def test_a_full_disk_leaves_the_earlier_file_and_names_it(tmp_path, name, limit):
+    path = tmp_path / name
+    path.write_text("earlier")
+
     with full_disk(limit), pytest.raises(OSError, match=rf"{name} could not be written: File too large") as caught:
-        WRITERS[name](tmp_path / name)
+        WRITERS[name](path)
+
     assert caught.value.errno == errno.EFBIG
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-    assert (tmp_path / name).read_text() == "earlier"
-    WRITERS[name](tmp_path / name)  # nothing crashes afterwards
+    assert [entry.name for entry in tmp_path.iterdir()] == [name]
+    assert path.read_text() == "earlier"
+    # HDF5 crashes later if a file that it could not flush stays open.
+    WRITERS[name](path)
 
 
-def test_temporary_names_are_not_those_of_another_host_or_process(tmp_path, monkeypatch):
-    names = []
-    for host, process in (("one", 7), ("two", 7), ("two", 7)):
+def test_temporary_names_are_not_those_of_another_host_process_or_call(tmp_path, monkeypatch):
+    names = set()
+    # Folders are shared between hosts; a thread of the same process may write the same file at once.
+    for host, process in (("one", 7), ("two", 7), ("two", 8), ("two", 8)):
         monkeypatch.setattr("platform.node", lambda host=host: host)
         monkeypatch.setattr(os, "getpid", lambda process=process: process)
-        with atomic_write(tmp_path / "a") as aside:
-            aside.touch()
-            names.append(aside.name)
-    assert len(set(names)) == 3
+        with atomic_write(tmp_path / "a") as temporary:
+            temporary.touch()
+        assert f"{host}-{process}" in temporary.name
+        names.add(temporary.name)
+    assert len(names) == 4
 
 
-def opened_run(path):
+def open_and_close_run(path: Path) -> None:
     with open_run(path):
         pass
 
@@ -69,24 +78,24 @@ def opened_run(path):
     ("name", "read"),
     [
         ("state.npy", load_arrays),
-        ("run.h5", opened_run),
+        ("run.h5", open_and_close_run),
         ("analysis.h5", lambda path: open_netcdf(path, "analysis")),
         ("ensemble.h5", lambda path: open_ensemble(path.parent)),
     ],
 )
-def test_what_cannot_be_read_is_named(tmp_path, name, read, content):
+def test_a_file_that_cannot_be_read_is_named(tmp_path, name, read, content):
+    path = tmp_path / name
     if content is not None:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(OSError, match=str(tmp_path / name)):
-        read(tmp_path / name)
+        path.write_bytes(content)
+    with pytest.raises(OSError, match=str(path)):
+        read(path)
 
 
-def test_a_file_cut_in_the_middle_is_named(tmp_path):
-    for name in ("a.npy", "a.h5"):
-        WRITERS[name](tmp_path / name)
-        whole = (tmp_path / name).read_bytes()
-        (tmp_path / name).write_bytes(whole[: len(whole) // 2])
-    for read in (lambda: load_arrays(tmp_path / "a.npy"), lambda: open_netcdf(tmp_path / "a.h5", "run")):
-        with pytest.raises(OSError, match="/a\\.") as caught:
-            read()
-        assert str(tmp_path) in str(caught.value)
+@pytest.mark.parametrize(("name", "read"), [("a.npy", load_arrays), ("a.h5", lambda path: open_netcdf(path, "run"))])
+def test_a_file_cut_in_the_middle_is_named(tmp_path, name, read):
+    path = tmp_path / name
+    WRITERS[name](path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(OSError, match=str(path)):
+        read(path)

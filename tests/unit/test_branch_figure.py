@@ -1,4 +1,4 @@
-"""The curve of a branch, and which of its states are at the bottom."""
+"""The curve of a branch, and which of its states are drawn as the lowest of their energy."""
 
 from pathlib import Path
 
@@ -15,55 +15,88 @@ from vipetsc.io.netcdf import write_netcdf
 RUNS = Path(__file__).parents[2] / "runs"
 
 
-def test_a_branch_is_drawn_through_its_points_along_its_tangents_and_keeps_a_corner_where_a_contact_grazes():
-    """Points of a circle in logarithms; a cubic between points 40 degrees apart stays within 3e-4 of a tenth of it."""
+def branch_of(**columns: np.ndarray | list) -> xr.Dataset:
+    """A branch with these values at its points."""
+    return xr.Dataset({name: ("point", values) for name, values in columns.items()})
+
+
+def test_a_branch_is_drawn_through_its_points_along_its_tangents():
+    """Points lie on a circle in logarithms, 40 degrees apart: a cubic stays within 3e-4 of its radius, 0.1."""
     angle = np.radians(np.arange(0, 330, 40.0))
-    frequency, energy = 100 * np.exp(0.1 * np.sin(angle)), np.exp(0.1 * np.cos(angle))
-    rate, energy_rate = 0.1 * np.cos(angle) * frequency, -0.1 * np.sin(angle) * energy
+    frequency = 100 * np.exp(0.1 * np.sin(angle))
+    energy = np.exp(0.1 * np.cos(angle))
+    frequency_rate = 0.1 * np.cos(angle) * frequency
+    energy_rate = -0.1 * np.sin(angle) * energy
+    # The slope is infinite where the energy turns.
     with np.errstate(divide="ignore"):
-        columns = {"tangent_period": -rate / frequency**2, "slope": rate / energy_rate}
-    columns |= {"energy": energy, "frequency": frequency, "kind": np.full(len(angle), "regular")}
-    branch = xr.Dataset({name: ("point", values) for name, values in columns.items()})
-    fine_energy, fine_frequency = frequency_energy.smooth(branch)
-    assert np.allclose(fine_energy[:: frequency_energy.FINE], energy) and np.allclose(
-        fine_frequency[:: frequency_energy.FINE], frequency
+        slope = frequency_rate / energy_rate
+    branch = branch_of(
+        energy=energy,
+        frequency=frequency,
+        slope=slope,
+        tangent_period=-frequency_rate / frequency**2,
+        kind=np.full(len(angle), "regular"),
     )
-    assert np.abs(np.hypot(np.log(fine_energy), np.log(fine_frequency / 100)) - 0.1).max() < 3e-4  # a chord: 6e-3
-    # Two straight lines that meet at a grazing point, whose tangent is that of either: no step leaves its line.
-    level = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-    frequency = np.where(level > 4, 100 * (level / 4) ** 2, 100.0)
-    for at_grazing in (1e-9, 50.0):
-        slope = np.where(level > 4, 2 * frequency / level, np.where(level < 4, 1e-12, at_grazing))
-        columns = {"energy": level, "frequency": frequency, "slope": slope, "tangent_period": -slope / frequency**2}
-        columns["kind"] = np.array(["regular", "regular", "grazing", "regular", "regular"])
-        fine_energy, fine_frequency = frequency_energy.smooth(xr.Dataset({n: ("point", v) for n, v in columns.items()}))
-        exact = np.where(fine_energy > 4, 100 * (fine_energy / 4) ** 2, 100.0)
-        assert fine_frequency == pytest.approx(exact, rel=1e-9)
+
+    fine_energy, fine_frequency = frequency_energy.smooth(branch)
+
+    assert np.allclose(fine_energy[:: frequency_energy.FINE], energy)
+    assert np.allclose(fine_frequency[:: frequency_energy.FINE], frequency)
+    radius = np.hypot(np.log(fine_energy), np.log(fine_frequency / 100))
+    # Straight lines between the points would be off by 6e-3.
+    assert np.abs(radius - 0.1).max() < 3e-4
+
+
+@pytest.mark.parametrize("slope_at_grazing", [1e-9, 50.0])
+def test_a_branch_keeps_a_corner_where_a_contact_grazes(slope_at_grazing):
+    """Two lines meet at a grazing point, whose tangent is that of either one: no step leaves its line."""
+
+    def exact(energy: np.ndarray) -> np.ndarray:
+        return np.where(energy > 4, 100 * (energy / 4) ** 2, 100.0)
+
+    energy = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    frequency = exact(energy)
+    # Not zero: the tangent's direction is taken from its logarithm.
+    slope = np.array([1e-12, 1e-12, slope_at_grazing, 2 * frequency[3] / 8.0, 2 * frequency[4] / 16.0])
+    branch = branch_of(
+        energy=energy,
+        frequency=frequency,
+        slope=slope,
+        tangent_period=-slope / frequency**2,
+        kind=["regular", "regular", "grazing", "regular", "regular"],
+    )
+
+    fine_energy, fine_frequency = frequency_energy.smooth(branch)
+
+    assert fine_frequency == pytest.approx(exact(fine_energy), rel=1e-9)
 
 
 def test_of_states_with_one_energy_that_of_the_lowest_frequency_is_marked():
-    """A branch that goes back from 4 J to 2 J at higher frequencies, and on at lower ones."""
-    branch = xr.Dataset(
-        {
-            "energy": ("point", [1.0, 3.0, 4.0, 3.5, 2.0, 2.5, 5.0]),
-            "frequency": ("point", [1.0, 3.0, 4.0, 5.0, 2.9, 1.0, 5.9]),
-        }
-    )
+    """A branch goes back from 4 J to 2 J at higher frequencies, and on at lower ones."""
+    branch = branch_of(energy=[1.0, 3.0, 4.0, 3.5, 2.0, 2.5, 5.0], frequency=[1.0, 3.0, 4.0, 5.0, 2.9, 1.0, 5.9])
     assert frequency_energy.lowest(branch).tolist() == [True, False, False, False, False, True, True]
 
 
-def test_a_branch_file_names_its_kind_and_an_older_one_is_recognised_by_its_variables():
+def test_a_branch_file_names_its_kind():
     for kind in branch_kinds.BRANCH_KINDS:
-        assert branch_kinds.branch_kind(xr.Dataset({"share": ("point", [1.0])}, attrs={"branch_kind": kind})) == kind
+        # What the file holds decides nothing then: a share stands for responses.
+        branch = branch_of(share=[1.0]).assign_attrs(branch_kind=kind)
+        assert branch_kinds.branch_kind(branch) == kind
     with pytest.raises(ValueError, match="later version"):
         branch_kinds.branch_kind(xr.Dataset(attrs={"branch_kind": "quasiperiodic"}))
-    older = {
-        branch_kinds.RESPONSES: ("share", "harmonics"),
-        branch_kinds.CONDENSED: ("harmonics",),
-        branch_kinds.ORBITS: ("orbits/number", "states/number"),
-    }
-    for kind, names in older.items():
-        assert branch_kinds.branch_kind(xr.Dataset({name: ("point", [1.0]) for name in names})) == kind
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        (branch_kinds.RESPONSES, ("share", "harmonics")),
+        (branch_kinds.CONDENSED, ("harmonics",)),
+        (branch_kinds.ORBITS, ("orbits/number", "states/number")),
+    ],
+)
+def test_an_older_branch_file_is_recognised_by_its_variables(kind, names):
+    branch = branch_of(**{name: [1.0] for name in names})
+    assert branch_kinds.branch_kind(branch) == kind
 
 
 def test_every_kind_of_branch_has_a_figure_and_no_two_figures_one_name():
@@ -79,24 +112,29 @@ def test_every_kind_of_branch_has_a_figure_and_no_two_figures_one_name():
         ({"source": "wave", "over": "frequency", "range": [900.0, 1100.0], "fixed": [1.0]}, "frequency [rad/s]"),
     ],
 )
-def test_the_axis_of_a_response_says_what_drives_the_sites(options, label):
+def test_the_axis_of_a_response_names_what_drives_the_sites(options, label):
     case = NfrcCase.from_table({"lattice": {"preset": "four-band"}, "contacts": {"sites": 1}, "nfrc": options})
     branch = xr.Dataset(attrs={"over": case.nfrc.over, "case": case.to_toml()})
     assert nfrc._parameter_label(branch) == label
 
 
-def test_a_condensed_branch_that_was_interrupted_is_drawn_without_motions(tmp_path):
+def put_condensed_branch(path: Path, points: int) -> None:
+    """Write a condensed branch as it stands before its end: without motions."""
     case = NnmCase.load(RUNS / "breather.toml")
-    points = {name: ("point", [1.0, 2.0, 3.0]) for name in ("energy", "frequency", "multiplier_max")}
-    kind = xr.Variable("point", np.zeros(3, np.int8), {"flag_meanings": "regular fold-energy"})
-    tables = {"elongation": (("point", "place"), np.ones((3, 1))), "harmonics": (("point", "place"), np.ones((3, 1)))}
-    places = {"point": [0, 1, 2], "place": [1]}
-    about = {"branch_kind": branch_kinds.CONDENSED, "case": case.to_toml(), "name": "breather"}
-    for name, count in (("begun", 3), ("empty", 0)):
-        branch = xr.Dataset(points | tables | {"kind": kind}, places, about).isel(point=slice(count))
-        write_netcdf(tmp_path / f"branch-{name}.h5", branch)
+    branch = branch_of(energy=[1.0, 2.0, 3.0], frequency=[1.0, 2.0, 3.0], multiplier_max=[1.0, 2.0, 3.0])
+    branch["kind"] = xr.Variable("point", np.zeros(3, np.int8), {"flag_meanings": "regular fold-energy"})
+    branch["elongation"] = (("point", "place"), np.ones((3, 1)))
+    branch["harmonics"] = (("point", "place"), np.ones((3, 1)))
+    branch = branch.assign_coords(point=[0, 1, 2], place=[1])
+    branch.attrs = {"branch_kind": branch_kinds.CONDENSED, "case": case.to_toml(), "name": "breather"}
+    write_netcdf(path, branch.isel(point=slice(points)))
+
+
+@pytest.mark.parametrize(
+    ("points", "panel", "note"), [(3, 2, "no motions stored"), (0, 0, "no point of the branch was found")]
+)
+def test_a_condensed_branch_that_was_interrupted_is_drawn_without_motions(tmp_path, points, panel, note):
+    put_condensed_branch(tmp_path / "branch-begun.h5", points)
     with style.rc_style():
         figure = registry.branch([tmp_path / "branch-begun.h5"])
-        assert [text.get_text() for text in figure.axes[2].texts] == ["no motions stored"]
-        (axes,) = registry.branch([tmp_path / "branch-empty.h5"]).axes
-        assert [text.get_text() for text in axes.texts] == ["no point of the branch was found"]
+    assert [text.get_text() for text in figure.axes[panel].texts] == [note]

@@ -1,6 +1,9 @@
 """An ensemble holds every member at the values of its keys, and the fits of its curves from the peak on."""
 
 import json
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,152 +30,244 @@ SWEEP = {
         "drive": {"cycles": [4, 4, 6], "amplitude": [8.0, 2.0, 4.0, 16.0]},
     },
 }
+# The member of ``folder`` that failed.
+FAILING = 5
 
 
-def measure(case):
+def transfer_of(case: Case) -> float:
     """A number that tells the members apart."""
     sites = len(case.contacts.sites)
     return case.drive.amplitude + 100 * sites + 1000 * case.drive.cycles + 1e5 * (case.contacts.law == "hertz")
 
 
-def test_warnings_that_differ_in_numbers_are_one():
-    told = ["deep: 0.0052 m", "deep: 5.3e-03 m", "lost 2 of 5", "deep: 0.0052 m", "lost 2 of 5", "alone"]
-    assert summarise(told) == ["3 members, for instance: deep: 5.3e-03 m", "2 members: lost 2 of 5", "1 member: alone"]
-
-
-def put_sweep(folder, plan, failing=(), changed=lambda case: 0.0):
+def put_sweep(
+    folder: Path, plan: Sweep, failing: Collection[int] = (), transfer: Callable[[Case], float] = transfer_of
+) -> Path:
     """A finished sweep whose members were not simulated, but have what an ensemble is made of."""
 
-    def told(number, case):
+    def outcome(number: int, case: Case) -> dict[str, Any] | str:
+        if number in failing:
+            return "ArithmeticError: overflow"
         statistics = {"episodes": number, "work": 2.0, "dissipated": 0.5, "ledger_error": 0.0, "engine": "ts"}
-        row = {"statistics": statistics, "measures": {"ibtet": measure(case) + changed(case)}}
-        return "ArithmeticError: overflow" if number in failing else row
+        return {"statistics": statistics, "measures": {"ibtet": transfer(case)}}
 
-    put_members(folder, plan, told)
+    put_members(folder, plan, outcome)
     return folder
 
 
 @pytest.fixture
 def folder(tmp_path):
     """A sweep of which one member failed."""
-    return put_sweep(tmp_path / "all", Sweep.from_table(SWEEP), failing=[5])
+    return put_sweep(tmp_path / "all", Sweep.from_table(SWEEP), failing=[FAILING])
+
+
+def test_warnings_that_differ_in_numbers_alone_are_one():
+    warnings = ["deep: 0.0052 m", "deep: 5.3e-03 m", "lost 2 of 5", "deep: 0.0052 m", "lost 2 of 5", "alone"]
+    assert summarise(warnings) == [
+        "3 members, for instance: deep: 5.3e-03 m",
+        "2 members: lost 2 of 5",
+        "1 member: alone",
+    ]
 
 
 def test_a_sample_is_compared_member_by_member(folder, tmp_path):
     sample = sampled(Sweep.from_table(SWEEP), 6, 1)
-    assert len(sample.members()) == 6
-    louder = sample.members()[3].case
+    members = sample.members()
+    assert len(members) == 6
+    other = members[3].case
 
-    def changed(case):
-        return 2e-3 if case == louder else 5e-4
+    # One member differs by more than the 1e-3 that pass as agreement, the others by less.
+    def transfer(case: Case) -> float:
+        return transfer_of(case) + (2e-3 if case == other else 5e-4)
 
-    rows = agreement(folder, put_sweep(tmp_path / "sample", sample, changed=changed))
-    assert [row["amplitude"] for row in rows] == sorted(member.case.drive.amplitude for member in sample.members())
-    assert [row["amplitude"] for row in rows if not row["agrees"]] == [louder.drive.amplitude]
+    rows = agreement(folder, put_sweep(tmp_path / "sample", sample, transfer=transfer))
+
+    assert [row["amplitude"] for row in rows] == sorted(member.case.drive.amplitude for member in members)
+    assert [row["amplitude"] for row in rows if not row["agrees"]] == [other.drive.amplitude]
     for row in rows:
         assert row["same"] == (row["episodes"][0] == row["episodes"][1])
-        expected = changed(louder) if not row["agrees"] else 5e-4
-        assert row["largest"] == pytest.approx(expected) or not row["differences"].get("ibtet")  # that one has failed
+        # The member that failed in the whole sweep has no difference.
+        if row["differences"].get("ibtet"):
+            assert row["largest"] == pytest.approx(5e-4 if row["agrees"] else 2e-3)
 
 
 def test_every_member_stands_at_the_values_of_its_keys(folder):
     ensemble = open_ensemble(folder)
     assert ensemble["ibtet"].dims == ("law", "sites", "amplitude")
     assert dict(ensemble["cycles"].sizes) == {"sites": 3}
+
     sweep = Sweep.from_table(SWEEP)
     for number, (name, member) in enumerate(zip(sweep.ids(), sweep.members(), strict=True)):
         case = member.case
-        keys = {"law": case.contacts.law, "sites": json.dumps(case.contacts.sites), "cycles": case.drive.cycles}
-        one = select(ensemble, **keys, amplitude=case.drive.amplitude)
-        assert one["member"].item() == name and one["number"].item() == number
-        assert one["contact_episodes"].item() == number or number == 5
-        if number == 5:
-            assert one["status"].item() == 2 and np.isnan(one["ibtet"].item())
+        stored = select(
+            ensemble,
+            law=case.contacts.law,
+            sites=json.dumps(case.contacts.sites),
+            cycles=case.drive.cycles,
+            amplitude=case.drive.amplitude,
+        )
+        assert stored["member"].item() == name
+        assert stored["number"].item() == number
+        if number == FAILING:
+            assert stored["status"].item() == FAILED
+            assert np.isnan(stored["ibtet"].item())
         else:
-            assert one["status"].item() == 0 and one["ibtet"].item() == measure(case)
-            assert one["dissipated_fraction"].item() == 0.25
+            assert stored["status"].item() == 0
+            assert stored["contact_episodes"].item() == number
+            assert stored["ibtet"].item() == transfer_of(case)
+            assert stored["dissipated_fraction"].item() == 0.25
+
     assert json.loads(ensemble.attrs["failed"]) == ["(0, 1, 1): ArithmeticError: overflow"]
-    assert (json.loads(ensemble.attrs["rtol"]), json.loads(ensemble.attrs["engine"])) == ([1e-10], ["ts"])
-    for curve, first in curves(ensemble):
+    assert json.loads(ensemble.attrs["rtol"]) == [1e-10]
+    assert json.loads(ensemble.attrs["engine"]) == ["ts"]
+
+
+def test_a_curve_comes_with_its_first_member(folder):
+    sweep = Sweep.from_table(SWEEP)
+    found = list(curves(open_ensemble(folder)))
+    assert len(found) == 6
+    for curve, first in found:
         case = sweep.case(first)
-        assert (case.contacts.law, case.drive.cycles) == (curve["law"].item(), curve["cycles"].item())
+        assert curve["law"].item() == case.contacts.law
+        assert curve["cycles"].item() == case.drive.cycles
 
 
-def test_a_law_is_fitted_from_the_largest_value_on():
+def test_a_power_law_is_fitted_from_the_largest_value_on():
     amplitude = np.geomspace(1.0, 100.0, 12)
     law = 3.0 * amplitude**-0.8
-    curve = np.where(np.arange(12) < 4, [0.1, 0.7, 0.2, 0.3, *[0.0] * 8], law)  # a smaller peak comes before
+    # A smaller peak comes before.
+    curve = law.copy()
+    curve[:4] = 0.1, 0.7, 0.2, 0.3
     order = np.random.default_rng(3).permutation(12)
+
     fit = fit_curve(amplitude[order], curve[order], normalise=False)
+
     assert (fit["peak_amplitude"], fit["peak"], fit["points"]) == (amplitude[4], law[4], 8)
-    assert fit["exponent"] == pytest.approx(-0.8, abs=1e-12) and fit["factor"] == pytest.approx(3.0)
-    assert fit["r2_log_log"] == pytest.approx(1.0) and fit["exponent_nonlinear"] == pytest.approx(-0.8)
-    assert fit["is_power_law"] == 1 and fit_curve(amplitude[:7], curve[:7], normalise=False)["is_power_law"] == 0
-    assert np.isnan(fit_curve(amplitude[:6], curve[:6], normalise=False)["exponent"])  # two points behind the peak
+    assert fit["exponent"] == pytest.approx(-0.8, abs=1e-12)
+    assert fit["exponent_nonlinear"] == pytest.approx(-0.8)
+    assert fit["factor"] == pytest.approx(3.0)
+    assert fit["r2_log_log"] == pytest.approx(1.0)
+    assert fit["is_power_law"] == 1
+
+    # Three points are fitted but are no power law; two are not fitted.
+    assert fit_curve(amplitude[:7], curve[:7], normalise=False)["is_power_law"] == 0
+    assert np.isnan(fit_curve(amplitude[:6], curve[:6], normalise=False)["exponent"])
 
 
-def test_a_linear_wave_arrives_with_its_host():
-    case = Case.load(overrides=["lattice.cells=30", "contacts.sites=[20, 7, 3]", "drive.cell=5"])
-    cell, time = four_band(), np.linspace(0, 1, 201)
-    velocity, displacement = np.zeros((201, 30, 4)), np.zeros((201, 30, 4))
-    peak = 0.2 + 0.02 * np.arange(30)
-    velocity[..., cell.host] = -np.exp(-(((time[:, None] - peak) / 0.05) ** 2))  # the largest in size is negative
+def linear_wave(case: Case, peak: np.ndarray) -> xr.Dataset:
+    """A run in which the hosts' velocities peak at the times ``peak`` (cell,), those of the resonators .1 s later."""
+    cell = four_band()
+    time = np.linspace(0, 1, 201)
+    velocity = np.zeros((201, 30, 4))
+    displacement = np.zeros((201, 30, 4))
+    # The largest velocity in size is negative.
+    velocity[..., cell.host] = -np.exp(-(((time[:, None] - peak) / 0.05) ** 2))
     velocity[..., cell.resonator] = 5 * np.exp(-(((time[:, None] - peak - 0.1) / 0.05) ** 2))
-    displacement[..., cell.resonator], displacement[..., cell.host] = 3e-3, -1e-3
-    dims = "time", "cell", "dof"
-    data = {"time": time, "displacement": (dims, displacement), "velocity": (dims, velocity)}
-    data["energy/work"] = "time", time
-    wave = LinearRun.of(xr.Dataset(data, attrs={"case": case.to_toml()}), {"work": 0.0}, (), ())
-    assert wave.arrival == pytest.approx(peak, abs=0.0026) and wave.statistics == {"work": 1.0}
-    assert leading_cell(case) == 7 and wave.arrival_at(7) == wave.arrival[6] and wave.arrival_at(0) is None
+    displacement[..., cell.resonator] = 3e-3
+    displacement[..., cell.host] = -1e-3
+    dims = ("time", "cell", "dof")
+    data = {
+        "time": time,
+        "displacement": (dims, displacement),
+        "velocity": (dims, velocity),
+        "energy/work": ("time", time),
+    }
+    return xr.Dataset(data, attrs={"case": case.to_toml()})
+
+
+def test_a_linear_wave_arrives_with_its_host_and_reaches_clearances_by_its_envelope():
+    case = Case.load(overrides=["lattice.cells=30", "contacts.sites=[20, 7, 3]", "drive.cell=5"])
+    peak = 0.2 + 0.02 * np.arange(30)
+    data = linear_wave(case, peak)
+
+    wave = LinearRun.of(data, {"work": 0.0}, (), ())
+
+    # Half a sampling interval, 5 ms.
+    assert wave.arrival == pytest.approx(peak, abs=0.0026)
+    assert wave.statistics == {"work": 1.0}
+    assert leading_cell(case) == 7
+    assert wave.arrival_at(7) == wave.arrival[6]
+    assert wave.arrival_at(0) is None
+
+    # The envelope of w is that of an oscillation with the largest w and the largest w'.
+    velocity = data["velocity"].values
+    cell = four_band()
     rate = np.abs(velocity[..., cell.resonator] - velocity[..., cell.host]).max(axis=0)
     assert wave.envelope == pytest.approx(np.hypot(4e-3, rate / case.drive.frequency), rel=1e-12)
     expected = case.drive.amplitude * wave.envelope[[19, 6, 2]] / np.asarray(case.contacts.clearance)
     assert wave.reached(case) == pytest.approx(expected)
 
 
-def test_records_of_another_version_are_made_again(folder, monkeypatch):
-    sweep, case = Sweep.from_table(SWEEP), Case.load()
+def test_a_linear_run_is_read_by_the_case_that_it_belongs_to(folder):
+    case = Case.load()
     run = LinearRun(np.array([1.0, 2.0]), np.array([0.1, 0.2]), {"work": 3.0}, {7: {"ibtet": 0.1}})
-    file = RecordFile(folder / "members-1.jsonl")
-    file.append(run.record(linear_name(case)))
-    assert read_linear(folder, sweep.case(0)) is None
+    RecordFile(folder / "members-1.jsonl").append(run.record(linear_name(case)))
+    assert read_linear(folder, Sweep.from_table(SWEEP).case(0)) is None
     again = read_linear(folder, case)
-    assert again.record("") == run.record("") and again.arrival_at(2) == 0.2
-    assert not (Results(sweep, folder).status == MISSING).any()
+    assert again.record("") == run.record("")
+    assert again.arrival_at(2) == 0.2
+
+
+def test_records_of_another_version_count_as_missing(folder, monkeypatch):
+    sweep = Sweep.from_table(SWEEP)
+    run = LinearRun(np.array([1.0, 2.0]), np.array([0.1, 0.2]), {"work": 3.0}, {7: {"ibtet": 0.1}})
+    RecordFile(folder / "members-1.jsonl").append(run.record(linear_name(Case.load())))
+    results = Results(sweep, folder)
+    assert not (results.status == MISSING).any()
+    assert results.linear
+
     monkeypatch.setattr(vipetsc, "__version__", "0.0.0")
     older = Results(sweep, folder)
-    assert (older.status == MISSING).all() and not older.linear
+    assert (older.status == MISSING).all()
+    assert not older.linear
 
 
 def test_the_latest_record_counts_but_no_failure_after_a_success(folder):
     sweep = Sweep.from_table(SWEEP)
     put_members(folder, sweep, lambda number, case: "later", file=1)
     results = Results(sweep, folder)
-    assert (results.status == FAILED).sum() == 1 and results.reasons == {5: "later"}
+    assert (results.status == FAILED).sum() == 1
+    assert results.reasons == {FAILING: "later"}
+
     results.merge_files()
     assert [path.name for path in folder.glob("*.jsonl")] == ["members.jsonl"]
-    text = (folder / "members.jsonl").read_bytes()
-    assert text.count(b"\n") == len(sweep.ids()) and Results(sweep, folder).reasons == {5: "later"}
+    assert (folder / "members.jsonl").read_bytes().count(b"\n") == len(sweep.ids())
+    assert Results(sweep, folder).reasons == {FAILING: "later"}
 
 
-def test_a_scaled_member_has_the_measures_of_its_linear_run(tmp_path):
-    """Of its first site; equal members are one; without the linear run's record it is missing."""
-    table = SWEEP | {"sweep": {"drive": {"amplitude": [1.0, 2.0, 1.0]}}}
-    sweep = Sweep.from_table(table)
-    run = LinearRun(np.zeros(40), np.zeros(40), {}, {9: {"ibtet": 0.1}, 5: {"ibtet": 0.2, "entropy/history": [1.0]}})
-    run.measures[5]["entropy/snapshot"] = [0.0]
-    file, statistics = RecordFile(tmp_path / "members-0.jsonl"), {"episodes": 0, "dissipated": 0.0, "engine": "ts"}
-    for name, site, work in zip(sweep.ids()[:2], (5, 9), (1.0, 4.0), strict=True):
-        about = {"id": name, "vipetsc_version": vipetsc.__version__, "status": "scaled"}
-        about["warnings"] = ["seen"] if site == 5 else ["seen", "alone"]
-        known = {"statistics": statistics | {"work": work, "ledger_error": 0.0}, "cpu_seconds": 0.0, "rtol": 1e-9}
-        file.append(about | known | {"linear": "wave", "site": site})
+def scaled_record(name: str, site: int, work: float, warnings: list[str]) -> dict[str, Any]:
+    """The record of a member without contact, whose measures are those of the linear run ``wave`` at its ``site``."""
+    statistics = {"episodes": 0, "dissipated": 0.0, "engine": "ts", "work": work, "ledger_error": 0.0}
+    return {
+        "id": name,
+        "vipetsc_version": vipetsc.__version__,
+        "status": "scaled",
+        "warnings": warnings,
+        "statistics": statistics,
+        "cpu_seconds": 0.0,
+        "rtol": 1e-9,
+        "linear": "wave",
+        "site": site,
+    }
+
+
+def test_a_scaled_member_has_the_measures_of_its_linear_run_at_its_first_site(tmp_path):
+    # Members with equal values are one.
+    sweep = Sweep.from_table(SWEEP | {"sweep": {"drive": {"amplitude": [1.0, 2.0, 1.0]}}})
+    one, two = sweep.ids()[:2]
+    file = RecordFile(tmp_path / "members-0.jsonl")
+    file.append(scaled_record(one, site=5, work=1.0, warnings=["seen"]))
+    file.append(scaled_record(two, site=9, work=4.0, warnings=["seen", "alone"]))
+    # Without the record of the linear run there are no measures.
     assert (Results(sweep, tmp_path).status == MISSING).all()
-    file.append(run.record("wave"))
+
+    measures = {9: {"ibtet": 0.1}, 5: {"ibtet": 0.2, "entropy/history": [1.0], "entropy/snapshot": [0.0]}}
+    file.append(LinearRun(np.zeros(40), np.zeros(40), {}, measures).record("wave"))
     _, warnings = conclude(Results(sweep, tmp_path))
-    ensemble = open_ensemble(tmp_path)
+
     assert warnings == ["3 members: seen", "1 member: alone"]
+    ensemble = open_ensemble(tmp_path)
     assert ensemble["status"].values.tolist() == [SCALED] * 3
-    assert ensemble["work"].values.tolist() == [1, 4, 1] and ensemble["ibtet"].values.tolist() == [0.2, 0.1, 0.2]
+    assert ensemble["work"].values.tolist() == [1, 4, 1]
+    assert ensemble["ibtet"].values.tolist() == [0.2, 0.1, 0.2]
     assert np.isnan(ensemble["entropy/history"].values[1]).all()

@@ -1,8 +1,9 @@
-"""What a verb's case takes is taken, and what it does not take is refused by name; one list of verbs and sections."""
+"""A verb's case takes what its class declares and refuses everything else by name; verbs and sections have one list."""
 
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import pytest
 
@@ -29,24 +30,32 @@ CHANGES = {
     "many drives": ({"drive": {"more": [{"frequency": 1000.0, "cell": 2}]}}, "drive.waveform"),
     "disorder": ({"disorder": {"clearance": {"relative": 1e-3}}}, "disorder"),
 }
-OWN = {
+# Sections without which a verb's case is incomplete.
+VERB_SECTIONS = {
     "sweep": {"drive": {"amplitude": [1.0, 2.0]}},
     "optimise": {"variables": {"profile": [1e-4, 1e-2]}},
     "nfrc": {"source": "force", "infinite": False},
 }
-PLANS = [kind for kind in VERB_CASES if kind.takes and kind is not NnmCase]
+# Normal modes drive nothing: their cases are tried apart.
+DRIVEN = [kind for kind in VERB_CASES if kind.takes and kind is not NnmCase]
 
 
-def refused(kind: type[CaseFile], changes: dict) -> set[str]:
+def refused_keys(kind: type[CaseFile], changes: dict[str, dict[str, Any]]) -> set[str]:
     """The keys of the problems of the built-in case with the section of the verb and with ``changes``."""
-    table = {"name": "four-band", kind.section: copy.deepcopy(OWN.get(kind.section, {}))} if kind.section else {}
+    table: dict[str, Any] = {"name": "four-band"}
+    if kind.section:
+        table[kind.section] = copy.deepcopy(VERB_SECTIONS.get(kind.section, {}))
     for section, values in changes.items():
         table[section] = table.get(section, {}) | values
     if "cell" in table.get("lattice", {}):
-        table |= {"contacts": {"sites": [9], "clearance": 1e-3, "stiffness": 1e4}, "drive": {"frequency": 1.0}}
+        # A cell of one's own has no defaults to take these from.
+        table["contacts"] = {"sites": [9], "clearance": 1e-3, "stiffness": 1e4}
+        table["drive"] = {"frequency": 1.0}
         table["time"] = {"end": 10.0, "sample_interval": 0.125}
+
     try:
         case = kind.from_table(table)
+        # Of a sweep, members are checked as they are built.
         if kind.section == "sweep":
             case.members()
     except CaseError as error:
@@ -55,20 +64,31 @@ def refused(kind: type[CaseFile], changes: dict) -> set[str]:
 
 
 @pytest.mark.parametrize("feature", sorted(FEATURES))
-@pytest.mark.parametrize("kind", PLANS, ids=lambda kind: kind.verb)
+@pytest.mark.parametrize("kind", DRIVEN, ids=lambda kind: kind.verb)
 def test_a_feature_is_refused_by_verbs_that_do_not_take_it(kind, feature):
     changes, key = CHANGES[feature]
-    assert (key in refused(kind, changes)) == (feature not in kind.takes)
+    assert (key in refused_keys(kind, changes)) == (feature not in kind.takes)
 
 
 @pytest.mark.parametrize("feature", ["damping", "absorbing ends", "unlike sites", "disorder", "rings"])
 def test_normal_modes_refuse_what_they_do_not_take(feature):
     changes, key = CHANGES[feature]
-    assert (key in refused(NnmCase, changes)) == (feature not in NnmCase.takes)
+    assert (key in refused_keys(NnmCase, changes)) == (feature not in NnmCase.takes)
 
 
 def test_every_verb_has_a_name_and_a_section_of_its_own():
-    assert len({kind.verb for kind in VERB_CASES}) == len({kind.section for kind in VERB_CASES}) == len(VERB_CASES)
-    assert VERB_CASES[0] is Case and not Case.section and Case.takes == FEATURES == CHANGES.keys()
+    assert len({kind.verb for kind in VERB_CASES}) == len(VERB_CASES)
+    assert len({kind.section for kind in VERB_CASES}) == len(VERB_CASES)
+
+
+def test_a_plain_run_takes_every_feature():
+    assert VERB_CASES[0] is Case
+    assert not Case.section
+    assert Case.takes == FEATURES == CHANGES.keys()
     assert all(kind.takes <= FEATURES for kind in VERB_CASES)
-    assert [*OF_SECTION] == [kind.verb for kind in VERB_CASES[1:]] == [*SECTIONS][-len(OF_SECTION) :]
+
+
+def test_sections_are_in_the_order_of_the_verbs():
+    verbs = [kind.verb for kind in VERB_CASES[1:]]
+    assert [*OF_SECTION] == verbs
+    assert [*SECTIONS][-len(OF_SECTION) :] == verbs

@@ -1,0 +1,189 @@
+"""Claims C11, C12, C14 and C18 on transfer to higher bands, measured from sweeps with known transfer."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import xarray as xr
+
+from tests.unit.claim_files import measure, put_sweep
+from vipetsc.case import Case
+from vipetsc.io.netcdf import write_netcdf
+from vipetsc.paper.claims.criteria import HOLDS, IN_PART, LAWS
+from vipetsc.paper.claims.evidence import Evidence, MissingEvidence
+
+# Amplitude in N of the first contact; the transfer jumps there and decays from there on.
+ONSET = 17.0
+
+
+def put_transfer(
+    root: Path, maximum: float = 0.35, floor: float = 1e-4, one_site: float = 0.1, weak_below: float = 0.0
+) -> None:
+    """Write the transfer of five sites, of at most ``maximum``, and of one; below ``weak_below`` N it is a fiftieth."""
+    table = {
+        "lattice": {"preset": "four-band"},
+        "drive": {"band": 2, "at": "max-group-velocity"},
+        "sweep": {
+            "measures": ["transfer"],
+            "zip": [["contacts.sites", "drive.cycles"]],
+            "lattice": {"reading": ["calibrated"]},
+            "contacts": {"law": ["hertz", "bilinear"], "sites": [5, 5, 1]},
+            "drive": {"cycles": [30, 15, 30], "amplitude": {"log": [1.0, 1e4], "count": 17}},
+        },
+    }
+
+    def content(case: Case) -> dict[str, float]:
+        amplitude = case.drive.amplitude
+        highest = maximum if len(case.contacts.sites) > 1 else one_site
+        if amplitude < weak_below:
+            highest *= 0.02
+        transfer = highest * (amplitude / ONSET) ** -1.5 if amplitude > ONSET else 0.0
+        # The floor comes from the record's ends, but for a fiftieth.
+        return {"ibtet": 0.02 * floor + transfer, "ibtet_whole": floor + transfer}
+
+    put_sweep(root / "interband", table, content, episodes=lambda case: int(case.drive.amplitude > ONSET))
+
+
+@pytest.mark.slow
+def test_coordinates_of_a_zipped_axis_meet_in_one_member(tmp_path):
+    put_transfer(tmp_path)
+    with Evidence(tmp_path) as evidence:
+        single = evidence.select("interband", "calibrated", law="bilinear", sites=1, cycles=30)
+        assert single["sites"].item() == 1
+        assert single["cycles"].item() == 30
+        assert single["law"].item() == "bilinear"
+        assert single["ibtet"].dims == ("amplitude",)
+
+        with pytest.raises(MissingEvidence, match=r"reading = calibrated, sites = 1, cycles = 15"):
+            evidence.select("interband", "calibrated", sites=1, cycles=15)
+
+
+@pytest.mark.slow
+def test_transfer_as_the_paper_has_it_holds(tmp_path):
+    put_transfer(tmp_path)
+
+    onset = measure("C11", tmp_path)
+    assert onset.verdict == HOLDS
+    assert onset.value["floor, hertz"] == pytest.approx(1e-4)
+    assert onset.value["floor without the record's ends, hertz"] == pytest.approx(2e-6)
+    assert "without the ends it is 2e-06" in onset.reason
+
+    single = measure("C14", tmp_path)
+    assert single.verdict == HOLDS
+    assert single.value["correlation of 15 and 30 cycles, hertz"] == pytest.approx(1.0)
+    assert single.uncertainty["amplitudes, hertz"] == 17
+
+
+def put_scatter(root: Path) -> None:
+    """Write four samples of scattered clearances at an amplitude of each law and number of sites.
+
+    The transfer of each sample deviates from the amplitude as its first clearance does from the nominal one.
+    """
+    rows = [(law, sites) for sites in (5, 1) for law in LAWS]
+    table = {
+        "lattice": {"preset": "four-band", "reading": "calibrated"},
+        "disorder": {"clearance": {"relative": 0.02}},
+        "sweep": {
+            "measures": ["transfer"],
+            "zip": [["contacts.law", "contacts.sites", "drive.amplitude"]],
+            "lattice": {"reading": ["calibrated"]},
+            "contacts": {"law": [law for law, _ in rows], "sites": [sites for _, sites in rows]},
+            "drive": {"amplitude": [20.0, 21.0, 22.0, 23.0]},
+            "disorder": {"seed": {"count": 4}},
+        },
+    }
+    nominal = {}
+    for count in (5, 1):
+        nominal[count] = Case.from_table({"contacts": {"sites": count}}).contacts.clearance[0]
+
+    def content(case: Case) -> dict[str, Any]:
+        clearance = case.contacts.clearance[0]
+        return {"ibtet": case.drive.amplitude * clearance / nominal[len(case.contacts.sites)]}
+
+    put_sweep(root / "interband-scatter", table, content, episodes=lambda case: 1)
+
+
+@pytest.mark.slow
+def test_scatter_is_printed_with_the_maxima_and_decides_nothing(tmp_path):
+    put_transfer(tmp_path)
+    before = {claim: measure(claim, tmp_path) for claim in ("C11", "C14")}
+    put_scatter(tmp_path)
+
+    for claim, law, amplitude in (("C11", "bilinear", 21.0), ("C14", "hertz", 22.0)):
+        found = measure(claim, tmp_path)
+        name = f"4 samples of 2 % clearance scatter at {amplitude:.4g} N, {law}"
+        mean = found.value[f"mean of {name}"]
+        deviation = found.uncertainty[f"deviation of the {name}"]
+        # Four samples of a normal deviation of 2 %: some multiples of it either way.
+        assert 0 < abs(mean / amplitude - 1) < 0.05
+        assert 0.002 < deviation / amplitude < 0.06
+
+        assert found.verdict == before[claim].verdict
+        assert found.threshold == before[claim].threshold
+        assert len(found.value) == len(before[claim].value) + 2
+
+
+@pytest.mark.parametrize(
+    ("rms", "loss", "onset", "expected"),
+    [(0.05, 0.03, 16.0, HOLDS), (0.07, 0.03, 16.0, IN_PART), (0.05, 0.05, 16.0, IN_PART), (0.05, 0.03, 25.0, IN_PART)],
+)
+def test_a_prediction_holds_by_its_errors_and_its_onset(tmp_path, rms, loss, onset, expected):
+    coordinates = {"amplitude": [12.0, 20.0, 30.0]}
+    data = {"predicted/upper": ("amplitude", [0.0, 0.1, 0.2]), "simulated/contact_episodes": ("amplitude", [0.0, 3, 9])}
+    good = {"rms_upper": 0.01, "worst_upper": 0.2, "worst_dissipated": 0.01, "onset_amplitude": 16.0}
+    changed = good | {"rms_upper": rms, "worst_dissipated": loss, "onset_amplitude": onset}
+    for law, attributes in (("hertz", good), ("bilinear", changed)):
+        folder = tmp_path / f"prediction-{law}"
+        folder.mkdir()
+        write_netcdf(folder / "prediction.h5", xr.Dataset(data, coordinates, attributes))
+
+    found = measure("C18", tmp_path)
+
+    assert found.verdict == expected
+    assert len(found.files) == 2
+    # The simulated contacts begin at 20 N.
+    assert found.value["amplitudes with contact on one side alone, bilinear"] == (onset > 20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("weak_below", "expected"), [(0.0, 10**0.25), (90.0, 10.0)])
+def test_an_onset_ends_at_half_the_maximum(tmp_path, weak_below, expected):
+    # Amplitudes are 10^(1/4) apart: one step, or four steps until the transfer is no longer weak.
+    put_transfer(tmp_path, weak_below=weak_below)
+    ratio = measure("C11", tmp_path).value["ratio of amplitudes from the floor to half the maximum, hertz"]
+    assert ratio == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_transfer_of_another_size_holds_in_part(tmp_path):
+    put_transfer(tmp_path, maximum=0.2, floor=1e-3, one_site=0.3)
+    onset = measure("C11", tmp_path)
+    assert onset.verdict == IN_PART
+    assert "floor, hertz" in onset.reason
+
+    single = measure("C14", tmp_path)
+    assert single.verdict == IN_PART
+    assert "maximum with one site" in single.reason
+
+
+def put_amplitudes(root: Path, content: Callable[[Case], dict[str, Any]]) -> None:
+    """Write three amplitudes of the four-band lattice with both laws, with fields."""
+    table = {
+        "lattice": {"preset": "four-band", "cells": 30},
+        "drive": {"band": 2, "at": "max-group-velocity", "cycles": 10},
+        "sweep": {
+            "fields": True,
+            "lattice": {"reading": ["calibrated"]},
+            "contacts": {"law": ["hertz", "bilinear"]},
+            "drive": {"amplitude": [1.0, 24.0, 200.0]},
+        },
+    }
+    put_sweep(root / "interband-amplitudes", table, content, episodes=lambda case: 1)
+
+
+@pytest.mark.parametrize(("medium", "high", "expected"), [(0.3, 0.02, HOLDS), (0.1, 0.2, IN_PART)])
+def test_medium_amplitude_fills_the_upper_bands(tmp_path, medium, high, expected):
+    transfer = {1.0: 1e-4, 24.0: medium, 200.0: high}
+    put_amplitudes(tmp_path, lambda case: {"ibtet": transfer[case.drive.amplitude]})
+    assert measure("C12", tmp_path).verdict == expected
