@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import h5py
@@ -27,7 +28,10 @@ engine = "propagator"
 samples = 101
 rtol = 1e-8
 """
-TS = RUN.replace("propagator", "ts") + '[output]\nfigures = false\nwriter = "parallel"\n'
+# Debian's h5py loads the one of its two builds that has MPI under mpirun alone.
+has_parallel_hdf5 = h5py.get_config().mpi or find_spec("h5py._debian_h5py_mpi")
+WRITER = "parallel" if has_parallel_hdf5 else "gather"
+TS = RUN.replace("propagator", "ts") + f'[output]\nfigures = false\nwriter = "{WRITER}"\n'
 SWEEP = """
 [lattice]
 preset = "diatomic"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 from mpi4py import MPI
 
@@ -10,7 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import assert_same_bits, datasets, small_case
+from tests.conftest import assert_same_bits, datasets, in_parallel, needs_parallel_hdf5, small_case
+from vipetsc.case import CaseError
 from vipetsc.dynamics import recorder, simulate
 from vipetsc.io import chunks
 from vipetsc.io.store import RunFolder, RunMemory
@@ -20,7 +22,7 @@ COMM = MPI.COMM_WORLD
 
 
 @pytest.mark.parallel(2)
-@pytest.mark.parametrize("writer", ["gather", "parallel"])
+@pytest.mark.parametrize("writer", ["gather", in_parallel])
 def test_all_ranks_agree_on_what_is_told_in_the_file(folder, monkeypatch, writer):
     """HDF5 fails to close a file whose attributes, such as the seconds a run took, differ between ranks."""
     finish = RunFolder.finish
@@ -40,6 +42,7 @@ def test_all_ranks_agree_on_what_is_told_in_the_file(folder, monkeypatch, writer
         assert file.attrs["ranks"] == COMM.size
 
 
+@needs_parallel_hdf5
 @pytest.mark.parallel(2)
 def test_a_run_in_memory_is_gathered_on_rank_0(folder):
     case = small_case(output={"writer": "parallel"}, time={"end": 0.02})
@@ -55,6 +58,7 @@ def test_a_run_in_memory_is_gathered_on_rank_0(folder):
     assert_same_bits(run, {str(name): item.values for name, item in held.variables.items()})
 
 
+@needs_parallel_hdf5
 @pytest.mark.parallel([2, 3])
 def test_ranks_that_write_together_write_what_one_gathers(folder, monkeypatch):
     """Several sites a rank, named in no order; several chunks; fields of a window; open and closed episodes."""
@@ -88,7 +92,7 @@ def test_rows_are_sorted_over_ranks_and_none_has_all():
 
 
 @pytest.mark.parallel(2)
-@pytest.mark.parametrize("writer", ["gather", "parallel"])
+@pytest.mark.parametrize("writer", ["gather", in_parallel])
 def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypatch, writer):
     path = folder / "run"
     simulate(small_case(time={"end": 0.01}), path)
@@ -176,3 +180,17 @@ def test_a_checkpoint_that_one_rank_cannot_read_is_refused_on_all(folder):
 
     with pytest.raises((OSError, ValueError)):
         RunFolder(folder / "run", COMM).last_state()
+
+
+@pytest.mark.parallel(2)
+def test_without_hdf5_for_mpi_all_ranks_refuse_to_write_together(folder, monkeypatch):
+    monkeypatch.setattr(h5py, "get_config", lambda: SimpleNamespace(mpi=False))
+    case = small_case(output={"writer": "parallel"}, time={"end": 0.01})
+    with pytest.raises(CaseError, match=r"output\.writer = 'parallel': needs an h5py that is built for MPI"):
+        simulate(case, folder / "run")
+    COMM.Barrier()
+    assert not (folder / "run").exists()
+
+    # A run of any size gathers where the case leaves the choice.
+    monkeypatch.setattr(recorder, "GATHER_LIMIT", 1000)
+    assert simulate(small_case(time={"end": 0.01}), folder / "run").complete

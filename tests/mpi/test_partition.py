@@ -9,7 +9,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.conftest import StopAt, assert_same_bits, datasets, on_two, small_case
+from tests.conftest import StopAt, assert_same_bits, datasets, in_parallel, needs_parallel_hdf5, on_two, small_case
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.observers import Observer
@@ -89,15 +89,21 @@ def test_same_bits_diatomic_and_driven_in_the_middle(folder):
 def test_ranks_without_cells_take_part(folder):
     case = small_case(lattice={"cells": 2}, contacts={"sites": [1, 2], "clearance": 5e-5}, time={"end": 0.02})
     runs_alike(folder, case)
-    parallel = small_case(
+
+
+@needs_parallel_hdf5
+@pytest.mark.parallel([3, 4])
+def test_ranks_without_cells_write_with_the_others(folder):
+    case = small_case(
         lattice={"cells": 2},
         contacts={"sites": [1, 2], "clearance": 5e-5},
         time={"end": 0.02},
         output={"writer": "parallel"},
     )
-    runs_alike(folder / "written-in-parallel", parallel)
+    runs_alike(folder, case)
 
 
+@needs_parallel_hdf5
 @pytest.mark.parallel(2)
 def test_parallel_writing_gives_the_gathered_file(folder):
     output = {"window": [3, 20], "every": 2, "stride": 3}
@@ -164,7 +170,7 @@ def test_a_step_that_fails_on_one_rank_ends_the_run_on_all(engine, stiffness, ob
 
 @pytest.mark.parallel([2, 3])
 @pytest.mark.parametrize(("engine", "looks"), [("ts", (500, 150)), ("propagator", (6, 1))])
-@pytest.mark.parametrize("writer", [*on_two("gather"), "parallel"])
+@pytest.mark.parametrize("writer", [*on_two("gather"), in_parallel])
 def test_a_stopped_run_goes_on_to_the_same_bits_on_any_number_of_ranks(folder, monkeypatch, engine, looks, writer):
     """On one rank, then on all, then on all but one; contacts last over both checkpoints."""
     comm = MPI.COMM_WORLD

@@ -13,7 +13,7 @@ from vipetsc.case import CaseError, Model
 from vipetsc.case.case_file import Problem
 from vipetsc.case.schema import OutputTable
 from vipetsc.dynamics.propagator.engine import step_series
-from vipetsc.dynamics.recorder import chunk_samples, recorded_cells, written_together
+from vipetsc.dynamics.recorder import chunk_samples, possible_output, recorded_cells, written_together
 from vipetsc.io.store import GATHER_LIMIT
 
 # States that an engine holds, each of 2 numbers a mass: two for each stage of a method and its saved copies; measured.
@@ -111,9 +111,11 @@ def check_indices(model: Model) -> None:
 def check_memory(model: Model, output: OutputTable, engine: str, comm: MPI.Comm) -> None:
     """Raise CaseError on all ranks if one has less memory left than the run needs; all must call it.
 
-    The same error is raised if PETSc's indices cannot count the components of the state.
+    The same error is raised if PETSc's indices cannot count the components of the state, or if every rank shall write
+    and h5py cannot.
     """
     check_indices(model)
+    output = possible_output(output, comm.size)
     sample = 8 * len(output.fields) * model.chain.cell.dofs * len(recorded_cells(output, model.chain.cells))
     if comm.size > 1 and output.writer == "gather" and sample > GATHER_LIMIT:
         remedy = f'a sample of {sample / 1e9:.3g} GB is more than one message holds; "parallel" sends none'

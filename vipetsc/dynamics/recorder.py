@@ -6,9 +6,10 @@ from typing import Any
 
 from mpi4py import MPI
 
+import h5py
 import numpy as np
 
-from vipetsc.case import Model
+from vipetsc.case import CaseError, Model, Problem
 from vipetsc.case.schema import OutputTable
 from vipetsc.dynamics.energies import ENERGY_SUMS, Energies
 from vipetsc.dynamics.observers import Observer, Setup
@@ -35,6 +36,22 @@ def written_together(model: Model, output: OutputTable, ranks: int) -> bool:
     return ranks > 1 and (output.writer == "parallel" or (output.writer == "auto" and large))
 
 
+def possible_output(output: OutputTable, ranks: int) -> OutputTable:
+    """The ``output`` as the h5py of these ``ranks`` can write it: where it has no MPI, ``auto`` gathers.
+
+    Raises CaseError if every rank shall write and cannot.
+    """
+    if ranks == 1 or h5py.get_config().mpi:
+        return output
+    if output.writer == "parallel":
+        remedy = (
+            "needs an h5py that is built for MPI (Debian: python3-h5py-mpi; conda-forge: h5py=*=mpi_openmpi*);"
+            ' "gather" does without'
+        )
+        raise CaseError([Problem("output.writer", output.writer, remedy)])
+    return output.model_copy(update={"writer": "gather"})
+
+
 def chunk_samples(sample_bytes: int) -> int:
     """Number of samples in a chunk, if a rank stores ``sample_bytes`` of fields for each."""
     return min(max(CHUNK_BYTES // max(sample_bytes, 1), 1), CHUNK_SAMPLES)
@@ -52,7 +69,7 @@ class Recorder(Observer):
     def begin(self, setup: Setup) -> None:
         super().begin(setup)
         layout = setup.layout
-        output = setup.case.output
+        output = possible_output(setup.case.output, layout.comm.size)
         recorded = np.array(recorded_cells(output, setup.model.chain.cells))
         first, stop = np.searchsorted(recorded, [layout.start, layout.stop]).tolist()
         local = recorded[first:stop] - layout.start
