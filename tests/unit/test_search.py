@@ -18,12 +18,12 @@ READINGS = tuple(SPRING)
 
 @pytest.fixture(scope="module")
 def found():
-    """The default grid in both readings."""
+    """Search the default grid in both readings."""
     return {reading: search_cells(reading, GRID, GRID[:-1], KAPPA) for reading in READINGS}
 
 
-def slow(reading, lam, eta):
-    """Signed deflection (kappa) and speeds (band) of one cell, from the paper's matrix with its -1/2 put in."""
+def direct_loop(reading, lam, eta):
+    """Return deflections (kappa,) and speeds (kappa, band) of a cell from the paper's matrix, its -1/2 put in."""
     m = 0.005
     k = 2e4
     k2 = 1e4
@@ -41,6 +41,7 @@ def slow(reading, lam, eta):
 
     deflection = []
     speeds = []
+    # Central differences of frequencies of some 1e3 rad/s are good to (1e-5)^2 and to rounding over 1e-5.
     h = 1e-5
     for kappa in KAPPA[1:-1]:
         _, u = modes(kappa)
@@ -55,9 +56,11 @@ def slow(reading, lam, eta):
 @pytest.mark.parametrize("reading", READINGS)
 @pytest.mark.parametrize(("row", "column"), [(0, 14), (0, 1), (9, 20), (36, 35), (20, 3)])
 def test_grid_equals_a_direct_loop(found, reading, row, column):
+    """Deflections, frequencies and velocities of a cell of the grid are those of a loop over its wavenumbers."""
     result = found[reading]
-    deflection, speeds = slow(reading, GRID[row], GRID[column])
+    deflection, speeds = direct_loop(reading, GRID[row], GRID[column])
     np.testing.assert_allclose(result.signed_deflection[row, column, 1:-1], deflection, atol=1e-9)
+
     point = bloch(four_band(reading, GRID[row], GRID[column]), KAPPA[1:-1])
     np.testing.assert_array_equal(result.frequency[row, column, 1:-1], point.frequency)
     np.testing.assert_allclose(np.abs(point.group_velocity), speeds, rtol=1e-4, atol=1e-3)
@@ -70,6 +73,7 @@ def test_out_of_phase_wherever_the_resonator_alone_is_slower_than_the_band_edge(
     alone = GRID[:, None] * SPRING[reading] / (0.005 * GRID[None, :-1])
     edge = 1e4 / 0.005
     clear = np.abs(alone - edge) > 1e-6 * edge
+    # On the edge itself rounding decides; few cells lie there.
     assert clear.mean() > 0.95
     np.testing.assert_array_equal(found[reading].out_of_phase[clear], (alone < edge)[clear])
 
@@ -82,10 +86,12 @@ def test_best_velocities_where_bands_three_and_four_touch(found, reading):
     eta = (5 + np.sqrt(25 - 200 * a)) / 20
     frequency = bloch(four_band(reading, lam, eta), 0.0).frequency
     assert frequency[3] - frequency[2] == pytest.approx(0, abs=1e-5)
+
     for cost in ("group_velocity", "weighted"):
         row, column = found[reading].optimum(cost)
         assert row == 0
         assert abs(GRID[column] - eta) <= 0.5 * (GRID[1] - GRID[0])
+
     # Finer in eta, the optimum closes in on it, as far as the spacing in kappa lets the touching bands be seen.
     fine = search_cells(reading, [lam], np.arange(0.4, 0.55, 5e-4), KAPPA)
     assert fine.eta[fine.optimum("weighted")[1]] == pytest.approx(eta, abs=1e-3)
@@ -97,9 +103,12 @@ def test_paper_choice(found):
     for reading, eta in (("printed", 0.45), ("calibrated", 0.475)):
         row, column = search_cells(reading, tenths, tenths, KAPPA).optimum("weighted")
         assert (tenths[row], tenths[column]) == (0.1, 0.5)
+
         best = found[reading].optimum("weighted")
         assert (GRID[best[0]], GRID[best[1]]) == (0.1, eta)
         assert found[reading].out_of_phase[best]
+
+        # The paper's choice costs less than 3 % of the best.
         paper = search_cells(reading, 0.1, 0.5, KAPPA)
         assert paper.out_of_phase.all()
         assert paper.cost("weighted").item() > 0.97 * found[reading].cost("weighted")[best]
@@ -108,19 +117,23 @@ def test_paper_choice(found):
 def test_no_cell_is_out_of_phase():
     """A stiff spring carries its resonator along: deflections are negative, and there is no optimum."""
     stiff = search_cells("printed", [5.0, 50.0], [0.3, 0.5], KAPPA)
+
     assert not stiff.out_of_phase.any()
     assert all(stiff.optimum(cost) is None for cost in COSTS)
+    # Ten times the stiffness leaves about a tenth of the relative motion.
     assert np.all(stiff.signed_deflection[1, :, 1:-1] < 0)
     assert np.abs(stiff.signed_deflection[1]).max() < 0.1 * np.abs(stiff.signed_deflection[0]).max() + 0.05
 
 
 def test_weighted_cost_is_the_product(found):
+    """The weighted cost is the product of deflection and group velocity."""
     result = found["printed"]
     np.testing.assert_array_equal(result.cost("weighted"), result.cost("deflection") * result.cost("group_velocity"))
 
 
 @pytest.mark.parametrize("eta", [0.0, 1.0])
 def test_a_massless_host_or_resonator_is_refused(eta):
+    """eta = 0 leaves the resonator without mass, eta = 1 the host: both are refused."""
     with pytest.raises(ValueError, match="must be positive"):
         search_cells("printed", [0.1], [eta], KAPPA)
 
@@ -132,15 +145,19 @@ def test_deflection_knows_neither_phase_nor_length_nor_direction(lam, eta, kappa
     cell = four_band(reading, lam, eta)
     right = bloch(cell, kappa)
     left = bloch(cell, -kappa)
-    there = signed_deflection(cell, right)
-    np.testing.assert_allclose(there, signed_deflection(cell, left), atol=1e-6)
+
+    deflection = signed_deflection(cell, right)
+    np.testing.assert_allclose(deflection, signed_deflection(cell, left), atol=1e-6)
+
     scaled = type(right)(right.frequency, right.vectors * 3 * np.exp(1j), right.group_velocity)
-    np.testing.assert_allclose(there, signed_deflection(cell, scaled), atol=1e-12)
-    assert np.abs(there).max() <= np.sqrt(2) + 1e-12
+    np.testing.assert_allclose(deflection, signed_deflection(cell, scaled), atol=1e-12)
+    assert np.abs(deflection).max() <= np.sqrt(2) + 1e-12
 
 
 def test_a_pair_of_which_one_mass_is_at_rest_has_no_phase():
+    """Where the host is at rest, the pair is neither in nor out of phase: the signed deflection is 0."""
     vectors = np.ones((4, 1))
     vectors[four_band().host] = 0.0
-    point = BlochPoint(np.ones(1), vectors, np.ones(1))
+    point = BlochPoint(frequency=np.ones(1), vectors=vectors, group_velocity=np.ones(1))
+
     assert signed_deflection(four_band(), point) == 0.0

@@ -20,37 +20,53 @@ cells = 40
 """
 
 
-def read(text: str, *overrides: str) -> Sweep:
+def sweep_of(text: str, *overrides: str) -> Sweep:
+    """Return the sweep of the base case with ``text`` behind it."""
     return Sweep.from_table(tomllib.loads(BASE + text), overrides)
 
 
 def test_members_are_the_product_in_the_files_order():
-    plan = read("[sweep.drive]\namplitude = [1.0, 2.0, 3.0]\n[sweep.contacts]\nsites = [1, 2]")
+    """Members are the product of all axes, the last one in the file varying fastest; each is a case."""
+    plan = sweep_of("[sweep.drive]\namplitude = [1.0, 2.0, 3.0]\n[sweep.contacts]\nsites = [1, 2]")
     assert plan.shape == (3, 2)
-    cases = [m.case for m in plan.members()]
-    assert [c.drive.amplitude for c in cases] == [1.0, 1.0, 2.0, 2.0, 3.0, 3.0]
-    assert [len(c.contacts.sites) for c in cases] == [1, 2] * 3
+    cases = [member.case for member in plan.members()]
+    assert [case.drive.amplitude for case in cases] == [1.0, 1.0, 2.0, 2.0, 3.0, 3.0]
+    assert [len(case.contacts.sites) for case in cases] == [1, 2] * 3
+
     table = tomllib.loads(BASE) | {"drive": {"amplitude": 2.0}, "contacts": {"sites": 2}, "time": {"engine": "auto"}}
     assert cases[3] == Case.from_table(table)
 
 
 def test_a_key_may_be_written_in_one_piece():
-    nested = read("[sweep.drive]\namplitude = [1.0, 2.0]\n[sweep.contacts]\nsites = [1, 2]")
-    flat = read('[sweep]\n"drive.amplitude" = [1.0, 2.0]\n"contacts.sites" = [1, 2]')
-    assert flat.ids() == nested.ids() and flat.members() == nested.members()
+    """A quoted key with dots names the same axis as a table of its section."""
+    nested = sweep_of("[sweep.drive]\namplitude = [1.0, 2.0]\n[sweep.contacts]\nsites = [1, 2]")
+    flat = sweep_of('[sweep]\n"drive.amplitude" = [1.0, 2.0]\n"contacts.sites" = [1, 2]')
+
+    assert flat.ids() == nested.ids()
+    assert flat.members() == nested.members()
 
 
 def test_ranges():
-    plan = read("[sweep.drive]\namplitude = { log = [0.1, 10], count = 3 }\nfrequency = { linear = [1, 2], count = 5 }")
+    """A logarithmic range has equal ratios, a linear one equal differences, both with their ends."""
+    plan = sweep_of(
+        "[sweep.drive]\namplitude = { log = [0.1, 10], count = 3 }\nfrequency = { linear = [1, 2], count = 5 }"
+    )
+
     amplitude, frequency = (next(iter(axis.values())) for axis in plan.axes)
+
     assert amplitude == pytest.approx([0.1, 1.0, 10.0], rel=1e-15)
     assert frequency == (1.0, 1.25, 1.5, 1.75, 2.0)
 
 
 def test_zipped_keys_vary_together_and_share_a_dimension():
+    """Zipped keys take their values in pairs, along one axis."""
     text = '[sweep]\nzip = [["contacts.sites", "drive.cycles"]]\n[sweep.contacts]\nsites = [5, 5, 1]\n'
-    plan = read(text + "[sweep.drive]\ncycles = [30, 15, 30]\namplitude = [1.0, 2.0]")
+    text += "[sweep.drive]\ncycles = [30, 15, 30]\namplitude = [1.0, 2.0]"
+
+    plan = sweep_of(text)
+
     assert plan.shape == (3, 2)
+    # Every second member has the first amplitude.
     assert [(len(m.case.contacts.sites), m.case.drive.cycles) for m in plan.members()[::2]] == [
         (5, 30),
         (5, 15),
@@ -59,29 +75,36 @@ def test_zipped_keys_vary_together_and_share_a_dimension():
 
 
 def test_a_key_inside_a_table_and_short_names():
+    """A key inside a table varies as well; axes are named by the last parts of their keys that tell them apart."""
     text = "[contacts]\nsites = { first = 11, spacing = 1, count = 1 }\n[sweep.contacts.sites]\ncount = [1, 3]"
-    plan = read(text)
+    plan = sweep_of(text)
     assert plan.names() == {"contacts.sites.count": "sites"}
-    assert [m.case.contacts.sites for m in plan.members()] == [[11], [11, 12, 13]]
-    twice = read("[sweep.drive]\ncell = [1, 2]\n[sweep.lattice]\ncells = [40]\n[sweep.contacts]\nsites = [1]")
+    assert [member.case.contacts.sites for member in plan.members()] == [[11], [11, 12, 13]]
+
+    twice = sweep_of("[sweep.drive]\ncell = [1, 2]\n[sweep.lattice]\ncells = [40]\n[sweep.contacts]\nsites = [1]")
     assert set(twice.names().values()) == {"cell", "cells", "sites"}
 
 
 def test_coordinates_are_numbers_where_they_can_be():
+    """Multiples of pi become numbers; names stay, and values of several kinds become texts."""
     assert coordinate(["2pi/9", "5pi/9"]) == pytest.approx(np.pi * np.array([2, 5]) / 9)
     assert list(coordinate(["hertz", "bilinear"])) == ["hertz", "bilinear"]
     assert list(coordinate([1, {"first": 3, "count": 2}])) == ["1", '{"first": 3, "count": 2}']
 
 
 def test_written_out_and_read_back_it_has_the_same_members():
-    plan = read('[sweep.drive]\nwavenumber = ["2pi/9", "5pi/9"]\namplitude = { log = [0.1, 20.0], count = 7 }')
-    again = Sweep.from_table(tomllib.loads(plan.to_toml()))
-    assert again.ids() == plan.ids() and again.members() == plan.members()
+    """The text of a sweep gives the same members under the same names."""
+    plan = sweep_of('[sweep.drive]\nwavenumber = ["2pi/9", "5pi/9"]\namplitude = { log = [0.1, 20.0], count = 7 }')
+
+    restored = Sweep.from_table(tomllib.loads(plan.to_toml()))
+
+    assert restored.ids() == plan.ids()
+    assert restored.members() == plan.members()
     assert len(set(plan.ids())) == 14
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("", "sweep: missing"),
         ("[sweep]\nfields = true", "names no key that varies"),
@@ -96,27 +119,44 @@ def test_written_out_and_read_back_it_has_the_same_members():
         ('[sweep]\nzip=[["drive.cycles"],["drive.cycles"]]\n[sweep.drive]\ncycles=[3,4]', "in one group only"),
     ],
 )
-def test_what_is_wrong_is_named_with_its_remedy(text, says):
+def test_what_is_wrong_is_named_with_its_remedy(text, message):
+    """A section that varies nothing, or wrongly, is refused with its key and what would be right."""
     with pytest.raises(CaseError) as error:
-        read(text).members()
-    assert says in str(error.value)
+        sweep_of(text).members()
+    assert message in str(error.value)
 
 
 def test_one_impossible_member_does_not_spoil_the_others():
-    members = read("[sweep.contacts]\nsites = [[10], [99], [20]]").members()
-    assert [m.case is not None for m in members] == [True, False, True]
+    """A member outside the lattice has its problems in place of a case; its neighbours are cases."""
+    members = sweep_of("[sweep.contacts]\nsites = [[10], [99], [20]]").members()
+
+    assert [member.case is not None for member in members] == [True, False, True]
     assert "contacts.sites = [99]" in str(members[1].problems[0])
 
 
 def test_names_of_members_are_those_of_their_values():
-    """Whatever the order of the axes; equal members have one name, and a number or a name finds its member."""
-    rows = "[sweep.drive]\namplitude = [1.0, 2.0, 1.0]\n[sweep.contacts]\nsites = [1, 2]"
-    plan, turned = read(rows), read("[sweep.contacts]\nsites = [1, 2]\n[sweep.drive]\namplitude = [1.0, 2.0, 1.0]")
-    table = np.array(plan.ids()).reshape(3, 2)
-    assert (table == np.array(turned.ids()).reshape(2, 3).T).all()
-    assert (table[0] == table[2]).all() and len(set(plan.ids())) == 4
-    assert read(rows, "drive.cycles=7").ids()[0] not in plan.ids()
-    assert plan.number(table[1, 1]) == plan.number("3") == 3 and plan.case(3).drive.amplitude == 2.0
+    """A name depends on a member's values, not on the order of the axes; equal members have one name."""
+    amplitudes = "[sweep.drive]\namplitude = [1.0, 2.0, 1.0]\n"
+    sites = "[sweep.contacts]\nsites = [1, 2]\n"
+    plan = sweep_of(amplitudes + sites)
+    transposed = sweep_of(sites + amplitudes)
+
+    names = np.array(plan.ids()).reshape(3, 2)
+    assert (names == np.array(transposed.ids()).reshape(2, 3).T).all()
+    assert (names[0] == names[2]).all()
+    assert len(set(plan.ids())) == 4
+    # Another value of a key that does not vary is another member.
+    assert sweep_of(amplitudes + sites, "drive.cycles=7").ids()[0] not in plan.ids()
+
+
+def test_a_number_or_a_name_finds_its_member():
+    """A member is found by its number or its name; others are refused."""
+    plan = sweep_of("[sweep.drive]\namplitude = [1.0, 2.0, 1.0]\n[sweep.contacts]\nsites = [1, 2]")
+
+    assert plan.number(plan.ids()[3]) == 3
+    assert plan.number("3") == 3
+    assert plan.case(3).drive.amplitude == 2.0
+    # Beyond the last one, before the first one, and no name of any.
     for name in ("6", "-1", "0123456789abcdef"):
         with pytest.raises(CaseError, match="is no member; ensemble"):
             plan.number(name)
@@ -124,12 +164,23 @@ def test_names_of_members_are_those_of_their_values():
 
 @pytest.mark.slow
 def test_many_members_are_cheap_until_one_is_asked_for():
-    plan = read("[sweep.drive]\namplitude = { linear = [0.0, 1.0], count = 250_000 }")
-    assert len(plan.ids()) == plan.count == 250_000 and len(plan.members(20)) == 20
-    assert plan.member(0).case is None and plan.case(plan.count - 1).drive.amplitude == 1.0
-    rows = "{ linear = [1, 2], count = 1001 }", "{ linear = [1, 2], count = 1000 }"
+    """A sweep of 250 000 members has their names in seconds, since no case is made until it is asked for."""
+    plan = sweep_of("[sweep.drive]\namplitude = { linear = [0.0, 1.0], count = 250_000 }")
+
+    assert plan.count == 250_000
+    assert len(plan.ids()) == 250_000
+    assert len(plan.members(20)) == 20
+    # No wave has the amplitude 0.
+    assert plan.member(0).case is None
+    assert plan.case(plan.count - 1).drive.amplitude == 1.0
+
+
+def test_a_sweep_of_more_than_a_million_members_is_refused():
+    """1001 times 1000 members are refused before one of them is made."""
+    amplitudes = "{ linear = [1, 2], count = 1001 }"
+    frequencies = "{ linear = [1, 2], count = 1000 }"
     with pytest.raises(CaseError, match="makes 1001000 members; at most 1000000"):
-        read("[sweep.drive]\namplitude = {}\nfrequency = {}".format(*rows))
+        sweep_of(f"[sweep.drive]\namplitude = {amplitudes}\nfrequency = {frequencies}")
 
 
 @given(
@@ -140,16 +191,23 @@ def test_many_members_are_cheap_until_one_is_asked_for():
 )
 @settings(max_examples=50)
 def test_a_range_has_its_ends_and_rises(first, ratio, count, kind):
-    plan = read(f"[sweep.drive]\namplitude = {{ {kind} = [{first!r}, {first * ratio!r}], count = {count} }}")
+    """A range has its count of values, its ends, and equal differences of values or of their logarithms."""
+    plan = sweep_of(f"[sweep.drive]\namplitude = {{ {kind} = [{first!r}, {first * ratio!r}], count = {count} }}")
+
     values = np.array(plan.axes[0]["drive.amplitude"])
     assert len(values) == count
     assert values[[0, -1]] == pytest.approx([first, first * ratio], rel=1e-12)
+    # A step may be a thousandth of the values: rounding takes the more of it.
     steps = np.diff(np.log(values) if kind == "log" else values)
     assert steps == pytest.approx(np.full(count - 1, steps[0]), rel=1e-6)
 
 
 def test_a_member_is_made_once():
-    plan = read("[sweep.drive]\namplitude = [1.0, 2.0]")
+    """A member is kept once it is made, and not passed on to a copy of the sweep, whose cases differ."""
+    plan = sweep_of("[sweep.drive]\namplitude = [1.0, 2.0]")
+
     members = plan.members()
-    assert plan.member(1) is members[1] is plan.members()[1]
+
+    assert plan.member(1) is members[1]
+    assert plan.members()[1] is members[1]
     assert plan.model_copy(update={"name": "other"}).member(1) is not members[1]
