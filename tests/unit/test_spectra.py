@@ -27,35 +27,46 @@ MASSES = (0.5, 2.0)
 
 
 def noise(shape, seed=0):
+    """Return standard normal numbers."""
     return np.random.default_rng(seed).standard_normal(shape)
 
 
 def split(signal, interval, edges):
-    """The parts of ``signal`` (t, ...) between consecutive ``edges`` in rad/s, at every sample."""
+    """Yield the parts of ``signal`` (t, ...) between consecutive ``edges`` in rad/s, at every sample."""
     nt = len(signal)
     spectrum = fft.dct(signal, type=1, axis=0)
-    part = np.searchsorted(edges, np.pi * np.arange(nt) / ((nt - 1) * interval), side="right") - 1
-    for p in range(len(edges) - 1):
-        inside = np.where((part == p).reshape(-1, *[1] * (signal.ndim - 1)), spectrum, 0.0)
-        yield fft.idct(inside, type=1, axis=0)
+    frequency = np.pi * np.arange(nt) / ((nt - 1) * interval)
+    part = np.searchsorted(edges, frequency, side="right") - 1
+
+    # One value a time, for all axes behind it.
+    part = part.reshape(-1, *[1] * (signal.ndim - 1))
+    for number in range(len(edges) - 1):
+        yield fft.idct(np.where(part == number, spectrum, 0.0), type=1, axis=0)
 
 
 @pytest.mark.parametrize(("row", "direction"), [(5, 1), (5, -1), (12, 1)])
 def test_a_plane_wave_lands_on_its_bin(row, direction):
+    """A wave of whole periods in time and space has all its energy in one bin of wavenumber and frequency."""
     nt = 128
     n = 48
     interval = 0.01
     column = 17
     kappa = direction * 2 * np.pi * row / n
     omega = 2 * np.pi * column / (nt * interval)
-    t, x = np.arange(nt)[:, None] * interval, np.arange(n)
+    t = np.arange(nt)[:, None] * interval
+    x = np.arange(n)
+    mass = 2.0
     velocity = np.cos(kappa * x - omega * t)[..., None]
-    found = dispersion(velocity, [2.0], interval, tapers=(0, 0))
+
+    found = dispersion(velocity, [mass], interval, tapers=(0, 0))
+
     k, w = np.unravel_index(np.argmax(found.energy), found.energy.shape)
     assert found.wavenumber[k] == pytest.approx(kappa)
     assert found.frequency[w] == pytest.approx(omega)
-    assert found.energy[k, w] == pytest.approx(0.5 * 2 * n * 0.5)  # m/2 sum of cos^2
+    # The sum over the cells of m/2 cos^2, whose mean is 1/2.
+    assert found.energy[k, w] == pytest.approx(0.5 * mass * n * 0.5)
     assert np.delete(found.energy.ravel(), found.energy.argmax()).max() < 1e-20
+
     fold = found.folded()
     k, w = np.unravel_index(np.argmax(fold.energy), fold.energy.shape)
     assert fold.wavenumber[k] == pytest.approx(abs(kappa))
@@ -64,16 +75,21 @@ def test_a_plane_wave_lands_on_its_bin(row, direction):
 @settings(max_examples=30)
 @given(st.integers(2, 40), st.integers(2, 40), st.integers(0, 99))
 def test_energies_obey_parseval(nt, n, seed):
+    """Energies over wavenumbers and frequencies sum to the kinetic energy, whatever the lengths."""
     velocity = noise((nt, n, 2), seed)
+
     kinetic = kinetic_energy(velocity, MASSES)
     assert kinetic.sum() == pytest.approx(0.5 * np.sum(np.array(MASSES) * velocity**2), rel=1e-12)
+
     wavenumber, content = wavenumber_content(velocity, MASSES)
     assert np.allclose(content.sum(axis=1), kinetic.sum(axis=1), rtol=1e-12)
     assert wavenumber[0] == 0
     assert wavenumber[-1] <= np.pi * (1 + 1e-15)
+
     found = dispersion(velocity, MASSES, 0.1, tapers=(0, 0))
     assert found.energy.sum() == pytest.approx(kinetic.sum(axis=1).mean(), rel=1e-12)
     assert np.all(np.diff(found.wavenumber) > 0)
+
     fold = found.folded()
     assert fold.energy.shape == (len(fold.wavenumber), len(fold.frequency))
     assert fold.energy.sum() == pytest.approx(found.energy.sum(), rel=1e-12)
@@ -82,23 +98,31 @@ def test_energies_obey_parseval(nt, n, seed):
 @settings(max_examples=30)
 @given(st.integers(2, 60), st.integers(1, 5), st.integers(0, 99), st.lists(st.floats(1, 40), max_size=5, unique=True))
 def test_parts_are_a_partition(nt, n, seed, inner):
+    """The energies of all parts, integrated over time, sum to that of the signal."""
     edges = np.array([0.0, *sorted(inner), np.inf])
     signal = noise((nt, n), seed)
+
+    # The trapezoidal rule is the one in which cosines of a DCT-I are orthogonal.
     energy = part_energies(signal[..., None], [2.0], 0.1, edges).sum(axis=0)
     assert trapezoid(energy) == pytest.approx(trapezoid(np.sum(signal**2, axis=1)), rel=1e-12)
 
 
 def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
+    """Energies and maps of parts are those of the parts themselves, computed at once or in blocks."""
     velocity = noise((64, 10, 2))
     edges = [0.0, 8.0, 20.0, np.inf]
     energy = part_energies(velocity, MASSES, 0.1, edges)
     total = kinetic_energy(velocity, MASSES).sum(axis=1)
     assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=1e-12)
+
     for memory in (1.0, 2e4):
         monkeypatch.setattr("vipetsc.spectra.band_energies.COLUMNS", 6)
         assert np.allclose(part_energies(velocity, MASSES, 0.1, edges, memory=memory), energy, rtol=1e-12)
+
     (middle,) = split(velocity, 0.1, edges[1:3])
     assert np.allclose(kinetic_energy(middle, MASSES).sum(axis=1), energy[1], rtol=1e-12)
+
+    # In blocks of 5 times and 3 cells, kept in single precision.
     maps = part_maps(velocity, MASSES, 0.1, [edges[:2], edges[1:3]], (5, 3), 1.0)
     assert maps.shape == (2, 13, 4)
     assert np.allclose(maps[1, 2, 1], kinetic_energy(middle, MASSES)[10:15, 3:6].mean(), rtol=1e-6)
@@ -108,57 +132,87 @@ def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
 @given(st.integers(2, 300), st.floats(0, 1), st.floats(0, 1), st.integers(0, 99))
 def test_few_times_give_the_energy_of_a_part_at_every_sample(nt, one, other, seed):
     """As many as the width of the part needs, wherever it lies and whatever the length."""
-    low, high = sorted((10 * np.pi * one, 10 * np.pi * other))
+    # The highest frequency of samples at this interval.
+    interval = 0.1
+    highest = np.pi / interval
+    edges = sorted((highest * one, highest * other))
     velocity = noise((nt, 3, 2), seed)
-    edges = [low, high]
-    energy = sum(kinetic_energy(part, MASSES).sum(axis=1) for part in split(velocity, 0.1, edges))
-    assert np.allclose(
-        part_energies(velocity, MASSES, 0.1, edges), [energy], rtol=0, atol=1e-12 * energy.max() + 1e-300
-    )
+
+    (part,) = split(velocity, interval, edges)
+    expected = kinetic_energy(part, MASSES).sum(axis=1)
+
+    energy = part_energies(velocity, MASSES, interval, edges)
+    # An empty part has the energy 0.
+    tolerance = 1e-12 * expected.max() + 1e-300
+    assert np.allclose(energy, [expected], rtol=0, atol=tolerance)
 
 
 def test_a_narrow_part_takes_few_times_and_a_wide_one_every_stride():
-    narrow = band_energies._fewest_steps(band_energies._Cosines(640, 895), 4420, 1)
-    assert 3 * 255 <= narrow < 1100
-    assert band_energies._fewest_steps(band_energies._Cosines(1100, 4400), 4420, 1) == 4420
-    assert band_energies._fewest_steps(band_energies._Cosines(1100, 4400), 4420, 10) < 460
+    """Steps in time follow from a part's width, and a stride makes them fewer; a last, open part is coarser for it."""
+    narrow = band_energies._Cosines(640, 895)
+    wide = band_energies._Cosines(1100, 4400)
+    # Squares of 255 cosines need at least three times as many points.
+    assert 3 * 255 <= band_energies._fewest_steps(narrow, 4420, 1) < 1100
+    assert band_energies._fewest_steps(wide, 4420, 1) == 4420
+    assert band_energies._fewest_steps(wide, 4420, 10) < 460
+
     velocity = noise((100, 3, 2))
     edges = [0.0, 20.0, np.inf]
-    every, some = (part_energies(velocity, MASSES, 0.1, edges, stride) for stride in (1, 10))
-    assert np.allclose(every[0], some[0], rtol=1e-12) and not np.allclose(every[1], some[1], rtol=0.1)
+    every = part_energies(velocity, MASSES, 0.1, edges, 1)
+    tenth = part_energies(velocity, MASSES, 0.1, edges, 10)
+    assert np.allclose(every[0], tenth[0], rtol=1e-12)
+    assert not np.allclose(every[1], tenth[1], rtol=0.1)
 
 
 def test_a_tone_stays_in_its_part():
+    """A tone of 200 rad/s that swells and fades leaves less than 1e-6 of its energy to other parts."""
     t = np.arange(2001) * 1e-3
-    velocity = (1 - np.cos(np.pi * t))[:, None, None] * np.sin(200 * t)[:, None, None]
+    velocity = ((1 - np.cos(np.pi * t)) * np.sin(200 * t))[:, None, None]
+
     energy = part_energies(velocity, [1.0], 1e-3, [0.0, 100.0, 300.0, np.inf]).sum(axis=1)
     assert energy[1] / energy.sum() > 1 - 1e-6
 
 
 def test_parts_name_bands_and_gaps():
+    """The four-band lattice's parts are its bands and gaps in order, with the edges of SPEC, and what is above."""
     parts = Parts.of(pass_bands(four_band("calibrated")))
     assert parts.names == ("band 1", "gap 1", "band 2", "gap 2", "band 3", "gap 3", "band 4", "above")
     assert np.allclose(parts.edges[1:-1], [612.25, 681.48, 1414.21, 2267.36, 3162.28, 3214.90, 3644.75], atol=0.006)
     assert [parts.names[i] for i in np.nonzero(parts.above(1023.27))[0]] == ["band 3", "band 4"]
+    # The driven band is the highest one of two.
     assert not Parts.of(pass_bands(diatomic())).above(5520.0).any()
+
+
+def test_parts_of_bands_that_overlap_touch_or_begin_above_zero():
+    """Bands that overlap are one part; a gap below the first band is named; a zero of rounding has none below it."""
     merged = Parts.of([Band(1, 0.0, 2.0), Band(2, 1.0, 3.0), Band(3, 5.0, 6.0)])
     assert merged.bands == ((1, 2), (), (3,), ())
     assert merged.edges.tolist() == [0, 3, 5, 6, np.inf]
     assert Parts.of([Band(1, 4.0, 6.0)]).names == ("gap 1", "band 1", "above")
     assert list(Parts.of([Band(1, 0.0, 5.0), Band(2, 1.0, 3.0), Band(3, 6.0, 7.0)]).edges) == [0, 5, 6, 7, np.inf]
-    assert Parts.of([Band(1, 1e-9, 6.0)]).names == ("band 1", "above")  # a free lattice's zero, rounded
+    # A free lattice's zero, rounded.
+    assert Parts.of([Band(1, 1e-9, 6.0)]).names == ("band 1", "above")
 
 
 def test_transfer_is_the_mean_share_after_arrival():
+    """The transfer is the mean over time, from the arrival on, of the fraction of the energy above the drive."""
     energy = np.array([[1.0, 1.0, 3.0], [0.0, 1.0, 1.0]])
     above = np.array([False, True])
+
+    # From sample 1 on: 1/2, then 1/4.
     assert ibtet(energy, above, 1) == pytest.approx((0.5 + 0.25) / 2)
+    # Without a part above, and without energy, there is none.
     assert np.isnan(ibtet(energy, ~above & above))
     assert np.isnan(ibtet(0 * energy, above))
+
+
+def test_a_front_has_arrived_at_a_hundredth_of_the_largest_value():
+    """The arrival is the first sample beyond 1 % of the maximum."""
     assert front_arrival(np.array([0, 1e-4, 0.02, 1.0, 0.5])) == 2
 
 
 def test_taper_keeps_the_mean_square():
+    """Tapers of any width are symmetric, with the mean square 1, and begin near zero."""
     for fraction in (0.0, 0.1, 1.0):
         window = taper(101, fraction)
         assert np.mean(window**2) == pytest.approx(1, rel=1e-14)
@@ -175,21 +229,27 @@ def test_ridge_of_a_packet_lies_on_the_branch():
     kappa = 2 * np.pi * rows / n
     weight = np.exp(-(((rows - 37) / 4) ** 2))
     omega = bloch(cell, kappa).frequency[:, 1]
-    t, x = np.arange(1200) * interval, np.arange(n)
+    t = np.arange(1200) * interval
+    x = np.arange(n)
     waves = np.exp(-1j * omega * t[:, None]) * weight
     velocity = (waves @ np.exp(1j * kappa[:, None] * (x - 40))).real[..., None]
+
     found, frequency = ridge(dispersion(velocity, [1.0], interval, tapers=(1, 0)), floor=1e-2)
     assert len(found) >= 10
-    assert np.all(found > 0)  # the packet travels one way only
+    # The packet travels one way only.
+    assert np.all(found > 0)
     branch = bloch(cell, found).frequency[:, 1]
     assert np.abs(frequency / branch - 1).max() < 1e-3
-    bins = 2 * np.pi / (1200 * interval)
-    assert np.abs(frequency - branch).max() < 0.1 * bins  # refined off the grid
+    # The ridge is refined off the grid of frequencies.
+    bin_width = 2 * np.pi / (1200 * interval)
+    assert np.abs(frequency - branch).max() < 0.1 * bin_width
 
 
 def test_ridge_leaves_quiet_wavenumbers_out():
+    """Wavenumbers with a billionth of the energy have no ridge; a symmetric peak has its ridge in the middle."""
     energy = np.full((3, 5), 1e-9)
     energy[1] = [1e-9, 0.5, 1.0, 0.5, 1e-9]
+
     found, frequency = ridge(Dispersion(np.arange(3.0), np.arange(5.0), energy))
     assert found.tolist() == [1.0]
     assert frequency == pytest.approx(2.0)
