@@ -91,3 +91,17 @@ def in_phase() -> Branch:
 
     assert continuation.finished
     return Branch(problem, points, [])
+    return Branch(problem, points, [])
+
+
+@pytest.fixture(scope="session")
+def short_branch() -> Branch:
+    """The out-of-phase branch of linear stops from the linear mode over both energy folds, without special points."""
+    problem = Shooting(Dop853Flow(reduced_model("bilinear")), MAPS["quarter"])
+    start = linear_start(problem, OUT_OF_PHASE, 0.02)
+    continuation = Continuation(problem, start, NnmTable(points=400, energy=[0.0, 1e4]))
+
+    points = [continuation.point, *continuation]
+
+    assert continuation.finished
+    return Branch(problem, points, [])

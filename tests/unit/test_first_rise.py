@@ -1,0 +1,133 @@
+"""The first change of a gap within a step: pairs of changes, near misses and starts on a change, in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from numpy.polynomial import Polynomial
+from scipy.integrate import DOP853
+
+from vipetsc.modes.shooting import dop853
+from vipetsc.modes.shooting.landing import CROSSING, EXTREMUM, NONE, first_rise
+
+# Rounding of a gap of order one.
+ROUNDING = 1e-12
+
+
+def interpolation_error(coefficients: np.ndarray) -> float:
+    """Return what the search allows for the interpolant's error, from its coefficients of orders 4 and 5."""
+    return 0.01 * (abs(coefficients[5]) + 0.3 * abs(coefficients[4]))
+
+
+def starting_gap(mantissas: tuple[float, ...], exponents: tuple[float, ...], start: str) -> np.ndarray:
+    """Return a polynomial at or below zero at 0: anywhere, on zero and falling, or at an extremum."""
+    coefficients = np.array(mantissas) * 10.0 ** np.array(exponents)
+    coefficients[0] = -abs(coefficients[0])
+    if start == "landed":
+        coefficients[0] = 0.0
+        coefficients[1] = -abs(coefficients[1])
+    if start == "extremum":
+        coefficients[1] = 0.0
+    return coefficients
+
+
+@pytest.mark.slow
+@given(
+    mantissas=st.tuples(*[st.floats(-1, 1)] * 6),
+    exponents=st.tuples(*[st.floats(-3, 0)] * 6),
+    start=st.sampled_from(["below", "landed", "extremum"]),
+)
+@example((0.0, 0.0, 0.5, -1.0, 0.0, 1.0), (0.0, 0.0, -3.0, -2.25, 0.0, -1.0), "below")
+@settings(max_examples=400)
+def test_the_first_change_of_a_gap_is_found(mantissas, exponents, start):
+    """Against dense sampling: nothing above the interpolant's error is missed, or comes before what is found."""
+    coefficients = starting_gap(mantissas, exponents, start)
+    margin = interpolation_error(coefficients)
+
+    position, outcome = first_rise(tuple(coefficients))
+
+    sampled = np.linspace(0, 1, 4001)[1:]
+    gap = Polynomial(coefficients)(sampled)
+    # A hundredth more than the margin: on the margin itself rounding decides.
+    clearly_above = np.nonzero(gap > 1.01 * margin + ROUNDING)[0]
+    if clearly_above.size:
+        assert outcome != NONE
+        assert position <= sampled[clearly_above[0]]
+
+    if outcome == NONE:
+        assert gap.max() <= ROUNDING + 1.01 * margin
+    else:
+        before = gap[sampled < position - 1e-9]
+        assert before.max(initial=-1.0) <= ROUNDING + margin
+        allowed = ROUNDING if outcome == CROSSING else margin + ROUNDING
+        assert abs(Polynomial(coefficients)(position)) <= allowed
+
+
+def test_a_hump_next_to_a_dip_in_one_quarter_of_a_step_is_found():
+    """A contact that has just opened closes again and opens, all within the first fifth of a step."""
+    position, outcome = first_rise((0.0, -4.6e-4, 5.0e-2, -0.31, 2.2e-4, 1.4e-3))
+
+    assert outcome == CROSSING
+    assert 0 < position < 0.02
+
+
+def test_a_hump_within_the_interpolants_error_comes_before_the_root_behind_it():
+    """Slope (x - .05)(x - .15), so that .05 is a largest value and the gap rises again within the same quarter."""
+    rise = Polynomial.fromroots([0.05, 0.15]).integ().coef
+    # The coefficient of order 5 makes the error 1e-5, ten times the gap's largest value.
+    coefficients = np.append(rise, [0.0, 1e-3])
+    coefficients[0] = 1e-6 - Polynomial(coefficients)(0.05)
+
+    position, outcome = first_rise(tuple(coefficients))
+
+    assert outcome == EXTREMUM
+    assert position == pytest.approx(0.05, abs=1e-3)
+
+
+def test_the_second_hump_of_a_gap_is_found():
+    """Slope -(x - .1)(x - .45)(x - .9): the first largest value is 2e-3 below zero, the second 2.3e-3 above."""
+    slope = -Polynomial.fromroots([0.1, 0.45, 0.9])
+    coefficients = np.append(slope.integ().coef, 0.0)
+    coefficients[0] = -2e-3 - slope.integ()(0.1)
+
+    position, outcome = first_rise(tuple(coefficients))
+
+    assert outcome == CROSSING
+    assert 0.45 < position < 0.9
+    assert Polynomial(coefficients)(position) == pytest.approx(0, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("largest_in_errors", "expected"), [(0.5, EXTREMUM), (-0.5, EXTREMUM), (-2, NONE), (2, CROSSING)]
+)
+def test_a_gap_that_nearly_closes_is_left_to_the_flow(largest_in_errors, expected):
+    """A largest value at .4, within the interpolant's error of zero, is an extremum; beyond it, a change or none."""
+    coefficients = np.array([0.0, 0.8, -1.0, 0.0, 0.0, -0.02])
+    turns = Polynomial(coefficients).deriv().roots()
+    inside = (turns.imag == 0) & (turns.real > 0) & (turns.real < 1)
+    top = turns[inside].real[0]
+    coefficients[0] = largest_in_errors * interpolation_error(coefficients) - Polynomial(coefficients)(top)
+
+    position, outcome = first_rise(tuple(coefficients))
+
+    assert outcome == expected
+    if outcome == EXTREMUM:
+        assert position == pytest.approx(top, abs=1e-8)
+
+
+@pytest.mark.parametrize("rounding", [1e-17, 0.0, -1e-17])
+def test_a_step_that_starts_on_a_near_miss_leaves_it(rounding):
+    """A start on an extremum below zero, whose slope is a rounding, is no change: the gap falls from there."""
+    assert first_rise((-1e-4, rounding, -1.0, 0.0, 0.5, 0.3)) == (1.0, NONE)
+
+
+def test_the_tableau_is_the_one_of_dop853():
+    """The coefficients in the package's table are SciPy's to the bit."""
+    for name in ("A", "B", "E3", "E5"):
+        ours = getattr(dop853, name)
+        reference = getattr(DOP853, name)
+        # SciPy's tables also hold the stages of a dense output, which the flow has no use for.
+        same_part = reference[tuple(slice(n) for n in ours.shape)]
+        assert np.array_equal(ours, same_part), name

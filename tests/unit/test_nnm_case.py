@@ -1,0 +1,121 @@
+"""The section [nnm]: problems named all at once, cases written out and read back, what branches do not support."""
+
+from __future__ import annotations
+
+import tomllib
+
+import pytest
+
+from tests.models import CLEARANCE
+from vipetsc.case import CaseError
+from vipetsc.case.nnm import NnmCase
+from vipetsc.modes.system import System
+
+
+def test_a_case_reports_everything_at_once():
+    """One error names every wrong key and value of all sections, with the key or value that was meant."""
+    table = {
+        "contacts": {"law": "bilinaer"},
+        "nnm": {"modes": [0], "larget_step": 1.0, "guards": {"turn": -1.0}},
+        "nmn": {},
+    }
+    with pytest.raises(CaseError) as caught:
+        NnmCase.from_table(table)
+
+    text = str(caught.value)
+    for part in ("contacts.law", "bilinear", "nnm.modes", "largest_step", "guards.turn", "did you mean nnm"):
+        assert part in text
+
+
+def test_a_case_is_written_out_and_read_back():
+    """The text of a case holds the contact's default numbers, and gives the same case and system again."""
+    case = NnmCase.from_table({"name": "a", "lattice": {"reading": "printed"}, "contacts": {"law": "bilinear"}})
+
+    table = tomllib.loads(case.to_toml())
+
+    assert NnmCase.from_table(table) == case
+    contacts = table["contacts"]
+    # SPEC section 9.
+    assert contacts["modulus"] == 1e8
+    assert contacts["radius"] == 0.005
+    assert contacts["poisson"] == 0.3
+    assert contacts["clearance"] == [CLEARANCE]
+    system = System.from_case(case)
+    assert system.contacts[0].clearance == pytest.approx(CLEARANCE)
+    assert [system.branch_name(mode) for mode in (0, 1)] == ["in-phase", "out-of-phase"]
+
+
+@pytest.mark.parametrize(
+    ("nnm", "message"),
+    [
+        ({"modes": [3]}, "2 modes"),
+        ({"system": "own"}, r"nnm.own"),
+        # A branch that is followed downwards ends at its lowest energy, which must not be that of rest.
+        ({"direction": "down"}, "lowest energy above 0"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(nnm, message):
+    """A mode that the system lacks, a system that is not given and a direction without an end are refused."""
+    with pytest.raises(CaseError, match=message):
+        NnmCase.from_table({"nnm": nnm})
+
+
+# What a spring, a smooth spring and a contact need besides the pair that it stands between.
+PAIR = {"start": 1, "end": 2}
+WRONG_PAIRS = {
+    "springs": PAIR | {"stiffness": 1.0},
+    "smooth": PAIR | {"cubic": 1.0},
+    "contacts": {"host": 1, "resonator": 2, "clearance": 1.0},
+}
+
+
+@pytest.mark.parametrize("key", WRONG_PAIRS)
+def test_pairs_that_are_not_in_the_system_are_named(key):
+    """A spring or contact to the second mass of a system of one mass is refused by its key."""
+    own = {"masses": [1.0], "springs": [{"start": 0, "end": 1, "stiffness": 1.0}], "smooth": [], "contacts": []}
+    own[key] = [*own[key], WRONG_PAIRS[key]]
+
+    with pytest.raises(CaseError, match=rf"nnm.own.{key}.*not a pair of the 1 masses"):
+        NnmCase.from_table({"nnm": {"system": "own", "own": own}})
+
+
+def test_a_cell_of_ones_own_needs_clearances_and_a_stiffness():
+    """Presets have a clearance and a contact's stiffness by default; for another cell both are asked for."""
+    springs = [{"start": 1, "end": 2, "stiffness": 1.0}, {"start": 2, "end": 1, "stiffness": 1.0, "next_cell": True}]
+    lattice = {"cell": {"masses": [1.0, 1.0], "springs": springs, "contact": [1, 2]}}
+
+    with pytest.raises(CaseError, match=r"contacts\.clearance"):
+        NnmCase.from_table({"lattice": lattice, "contacts": {"stiffness": 1.0}})
+    with pytest.raises(CaseError, match=r"contacts\.stiffness: missing; give it or also modulus, radius, poisson"):
+        NnmCase.from_table({"lattice": lattice, "contacts": {"clearance": 0.1}})
+
+
+def test_a_restitution_is_warned_of():
+    """Normal modes are conservative: a restitution below 1 is ignored with a warning, one of 1 without."""
+    lossy = NnmCase.from_table({"contacts": {"restitution": 0.7}})
+    assert lossy.warnings() == ["contacts.restitution = 0.7 counts as 1: normal modes lose nothing"]
+    assert NnmCase.from_table({"contacts": {"restitution": 1.0}}).warnings() == []
+
+
+@pytest.mark.parametrize("nnm", [{}, {"system": "chain"}, {"system": "condensed", "start_frequency": [1600.0]}])
+@pytest.mark.parametrize(
+    ("table", "key"),
+    [
+        ({"contacts": {"law": "power"}}, r"contacts\.exponent: missing"),
+        ({"contacts": {"exponent": 3.0}}, r"contacts\.exponent = 3.0: is for law"),
+        ({"contacts": {"side": "plus"}}, r"contacts\.side"),
+        ({"contacts": {"clearance_minus": 2e-3}}, r"contacts\.clearance_minus"),
+        ({"contacts": {"each": {"law": ["bilinear"]}}}, r"contacts\.each"),
+        ({"contacts": {"next_cell": True}}, r"contacts\.next_cell"),
+        ({"lattice": {"damping": {"mass": 1.0}}}, "without dashpots"),
+        ({"lattice": {"absorbing": {"cells": 2, "strength": 1.0}}}, r"lattice\.absorbing"),
+        ({"disorder": {"seed": 1, "cells": {"masses": {"relative": 0.01}}}}, "disorder"),
+    ],
+)
+def test_what_branches_do_not_support_is_refused(nnm, table, key):
+    """Dissipation, disorder, and contacts that differ or are not symmetric are refused for every kind of system."""
+    contacts = {"sites": [2], "clearance": 1e-3} | table.get("contacts", {})
+    lattice = {"preset": "four-band", "cells": 8} | table.get("lattice", {})
+
+    with pytest.raises(CaseError, match=key):
+        NnmCase.from_table(table | {"contacts": contacts, "lattice": lattice, "nnm": nnm})

@@ -1,0 +1,103 @@
+"""Regions of a branch and the power laws of its slope in them, on slopes whose exponents are exact."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vipetsc.modes.branches.regions import assign_regions, fit_slope
+
+# The energy in J at which the contacts of the branches below begin.
+FIRST_CONTACT = 1e-2
+
+
+def two_powers(energy: np.ndarray, factor: float, peak: float, exponent: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return factor/E + peak (E/E_0)^exponent beyond the first contact E_0, and the second term's fraction of it."""
+    touched = energy > FIRST_CONTACT
+    second = peak * (energy / FIRST_CONTACT) ** exponent
+    slope = np.where(touched, factor / energy + second, 0.0)
+    return slope, second / np.where(touched, slope, 1.0)
+
+
+def test_regions_and_power_law_of_a_constructed_branch():
+    """A slope of E^-1 after a steep grazing peak has regions I to IV in this order, and the exponent -1 in IV."""
+    energy = np.geomspace(1e-3, 1e6, 400)
+    touched = energy > FIRST_CONTACT
+    slope, _ = two_powers(energy, factor=1e3, peak=1e4, exponent=-6.0)
+    # The time in contact approaches the whole, as the clearance becomes negligible.
+    decades = np.log10(np.maximum(energy / FIRST_CONTACT, 1))
+    closed = np.where(touched, 1 - 0.5 / (1 + decades**2), 0.0)
+
+    region = assign_regions(energy, slope, touched.astype(int), closed)
+
+    assert np.all(np.diff(region) >= 0)
+    assert set(region) == {1, 2, 3, 4}
+    assert np.all((region == 1) == ~touched)
+    assert closed[region == 4].min() >= 0.95 > closed[region == 3].max()
+
+    law = fit_slope(energy, slope, region)["IV"]
+    # In region IV what is left of the peak changes the exponent by less than a thousandth.
+    assert law["exponent"] == pytest.approx(-1, abs=1e-3)
+    assert law["adjusted_r2"] > 0.9999
+    assert law["points"] == np.sum(region == 4)
+
+
+def test_region_three_begins_where_the_exponent_settles():
+    """Of E^-1 + c E^-6, the second with the fraction a: exponent -1 - 5 a, growth 25 a (1 - a) = 1/2 at a = 0.0204."""
+    energy = np.geomspace(1e-3, 1e6, 4000)
+    touched = energy > FIRST_CONTACT
+    slope, fraction = two_powers(energy, factor=1e3, peak=1e4, exponent=-6.0)
+
+    region = assign_regions(energy, slope, touched.astype(int), np.zeros(4000))
+
+    begin = np.nonzero(region == 3)[0][0]
+    # a (1 - a) = 0.02; a point further on, the fraction is 3 % less.
+    assert fraction[begin] == pytest.approx((1 - np.sqrt(0.92)) / 2, rel=0.05)
+    laws = fit_slope(energy, slope, region)
+    assert set(laws) == {"II", "III"}
+    assert laws["II"]["exponent"] < -1.2
+    assert laws["III"]["exponent"] == pytest.approx(-1, abs=1e-3)
+    assert laws["II"]["points"] == begin - np.argmax(slope)
+
+
+def test_the_law_of_region_two_is_that_of_its_falling_part():
+    """The law is fitted behind the last point where the branch goes backwards, and behind the peak."""
+    energy = np.geomspace(1, 100, 60)
+    first = np.full(5, 9.0)
+    backwards = [-1.0]
+    rising = energy[6:20] ** 3
+    falling = energy[20:] ** -2.5 * energy[20] ** 5.5
+    slope = np.concatenate([first, backwards, rising, falling])
+
+    laws = fit_slope(energy, slope, np.full(60, 2))
+
+    assert laws["II"]["exponent"] == pytest.approx(-2.5, abs=1e-12)
+    assert laws["II"]["points"] == len(falling)
+
+
+def test_too_few_points_or_no_numbers_have_no_law():
+    """Three points, or slopes that are not numbers, have no power law."""
+    energy = np.geomspace(1, 100, 60)
+    assert fit_slope(energy[:3], energy[:3] ** -1.0, np.full(3, 3)) == {}
+    assert fit_slope(energy, np.full(60, np.nan), np.full(60, 3)) == {}
+
+
+def test_a_steep_fall_from_the_peak_is_grazing_even_where_it_is_steady():
+    """E^-1 + c E^-3: the exponent -1 - 2 a stays at -3 first; from a(1 - a) = 1/8 on it has settled above -2."""
+    energy = np.geomspace(1e-3, 1e6, 4000)
+    touched = energy > FIRST_CONTACT
+    slope, fraction = two_powers(energy, factor=1.0, peak=1e8, exponent=-3.0)
+
+    region = assign_regions(energy, slope, touched.astype(int), np.zeros(4000))
+
+    assert fraction[region == 3].max() == pytest.approx((1 - np.sqrt(0.5)) / 2, rel=0.02)
+
+
+def test_regions_without_contacts():
+    """A linear branch is region I throughout; one of smooth springs alone belongs to no region."""
+    energy = np.geomspace(1e-3, 1e3, 50)
+    episodes = np.zeros(50, int)
+    closed = np.zeros(50)
+
+    assert set(assign_regions(energy, np.zeros(50), episodes, closed)) == {1}
+    assert set(assign_regions(energy, 1 / energy, episodes, closed)) == {0}

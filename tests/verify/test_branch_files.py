@@ -1,0 +1,193 @@
+"""Files of branches: written and read back, opened by xarray, drawn, stopped and resumed to the same bits."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import fields
+from pathlib import Path
+
+from mpi4py import MPI
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from vipetsc.case.nnm import NnmCase
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.branch_checks import sampled
+from vipetsc.modes.branches.files import LAYOUTS, read_branch, write_branch
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.regions import regions
+from vipetsc.parallel import StopRequest
+
+NAME = "branch-out-of-phase"
+
+
+@pytest.fixture(scope="module")
+def branch(short_branch) -> Branch:
+    """The short branch with its last orbit sampled, as ``follow_all`` makes it."""
+    points = short_branch.points
+    return Branch(
+        name="out-of-phase",
+        case="name = 'x'",
+        dofs=2,
+        points=points,
+        next_step=0.1,
+        complete=True,
+        ending="done",
+        findings=["a", "b"],
+        extra=sampled(short_branch.problem, points[-1:]),
+    )
+
+
+def table_of(branch: Branch) -> str:
+    """Return the CSV table of a branch as text."""
+    return str(LAYOUTS[branch.kind].table(branch))
+
+
+def follow(folder: Path, listener=None, stop=None, resume=False, **nnm) -> Branch:
+    """Follow the out-of-phase branch of linear stops as a case asks for it; ``nnm`` updates its table [nnm]."""
+    folder.mkdir(exist_ok=True)
+    table = {
+        "name": "x",
+        "lattice": {"preset": "four-band", "reading": "printed"},
+        "contacts": {"law": "bilinear", "modulus": 1e8},
+        "nnm": {"modes": [2], "chart": "auto"} | nnm,
+    }
+    case = NnmCase.from_table(table)
+    return follow_all(case, folder, MPI.COMM_SELF, resume=resume, listener=listener, stop=stop)[0]
+
+
+def test_a_branch_file_is_read_back(branch, tmp_path):
+    """Every quantity of every point, the table and how the branch ended survive a file."""
+    write_branch(branch, tmp_path, {"ranks": 1})
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{NAME}.csv", f"{NAME}.h5"]
+
+    restored = read_branch(tmp_path / f"{NAME}.h5")
+
+    for read, written in zip(restored.points, branch.points, strict=True):
+        # The next step stands with the branch, not with each point.
+        for name in {field.name for field in fields(written)} - {"next_step"}:
+            same = np.array_equal(getattr(read, name), getattr(written, name), equal_nan=name != "kind")
+            assert same, name
+    assert restored.next_step == branch.next_step
+    assert table_of(restored) == table_of(branch)
+    assert restored.ending == "done"
+    assert restored.complete
+    assert restored.findings == ["a", "b"]
+
+
+def test_the_table_of_a_branch_has_its_points(branch, tmp_path):
+    """A row of the CSV file holds a point's energy, slope, contacts, region and kind, in columns of these names."""
+    write_branch(branch, tmp_path, {"ranks": 1})
+
+    with (tmp_path / f"{NAME}.csv").open() as file:
+        rows = list(csv.DictReader(file))
+
+    assert list(rows[0])[-6:] == ["half_trace", "multiplier_max", "slope", "contacts", "region", "kind"]
+    assert [float(row["energy"]) for row in rows] == [point.energy for point in branch.points]
+    assert [int(row["region"]) for row in rows] == regions(branch).tolist()
+    # The first orbit is linear, with no slope: NaN differs from itself.
+    for row, point in zip(rows[1:], branch.points[1:], strict=True):
+        assert float(row["slope"]) == point.slope
+        assert int(row["contacts"]) == point.episodes
+        assert row["kind"] == point.kind
+
+
+def test_files_from_before_kinds_were_named_are_read(branch, tmp_path):
+    """A file without ``branch_kind``, which earlier versions left, is read as a branch of orbits."""
+    write_branch(branch, tmp_path, {})
+    path = tmp_path / f"{NAME}.h5"
+    with h5py.File(path, "a") as file:
+        del file.attrs["branch_kind"]
+
+    restored = read_branch(path)
+
+    assert restored.kind == branch.kind
+    assert [point.energy for point in restored.points] == [point.energy for point in branch.points]
+
+
+def test_xarray_opens_a_branch(branch, tmp_path):
+    """xarray finds units and named dimensions, and sampled orbits in a group of their own, which begin at rest."""
+    write_branch(branch, tmp_path, {})
+    path = tmp_path / f"{NAME}.h5"
+
+    with xr.open_dataset(path, engine="h5netcdf") as data:
+        assert data.frequency.attrs["units"] == "Hz"
+        assert data.initial.dims == ("point", "dof")
+        assert float(data.energy[0]) == branch.points[0].energy
+
+    last = branch.points[-1]
+    with xr.open_dataset(path, engine="h5netcdf", group="orbits") as orbits:
+        assert np.array_equal(orbits.displacement[0, 0], last.x)
+        assert np.all(orbits.velocity[0, 0] == 0)
+        assert float(orbits.energy[0]) == last.energy
+        assert int(orbits.number[0]) == last.index
+
+
+@pytest.mark.slow
+def test_a_picture_is_drawn_from_the_file(branch, tmp_path):
+    """A branch's file alone is enough for its picture."""
+    # Loads matplotlib, which no other test here needs.
+    from vipetsc.figures.registry import draw
+
+    write_branch(branch, tmp_path, {})
+
+    (path,) = draw("branches", [tmp_path])
+
+    assert path == tmp_path / "figures" / f"{NAME}.png"
+    assert path.stat().st_size > 20000
+
+
+def test_orbits_have_the_energies_that_are_asked_for(tmp_path):
+    """Between its two folds, .0264 and .02934 J, the branch passes an energy three times."""
+    branch = follow(tmp_path / "a", energy=[0.0, 0.05], orbits_at=[0.028, 0.0316, 9.0], locate=False)
+
+    # Those asked for are appended to the orbits that every branch samples.
+    energies = branch.extra["orbits/energy"].values[-4:]
+    periods = branch.extra["orbits/period"].values[-4:]
+    assert energies == pytest.approx([0.028] * 3 + [0.0316], rel=1e-12)
+    assert len(set(periods)) == 4
+    assert branch.findings == ["the branch has no orbit of 9 J"]
+
+
+@pytest.mark.slow
+def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(tmp_path, monkeypatch):
+    """A branch that was stopped in either half, and resumed each time, leaves the files of one that was not."""
+    # The growing branch is written after every point, which takes no test of the clock.
+    monkeypatch.setattr("vipetsc.modes.branches.follow.SAVE_EVERY", 0.0)
+    nnm = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.05]}
+    nnm |= {"switch": ["period-doubling"], "switch_points": 3}
+    parts = tmp_path / "parts"
+    whole = tmp_path / "whole"
+    stop = StopRequest()
+    saved = set()
+
+    def listener(branch, point):
+        saved.update(path.name for path in parts.iterdir())
+        stop.requested = (branch.name, point.index) in {("out-of-phase-down", 5), ("out-of-phase", 7)}
+
+    first = follow(parts, listener, stop, **nnm)
+    assert first.ending.startswith("stopped on request")
+    assert not (parts / f"{NAME}.h5").exists()
+    second = follow(parts, listener, stop, resume=True, **nnm)
+    assert second.ending == "stopped on request after point 7; resume goes on"
+    assert {f"{NAME}-down.h5", f"{NAME}.h5"} <= saved
+
+    last = follow(parts, resume=True, **nnm)
+    uninterrupted = follow(whole, **nnm)
+
+    assert last.complete
+    assert table_of(last) == table_of(uninterrupted)
+    names = {path.name for path in whole.iterdir()}
+    assert names == {path.name for path in parts.iterdir()}
+    for name in names:
+        if name.endswith("csv"):
+            assert (parts / name).read_text() == (whole / name).read_text()
+
+    # A crossing branch whose file is lost is followed again.
+    crossing = next(name for name in names if "doubling" in name and name.endswith("h5"))
+    (parts / crossing).unlink()
+    follow(parts, resume=True, **nnm)
+    assert (parts / crossing).exists()

@@ -1,0 +1,149 @@
+"""Steps along a branch: their arclength, the guards that bound them, where a branch ends, crosses or stands still."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from tests.models import CLEARANCE, IN_PHASE, OUT_OF_PHASE, reduced_model
+from vipetsc.case.nnm import Guards, NnmTable
+from vipetsc.modes.branches.branch_checks import BranchMonitor, is_jump, suspects
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.continuation.guards import half_trace_change
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import unit
+from vipetsc.modes.shooting.charts import Relative
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.reference import Newmark
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start
+
+
+def test_steps_have_the_arclength_that_they_say(short_branch):
+    """t . (xi - xi0) = s in the chart of the point before, whose unknowns are of order one."""
+    for before, after in itertools.pairwise(short_branch.points):
+        chart = Relative(reduced_model(), before.x, before.period)
+        xi = chart.encode(before.x, before.period)
+        gap = before.x[1] - before.x[0]
+        size = np.abs(before.x).max()
+        scale = min(max(abs(gap), CLEARANCE), size)
+        assert xi == pytest.approx([before.x[0] / size, gap / scale, 1.0], rel=1e-12)
+
+        tangent = np.linalg.solve(chart.derivative(xi), before.tangent)
+        chord = chart.encode(after.x, after.period) - xi
+        assert tangent @ chord / np.linalg.norm(tangent) == pytest.approx(after.step, rel=1e-6)
+        assert after.index == before.index + 1
+
+
+@pytest.mark.parametrize(
+    ("name", "bound", "sentence"),
+    [
+        ("energy", [0.0, 0.0294], "left the energy range 0 to 0.0294 J"),
+        ("frequency", [0.0, 474.5], "left the frequency range 0 to 474.5 Hz"),
+    ],
+)
+def test_a_branch_ends_with_the_first_point_beyond_a_range(name, bound, sentence):
+    """The last point of a branch, and no other, is beyond the range that it says it has left."""
+    problem = Shooting(Dop853Flow(reduced_model()), MAPS["quarter"])
+    continuation = Continuation(problem, linear_start(problem, OUT_OF_PHASE, 0.02), NnmTable(**{name: bound}))
+
+    points = list(continuation)
+
+    assert continuation.ending == sentence
+    assert continuation.finished
+    outside = [number for number, point in enumerate(points, 1) if getattr(point, name) > bound[1]]
+    assert outside == [len(points)]
+
+
+def test_a_branch_that_has_used_up_its_points_is_not_finished():
+    """A branch that ends at the number of its points can go on, and says how."""
+    problem = Shooting(Dop853Flow(reduced_model()), MAPS["quarter"])
+    continuation = Continuation(problem, linear_start(problem, OUT_OF_PHASE, 0.02), NnmTable(points=3))
+
+    points = list(continuation)
+
+    assert len(points) == 3
+    assert continuation.ending == "3 points reached: raise nnm.points and resume to go on"
+    assert not continuation.finished
+
+
+def test_guards_are_what_the_points_obey(short_branch):
+    """No step strains a guard beyond its bound; some are held back by the half-trace, some by the turn."""
+    guards = Guards()
+    turns = []
+    changes = []
+    for before, after in itertools.pairwise(short_branch.points):
+        chart = Relative(reduced_model(), before.x, before.period)
+        derivative = chart.derivative(chart.encode(before.x, before.period))
+        first, second = (unit(np.linalg.solve(derivative, point.tangent)) for point in (before, after))
+
+        turns.append(np.arccos(np.clip(first @ second, -1, 1)))
+        changes.append(half_trace_change(before, after))
+        assert abs(before.episodes - after.episodes) <= guards.contacts
+
+    # Bounds that no step comes near would not be tested by this branch.
+    assert 0.3 * guards.half_trace < max(changes) <= guards.half_trace
+    assert 0.3 * guards.turn < max(turns) <= guards.turn
+
+
+def in_phase_hertz(**control) -> tuple[Shooting, list[Point]]:
+    """Follow the in-phase Hertz branch in the chart auto, up to just behind the tip of its 3:1 tongue."""
+    system = reduced_model("hertz")
+    problem = Shooting(Dop853Flow(system), MAPS["quarter"])
+    start = linear_start(problem, IN_PHASE, system.grazing_energy(IN_PHASE) / 100)
+    table = {"points": 150, "chart": "auto", "energy": [0, 6e9]} | control
+    continuation = Continuation(problem, start, NnmTable(**table))
+    return problem, [continuation.point, *continuation]
+
+
+def findings(problem: Shooting, points: list[Point]) -> list[str]:
+    """Return what the monitor of a growing branch says of its points."""
+    monitor = BranchMonitor(problem, Guards())
+    return [text for text in map(monitor.check, points) if text]
+
+
+def turns_too_far(problem: Shooting, points: list[Point]) -> list[int]:
+    """Return the points behind which the branch turns by more than one step may."""
+    return [number for number, reason in suspects(problem, points) if "turns by" in reason]
+
+
+# The tip of the in-phase Hertz branch's 3:1 tongue lies on the out-of-phase branch: a turn that the grazing chart hides
+# leads onto that. The true branch comes back from the tip, with c = 1 passed there, and no orbit repeats itself.
+@pytest.mark.slow
+def test_guarded_the_in_phase_hertz_branch_comes_back_from_the_tip():
+    """With the guard on turns the branch turns at the tip, and the monitor has nothing to say."""
+    problem, points = in_phase_hertz()
+
+    assert max(problem.turn(a, b) for a, b in itertools.pairwise(points)) > 0.2
+    assert turns_too_far(problem, points) == []
+    assert findings(problem, points) == []
+    assert points[-1].energy < points[124].energy < 0.031
+
+
+@pytest.mark.slow
+def test_unguarded_the_in_phase_hertz_branch_goes_over_to_the_out_of_phase_one():
+    """Without the guard on turns the branch goes on along another one passed three times; the checks name the place."""
+    problem, points = in_phase_hertz(guards=Guards(turn_relative=0), points=200)
+
+    assert max(problem.turn(a, b) for a, b in itertools.pairwise(points)) > 0.2
+    assert turns_too_far(problem, points) == [123]
+    assert findings(problem, points)[0] == "left its branch: the orbit of point 200 is another one passed 3 times"
+    assert is_jump(problem, points[123], points[124], NnmTable(chart="auto"))
+
+
+@pytest.mark.slow
+def test_a_branch_that_stands_still_says_so():
+    """Newmark's rule meets contacts at the ends of steps only: at grazing its branch stands, which the monitor says."""
+    monitor = BranchMonitor(Shooting(Dop853Flow(reduced_model()), MAPS["quarter"]), Guards(standstill=20))
+    problem = Shooting(Newmark(reduced_model()), MAPS["quarter"])
+    start = linear_start(problem, OUT_OF_PHASE, 0.0293434)
+    continuation = Continuation(problem, start, NnmTable(points=100, chart="auto"))
+
+    finding = next(text for text in map(monitor.check, continuation) if text)
+
+    assert finding.startswith("does not advance: 20 points up to ")
+    # The grazing energy, SPEC section 9.
+    assert "E = 0.0293434562 J" in finding
