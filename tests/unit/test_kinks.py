@@ -76,7 +76,7 @@ def test_substeps_end_where_a_pressed_contact_opens_and_closes(side):
     cluster.taylor[0, 1] = -side * speed * interval
     cluster.state["length"] = 1.0
 
-    assert advance_cluster(cluster) == DONE
+    assert advance_cluster(cluster, may_rest=False) == (DONE, -1)
 
     # The phase at which it opens, the time in the air, and the rest of the step on the stop again.
     opening = np.arcsin(depth * RATE / speed) / RATE

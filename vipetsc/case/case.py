@@ -120,7 +120,8 @@ class Case(CaseFile):
             yield from check_inhomogeneity(lattice, driven)
 
         if valid("lattice.cells", "contacts.sites"):
-            yield from check_contacts(lattice, contacts, valid)
+            initial = sections.get("initial") if valid("initial") else None
+            yield from check_contacts(lattice, contacts, initial, valid)
             if cell and valid("contacts"):
                 yield from check_pairs(lattice, contacts, cell, site_cells(lattice, contacts))
         if valid("initial.kind") and "initial" in sections:

@@ -1,7 +1,7 @@
 """The laws and stops of the sites of a case: one for all, with lists over the sites where they differ."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,8 +29,11 @@ def values_of_sites(contacts: ContactsTable, key: str, count: int) -> list[Any]:
     return lists_of(contacts).get(key) or [getattr(contacts, key)] * count
 
 
-def check_per_site(contacts: ContactsTable, count: int, gaps: list[float], valid: Valid) -> Iterator[Problem]:
-    """Problems with the laws and the stops of ``count`` sites with the clearances ``gaps`` in m."""
+def check_per_site(
+    contacts: ContactsTable, gaps: list[float], at_rest: Sequence[bool], valid: Valid
+) -> Iterator[Problem]:
+    """Problems with the laws and the stops of sites with the clearances ``gaps`` in m, ``at_rest`` (site,) at t = 0."""
+    count = len(gaps)
     per_site = lists_of(contacts)
     for key, values in per_site.items():
         if len(values) != count:
@@ -49,7 +52,7 @@ def check_per_site(contacts: ContactsTable, count: int, gaps: list[float], valid
     if has_material and lacking:
         yield Problem(f"contacts.{lacking[0]}", None, "missing; the stiffness of each site needs it")
     yield from _check_laws(contacts, count)
-    yield from _check_stops(contacts, count, gaps)
+    yield from _check_stops(contacts, gaps, at_rest)
 
 
 def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
@@ -75,9 +78,9 @@ def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
             yield Problem(_path_of(contacts, "restitution"), restitution, remedy)
 
 
-def _check_stops(contacts: ContactsTable, count: int, gaps: list[float]) -> Iterator[Problem]:
-    """Problems with contacts that are closed at rest: a second stop, or dissipation in a pressed contact."""
-    restitutions = values_of_sites(contacts, "restitution", count)
+def _check_stops(contacts: ContactsTable, gaps: list[float], at_rest: Sequence[bool]) -> Iterator[Problem]:
+    """Problems with contacts that are closed at rest: a second stop, or a dissipation that has no limit."""
+    restitutions = values_of_sites(contacts, "restitution", len(gaps))
     stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
     for number, (plus, minus) in enumerate(stops, 1):
         if min(plus, minus) <= 0 and max(plus, minus) < np.inf:
@@ -87,6 +90,15 @@ def _check_stops(contacts: ContactsTable, count: int, gaps: list[float]) -> Iter
         if min(plus, minus) < 0 and restitutions[number - 1] < 1:
             remedy = "a contact that is pressed together has no approach velocity: its restitution must be 1"
             yield Problem(_path_of(contacts, "precompression"), -min(plus, minus), f"site {number}: {remedy}")
+            return
+
+        is_singular = restitutions[number - 1] < 1 and contacts.approach_floor == 0
+        if min(plus, minus) == 0 and at_rest[number - 1] and is_singular:
+            remedy = (
+                f"site {number} touches its stop at rest: its first contact has no approach velocity, by which the"
+                " damping divides; give restitution = 1, a clearance, or an approach_floor in m/s"
+            )
+            yield Problem(_path_of(contacts, "restitution"), restitutions[number - 1], remedy)
             return
 
 

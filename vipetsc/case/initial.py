@@ -16,6 +16,9 @@ from vipetsc.lattice import Chain, UnitCell, bloch
 from vipetsc.lattice.modes import mode_frequency, mode_shape, number_near
 from vipetsc.lattice.packet import Packet, gaussian_packet
 
+# A packet's envelope has fallen below 1e-10, the tolerance of a landing, so many widths from its middle.
+PACKET_WIDTHS = 6.8
+
 
 class KindKeys(NamedTuple):
     """The keys of one kind of motion: those that it ``needs``, of which it needs ``one_of``, others that it takes."""
@@ -71,6 +74,12 @@ class InitialTable(Section):
     def moves(self) -> bool:
         """Whether there is motion at t = 0."""
         return self.kind != "zero"
+
+    def is_at_rest(self, cell: int) -> bool:
+        """Whether masses of the ``cell`` (from 1) are at rest at t = 0, as far as the section itself says."""
+        if self.kind == "packet" and self.cell and self.width:
+            return abs(cell - self.cell) > PACKET_WIDTHS * self.width
+        return not self.moves
 
     def packet(self, cell: UnitCell) -> Packet:
         """The packet, of 1 m; only of that kind."""

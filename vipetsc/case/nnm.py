@@ -194,7 +194,7 @@ class NnmCase(CaseFile):
         problems = [*_check_options(nnm), *refusals(cls, refusable, valid)]
         # Lists over sites are refused above; checking their values too would report them twice.
         if not contacts.each:
-            problems += check_per_site(contacts, 0, [], valid)
+            problems += check_per_site(contacts, [], [], valid)
 
         # Masses of the system, and how many of its lowest modes are motions as a whole.
         dofs = 2

@@ -10,7 +10,7 @@ from vipetsc.case.case_file import Problem, Table, Valid
 from vipetsc.case.contacts import check_per_site, pairs_of_sites, resolved_per_site
 from vipetsc.case.drive import DriveTable, packet_speed, resolve_drives, waveform_of
 from vipetsc.case.inhomogeneity import cell_variation, designed_end
-from vipetsc.case.initial import Beginning
+from vipetsc.case.initial import Beginning, InitialTable
 from vipetsc.case.schema import CONTACTS, PRESETS, DampingTable, LatticeTable, TimeTable
 from vipetsc.case.sites import ContactsTable, Span
 from vipetsc.case.waveforms import DEFAULT, SINES
@@ -200,8 +200,10 @@ def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Prob
         yield Problem("contacts.clearance", None, "missing; give the clearance in m")
 
 
-def check_contacts(lattice: LatticeTable, contacts: ContactsTable, valid: Valid) -> Iterator[Problem]:
-    """Problems with the sites of a run and with the law."""
+def check_contacts(
+    lattice: LatticeTable, contacts: ContactsTable, initial: InitialTable | None, valid: Valid
+) -> Iterator[Problem]:
+    """Problems with the sites of a run that begins with the motion ``initial``, and with the law."""
     yield from check_sites(lattice, contacts)
     is_unplaced = isinstance(contacts.sites, int) and lattice.preset is None  # a count needs a preset to place it
     has_stiffnesses = contacts.each and (contacts.each.stiffness or contacts.each.modulus)
@@ -211,7 +213,8 @@ def check_contacts(lattice: LatticeTable, contacts: ContactsTable, valid: Valid)
     has_clearances = contacts.clearance is not None or lattice.preset is not None or not sites
     gaps = clearances(lattice, contacts, len(sites)) if has_clearances else []
     if len(gaps) == len(sites):
-        yield from check_per_site(contacts, len(sites), gaps, valid)
+        at_rest = [initial is None or initial.is_at_rest(site) for site in sites]
+        yield from check_per_site(contacts, gaps, at_rest, valid)
 
 
 def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> Iterator[Problem]:

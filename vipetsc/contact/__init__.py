@@ -21,10 +21,16 @@ solves it for e = r. Fast separation makes g < 0, a
 pull; ``adhesion = "clip"`` holds the force at zero then, and a grazing onset is kept from an unbounded g by a floor
 of |w'_minus|.
 
-**Modes.** A site is free, closed (in contact) or clipped. Within a time step its mode is frozen and the law is
-continued as an odd function through x = 0: the force is smooth, so that no kink spoils the order of the method.
-Every change of mode is a switching function that crosses zero upwards: sigma w - D (onset), D - sigma w
+**Modes.** A site is free, closed (in contact), clipped or at rest in contact. Within a time step its mode is frozen and
+the law is continued as an odd function through x = 0: the force is smooth, so that no kink spoils the order of the
+method. Every change of mode is a switching function that crosses zero upwards: sigma w - D (onset), D - sigma w
 (separation), -g and g (clipping begins and ends).
+
+**Rest.** A site whose stop has no clearance may touch it at rest. A wave's front comes to it through all magnitudes
+below the tolerance of a landing, each with a root of its own: landings that lead nowhere. A site that would land again
+without having left the tolerance rests: its force is that of max(x, 0), without loss, and nothing is landed on until it
+is a hundred tolerances away. There it is free, or closed as after an onset from rest, which has no approach velocity:
+w'_minus is then the floor, without which only c = 0 has a limit.
 
 **Search.** w on a step of length h is the quintic Hermite interpolant of (w, w', w'') at both ends, in Bernstein
 form: w(s h) = sum_i b_i B_i(s). The coefficients bound the polynomial, and the number of their changes of sign bounds

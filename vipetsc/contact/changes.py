@@ -5,7 +5,8 @@ of one of two switching functions of the site's mode, each affine in w or in w':
 
 - free: w - D and -w - D, an onset on either side;
 - closed: D - side w, the separation, and with clipping -g (the force would turn into a pull);
-- clipped: D - side w, and g.
+- clipped: D - side w, and g;
+- resting: D - side w and side w - D, both less a distance far beyond the tolerance of a landing.
 """
 
 from typing import Any, NamedTuple
@@ -13,13 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import allocating, kernel
-from vipetsc.contact.law import CLIPPED, CLOSED, FREE, PERMANENT, contact_force, gap_of
+from vipetsc.contact.law import CLIPPED, CLOSED, FREE, PERMANENT, RESTING, contact_force, gap_of, resting_side
 from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
 # A site has landed on its clearance when |side w - D| is within this fraction of D (of its ``scale``).
 LANDED_W = 1e-10
 # ... and on g = 0 when |g| is within this.
 LANDED_G = 1e-9
+# A site at rest in contact has opened or closed when it is this fraction of its scale away from D: the many landings
+# that made it rest are over, and it lands at D again.
+MOVED_W = 100 * LANDED_W
 
 # The largest force in a step is sampled at the ends of so many intervals, then narrowed by golden sections.
 _INTERVALS = 8
@@ -78,6 +82,11 @@ def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
         return AffineForm(1, 0.0, -np.inf, 0.0, site.mode)
 
     side = 1 if site.mode > 0 else -1
+    if abs(site.mode) == RESTING:
+        moved = MOVED_W * site.scale
+        if function == 0:
+            return AffineForm(0, float(-side), gap_of(site, side) - moved, tolerance, FREE)
+        return AffineForm(0, float(side), -gap_of(site, side) - moved, tolerance, side * CLOSED)
     if function == 0:
         return AffineForm(0, float(-side), gap_of(site, side), tolerance, FREE)
     if not site.clip:
@@ -108,6 +117,21 @@ def _stays_free(site: Any, b: np.ndarray) -> bool:
     for w in b:
         within &= -minus < w < plus
     return within
+
+
+@kernel
+def stays_landed(site: Any, start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> bool:
+    """Whether a site that can rest stays within the tolerance of a landing in the step from ``start`` to ``end`` (3,).
+
+    ``b`` (6,) is overwritten.
+    """
+    if resting_side(site) == 0:
+        return False
+    bernstein(start, end, h, b)
+    stays = True
+    for w in b:
+        stays &= abs(w) <= LANDED_W * site.scale
+    return stays
 
 
 @kernel

@@ -14,8 +14,10 @@ from vipetsc.compiled import kernel
 from vipetsc.lattice import Contact
 from vipetsc.lattice.contact import PHASES
 
-# Modes of a site; the sign is the side.
-FREE, CLOSED, CLIPPED, PERMANENT = 0, 1, 2, 3
+# Speeds of approach in m/s are raised to this for an impact's duration: the energy of a slower one underflows.
+SLOWEST = 1e-100
+# Modes of a site; the sign is the side. Those from PERMANENT on have the force of max(x, 0), without loss.
+FREE, CLOSED, CLIPPED, PERMANENT, RESTING = 0, 1, 2, 3, 4
 
 ELASTIC = np.dtype([(name, np.float64) for name in ("stiffness", "exponent", "duration_factor", "speed_exponent")])
 """Parameters of an elastic law: kc in N/m^n, the power n with which the force begins, ``Contact.duration_factor``.
@@ -111,6 +113,19 @@ def gap_of(site: Any, side: float) -> float:
 
 
 @kernel
+def resting_side(site: Any) -> int:
+    """The side on which a ``SITE`` may rest in contact, that of a stop without clearance; 0 if it cannot rest.
+
+    The damping of a contact that is pressed from rest has no limit without a floor of the approach velocity.
+    """
+    if site.damping != 0.0 and site.floor == 0.0:
+        return 0
+    if site.clearance == 0.0:
+        return 1
+    return -1 if site.clearance_minus == 0.0 else 0
+
+
+@kernel
 def elastic_force_and_slope(law: Any, x: float) -> tuple[float, float]:
     """f in N and df/dx in N/m at the indentation x in m, continued as an odd function to x < 0.
 
@@ -152,6 +167,7 @@ def begins_linearly(law: Any) -> bool:
 def impact_time(site: Any, speed: float) -> float:
     """Contact time in s of an isolated conservative impact on a ``SITE`` at ``speed`` in m/s: see ``Contact``."""
     law = site.elastic
+    speed = max(speed, SLOWEST)
     if law.duration_factor > 0.0:
         inertia = (law.exponent + 1.0) / 2.0 * site.reduced_mass
         depth = (inertia * speed**law.speed_exponent / law.stiffness) ** (1.0 / (law.exponent + 1.0))
@@ -186,8 +202,8 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
 
     side = 1.0 if site.mode > 0 else -1.0
     x = side * w - gap_of(site, side)
-    if abs(site.mode) == PERMANENT:
-        # No change of mode is looked for: the force itself has the kink where the masses part.
+    if abs(site.mode) >= PERMANENT:
+        # No change of mode at x = 0 is looked for: the force itself has the kink where the masses part.
         return side * elastic_force(site.elastic, max(x, 0.0)), 0.0
 
     elastic = elastic_force(site.elastic, x)

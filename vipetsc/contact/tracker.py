@@ -12,11 +12,13 @@ from vipetsc.contact.law import (
     CLOSED,
     FREE,
     PERMANENT,
+    RESTING,
     contact_force,
     elastic_energy,
     elastic_force,
     gap_of,
     impact_time,
+    resting_side,
 )
 
 # Limits of the contact law, of which it is counted how often they acted.
@@ -45,6 +47,12 @@ class Tracks(NamedTuple):
     sites: np.ndarray
     log: np.ndarray
     closed: np.ndarray
+
+
+@kernel
+def in_episode(mode: int) -> bool:
+    """Whether a site of this mode is in a contact that is logged: neither free nor at rest without load."""
+    return mode != FREE and abs(mode) != RESTING
 
 
 @njit(error_model="numpy")
@@ -89,7 +97,7 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
             episode = tracks.sites[i].episode
             episode.indentation = max(episode.indentation, side * end[i, 0] - gap_of(contacts[i], side))
             episode.force = max(episode.force, side * contact_force(contacts, i, end[i, 0], end[i, 1])[0])
-        elif contacts[i].mode != FREE:
+        elif in_episode(contacts[i].mode):
             update_episode(contacts, tracks, i, extremes(contacts, i, start, end, h))
 
 
@@ -117,14 +125,33 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
 
 
 @njit(error_model="numpy")
+def rest_site(contacts: np.ndarray, tracks: Tracks, i: int, motion: np.ndarray, energies: np.ndarray, t: float) -> bool:
+    """Let site ``i`` rest in contact if it touches a stop without clearance; whether it does. The log must have room.
+
+    Otherwise as ``switch_sites``. Motion below the tolerance of a landing can ask for one landing after the other at
+    the same time: the force of a site at rest needs none.
+    """
+    site = contacts[i]
+    side = resting_side(site)
+    if side == 0 or abs(site.mode) >= PERMANENT or abs(motion[i, 0]) > LANDED_W * site.scale:
+        return False
+    _set_mode(contacts, tracks, i, side * RESTING, motion[i, 1], energies[i], t)
+    return True
+
+
+@njit(error_model="numpy")
 def _set_mode(contacts: np.ndarray, tracks: Tracks, i: int, mode: int, rate: float, energy: float, t: float) -> None:
     """Give site ``i`` its new mode at w' = ``rate``; begin or end its episode, ``energy`` in J dissipated so far."""
     site = contacts[i]
     track = tracks.sites[i]
     episode = track.episode
-    was_free = site.mode == FREE
+    had_episode = in_episode(site.mode)
+    rested = abs(site.mode) == RESTING
     site.mode = mode
-    if was_free:
+    if not had_episode and in_episode(mode):
+        if rested and site.damping != 0.0:
+            # What is pressed from rest has no approach velocity but the floor.
+            rate = 0.0
         side = 1 if mode > 0 else -1
         # A grazing onset would make the factor g unbounded.
         track.counts.floored += abs(rate) < site.floor
@@ -132,13 +159,15 @@ def _set_mode(contacts: np.ndarray, tracks: Tracks, i: int, mode: int, rate: flo
         episode.site = track.number
         episode.side = side
         episode.onset = t
-        episode.approach_velocity = rate
+        episode.approach_velocity = 0.0 if rested else rate
         episode.separation = np.nan
         episode.indentation = 0.0
         episode.force = 0.0
         episode.loss = -energy  # what the site has dissipated by its end is added
-    elif mode == FREE:
+    elif had_episode and not in_episode(mode):
         track.pulls = False
+        if mode != FREE and episode.indentation <= LANDED_W * site.scale:
+            return  # it comes to rest where it had landed: no impact
         episode.separation = t
         episode.loss += energy
         tracks.log[tracks.closed[0]] = episode
@@ -240,13 +269,20 @@ class ImpactTracker:
         self.tracks = with_room(self.tracks)
         return switch_sites(self.contacts, self.tracks, self.start, energies, t)
 
+    def rest(self, number: int, t: float, energies: np.ndarray) -> None:
+        """Let the site of that ``number`` in the log rest in contact, if it is here; otherwise as ``switch``."""
+        self.tracks = with_room(self.tracks)
+        for i in np.flatnonzero(self.tracks.sites["number"] == number):
+            rest_site(self.contacts, self.tracks, i, self.start, energies, t)
+
     def take_episodes(self, energies: np.ndarray, unfinished: bool = False) -> np.ndarray:
         """Episodes closed since the last call, and ``unfinished`` ones as they are; ``energies`` as in ``switch``."""
         closed = self.tracks.log[: self.tracks.closed[0]].copy()
         self.tracks.closed[:] = 0
         if not unfinished:
             return closed
-        in_contact = np.flatnonzero(self.contacts["mode"] != FREE)
+        modes = self.contacts["mode"]
+        in_contact = np.flatnonzero((modes != FREE) & (np.abs(modes) != RESTING))
         still_open = self.tracks.sites["episode"][in_contact]
         still_open["loss"] += energies[in_contact]
         return np.concatenate([closed, still_open])

@@ -206,7 +206,12 @@ class Recorder(Observer):
         sites = len(self.setup.model.chain.sites)
         radius = self.setup.case.contact_radius
         if sites and not self.episodes:
-            return [f"no contact: nothing reached {'the site' if sites == 1 else f'one of the {sites} sites'}"]
+            place = "the site" if sites == 1 else f"one of the {sites} sites"
+            touching = sum(min(gap) <= 0 for gap in self.setup.model.gaps)
+            if not touching:
+                return [f"no contact: nothing reached {place}"]
+            place = "the site that touches its stop" if sites == 1 else f"one of the {touching} sites that touch"
+            return [f"no contact: nothing pressed {place} at rest"]
 
         if radius is None or self.setup.model.contact.law != "hertz" or self.deepest <= radius:
             return []

@@ -15,7 +15,7 @@ the substep the nodes see little of it.
 import numpy as np
 
 from vipetsc.compiled import inlined, kernel
-from vipetsc.contact.changes import LANDED_W, ModeChange, extremes, first_change, switching
+from vipetsc.contact.changes import LANDED_W, ModeChange, extremes, first_change, stays_landed, switching
 from vipetsc.contact.law import CLOSED, FREE, PERMANENT, begins_linearly, contact_force, gap_of
 from vipetsc.contact.search import (
     LANDED,
@@ -40,8 +40,9 @@ from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN
 from vipetsc.dynamics.propagator.series import ROUNDING, copy, first_onset, shift
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, write_on_tape
 
-# How an advance ended: at the end of the step, on a change of modes, or without progress.
-DONE, CHANGED, FAILED = range(3)
+# How an advance ended: at the end of the step, on a change of modes, on one of a site that is to rest instead, or
+# without progress.
+DONE, CHANGED, RESTS, FAILED = range(4)
 
 MOST_SUBSTEPS = 20_000
 # Longest substep in radians of the fastest oscillation, where sites are searched for changes: the quintic that the
@@ -138,7 +139,7 @@ def first_kink(cluster: Cluster, trial: Trial, length: float) -> float:
     c = trial.sums.bernstein[0]
     for i in trial.closed:
         site = cluster.contacts[i]
-        if abs(site.mode) != PERMANENT:
+        if abs(site.mode) < PERMANENT:
             continue
         side = 1.0 if site.mode > 0 else -1.0
         gap = gap_of(site, side)
@@ -206,8 +207,8 @@ def _land(cluster: Cluster, trial: Trial, substep: Substep, change: ModeChange) 
 
 
 @inlined
-def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[Substep, bool]:
-    """Search a substep just tried and land on its first change: the substep taken, whether the change was met.
+def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[Substep, bool, int]:
+    """Search a substep just tried and land on its first change: the substep taken, whether it was met, the site.
 
     A substep of negative length was rejected; ``state.length`` has the next one to try.
     """
@@ -215,21 +216,30 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
     seconds = cluster.interval * substep.length
     change = first_change(cluster.contacts, cluster.site_motion, trial.site_motion, seconds, trial.sums.bernstein)
     if change.position > 1.0:
-        return substep, False
+        return substep, False, -1
 
     site = cluster.contacts[change.site]
     separates = not begins_linearly(site.elastic) and abs(site.mode) == CLOSED and change.function == 0
     if separates and substep.kind == ONSET and substep.length > SHORTEST:
         # The force begins and ends as a power 3/2, and nodes suit one end: a substep for each.
         state.length = 0.5 * change.position * substep.length
-        return Substep(ONSET, -1.0), False
+        return Substep(ONSET, -1.0), False, -1
     kind = EXIT if separates else substep.kind
     state.landings += 1
     taken, landed = _land(cluster, trial, Substep(kind, substep.length), change)
     if taken < 0.0:
         state.rejected += 1
         state.length = -CUT * taken
-    return Substep(kind, taken), landed
+    return Substep(kind, taken), landed, change.site
+
+
+@kernel
+def _has_stayed(cluster: Cluster, trial: Trial, site: int, length: float) -> bool:
+    """Whether a ``site`` that can rest has not moved from where it had landed, in a substep of that ``length``."""
+    start = cluster.site_motion[site]
+    # Without a length nothing was tried: the site is where it was.
+    end = trial.site_motion[site] if length > 0.0 else start
+    return stays_landed(cluster.contacts[site], start, end, length * cluster.interval, trial.sums.bernstein[0])
 
 
 @inlined
@@ -319,10 +329,11 @@ def _take(cluster: Cluster, trial: Trial, substep: Substep) -> None:
 
 
 @kernel
-def advance_cluster(cluster: Cluster) -> int:
+def advance_cluster(cluster: Cluster, may_rest: bool) -> tuple[int, int]:
     """Advance a cluster to the first change of modes or to the step's end.
 
-    Returns ``DONE``, ``CHANGED`` (``cluster`` stands behind it) or ``FAILED``.
+    Returns ``DONE``, ``CHANGED`` (``cluster`` stands behind it), ``RESTS``, if it ``may_rest``, or ``FAILED``, and the
+    site of a change that was met before the site had moved from where it had landed, else -1.
     """
     state = cluster.state[0]
     room = cluster.trial
@@ -334,10 +345,10 @@ def advance_cluster(cluster: Cluster) -> int:
     for _ in range(MOST_SUBSTEPS):
         if 1.0 - state.position <= ROUNDING:
             state.position = 1.0
-            return DONE
+            return DONE, -1
         trial = _select_active(cluster)
         if trial.active.size == 0:
-            return _advance_freely(cluster)
+            return _advance_freely(cluster), -1
 
         evaluate_site_motion(cluster, cluster.taylor, cluster.site_motion)
         substep = _choose_substep(cluster, trial)
@@ -348,25 +359,33 @@ def advance_cluster(cluster: Cluster) -> int:
             state.rejected += 1
             state.length = CUT * substep.length
             if substep.length < ROUNDING:
-                return FAILED
+                return FAILED, -1
             continue
 
         substep = _end_on_kink(cluster, trial, substep)
         if substep.length < 0.0:
             continue
         landed = False
+        site = -1
         if not blind:
-            substep, landed = _search_and_land(cluster, trial, substep)
+            substep, landed, site = _search_and_land(cluster, trial, substep)
             if substep.length < 0.0:
                 continue
 
+        if site >= 0 and not _has_stayed(cluster, trial, site, substep.length):
+            site = -1
+
         # A change at the very start that is none: past it.
         blind = substep.length == 0.0 and not landed
+        if blind and site >= 0:
+            if may_rest:
+                return RESTS, site
+            may_rest = True
         if substep.length > 0.0:
             # Judged only now: a force continued beyond its end is no smooth function.
             if not _control_length(cluster, trial, substep.length, landed):
                 continue
             _take(cluster, trial, substep)
         if landed:
-            return CHANGED
-    return FAILED
+            return (RESTS if may_rest and site >= 0 else CHANGED), site
+    return FAILED, -1

@@ -18,11 +18,20 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.compiled import njit
 from vipetsc.contact.changes import Extremes
-from vipetsc.contact.law import FREE, impact_time
-from vipetsc.contact.tracker import LIMITS, ImpactTracker, Tracks, switch_sites, update_episode, with_room
+from vipetsc.contact.law import FREE, RESTING, impact_time
+from vipetsc.contact.tracker import (
+    LIMITS,
+    ImpactTracker,
+    Tracks,
+    in_episode,
+    rest_site,
+    switch_sites,
+    update_episode,
+    with_room,
+)
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.layout import Layout, join
-from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, advance_cluster
+from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, RESTS, advance_cluster
 from vipetsc.dynamics.propagator.clusters import (
     DofTables,
     Groups,
@@ -61,7 +70,7 @@ FORCE = np.dtype([("number", np.int64), ("energy", float), ("history", HISTORY),
 def _update_open_episodes(cluster: Cluster, tracks: Tracks) -> None:
     """Bring the open episodes of a cluster up to date."""
     for i in range(cluster.contacts.size):
-        if cluster.contacts[i].mode != FREE:
+        if in_episode(cluster.contacts[i].mode):
             history = cluster.history[i]
             reached = Extremes(history.indentation, history.force, history.smallest_force)
             update_episode(cluster.contacts, tracks, i, reached)
@@ -74,9 +83,9 @@ def _switch(cluster: Cluster, tracks: Tracks, now: float) -> None:
     state = cluster.state[0]
     # Before the switch: an episode that ends takes its extremes along.
     _update_open_episodes(cluster, tracks)
-    was_free = contacts["mode"] == FREE
+    was_free = (contacts["mode"] == FREE) | (np.abs(contacts["mode"]) == RESTING)
     state.switches += switch_sites(contacts, tracks, cluster.site_motion, cluster.energy, now)
-    is_free = contacts["mode"] == FREE
+    is_free = (contacts["mode"] == FREE) | (np.abs(contacts["mode"]) == RESTING)
 
     for i in np.flatnonzero(was_free & ~is_free):
         duration = impact_time(contacts[i], abs(contacts[i].approach))
@@ -103,14 +112,22 @@ def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, 
     state.begin = begin
     state.position = 0.0
     cluster.moments[:] = 0.0
+    # One landing that leads nowhere may be an accident; from the second one in a step on, its site rests.
+    may_rest = False
     for _ in range(MOST_CHANGES):
-        outcome = advance_cluster(cluster)
-        if outcome != CHANGED:
+        outcome, site = advance_cluster(cluster, may_rest)
+        if outcome not in (CHANGED, RESTS):
             return outcome == DONE, tracks
         tracks = with_room(tracks)
         sites = tracks.sites[first : first + cluster.contacts.size]
+        own_tracks = Tracks(sites, tracks.log, tracks.closed)
         now = begin + state.position * cluster.interval
-        _switch(cluster, Tracks(sites, tracks.log, tracks.closed), now)
+        if outcome == CHANGED:
+            _switch(cluster, own_tracks, now)
+            may_rest |= site >= 0
+        else:
+            _update_open_episodes(cluster, own_tracks)
+            rest_site(cluster.contacts, own_tracks, site, cluster.site_motion, cluster.energy, now)
     return False, tracks
 
 

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.changes import ModeChange, first_change, switching
+from vipetsc.contact.changes import ModeChange, first_change, stays_landed, switching
 from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.contact.tracker import LIMITS, ImpactTracker
 from vipetsc.dynamics import log
@@ -42,6 +42,8 @@ STEP_PER_TIME = 0.25
 LINEAR_ONSET = 1 / 20, 8
 OTHER_ONSET = 1 / 200, 2.5
 LONGEST_ONSET = 0.1
+# An outcome of a landing beside those of the search: its site rests.
+RESTS = -1
 # Work and losses do not decide the step.
 NO_TOLERANCE = 1e30
 
@@ -260,7 +262,7 @@ class Integrator(Engine):
             self.saved.copy(self.state)
             self.ts.restartStep()
             if length <= SHORTEST_STEP * max(self.time, self.free_step):
-                self._switch()  # the change lies at the start of the step
+                self._switch_at_start(owner, change)
                 return
             if self._trial(length) is None:
                 return
@@ -272,13 +274,22 @@ class Integrator(Engine):
         self.time += length
         if outcome == LANDED:
             self._switch()
+        elif outcome == RESTS:
+            self._rest(owner, change)
 
     def _judge(self, attempt: Landing, change: ModeChange) -> tuple[Landing, int]:
-        """The next attempt at ``change`` after one that ended at the tracker's ``end``, and whether to make it."""
+        """The next attempt at ``change`` after one that ended at the tracker's ``end``, and whether to make it.
+
+        Where it has landed without having moved since it last did, its site is to rest.
+        """
         tracker = self.tracker
         site = change.site
         value, rate, tolerance, _ = switching(tracker.contacts, site, change.function, tracker.end[site])
         attempt, outcome = correct(attempt, value, rate, tolerance, goal=tolerance)
+        if outcome == LANDED:
+            start = tracker.start[site]
+            if stays_landed(tracker.contacts[site], start, tracker.end[site], attempt.length, np.empty(6)):
+                outcome = RESTS
         if outcome != SEARCH:
             return attempt, outcome
 
@@ -287,6 +298,29 @@ class Integrator(Engine):
         if position > 1.0:
             return attempt, MISSED
         return shorten(attempt, position), RETRY
+
+    def _switch_at_start(self, owner: int, change: ModeChange) -> None:
+        """Switch at a ``change`` of the rank ``owner`` that lies at the start of a step, or let its site rest."""
+        tracker = self.tracker
+        site = change.site
+        rests = False
+        if self.comm.rank == owner:
+            start = tracker.start[site]
+            _, rate, _, _ = switching(tracker.contacts, site, change.function, start)
+            # Nothing would switch, and the next step would find the same change.
+            rests = rate <= 0.0 and bool(stays_landed(tracker.contacts[site], start, start, 0.0, np.empty(6)))
+        if self.comm.bcast(rests, owner):
+            self._rest(owner, change)
+        else:
+            self._switch()
+
+    def _rest(self, owner: int, change: ModeChange) -> None:
+        """Let the site of a ``change`` of the rank ``owner`` rest, and set the step with which to go on."""
+        numbers = self.tracker.tracks.sites["number"]
+        number = self.comm.bcast(int(numbers[change.site]) if self.comm.rank == owner else -1, owner)
+        was_free = not self._any_open
+        self.tracker.rest(number, self.time, self.layout.losses(self.state.array_r))
+        self._restart(was_free)
 
     def _switch(self) -> None:
         """Switch modes of all landed sites and set the step with which to go on."""

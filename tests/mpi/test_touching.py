@@ -1,0 +1,38 @@
+"""Contacts that touch at rest, within and between the cells of two ranks: the same bits on any number of them."""
+
+from __future__ import annotations
+
+import hashlib
+
+from mpi4py import MPI
+
+import pytest
+
+from tests.verify.test_touching import bead_case, sprung_case
+from vipetsc.dynamics import simulate
+from vipetsc.io.store import RunMemory
+
+
+def digest(comm, case):
+    """A hash of motion, energies and impacts on rank 0, and the landings; None on the others."""
+    memory = RunMemory(comm)
+    result = simulate(case, memory)
+    assert result.complete, result.sentence
+    if comm.rank:
+        return None
+
+    data = memory.dataset
+    names = [name for name in sorted(data) if name.startswith(("displacement", "impacts/", "energy/"))]
+    parts = [data[name].values.tobytes() for name in names]
+    return hashlib.sha256(b"".join(parts)).hexdigest(), result.statistics["landings"]
+
+
+@pytest.mark.parallel([1, 2])
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+@pytest.mark.parametrize("create", [sprung_case, bead_case])
+def test_touching_contacts_have_the_bits_of_one_rank(engine, create):
+    comm = MPI.COMM_WORLD
+    case = create(engine)
+    alone = digest(MPI.COMM_SELF, case) if comm.rank == 0 else None
+    together = digest(comm, case)
+    assert together == alone

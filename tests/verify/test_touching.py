@@ -1,0 +1,181 @@
+"""Stops without clearance: contacts that touch at rest, against an independent integration of the same equations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.integrate import solve_ivp
+
+from vipetsc.case import Case, CaseError
+from vipetsc.dynamics import simulate
+from vipetsc.io.store import RunMemory
+
+MASSES = [1e-3, 2e-3]  # kg
+STIFFNESS = 1e4  # N/m, of both springs of a cell
+CELLS = 20
+SITE = 10
+DRIVE = {"amplitude": 10.0, "cycles": 2, "frequency": 2e3}
+HERTZ = {"law": "hertz", "stiffness": 1e6}
+BILINEAR = {"law": "bilinear", "stiffness": 2e4}
+EXPONENTS = {"hertz": 1.5, "bilinear": 1.0}
+
+
+class Stop(NamedTuple):
+    """A contact of the reference: numbers of its masses, -1 for ground; its side, kc in N/m^n and n."""
+
+    host: int
+    resonator: int
+    side: int
+    stiffness: float
+    exponent: float
+
+
+def sprung_case(engine: str = "ts", **contacts: object) -> Case:
+    """A chain of two masses a cell under a burst, with one site whose one stop has no clearance."""
+    springs = [
+        {"start": 1, "end": 2, "stiffness": STIFFNESS},
+        {"start": 2, "end": 1, "stiffness": STIFFNESS, "next_cell": True},
+    ]
+    return Case.from_table({
+        "lattice": {"cell": {"masses": MASSES, "contact": [1, 2], "springs": springs}, "cells": CELLS},
+        "contacts": HERTZ | {"clearance": 0.0, "side": "plus", "sites": [SITE]} | contacts,
+        "drive": DRIVE,
+        "time": {"end": 0.02, "sample_interval": 2e-4, "engine": engine},
+    })  # fmt: skip
+
+
+def bead_case(engine: str = "ts", cells: int = 4) -> Case:
+    """Beads of two masses that only their contacts join, all of which touch at rest: within cells and between them."""
+    pairs = [[1, 2]] * cells + [[2, 1]] * (cells - 1)
+    contacts = {
+        "clearance": 0.0,
+        "side": "minus",
+        "sites": [*range(1, cells + 1), *range(1, cells)],
+        "each": {"pair": pairs, "next_cell": [False] * cells + [True] * (cells - 1)},
+    }
+    return Case.from_table({
+        "lattice": {"cell": {"masses": MASSES}, "cells": cells, "ends": "free"},
+        "contacts": HERTZ | contacts | {"stiffness": 1e9},
+        "drive": {"amplitude": 10.0, "cycles": 1, "frequency": 2e4},
+        "time": {"end": 1e-3, "sample_interval": 1e-5, "engine": engine},
+    })  # fmt: skip
+
+
+def run_complete(case: Case) -> xr.Dataset:
+    """The run of a case, which must come to its end with the engine that it names and with a closed ledger."""
+    memory = RunMemory(MPI.COMM_SELF)
+    result = simulate(case, memory)
+    assert result.complete, result.sentence
+    assert result.statistics["engine"] == case.time.engine
+
+    run = memory.dataset
+    stored = run["energy/kinetic"] + run["energy/spring"] + run["energy/contact"] + run["energy/dissipated"]
+    assert np.abs(run["energy/work"] - stored).max() < 1e-8 * run["energy/work"].max()
+    return run
+
+
+def integrate(stiffness: np.ndarray, stops: Sequence[Stop], drive: dict[str, float], times: np.ndarray) -> np.ndarray:
+    """Displacements (time, mass) of masses with the matrix ``stiffness`` under a burst on the first: SciPy's DOP853."""
+    n = len(stiffness)
+    mass = np.tile(MASSES, n // 2)
+    omega = drive["frequency"]
+    duration = 2 * np.pi * drive["cycles"] / omega
+
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        u = y[:n]
+        force = -stiffness @ u
+        if t < duration:
+            force[0] += drive["amplitude"] * (1 - np.cos(omega * t / drive["cycles"])) * np.sin(omega * t)
+        for stop in stops:
+            w = u[stop.resonator] - (u[stop.host] if stop.host >= 0 else 0.0)
+            push = stop.side * stop.stiffness * max(stop.side * w, 0.0) ** stop.exponent
+            force[stop.resonator] -= push
+            if stop.host >= 0:
+                force[stop.host] += push
+        return np.concatenate([y[n:], force / mass])
+
+    # The steps are short enough to see every contact.
+    longest = (times[1] - times[0]) / 4
+    span = (0, times[-1])
+    solution = solve_ivp(rate, span, np.zeros(2 * n), "DOP853", times, rtol=1e-12, atol=1e-18, max_step=longest)
+    return solution.y[:n].T
+
+
+def chain_stiffness() -> np.ndarray:
+    """The matrix of the springs of ``sprung_case``, which are all alike, between two walls."""
+    n = 2 * CELLS
+    return STIFFNESS * (2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+
+
+def difference(run: xr.Dataset, expected: np.ndarray) -> float:
+    """The largest difference of displacements from those ``expected`` (time, mass), over the largest of them."""
+    found = run["displacement"].values.reshape(expected.shape)
+    return float(np.abs(found - expected).max() / np.abs(expected).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+@pytest.mark.parametrize("law", [HERTZ, BILINEAR], ids=["hertz", "bilinear"])
+@pytest.mark.parametrize("side", ["plus", "minus"])
+@pytest.mark.parametrize("pair", [[1, 2], [0, 1]], ids=["masses", "ground"])
+def test_a_stop_without_clearance_is_that_of_an_independent_solver(engine, law, side, pair):
+    run = run_complete(sprung_case(engine, **law, side=side, pair=pair))
+    host, resonator = (2 * (SITE - 1) + mass - 1 if mass else -1 for mass in pair)
+    stop = Stop(host, resonator, 1 if side == "plus" else -1, law["stiffness"], EXPONENTS[law["law"]])
+    expected = integrate(chain_stiffness(), [stop], DRIVE, run["time"].values)
+    assert difference(run, expected) < 1e-8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+def test_touching_beads_of_two_masses_are_those_of_an_independent_solver(engine):
+    case = bead_case(engine)
+    run = run_complete(case)
+    n = 2 * case.lattice.cells
+    stops = [Stop(i, i + 1, -1, 1e9, 1.5) for i in range(n - 1)]
+    drive = {"amplitude": 10.0, "cycles": 1, "frequency": 2e4}
+    expected = integrate(np.zeros((n, n)), stops, drive, run["time"].values)
+    assert difference(run, expected) < 1e-8
+
+
+@pytest.mark.slow
+def test_engines_log_the_same_impacts_of_a_stop_without_clearance():
+    """A site at rest that a front below all tolerances reaches has no impact: the engines resolve it differently."""
+    runs = [run_complete(sprung_case(engine)) for engine in ("ts", "propagator")]
+    first, second = ({name: run[f"impacts/{name}"].values for name in ("onset", "indentation")} for run in runs)
+    assert len(first["onset"]) == len(second["onset"]) > 5
+    assert first["onset"] == pytest.approx(second["onset"], abs=1e-9)
+    assert first["indentation"] == pytest.approx(second["indentation"], rel=1e-6)
+
+
+@pytest.mark.slow
+def test_with_a_floor_a_touching_stop_dissipates_alike_in_both_engines():
+    lossy = {"restitution": 0.7, "approach_floor": 0.5}
+    runs = [run_complete(sprung_case(engine, **lossy)) for engine in ("ts", "propagator")]
+    found, expected = (run["displacement"].values for run in runs)
+    assert np.abs(found - expected).max() < 1e-8 * np.abs(expected).max()
+    losses = [run["energy/dissipated"].values[-1] for run in runs]
+    assert losses[0] > 0 and losses[0] == pytest.approx(losses[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("each", [{}, {"each": {"restitution": [0.7]}}])
+def test_a_loss_in_a_contact_that_touches_at_rest_is_refused(each):
+    lossy: dict[str, object] = each or {"restitution": 0.7}
+    with pytest.raises(CaseError) as error:
+        sprung_case(**lossy)
+    [problem] = error.value.problems
+    assert problem.key == ("contacts.each.restitution" if each else "contacts.restitution")
+    assert "touches its stop at rest" in problem.remedy and "approach_floor" in problem.remedy
+
+
+def test_a_touching_site_that_nothing_presses_is_not_said_to_be_unreached():
+    case = sprung_case().varied(time={"end": 1e-3, "sample_interval": 2e-4}, drive={"amplitude": 1e-30})
+    memory = RunMemory(MPI.COMM_SELF)
+    result = simulate(case, memory)
+    assert "no contact: nothing pressed the site that touches its stop at rest" in result.warnings
