@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.unit.test_figures import NT, SHAPES, write_run
+from tests.unit.test_figures import INTERVAL, NT, SHAPES, write_run
 from vipetsc.cli.main import main
 from vipetsc.figures import movie
 from vipetsc.figures.movie_frames import FADE, Shot, movie_frames
@@ -21,6 +21,7 @@ CELL = four_band()
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
+    """Write a synthetic run, a travelling wave, and analyse it."""
     path = tmp_path_factory.mktemp("run")
     write_run(path / "run.h5")
     measure_run(path)
@@ -29,7 +30,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def clear(folder):
-    """The same without pictures."""
+    """Remove the pictures of the run's folder."""
     for path in (folder / "figures").glob("*"):
         path.unlink()
     return folder
@@ -43,48 +44,74 @@ def opened(folder):
 
 @pytest.fixture(scope="module")
 def stage(opened):
+    """Draw the stage of a short, narrow movie: 320 pixels, three frames a second."""
+    run, analysis = opened
+    shot = Shot(speed=0.016, rate=3.0, width=320)
     with rc_style():
-        return movie.MovieFigure(opened[0], movie_frames(*opened, Shot(speed=0.016, rate=3.0, width=320)), 320)
+        return movie.MovieFigure(run, movie_frames(run, analysis, shot), shot.width)
 
 
-def test_envelopes_of_bands_sum_to_the_energy_of_a_ring_and_are_where_the_wave_is():
-    chain, rng = Chain(CELL, 30, "periodic"), np.random.default_rng(3)
-    u, v = 1e-3 * rng.standard_normal((2, 30, 4))
-    energy = 0.5 * (np.square(v) @ CELL.masses).sum() + 0.5 * u.ravel() @ chain.stiffness_matrix() @ u.ravel()
+def test_envelopes_of_bands_sum_to_the_energy_of_a_ring():
+    """Of any motion of a ring the envelopes of the bands sum to its energy, each to the energy of its waves."""
+    chain = Chain(CELL, 30, "periodic")
+    u, v = 1e-3 * np.random.default_rng(3).standard_normal((2, 30, 4))
+    kinetic = 0.5 * (np.square(v) @ CELL.masses).sum()
+    potential = 0.5 * u.ravel() @ chain.stiffness_matrix() @ u.ravel()
+
     envelopes = band_envelopes(CELL, u, v)
-    assert envelopes.sum() == pytest.approx(energy, rel=1e-12)
-    assert envelopes.sum(axis=1) == pytest.approx(wave_energies(CELL, u, v)[0].sum(axis=0), rel=1e-12)
-    # A packet of the third band that goes to higher cells: no other band, no swing within a period.
-    x, kappa = np.arange(200), 1.2
+
+    assert envelopes.sum() == pytest.approx(kinetic + potential, rel=1e-12)
+    energies, *_ = wave_energies(CELL, u, v)
+    assert envelopes.sum(axis=1) == pytest.approx(energies.sum(axis=0), rel=1e-12)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.7])
+def test_the_envelope_of_a_packet_is_where_the_packet_is(phase):
+    """A packet of the third band that goes to higher cells: no other band, no swing within a period."""
+    band = 2
+    centre = 90
+    width = 12
+    x = np.arange(200)
+    kappa = 1.2
     wave = bloch(CELL, kappa)
-    packet = np.exp(-(((x - 90) / 12) ** 2) + 1j * kappa * x)[:, None] * wave.vectors[:, 2]
-    for phase in (0.0, 0.7):
-        turned = packet * np.exp(-1j * phase)
-        u, v = turned.real, (-1j * wave.frequency[2] * turned).real
-        envelopes = band_envelopes(CELL, u, v)
-        assert 2 * np.pi * np.fft.fftfreq(200)[wave_energies(CELL, u, v)[0][:, 2].argmax()] == pytest.approx(
-            1.2, abs=0.04
-        )
-        assert envelopes[2].sum() > 0.999 * envelopes.sum()
-        assert envelopes[2].argmax() in (89, 90, 91)
-        assert envelopes[2, 60:120] == pytest.approx(
-            0.5 * wave.frequency[2] ** 2 * np.exp(-2 * ((x - 90) / 12) ** 2)[60:120], rel=0.15
-        )
+    omega = wave.frequency[band]
+    profile = np.exp(-(((x - centre) / width) ** 2) + 1j * (kappa * x - phase))
+    packet = profile[:, None] * wave.vectors[:, band]
+    u = packet.real
+    v = (-1j * omega * packet).real
+
+    envelopes = band_envelopes(CELL, u, v)
+
+    energies, *_ = wave_energies(CELL, u, v)
+    wavenumbers = 2 * np.pi * np.fft.fftfreq(len(x))
+    # Wavenumbers of 200 cells are 0.031 apart.
+    assert wavenumbers[energies[:, band].argmax()] == pytest.approx(kappa, abs=0.04)
+    assert envelopes[band].sum() > 0.999 * envelopes.sum()
+    assert envelopes[band].argmax() in (centre - 1, centre, centre + 1)
+    # The modes are mass-normalised. Waves of other velocity within the packet shift its envelope by up to 15 %.
+    expected = 0.5 * omega**2 * np.abs(profile) ** 2
+    assert envelopes[band, 60:120] == pytest.approx(expected[60:120], rel=0.15)
 
 
 @pytest.mark.slow
 def test_an_impact_flashes_in_the_frame_whose_time_holds_it_and_fades(opened):
-    content = movie_frames(*opened, Shot(start=0.005, stop=0.045, speed=0.015, rate=10.0))  # a frame is 1.5 ms
+    """A site lights up in the one frame whose time since the last holds an onset, and fades by FADE a frame."""
+    # A frame is 1.5 ms.
+    content = movie_frames(*opened, Shot(start=0.005, stop=0.045, speed=0.015, rate=10.0))
+
+    # The run's six onsets belong to its two sites in turn.
     onsets = np.linspace(0.01, 0.04, 6)
     for site in (0, 1):
         for k in range(1, len(content.time)):
-            holds = any(content.time[k - 1] < onset <= content.time[k] for onset in onsets[site::2])
-            expected = 1.0 if holds else FADE * content.flash[k - 1, site]
+            since = onsets[site::2] > content.time[k - 1]
+            struck = np.any(since & (onsets[site::2] <= content.time[k]))
+            expected = 1.0 if struck else FADE * content.flash[k - 1, site]
             assert content.flash[k, site] == pytest.approx(expected), (site, k)
     assert (content.flash == 1).sum() == 6
     assert content.sites.tolist() == [8, 16]
 
 
+@pytest.mark.slow
 def test_cells_that_differ_have_their_own_masses_and_the_branches_of_their_mean(tmp_path):
     """With velocities alone, what a frame shows is the kinetic energy of the cells as they are."""
     write_run(tmp_path / "run.h5")
@@ -96,25 +123,34 @@ def test_cells_that_differ_have_their_own_masses_and_the_branches_of_their_mean(
         file.attrs["case"] = "\n".join([file.attrs["case"], "[lattice.profiles]", *profiles])
         file["displacement"][...] = 0.0
         velocity = file["velocity"][...]
-    own = np.tile(CELL.masses, (24, 1))
-    own[:, 0] = np.linspace(0.005, 0.01, 24)
+    masses = np.tile(CELL.masses, (24, 1))
+    masses[:, 0] = np.linspace(0.005, 0.01, 24)
+
     with open_run(tmp_path / "run.h5") as run:
         content = movie_frames(run, None, Shot(speed=0.016, rate=3.0))
         part = movie_frames(run, None, Shot(speed=0.016, rate=3.0, cells=(11, 24)))
-        fast = movie_frames(run, None, Shot("velocity", speed=0.016, rate=3.0))
-    rows = np.rint(content.time / 2e-4).astype(int)
-    kinetic = 0.5 * (own * velocity[rows] ** 2).sum(axis=(1, 2))
+        velocities = movie_frames(run, None, Shot("velocity", speed=0.016, rate=3.0))
+
+    rows = np.rint(content.time / INTERVAL).astype(int)
+    kinetic = 0.5 * (masses * velocity[rows] ** 2).sum(axis=(1, 2))
     assert content.waves.sum(axis=(1, 2)) == pytest.approx(kinetic, rel=1e-12)
-    assert content.wave.sum(axis=(1, 2))[3:] == pytest.approx(kinetic[3:], rel=0.05)  # some is beyond the ends
-    assert np.array_equal(fast.wave[:, 0], velocity[rows, :, CELL.host])
+    # At first a part of the wave is beyond the end of the lattice.
+    assert content.wave.sum(axis=(1, 2))[3:] == pytest.approx(kinetic[3:], rel=0.05)
+    assert np.array_equal(velocities.wave[:, 0], velocity[rows, :, CELL.host])
+
+    # The mean cell of all, and of those that are shown.
     assert content.cell.masses == pytest.approx((0.0075, *CELL.masses[1:]))
-    assert part.cell.masses[0] == pytest.approx(own[10:, 0].mean())
-    stiffness = [cell.springs[0].stiffness / CELL.springs[0].stiffness for cell in (content.cell, part.cell)]
-    assert stiffness == pytest.approx([1 + 2 / 24, 1.0])
+    assert part.cell.masses[0] == pytest.approx(masses[10:, 0].mean())
+    stiffness = CELL.springs[0].stiffness
+    # One cell of 24 has three times the stiffness, and none of those shown.
+    assert content.cell.springs[0].stiffness == pytest.approx((1 + 2 / 24) * stiffness)
+    assert part.cell.springs[0].stiffness == pytest.approx(stiffness)
 
 
 def test_frames_show_the_nearest_samples_and_read_no_others(folder, opened, monkeypatch):
-    read, original = {}, h5py.Dataset.__getitem__
+    """Nine frames of ten cells show the samples nearest in time and read nine rows of ten cells from the file."""
+    read = {}
+    original = h5py.Dataset.__getitem__
 
     def counted(self, *key, **options):
         values = original(self, *key, **options)
@@ -122,42 +158,59 @@ def test_frames_show_the_nearest_samples_and_read_no_others(folder, opened, monk
         return values
 
     with h5py.File(folder / "run.h5") as file:
-        time, velocity = (file[name][...] for name in ("time", "velocity"))
+        time = file["time"][...]
+        velocity = file["velocity"][...]
+
     monkeypatch.setattr(h5py.Dataset, "__getitem__", counted)
-    content = movie_frames(*opened, Shot("velocity", 0.01, 0.0308, 0.0208, 8.0, cells=(5, 14)))
+    # Eight frames a second of 20.8 ms: 2.6 ms a frame.
+    shot = Shot("velocity", start=0.01, stop=0.0308, speed=0.0208, rate=8.0, cells=(5, 14))
+    content = movie_frames(*opened, shot)
+
     assert content.time == pytest.approx(0.01 + np.arange(9) * 0.0026)
     rows = np.abs(time - content.time[:, None]).argmin(axis=1)
     assert np.array_equal(content.wave[:, 0], velocity[rows, 4:14, CELL.host])
-    assert read["/velocity"] == read["/displacement"] == 9 * 10 * CELL.dofs
+    assert read["/velocity"] == 9 * 10 * CELL.dofs
+    assert read["/displacement"] == 9 * 10 * CELL.dofs
     assert content.cells.tolist() == list(range(5, 15))
 
 
 @pytest.mark.slow
 def test_a_gif_holds_every_frame_for_its_time(clear, stage):
+    """A GIF has the frames of the stage, within the colours that it can hold, and lasts as long as they do."""
     count = len(stage.content.time)
+    assert count == int((NT - 1) * INTERVAL / 0.016 * 3) + 1
+
     (path,) = movie.write_movie(stage, 3.0, [clear / "figures" / "movie.gif"])
     assert [p.name for p in path.parent.iterdir()] == ["movie.gif"]
+
     with Image.open(path) as image:
-        assert (image.n_frames, image.size) == (count, (320, 180))
+        assert image.n_frames == count
+        assert image.size == (320, 180)
         lasts = 0
         for k in range(count):
             image.seek(k)
             lasts += image.info["duration"]
             frame = np.asarray(image.convert("RGB"), int)
-            assert np.abs(frame - stage.frame(k)[..., :3]).mean() < 0.7, k  # 255 colours are left
+            # 255 colours are left: a mean deviation below one step of 256.
+            assert np.abs(frame - stage.frame(k)[..., :3]).mean() < 0.7, k
+    # In ms, of which a GIF counts tens.
     assert lasts == round(1000 * count / 3, -1)
-    assert count == int((NT - 1) * 2e-4 / 0.016 * 3) + 1
 
 
 def test_an_mp4_is_made_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monkeypatch):
+    """ffmpeg gets every frame as it is; where it fails, its words are raised and the old movie stays."""
+    # In place of ffmpeg: a script that writes what it reads into the last of its arguments.
     program = tmp_path / "ffmpeg"
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
     program.write_text('#!/bin/sh\nfor last; do :; done\n/bin/cat > "$last"\n')
     program.chmod(0o755)
+
     (path,) = movie.write_movie(stage, 3.0, [clear / "figures" / "movie.mp4"])
+
     frames = np.frombuffer(path.read_bytes(), np.uint8).reshape(-1, 180, 320, 4)
     assert len(frames) == len(stage.content.time)
     assert np.array_equal(frames[3], stage.frame(3))
+
     before = path.stat()
     program.write_text('#!/bin/sh\nfor last; do :; done\necho half > "$last"\necho no such codec >&2\nexit 1\n')
     with pytest.raises(OSError, match="no such codec"):
@@ -168,11 +221,15 @@ def test_an_mp4_is_made_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monkeypa
 
 @pytest.mark.slow
 def test_without_ffmpeg_there_is_a_gif_and_a_remedy(clear, monkeypatch, capsys):
+    """Without ffmpeg a movie is a GIF, with a word on how to get it; a movie asked for as MP4 is refused."""
     monkeypatch.setattr(movie, "ffmpeg", lambda: None)
     few = ["plot", str(clear), "--movie", "--speed", "0.016", "--rate", "2", "--width", "320"]
     assert main(few) == 0
     assert [p.name for p in (clear / "figures").iterdir()] == ["movie-energy.gif"]
-    assert "apt-get install" in (message := capsys.readouterr().err) and "imageio-ffmpeg" in message
+    message = capsys.readouterr().err
+    assert "apt-get install" in message
+    assert "imageio-ffmpeg" in message
+
     assert main([*few, "--format", "mp4"]) == 2
     assert "apt-get install" in capsys.readouterr().err
 
@@ -199,26 +256,32 @@ def test_without_ffmpeg_there_is_a_gif_and_a_remedy(clear, monkeypatch, capsys):
         "--format gif",
     ],
 )
-def test_what_cannot_be_is_told_and_nothing_written(clear, words, capsys):
+def test_movies_that_cannot_be_are_refused_and_write_nothing(clear, words, capsys):
+    """A range, window, speed or format that gives no movie ends with exit code 2, its option and no file."""
     before = sorted(clear.rglob("*"))
     try:
         code = main(["plot", str(clear), *words.split()])
     except SystemExit as ended:
         code = ended.code
     assert code == 2
-    assert words.split()[-2] in (message := capsys.readouterr().err) or words.split()[0] in message
+    message = capsys.readouterr().err
+    # The option with the wrong value, or the one that the others need.
+    assert words.split()[-2] in message or words.split()[0] in message
     assert sorted(clear.rglob("*")) == before
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", ["no sites", "window after the site", "single cell", "every third sample"])
 def test_every_run_with_velocities_has_a_movie(shape, tmp_path):
+    """Runs without sites, with a window behind them, of every third sample or of one cell have moving frames."""
     write_run(tmp_path / "run.h5", **SHAPES[shape])
+    shot = Shot("velocity", rate=0.3, width=320)
+
     with rc_style(), open_run(tmp_path / "run.h5") as run:
-        shot = Shot("velocity", rate=0.3, width=320)
         stage = movie.MovieFigure(run, movie_frames(run, None, shot), shot.width)
         assert field_time(run)[-1] >= stage.content.time[-1]
         assert np.ptp(stage.frame(1)) > 0
+        # One cell has no wave along the lattice, of which bands would be shown.
         if shape == "single cell":
             with pytest.raises(ValueError, match="side by side"):
                 movie_frames(run, None, Shot())

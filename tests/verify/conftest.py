@@ -91,7 +91,6 @@ def in_phase() -> Branch:
 
     assert continuation.finished
     return Branch(problem, points, [])
-    return Branch(problem, points, [])
 
 
 @pytest.fixture(scope="session")
