@@ -71,7 +71,7 @@ def desk(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("guide")
     shutil.copytree(ROOT / "scripts", folder / "scripts")
     shutil.copytree(ROOT / "runs", folder / "runs", ignore=lambda _, names: {n for n in names if "." not in n})
-    outside = {name: value for name, value in clean_environment().items() if not name.startswith("OMPI_")}
+    outside = {name: value for name, value in clean_environment().items() if not name.startswith(("OMPI_", "PRTE_"))}
     environment = outside | {"PYTHONPATH": str(ROOT), "VIPETSC_PYTHON": sys.executable}
     ended = subprocess.run(
         ["bash", "-c", session()], cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False
