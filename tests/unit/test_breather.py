@@ -1,8 +1,9 @@
-"""Branches of condensed motions: exact solutions, shooting, files, cases; breathers of the lattice."""
+"""Branches of condensed motions: exact solutions, breathers of the lattice, files, and cases that are refused."""
 
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 from mpi4py import MPI
 
@@ -11,30 +12,27 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.special import ellipk
 
+from tests.breathers import breather_case
+from tests.condensed_branches import condensed_branch, condensed_breather
+from tests.models import CLEARANCE, four_band_contact, reduced_model
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase, NnmTable
 from vipetsc.case.resolve import build_chain
 from vipetsc.figures.registry import branch as draw
 from vipetsc.io.state import State
-from vipetsc.lattice import Chain, Contact, WaveCompliance, contact_stiffness, four_band, pass_bands
+from vipetsc.lattice import Chain, Contact, WaveCompliance, four_band, pass_bands
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.branches.condensed import condensed_system, state_of
+from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import claim_branches, follow_all
-from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError
-from vipetsc.modes.shooting.dop853 import Dop853Flow
-from vipetsc.modes.shooting.maps import MAPS
-from vipetsc.modes.shooting.orbit import resonance
-from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.system import ContactPair, SmoothSpring, System
 from vipetsc.parallel import StopRequest
 
-D = 10**-2.75
-HERTZ = Contact("hertz", contact_stiffness(1e8, 0.005, 0.3))
+HERTZ = four_band_contact("hertz")
 BREATHER = """
 [lattice]
 preset = "four-band"
@@ -44,7 +42,7 @@ cells = {cells}
 restitution = 1.0
 sites = [{site}]
 [nnm]
-system = "condensed"
+system = "{system}"
 start_frequency = [{omega}]
 points = {points}
 first_step = 1e-2
@@ -52,40 +50,30 @@ tolerance = 1e-11
 """
 
 
-def condensed(system: System, **options) -> ConservativeMotions:
-    return condensed_system(system, NnmTable(**{"tolerance": 1e-12, "first_step": 1e-2} | options))
-
-
-def branch(system: System, mode: int, energy: float, **options) -> tuple[ConservativeMotions, list]:
-    """Points of a branch that begins at a linear mode with an ``energy``."""
-    problem, (omega, shapes) = condensed(system, **options), system.linear_modes()
-    rows = np.vstack([system.contact_rows, system.spring_rows])
-    z = rows @ shapes[:, mode] * np.sqrt(2 * energy) / omega[mode]
-    start = problem.from_mode(z, float(omega[mode]))
-    return problem, [start, *Continuation(problem, start, problem.control)]
-
-
-def displacement(problem: ConservativeMotions, point: Point) -> np.ndarray:
-    (u,) = state_of(problem, point).values()
-    return u
-
-
-@pytest.mark.slow
 def test_a_mass_between_two_stops_has_its_period_in_closed_form():
-    k, kc, m, clearance = 3.0, 40.0, 2.0, 0.1
+    """Between the stops the mass moves with k, beyond them with k + kc about another middle."""
+    k = 3.0
+    kc = 40.0
+    m = 2.0
+    clearance = 0.1
+    slow = np.sqrt(k / m)
+    fast = np.sqrt((k + kc) / m)
     pair = ContactPair(None, 0, clearance, Contact("bilinear", kc))
     system = System.assemble([m], [(None, 0, k)], [pair])
-    problem, points = branch(system, 0, 0.5 * k * (0.99 * clearance) ** 2, truncation=1e-7, points=6)
-    points += [problem.from_gap(share * np.sqrt(k / m), np.array([1.0])) for share in (1.3, 3.0)]
-    assert points[0].frequency == pytest.approx(np.sqrt(k / m) / (2 * np.pi), rel=1e-12)  # no contact yet
+
+    problem, points = condensed_branch(system, 0, 0.5 * k * (0.99 * clearance) ** 2, truncation=1e-7, points=6)
+    for factor in (1.3, 3.0):
+        points.append(problem.from_gap(factor * slow, np.array([1.0])))
+
+    # The first point has no contact yet.
+    assert points[0].frequency == pytest.approx(slow / (2 * np.pi), rel=1e-12)
     assert points[0].truncation < 1e-15
     for point in points:
         amplitude = float(point.elongations[0])
         energy = 0.5 * k * amplitude**2 + 0.5 * kc * max(amplitude - clearance, 0) ** 2
-        if amplitude <= clearance:
-            quarter = np.pi / 2 * np.sqrt(m / k)
-        else:
-            middle, slow, fast = kc * clearance / (k + kc), np.sqrt(k / m), np.sqrt((k + kc) / m)
+        quarter = np.pi / 2 / slow
+        if amplitude > clearance:
+            middle = kc * clearance / (k + kc)
             quarter = np.arcsin(clearance / np.sqrt(2 * energy / k)) / slow
             quarter += np.arccos((clearance - middle) / (amplitude - middle)) / fast
         assert point.frequency == pytest.approx(1 / (4 * quarter), rel=3e-7)
@@ -94,8 +82,9 @@ def test_a_mass_between_two_stops_has_its_period_in_closed_form():
 
 
 def test_a_cubic_spring_has_the_period_of_elliptic_functions():
+    """The oscillator x'' + x + x^3 = 0 is Duffing's."""
     system = System.assemble([1.0], [(None, 0, 1.0)], smooth=[SmoothSpring.between(None, 0, cubic=1.0)])
-    _, points = branch(system, 0, 1e-3, truncation=1e-10, points=25, largest_step=0.3)
+    _, points = condensed_branch(system, 0, 1e-3, truncation=1e-10, points=25, largest_step=0.3)
     for point in points:
         a = float(point.elongations[0])
         frequency = np.sqrt(1 + a**2) / (4 * ellipk(a**2 / (2 * (1 + a**2))))
@@ -105,232 +94,210 @@ def test_a_cubic_spring_has_the_period_of_elliptic_functions():
 
 
 def test_the_slope_of_the_energy_is_that_between_points():
-    _, points = branch(reduced("hertz"), 1, 0.028, points=20, truncation=1e-6)
-    for a, b in itertools.pairwise([p for p in points if p.episodes][3:]):
-        chord = (b.frequency - a.frequency) / (b.energy - a.energy)
-        assert min(a.slope, b.slope) * 0.99 <= chord <= max(a.slope, b.slope) * 1.01
-
-
-def reduced(law: str, power: float | None = None) -> System:
-    return System.reduced(four_band(), D, Contact(law, HERTZ.stiffness, exponent=power))
-
-
-KERSCHEN = System.assemble(
-    [1.0, 1.0], [(None, 0, 1.0), (0, 1, 1.0), (None, 1, 1.0)], smooth=[SmoothSpring.between(None, 0, cubic=0.5)]
-)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("system", "mode", "energy", "truncation"),
-    [
-        (KERSCHEN, 0, 1e-2, 1e-9),
-        (KERSCHEN, 1, 1e-2, 1e-9),
-        (reduced("hertz"), 0, 0.0034, 1e-8),
-        (reduced("power", 2.3), 1, 0.028, 1e-8),
-        (reduced("bilinear"), 3200.0, 0.0, 1e-7),  # rad/s: from a describing function
-    ],
-)
-def test_same_curves_as_by_shooting(system, mode, energy, truncation):
-    """The corrected orbit of shooting has the frequency of the branch at its energy, to 1e-6."""
-    if energy:
-        problem, points = branch(system, mode, energy, truncation=truncation, points=12)
-    else:
-        problem = condensed(system, truncation=truncation, points=2)
-        points = list(Continuation(problem, problem.from_gap(mode, np.array([1.0])), problem.control))
-    assert system.springs or points[-1].episodes
-    shooting = Shooting(Dop853Flow(system), MAPS["quarter"], 1e-12)
-    for point in points[:0:-4]:
-        u = displacement(problem, point)
-        frame = shooting.relative_frame(u, point.period)
-        row = np.append(u / np.linalg.norm(u), 0.0)
-        attempt = frame.solve(frame.xi, row, row @ frame.xi)
-        assert attempt.converged
-        orbit = frame.measures(attempt)
-        nonlinear = bool(point.episodes or system.springs)
-        here = point.frequency + (point.slope * (orbit.energy - point.energy) if nonlinear else 0.0)
-        assert orbit.frequency == pytest.approx(here, rel=1e-6)
-        assert point.energy == pytest.approx(system.energy(u, 0 * u), rel=1e-6)
-
-
-def breather(cells: int, site: int, omega: float, truncation=1e-8, **options) -> tuple[ConservativeMotions, Point]:
-    chain = Chain(four_band("calibrated"), cells, "fixed", (site - 1,), (D,))
-    control = NnmTable(truncation=truncation, tolerance=1e-12, **options)
-    problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), SiteForces([(HERTZ, D)]), control)
-    return problem, problem.from_gap(omega, np.array([1.0]))
+    _, points = condensed_branch(reduced_model("hertz"), 1, 0.028, points=20, truncation=1e-6)
+    # Just after grazing the slope changes within a step.
+    with_contact = [point for point in points if point.episodes][3:]
+    for left, right in itertools.pairwise(with_contact):
+        chord = (right.frequency - left.frequency) / (right.energy - left.energy)
+        assert min(left.slope, right.slope) * 0.99 <= chord <= max(left.slope, right.slope) * 1.01
 
 
 @pytest.mark.parametrize("omega", [1450.0, 1600.0, 1800.0, 2000.0, 3700.0, 4000.0, 5000.0])
-def test_breathers_of_the_built_in_lattice(omega):
-    _, point = breather(300, 100, omega, 1e-6)
-    if omega == 1600.0:
-        assert point.elongations[0] / D == pytest.approx(1.286, abs=5e-4)
-        assert point.energy == pytest.approx(0.0203, abs=5e-5)
+def test_the_built_in_lattice_has_breathers_in_its_gaps(omega):
+    _, point = condensed_breather(300, 100, omega, 1e-6)
     assert point.residual < 1e-11
     assert point.frequency == pytest.approx(omega / (2 * np.pi), rel=1e-14)
 
 
-@pytest.mark.slow
-def test_a_breather_returns_after_a_period_in_its_chain():
-    chain = Chain(four_band("calibrated"), 12, "fixed", (5,), (D,))
-    problem, point = breather(12, 6, 1600.0, 2e-9, max_newton=12)
-    state = state_of(problem, point)
-    u = np.concatenate([state[cell] for cell in range(12)])
-    system = System.from_chain(chain, HERTZ)
-    assert point.energy == pytest.approx(system.energy(u, 0 * u), rel=1e-8)
-    flow = Dop853Flow(system)
-    end = flow.arc(np.append(u, 0 * u), point.period, point.period).end
-    assert np.abs(end[:48] - u).max() < 1e-8 * np.abs(u).max()
-    assert np.abs(end[48:]).max() < 1e-8 * np.abs(u).max() * 2 * np.pi / point.period
+def test_the_breather_of_the_specification_has_its_amplitude_and_energy():
+    _, point = condensed_breather(300, 100, 1600.0, 1e-6)
+    assert point.elongations[0] / CLEARANCE == pytest.approx(1.286, abs=5e-4)
+    assert point.energy == pytest.approx(0.0203, abs=5e-5)
 
 
-def test_the_cost_does_not_grow_with_the_cells():
-    def frequencies(cells: int) -> int:
-        """How many frequencies waves are solved at for a breather."""
-        chain = Chain(four_band("calibrated"), cells, "fixed", (cells // 3,), (D,))
-        compliance, asked = WaveCompliance(chain), 0
+class CountedCompliance(SeriesCompliance):
+    """A compliance that counts the frequencies at which waves are solved."""
 
-        class Counted(SeriesCompliance):
-            def at(self, omegas):
-                nonlocal asked
-                asked += np.size(omegas)
-                return super().at(omegas)
+    frequencies = 0
 
+    def at(self, omegas: np.ndarray) -> np.ndarray:
+        self.frequencies += np.size(omegas)
+        return super().at(omegas)
+
+
+def test_the_cost_of_a_breather_does_not_grow_with_the_cells():
+    counts = {}
+    for cells in (300, 1_000_000):
+        chain = Chain(four_band("calibrated"), cells, "fixed", (cells // 3,), (CLEARANCE,))
+        compliance = CountedCompliance(WaveCompliance(chain))
         control = NnmTable(truncation=1e-5, tolerance=1e-11)
-        problem = ConservativeMotions(Counted(compliance), SiteForces([(HERTZ, D)]), control)
+        problem = ConservativeMotions(compliance, SiteForces([(HERTZ, CLEARANCE)]), control)
         problem.from_gap(4000.0, np.array([1.0]))
-        return asked
-
-    assert frequencies(1_000_000) <= 2 * frequencies(300)
+        counts[cells] = compliance.frequencies
+    assert counts[1_000_000] <= 2 * counts[300]
 
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 @pytest.mark.parametrize("sites", [(3, 20, 150, 299), (0,), (150, 152)])
 def test_moments_are_the_compliance_far_above_the_bands(ends, sites):
-    chain = Chain(four_band("calibrated"), 300, ends, sites, (D,) * len(sites))
+    chain = Chain(four_band("calibrated"), 300, ends, sites, (CLEARANCE,) * len(sites))
+    # The series takes over at twice the highest frequency.
     omega = pass_bands(chain.cell)[-1].high * np.array([0.5, 2.01, 3.0, 20.0 - 1e-3j])
     exact = WaveCompliance(chain).at(omega)
-    assert SeriesCompliance(WaveCompliance(chain)).at(omega) == pytest.approx(
-        exact, rel=0, abs=1e-14 * np.abs(exact).max()
-    )
+    found = SeriesCompliance(WaveCompliance(chain)).at(omega)
+    assert found == pytest.approx(exact, rel=0, abs=1e-14 * np.abs(exact).max())
 
 
-def two_sites(signs: list[int]) -> Point:
-    chain = Chain(four_band("calibrated"), 60, "fixed", (28, 31), (D, D))
+def breather_of_two_sites(signs: list[int]) -> Point:
+    """The breather at 4000 rad/s of a chain with contacts in cells 29 and 32, mirror images of one another."""
+    chain = Chain(four_band("calibrated"), 60, "fixed", (28, 31), (CLEARANCE, CLEARANCE))
     control = NnmTable(truncation=1e-6, tolerance=1e-11)
-    problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), SiteForces([(HERTZ, D)] * 2), control)
+    forces = SiteForces([(HERTZ, CLEARANCE)] * 2)
+    problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), forces, control)
     return problem.from_gap(4000.0, np.array(signs))
 
 
-def test_two_sites_in_and_out_of_phase():
-    alone, together, against = two_sites([1, 0]), two_sites([1, 1]), two_sites([1, -1])
-    assert together.elongations[0] == pytest.approx(together.elongations[1], rel=1e-9)  # mirror images
-    assert against.elongations[0] == pytest.approx(-against.elongations[1], rel=1e-9)
-    assert abs(alone.elongations[1]) < D
-    assert together.energy + against.energy == pytest.approx(4 * alone.energy, rel=0.05)
+def test_two_sites_move_in_and_out_of_phase():
+    alone = breather_of_two_sites([1, 0])
+    together = breather_of_two_sites([1, 1])
+    opposed = breather_of_two_sites([1, -1])
+    assert together.elongations[0] == pytest.approx(together.elongations[1], rel=1e-9)
+    assert opposed.elongations[0] == pytest.approx(-opposed.elongations[1], rel=1e-9)
+    # The other site does not reach its stop.
+    assert abs(alone.elongations[1]) < CLEARANCE
+    assert together.energy + opposed.energy == pytest.approx(4 * alone.energy, rel=0.05)
 
 
-def case(omega: str = "4000.0", points: int = 3, cells: int = 60, site: int = 20, more: str = "") -> NnmCase:
-    more = more if "truncation" in more else f"truncation = 1e-5\n{more}"
-    return NnmCase.from_toml(BREATHER.format(omega=omega, points=points, cells=cells, site=site) + more)
+def chain_case(
+    omega: str = "4000.0",
+    points: int = 3,
+    cells: int = 60,
+    site: int = 20,
+    system: str = "condensed",
+    more: str = "truncation = 1e-5",
+) -> NnmCase:
+    """The case of a branch of a breather; ``more`` are lines of its section."""
+    text = BREATHER.format(omega=omega, points=points, cells=cells, site=site, system=system)
+    return NnmCase.from_toml(f"{text}{more}\n")
 
 
-def followed(given: NnmCase, folder, resume: bool = False, stop: StopRequest | None = None):
-    with claim_branches(given, folder, MPI.COMM_SELF, resume=resume) as claim:
-        branches = follow_all(given, claim.folder, MPI.COMM_SELF, claim.going_on, None, stop)
+def followed(case: NnmCase, folder: Path, resume: bool = False, stop: StopRequest | None = None) -> list[Branch]:
+    """The branches of a case, followed as the verb does."""
+    with claim_branches(case, folder, MPI.COMM_SELF, resume=resume) as claim:
+        branches = follow_all(case, claim.folder, MPI.COMM_SELF, claim.going_on, None, stop)
         claim.publish()
     return branches
 
 
 @pytest.mark.slow
-def test_files_states_and_the_way_on(tmp_path):
-    (whole,) = followed(case(), tmp_path / "whole")
-    (part,) = followed(case(points=2), tmp_path / "part")
+def test_a_branch_in_two_parts_is_the_whole_one_bit_for_bit(tmp_path):
+    (whole,) = followed(chain_case(), tmp_path / "whole")
+    (part,) = followed(chain_case(points=2), tmp_path / "part")
     assert "resume" in part.ending
-    (rest,) = followed(case(), tmp_path / "part", resume=True)
-    read = read_branch(tmp_path / "whole" / "branch-breather-4000.h5")
-    for point, other, stored in zip(whole.points, rest.points, read.points, strict=True):
+
+    (resumed,) = followed(chain_case(), tmp_path / "part", resume=True)
+
+    stored = read_branch(tmp_path / "whole" / "branch-breather-4000.h5")
+    for point, other, read in zip(whole.points, resumed.points, stored.points, strict=True):
         assert np.array_equal(point.x, other.x)
-        assert np.array_equal(point.x, stored.x)
-        assert np.array_equal(point.tangent, stored.tangent)
-        assert (point.energy, point.truncation, point.order) == (stored.energy, stored.truncation, stored.order)
-    state = State.read(tmp_path / "whole" / "branch-breather-4000.h5", orbit=1)
-    assert state.period == pytest.approx(2 * np.pi / 4000)
-    u = state.on(0, 60)[0].ravel()
-    chain = build_chain(case().lattice, case().contacts)
-    energy = 0.5 * u @ chain.stiffness_matrix() @ u + HERTZ.potential(u[4 * 19 + 2] - u[4 * 19 + 1], D)
-    assert whole.points[0].energy == pytest.approx(float(energy), rel=1e-5)
-    lines = (tmp_path / "whole" / "branch-breather-4000.csv").read_text().splitlines()
-    assert lines[0].startswith("energy,frequency,period,w1,harmonics,truncation")
-    assert len(lines) == 1 + len(whole.points)
-    assert isinstance(draw([tmp_path / "whole" / "branch-breather-4000.h5"]), Figure)
+        assert np.array_equal(point.x, read.x)
+        assert np.array_equal(point.tangent, read.tangent)
+        assert (point.energy, point.truncation, point.order) == (read.energy, read.truncation, read.order)
 
 
 @pytest.mark.slow
-def test_a_stopped_branch_goes_on(tmp_path):
+def test_a_branch_is_stored_with_states_and_a_table_and_drawn(tmp_path):
+    case = chain_case()
+    (branch,) = followed(case, tmp_path)
+    file = tmp_path / "branch-breather-4000.h5"
+
+    # The state at rest has the energy of the point: all of it is in springs and the contact.
+    state = State.read(file, orbit=1)
+    assert state.period == pytest.approx(2 * np.pi / 4000)
+    chain = build_chain(case.lattice, case.contacts)
+    u = state.on(0, 60)[0]
+    w = u[19, chain.cell.resonator] - u[19, chain.cell.host]
+    energy = 0.5 * u.ravel() @ chain.stiffness_matrix() @ u.ravel() + HERTZ.potential(w, CLEARANCE)
+    # The state has the harmonics up to a truncation of 1e-5.
+    assert branch.points[0].energy == pytest.approx(float(energy), rel=1e-5)
+
+    lines = file.with_suffix(".csv").read_text().splitlines()
+    assert lines[0].startswith("energy,frequency,period,w1,harmonics,truncation")
+    assert len(lines) == 1 + len(branch.points)
+    assert isinstance(draw([file]), Figure)
+
+
+@pytest.mark.slow
+def test_a_stopped_branch_is_resumed_to_the_same_energies(tmp_path):
     stop = StopRequest()
     stop.requested = True
-    (begun,) = followed(case(), tmp_path / "b", stop=stop)
+    (begun,) = followed(chain_case(), tmp_path / "stopped", stop=stop)
     assert begun.ending.startswith("stopped on request after point 1")
-    (rest,) = followed(case(), tmp_path / "b", resume=True)
-    (whole,) = followed(case(), tmp_path / "w")
-    assert [p.energy for p in rest.points] == [p.energy for p in whole.points]
+
+    (resumed,) = followed(chain_case(), tmp_path / "stopped", resume=True)
+    (whole,) = followed(chain_case(), tmp_path / "whole")
+    assert [point.energy for point in resumed.points] == [point.energy for point in whole.points]
 
 
 @pytest.mark.slow
-def test_a_branch_that_fails_keeps_its_points_and_names_the_knob(tmp_path):
-    more = "harmonics = 61\ntruncation = 1e-5\ndirection = 'up'\nsmallest_step = 1e-4"
-    (stuck,) = followed(case("3700.0", 60, more=more.replace("1e-5", "4.4e-7")), tmp_path)
-    assert stuck.ending.startswith("failed: step below")
-    assert "nnm.harmonics or nnm.truncation" in stuck.ending
-    assert "E = " in stuck.ending
-    assert len(read_branch(tmp_path / "branch-breather-3700.h5").points) == len(stuck.points) > 0
+def test_a_branch_that_fails_keeps_its_points_and_names_the_key(tmp_path):
+    # So few harmonics do not keep to so small a truncation for long.
+    more = "harmonics = 61\ntruncation = 4.4e-7\ndirection = 'up'\nsmallest_step = 1e-4"
+    (failed,) = followed(chain_case("3700.0", points=60, more=more), tmp_path)
+    assert failed.ending.startswith("failed: step below")
+    assert "nnm.harmonics or nnm.truncation" in failed.ending
+    assert "E = " in failed.ending
+    stored = read_branch(tmp_path / "branch-breather-3700.h5")
+    assert len(stored.points) == len(failed.points) > 0
 
 
-def test_where_no_breather_begins():
+def test_a_frequency_at_which_no_breather_begins_is_refused_with_a_remedy():
     with pytest.raises(ContinuationError, match=r"no breather begins at 2200 rad/s: .*change nnm.start_frequency"):
-        breather(300, 100, 2200.0)
+        condensed_breather(300, 100, 2200.0)
 
 
 @pytest.mark.parametrize(
     ("change", "key"),
     [
-        ("1000.0", "nnm.start_frequency"),  # in a pass band
+        # In a pass band.
+        ("1000.0", "nnm.start_frequency"),
         ("", "nnm.start_frequency"),
         ("4000.0]\nstart_sites = [2", "nnm.start_sites"),
         ("4000.0]\ncompare = ['tsrk'", "nnm.compare"),
         ("4000.0]\nharmonics = [3", "nnm.harmonics"),
     ],
 )
-def test_bad_cases_are_refused(change, key):
+def test_bad_values_of_a_condensed_case_are_refused(change, key):
     with pytest.raises(CaseError, match=key):
-        case(change)
+        chain_case(change)
 
 
-def test_branches_shot_with_dense_matrices_have_no_start_frequency():
-    for system in ("reduced", 'chain"\nshooting = "dense'):
-        text = BREATHER.format(omega=4000.0, points=3, cells=3, site=2).replace("condensed", system)
-        with pytest.raises(CaseError, match=r"nnm.start_frequency"):
-            NnmCase.from_toml(text)
+@pytest.mark.parametrize("system", ["reduced", 'chain"\nshooting = "dense'])
+def test_branches_shot_with_dense_matrices_have_no_start_frequency(system):
+    with pytest.raises(CaseError, match=r"nnm.start_frequency"):
+        chain_case(cells=3, site=2, system=system)
 
 
-@pytest.mark.slow
-def test_the_tongues_of_the_in_phase_mode_are_followed():
-    """Kerschen's 3:1 and 5:1: a harmonic balance passes their tips, and shooting from it finds the same orbits."""
-    problem, points = branch(KERSCHEN, 0, 1.0, truncation=1e-7, points=130, largest_step=0.15)
-    energy = np.array([p.energy for p in points])
-    tips = 1 + np.nonzero((energy[1:-1] > energy[:-2]) & (energy[1:-1] > energy[2:]))[0]
-    assert energy[tips] == pytest.approx([4679, 2100, 107310], rel=1e-2)
-    shooting, counts = Shooting(Dop853Flow(KERSCHEN), MAPS["quarter"], 1e-12), []
-    for i in (*tips, *(tips + 4)):
-        point, u, before = points[i], displacement(problem, points[i]), displacement(problem, points[i - 1])
-        frame = shooting.relative_frame(u, point.period)
-        row = frame.xi - frame.chart.encode(before, points[i - 1].period)  # at the same length along the branch
-        attempt = frame.solve(frame.xi, row / np.linalg.norm(row), row @ frame.xi / np.linalg.norm(row))
-        orbit = frame.measures(attempt)
-        assert attempt.converged
-        assert orbit.frequency == pytest.approx(point.frequency, rel=1e-8)
-        assert orbit.energy == pytest.approx(point.energy, rel=1e-6)
-        counts.append(resonance(shooting, orbit))
-    assert counts[:3] == [3, 3, 5]
-    assert max(p.order for p in points) < 100
+@pytest.mark.parametrize(
+    ("nnm", "message"),
+    [
+        ({"shooting": "dense"}, "needs nnm.shooting"),
+        ({"compare": ["newmark"]}, "needs dense matrices"),
+        ({"system": "reduced", "start_frequency": [], "multipliers": 3}, 'is for "chain"'),
+        ({"shooting": "newton"}, "nnm.shooting"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(nnm, message):
+    with pytest.raises(CaseError, match=message):
+        breather_case(**nnm)
+
+
+def test_multipliers_of_the_whole_of_a_long_lattice_are_refused():
+    case = breather_case(system="condensed", points=1, truncation=1e-7)
+    table = case.model_dump(by_alias=True, exclude_none=True)
+    table["lattice"] |= {"cells": 10_001}
+    NnmCase.from_table(table)
+
+    table["nnm"] |= {"multipliers": 2}
+    with pytest.raises(CaseError, match=r"nnm\.multipliers.*multiplier_max needs the sites alone"):
+        NnmCase.from_table(table)

@@ -1,4 +1,4 @@
-"""The right-hand side, the sites' motion and the energies of a lattice, against matrices assembled here."""
+"""The engine's rates, motion of sites and energies against matrices assembled here; sums of PETSc's stages."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import small_case
+from vipetsc.case import Case, Model
 from vipetsc.contact.law import CLOSED
 from vipetsc.dynamics import run
 from vipetsc.dynamics.energies import ENERGY_SUMS, LARGEST, Energies, EnergyMeter, add_energy, measure
@@ -19,31 +20,37 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.io.store import RunMemory
+from vipetsc.lattice import Chain
 
-CELLS, DRIVEN, SITES = 7, 3, (3, 7)
+CELLS = 7
+# Counted from 1.
+DRIVEN_CELL = 3
+CONTACT_CELLS = (3, 7)
 
 
-def stiffness_matrix(chain):
-    """(cells * dofs) squared, in N/m; a wall holds the other end of a spring that leaves a fixed lattice."""
-    n, d = chain.cells, chain.cell.dofs
-    k = np.zeros((n * d, n * d))
-    for s in chain.cell.springs:
-        for cell in range(-1, n) if s.next_cell else range(n):
-            ends = [(cell, s.start), (cell + s.next_cell, s.end)]
+def stiffness_matrix(chain: Chain) -> np.ndarray:
+    """The matrix (cells * dofs) squared in N/m; a wall holds the other end of a spring that leaves a fixed lattice."""
+    n = chain.cells
+    d = chain.cell.dofs
+    matrix = np.zeros((n * d, n * d))
+    for spring in chain.cell.springs:
+        for left in range(-1 if spring.next_cell else 0, n):
+            right = left + spring.next_cell
             if chain.ends == "periodic":
-                if cell < 0:
+                if left < 0:
                     continue
-                ends = [(c % n, mass) for c, mass in ends]
-            inside = [c * d + mass for c, mass in ends if 0 <= c < n]
+                right = right % n
+            ends = [(left, spring.start), (right, spring.end)]
+            inside = [cell * d + mass for cell, mass in ends if 0 <= cell < n]
             if len(inside) < 2 and chain.ends == "free":
                 continue
             stretch = np.zeros(n * d)
             stretch[inside] = [1, -1][: len(inside)]
-            k += s.stiffness * np.outer(stretch, stretch)
-    return k
+            matrix += spring.stiffness * np.outer(stretch, stretch)
+    return matrix
 
 
-def energies_of(model, layout: Layout, state) -> Energies:
+def energies_of(model: Model, layout: Layout, state: PETSc.Vec) -> Energies:
     """Energies of one state."""
     meter = EnergyMeter(model, layout)
     with state.localForm() as local:
@@ -51,64 +58,112 @@ def energies_of(model, layout: Layout, state) -> Energies:
         return meter.total(measure(local.array, meter.lattice, meter.unit)[None], np.array([work]))
 
 
-@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
-def test_rates_motion_and_energies_are_those_of_the_equations(ends):
-    case = small_case(
-        lattice={"cells": CELLS, "ends": ends},
-        contacts={"law": "hertz", "sites": list(SITES), "clearance": 1e-5, "restitution": 0.7},
-        drive={"cell": DRIVEN, "mass": 2},
-    )
-    model = case.model()
-    layout = Layout(model, MPI.COMM_SELF)
-    engine = Integrator(model, layout)
-    chain, d, t = model.chain, layout.dofs, 0.3 * model.drive.duration
-    host, resonator = chain.cell.host, chain.cell.resonator
-    rng = np.random.default_rng(5)
-    u, v = 1e-5 * rng.normal(size=(CELLS, d)), 1e-2 * rng.normal(size=(CELLS, d))
-    u[SITES[0] - 1, [host, resonator]] = -2e-5, 1e-5  # indentation 2e-5 m at the first site
-    u[SITES[1] - 1, [host, resonator]] = 1e-6, 2e-6
-    sites = engine.lattice.contacts
-    sites["mode"][0], sites["clearance"][0], sites["approach"][0] = CLOSED, 1e-5, 0.02
-    work, lost = 0.25, np.array([0.5, 0.125])
-    engine.state.array[:] = np.concatenate([u.T.ravel(), v.T.ravel(), [work], lost])
-    f = engine.state.duplicate()
-    engine.ts.computeRHSFunction(t, engine.state, f)
+class ClosedContact:
+    """A Runge-Kutta engine at rest in time, in a random state whose first contact is closed, its second one free."""
 
-    masses = np.tile(chain.cell.masses, (CELLS, 1))
-    springs = stiffness_matrix(chain)
-    force = -(springs @ u.ravel()).reshape(CELLS, d)
-    drive = float(model.drive.force(t))
-    force[DRIVEN - 1, 1] += drive
-    site, rate = SITES[0] - 1, float(np.diff(v[SITES[0] - 1, [host, resonator]])[0])
-    push = float(model.contact.force(3e-5, 1e-5, rate, 0.02))
-    elastic = float(model.contact.force(3e-5, 1e-5))
-    force[site, host] += push
-    force[site, resonator] -= push
-    acceleration = force / masses
-    scale = np.abs(acceleration).max()
-    np.testing.assert_array_equal(f.array[: CELLS * d], v.T.ravel())
-    np.testing.assert_allclose(f.array[CELLS * d : 2 * CELLS * d], acceleration.T.ravel(), atol=1e-13 * scale)
-    assert f.array[2 * CELLS * d] == pytest.approx(drive * v[DRIVEN - 1, 1])
-    assert f.array[2 * CELLS * d + 1] == pytest.approx((push - elastic) * rate)
-    assert f.array[2 * CELLS * d + 2] == 0.0
+    # In m and m/s: the indentation at w = 3e-5 m is 2e-5 m.
+    clearance = 1e-5
+    approach = 0.02
+    work = 0.25
+    losses = (0.5, 0.125)
 
+    def __init__(self, ends: str) -> None:
+        self.case: Case = small_case(
+            lattice={"cells": CELLS, "ends": ends},
+            contacts={"law": "hertz", "sites": list(CONTACT_CELLS), "clearance": 1e-5, "restitution": 0.7},
+            drive={"cell": DRIVEN_CELL, "mass": 2},
+        )
+        self.model = self.case.model()
+        self.chain = self.model.chain
+        self.pair = [self.chain.cell.host, self.chain.cell.resonator]
+        self.time = 0.3 * self.model.drive.duration
+
+        rng = np.random.default_rng(5)
+        self.u = 1e-5 * rng.normal(size=(CELLS, self.chain.cell.dofs))
+        self.v = 1e-2 * rng.normal(size=(CELLS, self.chain.cell.dofs))
+        self.u[CONTACT_CELLS[0] - 1, self.pair] = -2e-5, 1e-5
+        self.u[CONTACT_CELLS[1] - 1, self.pair] = 1e-6, 2e-6
+
+        self.layout = Layout(self.model, MPI.COMM_SELF)
+        self.engine = Integrator(self.model, self.layout)
+        sites = self.engine.lattice.contacts
+        sites["mode"][0] = CLOSED
+        sites["clearance"][0] = self.clearance
+        sites["approach"][0] = self.approach
+        ledger = [self.work, *self.losses]
+        self.engine.state.array[:] = np.concatenate([self.u.T.ravel(), self.v.T.ravel(), ledger])
+        # On a ring the rank is its own neighbour.
+        self.engine.state.ghostUpdate()
+
+    def contact_force(self, dissipates: bool = True) -> float:
+        """The force of the closed contact in N, or its elastic part."""
+        site = CONTACT_CELLS[0] - 1
+        w = float(np.diff(self.u[site, self.pair])[0])
+        rate = float(np.diff(self.v[site, self.pair])[0])
+        if dissipates:
+            return float(self.model.contact.force(w, self.clearance, rate, self.approach))
+        return float(self.model.contact.force(w, self.clearance))
+
+    def accelerations(self) -> np.ndarray:
+        """Accelerations (cell, dof) in m/s^2 by springs, the drive and the closed contact."""
+        force = -(stiffness_matrix(self.chain) @ self.u.ravel()).reshape(self.u.shape)
+        force[DRIVEN_CELL - 1, 1] += float(self.model.drive.force(self.time))
+        site = CONTACT_CELLS[0] - 1
+        force[site, self.pair[0]] += self.contact_force()
+        force[site, self.pair[1]] -= self.contact_force()
+        return force / np.array(self.chain.cell.masses)
+
+
+@pytest.fixture(params=["fixed", "free", "periodic"])
+def lattice(request):
+    lattice = ClosedContact(request.param)
+    yield lattice
+    lattice.engine.destroy()
+
+
+def test_rates_are_those_of_the_equations(lattice):
+    rates = lattice.engine.state.duplicate()
+    lattice.engine.ts.computeRHSFunction(lattice.time, lattice.engine.state, rates)
+    half = CELLS * lattice.chain.cell.dofs
+    velocities, accelerations, ledger = np.split(rates.array, [half, 2 * half])
+
+    expected = lattice.accelerations()
+    np.testing.assert_array_equal(velocities, lattice.v.T.ravel())
+    np.testing.assert_allclose(accelerations, expected.T.ravel(), atol=1e-13 * np.abs(expected).max())
+
+    drive = float(lattice.model.drive.force(lattice.time))
+    rate = float(np.diff(lattice.v[CONTACT_CELLS[0] - 1, lattice.pair])[0])
+    lost = (lattice.contact_force() - lattice.contact_force(dissipates=False)) * rate
+    assert ledger == pytest.approx([drive * lattice.v[DRIVEN_CELL - 1, 1], lost, 0.0])
+
+
+def test_the_motion_of_sites_is_that_of_the_equations(lattice):
     motion = np.empty((2, 3))
-    engine.observe(motion, t)
-    rows = [x[SITES[i] - 1, resonator] - x[SITES[i] - 1, host] for i in range(2) for x in (u, v, acceleration)]
-    np.testing.assert_allclose(motion.ravel(), rows, rtol=1e-12)
+    lattice.engine.observe(motion, lattice.time)
+    for row, cell in zip(motion, CONTACT_CELLS, strict=True):
+        fields = (lattice.u, lattice.v, lattice.accelerations())
+        expected = [np.diff(field[cell - 1, lattice.pair])[0] for field in fields]
+        np.testing.assert_allclose(row, expected, rtol=1e-12)
 
-    energies = energies_of(model, layout, engine.state)
-    assert energies.kinetic == pytest.approx(0.5 * np.sum(masses * v**2), rel=1e-12)
-    assert energies.spring == pytest.approx(0.5 * u.ravel() @ springs @ u.ravel(), rel=1e-12)
-    assert energies.contact == pytest.approx(float(model.contact.potential(3e-5, 1e-5)), rel=1e-10)
-    assert (energies.work[0], energies.dissipated[0]) == (work, lost.sum())
-    engine.destroy()
+
+def test_energies_are_those_of_the_state_and_of_its_ledger(lattice):
+    energies = energies_of(lattice.model, lattice.layout, lattice.engine.state)
+    u = lattice.u.ravel()
+    kinetic = 0.5 * np.sum(np.array(lattice.chain.cell.masses) * lattice.v**2)
+    contact = float(lattice.model.contact.potential(3e-5, lattice.clearance))
+    assert energies.kinetic == pytest.approx(kinetic, rel=1e-12)
+    assert energies.spring == pytest.approx(0.5 * u @ stiffness_matrix(lattice.chain) @ u, rel=1e-12)
+    # Energies are summed in whole units, of which the contact's is a small number.
+    assert energies.contact == pytest.approx(contact, rel=1e-10)
+    assert energies.work[0] == lattice.work
+    assert energies.dissipated[0] == sum(lattice.losses)
 
 
 def test_energies_below_the_unit_of_the_sums_add_up():
     model = small_case().model()
     layout = Layout(model, MPI.COMM_SELF)
-    unit, state = EnergyMeter(model, layout).unit, layout.create_vector()
+    unit = EnergyMeter(model, layout).unit
+    state = layout.create_vector()
     first = layout.dofs * layout.owned
     state.array[first : first + layout.owned] = np.sqrt(2 * 0.4 * unit / model.chain.cell.masses[0])
     assert energies_of(model, layout, state).kinetic == pytest.approx(0.4 * unit * layout.owned, rel=1e-10)
@@ -125,33 +180,43 @@ def test_energies_beyond_all_scales_saturate_the_sums():
 @pytest.mark.parametrize("count", [1, 4, 7, 13])
 def test_stages_are_added_as_petsc_adds_them(size, count):
     rng = np.random.default_rng(size + count)
-    plain = PETSc.Vec().createMPI(size, comm=MPI.COMM_SELF)
-    ours = plain.duplicate()
-    register_sums(ours)
-    ours, first = ours.duplicate(), ours  # TSRK's vectors are duplicates
-    stages = [ours.duplicate() for _ in range(count)]
+    by_petsc = PETSc.Vec().createMPI(size, comm=MPI.COMM_SELF)
+    registered = by_petsc.duplicate()
+    register_sums(registered)
+    # TSRK's vectors are duplicates.
+    compiled = registered.duplicate()
+    stages = [compiled.duplicate() for _ in range(count)]
     for vector in stages:
         vector.array[:] = rng.normal(size=size)
+    # Some stages have no weight.
     factors = rng.normal(size=count) * (np.arange(count) % 3 != 1)
-    plain.array[:] = ours.array[:] = rng.normal(size=size)
-    before = ours.array.copy()
-    plain.maxpy(factors, stages)
-    ours.maxpy(factors, stages)
-    assert ours.array.tobytes() == plain.array.tobytes() != before.tobytes()
+    start = rng.normal(size=size)
+    by_petsc.array[:] = start
+    compiled.array[:] = start
+
+    by_petsc.maxpy(factors, stages)
+    compiled.maxpy(factors, stages)
+
+    assert compiled.array.tobytes() == by_petsc.array.tobytes()
+    assert compiled.array.tobytes() != start.tobytes()
+
+    # PETSc's own sum would not leave out NaN times zero.
     stages[0].set(np.nan)
-    ours.maxpy([0.0, 1.0], [stages[0], first])  # PETSc's own sum would not leave out NaN times zero
-    assert np.isfinite(ours.array).all()
-    for vector in (plain, ours, first, *stages):
+    compiled.maxpy([0.0, 1.0], [stages[0], registered])
+    assert np.isfinite(compiled.array).all()
+    for vector in (by_petsc, compiled, registered, *stages):
         vector.destroy()
 
 
-def test_a_simulation_on_several_ranks_lets_a_rank_that_raises_end_all(monkeypatch):
-    """At its call, not at its import; a hook that is not Python's own stays."""
+@pytest.mark.parametrize(
+    ("ranks", "hook", "expected"), [(1, sys.__excepthook__, 0), (2, sys.__excepthook__, 1), (2, print, 0)]
+)
+def test_a_simulation_on_several_ranks_lets_a_rank_that_raises_end_all(monkeypatch, ranks, hook, expected):
+    """The hook is installed at the call, not at the import, and another hook than Python's own stays."""
     installed = []
     monkeypatch.setattr(run, "install_abort_hook", lambda: installed.append(1))
-    for size, hook, expected in ((1, sys.__excepthook__, 0), (2, sys.__excepthook__, 1), (2, print, 1)):
-        monkeypatch.setattr(run, "MPI", SimpleNamespace(COMM_WORLD=SimpleNamespace(size=size)))
-        monkeypatch.setattr(sys, "excepthook", hook)
-        with pytest.raises(ValueError, match="cannot be resumed"):
-            run.simulate(small_case(), RunMemory(), resume=True)
-        assert len(installed) == expected
+    monkeypatch.setattr(run, "MPI", SimpleNamespace(COMM_WORLD=SimpleNamespace(size=ranks)))
+    monkeypatch.setattr(sys, "excepthook", hook)
+    with pytest.raises(ValueError, match="cannot be resumed"):
+        run.simulate(small_case(), RunMemory(), resume=True)
+    assert len(installed) == expected

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.conftest import small_case
+from tests.exact_lattices import exponential
 from tests.unit.propagator_parts import chain_parts
-from tests.unit.test_exact_lattices import exponential
 from vipetsc.case import Case
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.series import StepSeries

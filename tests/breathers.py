@@ -1,0 +1,36 @@
+"""A short lattice with one contact whose breathers many tests follow."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tests.models import CLEARANCE
+from vipetsc.case import NnmCase
+from vipetsc.lattice import Chain, four_band
+
+# The gap between bands 2 and 3 holds 1600 rad/s, where the breather of SPEC section 15 is: it decays within few cells.
+BREATHER_CELLS = 14
+BREATHER_SITE = 5
+BREATHER_FREQUENCY = 1600.0
+
+
+def breather_chain(ends: str = "fixed", sites: tuple[int, ...] = (BREATHER_SITE,)) -> Chain:
+    """The calibrated four-band lattice of 14 cells with contacts at ``sites``."""
+    return Chain(four_band("calibrated"), BREATHER_CELLS, ends, sites, (CLEARANCE,) * len(sites))
+
+
+def breather_case(**nnm: Any) -> NnmCase:
+    """The branch of two points from that breather, shot with the whole lattice; ``nnm`` updates its section."""
+    section: dict[str, Any] = {
+        "system": "chain",
+        "start_frequency": [BREATHER_FREQUENCY],
+        "tolerance": 1e-12,
+        "points": 2,
+    }
+    table = {
+        "name": "cells",
+        "lattice": {"preset": "four-band", "reading": "calibrated", "cells": BREATHER_CELLS},
+        "contacts": {"law": "hertz", "sites": [BREATHER_SITE + 1], "clearance": CLEARANCE},
+        "nnm": section | nnm,
+    }
+    return NnmCase.from_table(table)

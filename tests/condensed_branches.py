@@ -1,0 +1,52 @@
+"""Branches of condensed motions, by harmonic balance, that several tests follow."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tests.models import CLEARANCE, four_band_contact
+from vipetsc.case.nnm import NnmTable
+from vipetsc.lattice import Chain, WaveCompliance, four_band
+from vipetsc.lattice.moments import SeriesCompliance
+from vipetsc.modes.balance.conservative import ConservativeMotions
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.branches.condensed import condensed_system, state_of
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.point import Point
+from vipetsc.modes.system import System
+
+
+def condensed_problem(system: System, **options: Any) -> ConservativeMotions:
+    """The motions of a system with few masses; ``options`` are keys of [nnm]."""
+    return condensed_system(system, NnmTable(**{"tolerance": 1e-12, "first_step": 1e-2} | options))
+
+
+def condensed_branch(
+    system: System, mode: int, energy: float, **options: Any
+) -> tuple[ConservativeMotions, list[Point]]:
+    """The problem and the points of a branch that begins at a linear mode (from 0) with an ``energy`` in J."""
+    problem = condensed_problem(system, **options)
+    omega, shapes = system.linear_modes()
+    rows = np.vstack([system.contact_rows, system.spring_rows])
+    z = rows @ shapes[:, mode] * np.sqrt(2 * energy) / omega[mode]
+    start = problem.from_mode(z, float(omega[mode]))
+    return problem, [start, *Continuation(problem, start, problem.control)]
+
+
+def condensed_breather(
+    cells: int, site: int, omega: float, truncation: float = 1e-8, **options: Any
+) -> tuple[ConservativeMotions, Point]:
+    """The problem and the breather of ``omega`` in rad/s about a contact in cell ``site`` (from 1)."""
+    chain = Chain(four_band("calibrated"), cells, "fixed", (site - 1,), (CLEARANCE,))
+    control = NnmTable(truncation=truncation, tolerance=1e-12, **options)
+    forces = SiteForces([(four_band_contact("hertz"), CLEARANCE)])
+    problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), forces, control)
+    return problem, problem.from_gap(omega, np.array([1.0]))
+
+
+def displacement(problem: ConservativeMotions, point: Point) -> np.ndarray:
+    """Displacements of a system's masses at rest, at phase 0."""
+    (u,) = state_of(problem, point).values()
+    return u

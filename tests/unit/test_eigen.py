@@ -1,0 +1,156 @@
+"""Guards of the search for modes near a frequency: the direct solver, SLEPc, copies of modes, rigid motions."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from vipetsc.case import CaseError
+from vipetsc.dynamics import eigen
+from vipetsc.dynamics.eigen import load_slepc, modes_near
+from vipetsc.dynamics.matrices import LatticeMatrices
+from vipetsc.lattice import Chain, Spring, UnitCell
+
+pytestmark = pytest.mark.parallel(1)
+
+# Two masses a cell whose matrices are whole numbers: sums and products of them have no rounding.
+WHOLE = UnitCell((1.0, 1.0), (Spring(0, 0, 1.0, next_cell=True), Spring(0, 1, 1.0)), host=0, resonator=1)
+
+
+class RecordingTransformation:
+    """A spectral transformation that records with what it is to be solved."""
+
+    def __init__(self, ranks: int) -> None:
+        self.comm = SimpleNamespace(size=ranks)
+        self.type = ""
+        self.solver = ""
+
+    def setType(self, name: str) -> None:
+        self.type = name
+
+    def getKSP(self) -> RecordingTransformation:
+        return self
+
+    def getPC(self) -> RecordingTransformation:
+        return self
+
+    def setFactorSolverType(self, name: str) -> None:
+        self.solver = name
+
+
+def pretend_packages(monkeypatch, packages: set[str]) -> None:
+    """Make the search see a PETSc with these external packages."""
+    system = SimpleNamespace(hasExternalPackage=lambda name: name in packages)
+    monkeypatch.setattr(eigen, "PETSc", SimpleNamespace(Sys=system))
+
+
+@pytest.mark.parametrize(
+    ("ranks", "packages", "solver"),
+    [
+        # PETSc's own solver is always there, for one rank.
+        (1, set(), "petsc"),
+        (1, {"superlu", "mumps"}, "superlu"),
+        (1, {"superlu_dist", "mumps"}, "petsc"),
+        (2, {"superlu", "superlu_dist", "mumps"}, "superlu_dist"),
+        (2, {"superlu", "mumps"}, "mumps"),
+    ],
+)
+def test_the_first_direct_solver_that_petsc_has_is_taken(monkeypatch, ranks, packages, solver):
+    pretend_packages(monkeypatch, packages)
+    transformation = RecordingTransformation(ranks)
+    eigen._solve_directly(transformation)
+    assert transformation.solver == solver
+
+
+def test_several_ranks_without_a_direct_solver_are_refused(monkeypatch):
+    pretend_packages(monkeypatch, {"superlu"})
+    with pytest.raises(CaseError, match="no direct solver for several ranks, superlu_dist or mumps; call it on one"):
+        eigen._solve_directly(RecordingTransformation(ranks=2))
+
+
+def test_a_machine_without_slepc_is_told_what_to_install(monkeypatch):
+    # None in sys.modules makes an import fail.
+    monkeypatch.setitem(sys.modules, "slepc4py", None)
+    with pytest.raises(CaseError, match=r"slepc4py: is needed for modes of long lattices .*apt install slepc-dev"):
+        load_slepc()
+
+
+def matrices_of(ends: str, cells: int = 12) -> LatticeMatrices:
+    return LatticeMatrices(Chain(WHOLE, cells, ends), MPI.COMM_SELF)
+
+
+@pytest.mark.parametrize("ends", ["free", "periodic"])
+def test_a_frequency_asked_for_may_be_exactly_that_of_a_mode(ends):
+    """At 0 the matrix of whole numbers is singular without any rounding, and the rigid motion has the frequency 0."""
+    matrices = matrices_of(ends)
+    modes = modes_near(matrices, 1, 0.0)
+    assert modes.frequency.tolist() == [0.0]
+    assert np.ptp(modes.shapes) < 1e-9 * np.abs(modes.shapes).max()
+    matrices.destroy()
+
+
+def test_the_lowest_frequency_of_a_fixed_lattice_is_not_taken_for_zero():
+    # Long waves of 400 cells: omega^2 = 1.5e-5 of the largest one, far above rounding.
+    matrices = matrices_of("fixed", 400)
+    (frequency,) = modes_near(matrices, 1, 0.0).frequency
+    assert frequency == pytest.approx(np.pi / 401 / np.sqrt(2), rel=1e-4)
+    matrices.destroy()
+
+
+def test_both_copies_of_a_mode_of_a_ring_are_found():
+    """Waves to the left and to the right have one frequency, of which a Krylov space may miss one."""
+    matrices = matrices_of("periodic")
+    modes = modes_near(matrices, 3, 0.0)
+    assert modes.frequency[0] == 0.0
+    assert modes.frequency[1] == pytest.approx(modes.frequency[2], rel=1e-9)
+    # They are different motions.
+    overlap = np.sum(modes.shapes[1] * modes.shapes[2])
+    assert abs(overlap) < 1e-8
+    matrices.destroy()
+
+
+def record_searches(monkeypatch) -> list[int]:
+    """The number of modes that each search from now on is asked for."""
+    slepc = load_slepc()
+    wanted: list[int] = []
+
+    class RecordingSolver(slepc.EPS):
+        def solve(self) -> None:
+            wanted.append(self.getDimensions()[0])
+            super().solve()
+
+    monkeypatch.setattr(eigen, "load_slepc", lambda: SimpleNamespace(EPS=RecordingSolver))
+    return wanted
+
+
+def test_further_copies_are_sought_one_at_a_time_until_none_is_nearer(monkeypatch):
+    wanted = record_searches(monkeypatch)
+    matrices = matrices_of("periodic")
+    modes_near(matrices, 3, 0.0)
+    assert wanted[0] == 3
+    assert set(wanted[1:]) == {1}
+    # A ring's three lowest modes are all that there are so near: one search finds a farther one, and none more.
+    assert len(wanted) == 2
+    matrices.destroy()
+
+
+def test_no_copies_are_sought_where_all_modes_were_found(monkeypatch):
+    wanted = record_searches(monkeypatch)
+    matrices = matrices_of("fixed", 4)
+    modes_near(matrices, matrices.rows, 1.0)
+    assert wanted == [matrices.rows]
+    matrices.destroy()
+
+
+def test_all_modes_of_a_lattice_may_be_asked_for():
+    matrices = matrices_of("fixed", 4)
+    modes = modes_near(matrices, matrices.rows, 1.0)
+    assert len(modes.frequency) == matrices.rows
+    assert np.all(np.diff(modes.frequency) > 0)
+    assert modes.residual.max() < 1e-9
+    matrices.destroy()

@@ -1,0 +1,193 @@
+"""The flow of a lattice and its linearisation: linear theory, differences, the symplectic form."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+
+from tests.breathers import BREATHER_CELLS as CELLS
+from tests.breathers import BREATHER_FREQUENCY, breather_chain
+from tests.models import CLEARANCE, four_band_contact
+from vipetsc.lattice import Chain, Contact, four_band
+from vipetsc.lattice.chain import Pair
+from vipetsc.modes.lattice.lattice_flow import LatticeFlow
+from vipetsc.modes.problem import FlowError
+
+DOFS = 4
+PERIOD = 2 * np.pi / BREATHER_FREQUENCY
+STIFFNESS = {"hertz": four_band_contact("hertz").stiffness, "bilinear": 2e4}
+# Displacements and velocities of comparable energies: they differ by the frequency, about 1e3 rad/s.
+UNITS = np.repeat([1e-3, 1.0], DOFS)[:, None]
+
+
+def lattice_flow(sites: tuple[int, ...], contact: Contact, ends: str = "fixed") -> LatticeFlow:
+    return LatticeFlow(breather_chain(ends, sites), contact, MPI.COMM_SELF)
+
+
+def irregular_motion(sites: tuple[int, ...], w: float = 1.6e-3, speed: float = 1.0) -> np.ndarray:
+    """A state (2 dof, cell) of irregular small motion, in which the ``sites`` have w in m and w' in m/s.
+
+    By default they are about to touch, at 1.8 mm.
+    """
+    state = 1e-5 * np.random.default_rng(1).standard_normal((2 * DOFS, CELLS))
+    state[DOFS:] *= 1e3
+    for site in sites:
+        state[2, site] = state[1, site] + w
+        state[DOFS + 2, site] = state[DOFS + 1, site] + speed
+    return state
+
+
+class Linearised(NamedTuple):
+    """How the end of an arc moves with its start along a change: by the linearisation, and by differences."""
+
+    moved: np.ndarray
+    difference: np.ndarray
+
+    def largest_error(self) -> float:
+        """The largest error, relative to the largest displacement or velocity."""
+        largest = np.abs(self.moved).reshape(2, -1).max(axis=1)
+        scale = np.repeat(largest, DOFS)[:, None]
+        return float(np.max(np.abs(self.moved - self.difference) / scale))
+
+
+def linearise(flow: LatticeFlow, start: np.ndarray, change: np.ndarray) -> Linearised:
+    # Rounding and the third derivative then both leave some 1e-8.
+    step = 1e-6
+    ahead = flow.arc(start + step * change, PERIOD).end
+    behind = flow.arc(start - step * change, PERIOD).end
+    moved = flow.arc(start, PERIOD).move(change[None])[0]
+    return Linearised(moved=moved, difference=(ahead - behind) / (2 * step))
+
+
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+def test_without_contact_the_multipliers_are_those_of_the_linear_modes(ends):
+    flow = lattice_flow((5,), four_band_contact(), ends)
+    arc = flow.arc(irregular_motion((5,), w=0.0, speed=0.0), PERIOD)
+    assert arc.episodes == 0
+    assert arc.closed == 0.0
+
+    map_ = flow.gather(arc.move(flow.scatter(np.eye(2 * CELLS * DOFS)))).T
+    found = np.linalg.eigvals(map_)
+    squared = eigh(flow.chain.stiffness_matrix().toarray(), np.diag(flow.chain.masses()), eigvals_only=True)
+    turned = np.sqrt(np.maximum(squared, 0)) * PERIOD
+    expected = np.exp(1j * np.outer([1, -1], turned)).ravel()
+    # The rigid motion of free ends is a double eigenvalue 1 with one eigenvector: it errs by the root of rounding.
+    tolerance = 1e-12 if ends == "fixed" else 1e-6
+    assert np.abs(found[:, None] - expected[None]).min(axis=0).max() < tolerance
+
+
+def test_gathering_and_scattering_leave_a_state_as_it_is():
+    flow = lattice_flow((5,), four_band_contact())
+    state = irregular_motion((5,))
+    np.testing.assert_array_equal(flow.scatter(flow.gather(state)), state)
+
+
+CONTACTS = {
+    "elastic": {},
+    "dissipative": {"restitution": 0.7},
+    "clipped": {"restitution": 0.3, "adhesion": "clip"},
+    "floored": {"restitution": 0.7, "approach_floor": 2.0},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sites", [(5,), (5, 6, 11)])
+@pytest.mark.parametrize("law", ["hertz", "bilinear"])
+@pytest.mark.parametrize("kind", CONTACTS)
+def test_the_linearisation_agrees_with_differences(kind, law, sites):
+    """One site, and two sites of a cluster with one apart: the shift of the onset enters by the approach velocity."""
+    flow = lattice_flow(sites, Contact(law, STIFFNESS[law], **CONTACTS[kind]))
+    start = irregular_motion(sites)
+    assert flow.arc(start, PERIOD).episodes >= len(sites)
+
+    change = np.random.default_rng(2).standard_normal((2 * DOFS, CELLS)) * UNITS
+    found = linearise(flow, start, change)
+
+    for half in np.split(np.abs(found.moved - found.difference) / np.abs(found.moved), 2):
+        assert np.median(half) < 1e-6
+    assert found.largest_error() < 1e-7
+
+
+@pytest.mark.parametrize("restitution", [1.0, 0.7])
+def test_the_linearisation_of_contacts_between_cells_and_with_ground_agrees_with_differences(restitution):
+    """On a ring there are two contacts of one cell, one of them with ground, and one across its joint."""
+    pairs = (Pair(-1, 2), Pair(0, 3), Pair(3, 0, next_cell=True))
+    sites = (4, 4, CELLS - 1)
+    chain = Chain(four_band("calibrated"), CELLS, "periodic", sites, (CLEARANCE,) * 3, pairs=pairs)
+    flow = LatticeFlow(chain, Contact("hertz", STIFFNESS["hertz"], restitution), MPI.COMM_SELF)
+    random = np.random.default_rng(1)
+    start = 1e-2 * random.standard_normal((2 * DOFS, CELLS)) * UNITS
+    for pair, site in zip(pairs, sites, strict=True):
+        cell = (site + pair.next_cell) % CELLS
+        start[pair.resonator, cell] = 1.7e-3
+        start[DOFS + pair.resonator, cell] = 4.0
+    assert flow.arc(start, PERIOD).episodes >= 3
+
+    change = random.standard_normal((2 * DOFS, CELLS)) * UNITS
+    assert linearise(flow, start, change).largest_error() < 1e-7
+
+
+def test_the_approach_velocity_enters_the_linearisation():
+    """Without its part, by the derivative of the force, the end would move by a thousandth less or more."""
+    flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"], 0.7))
+    arc = flow.arc(irregular_motion((5,)), PERIOD)
+    change = np.random.default_rng(2).standard_normal((1, 2 * DOFS, CELLS)) * UNITS
+    moved = arc.move(change)
+
+    arc.engine._forces.clusters.tape.rows["onset"] = 0
+    # The linear steps are recorded from the tape anew.
+    arc.engine._linear = None
+    arc.engine._release()
+    assert np.abs(arc.move(change) - moved).max() > 1e-3 * np.abs(moved).max()
+
+
+@pytest.mark.parametrize("law", ["hertz", "bilinear"])
+def test_the_conservative_flow_is_symplectic_and_conserves_the_energy(law):
+    """The arc starts within a contact, and goes through its end and the next one on the other side."""
+    contact = Contact(law, STIFFNESS[law])
+    flow = lattice_flow((5,), contact)
+    start = irregular_motion((5,), w=4e-3, speed=0.0)
+    arc = flow.arc(start, 2 * PERIOD)
+    assert arc.episodes >= 2
+
+    masses = flow.chain.masses()
+    stiffness = flow.chain.stiffness_matrix()
+
+    def energy(state: np.ndarray) -> float:
+        u, v = np.split(flow.gather(state), 2)
+        w = u[5 * DOFS + 2] - u[5 * DOFS + 1]
+        return 0.5 * masses @ v**2 + 0.5 * u @ (stiffness @ u) + contact.potential(w, CLEARANCE)
+
+    assert energy(arc.end) == pytest.approx(energy(start), rel=1e-13)
+
+    # Momenta and displacements in one unit.
+    n = CELLS * DOFS
+    scale = np.append(np.sqrt(masses) * BREATHER_FREQUENCY, np.sqrt(masses))
+    map_ = scale[:, None] * flow.gather(arc.move(flow.scatter(np.eye(2 * n)))).T / scale
+    form = np.kron([[0, 1], [-1, 0]], np.eye(n))
+    np.testing.assert_allclose(map_.T @ form @ map_, form, atol=1e-9)
+
+
+def test_a_dissipative_contact_cannot_be_closed_at_the_start():
+    flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"], 0.7))
+    with pytest.raises(FlowError, match="dissipates is closed"):
+        flow.arc(irregular_motion((5,), w=2.2e-3, speed=0.0), PERIOD)
+
+
+def test_contacts_that_always_act_are_refused():
+    chain = Chain(four_band("calibrated"), CELLS, "fixed", (5,), (0.0,), pairs=(Pair(0, 0, next_cell=True),))
+    flow = LatticeFlow(chain, Contact("hertz", 1e6), MPI.COMM_SELF)
+    with pytest.raises(FlowError, match="touch or are pressed"):
+        flow.arc(np.zeros((2 * DOFS, CELLS)), PERIOD)
+
+
+def test_a_lattice_shorter_than_the_reach_of_a_step_is_refused():
+    chain = Chain(four_band("calibrated"), 2, "fixed", (1,), (CLEARANCE,))
+    flow = LatticeFlow(chain, four_band_contact(), MPI.COMM_SELF)
+    with pytest.raises(FlowError, match="2 cells are fewer"):
+        flow.arc(np.zeros((2 * DOFS, 2)), PERIOD)

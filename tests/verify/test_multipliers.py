@@ -1,0 +1,170 @@
+"""Whole lattices shot without dense matrices, and their largest multipliers by Floquet and by Hill."""
+
+from __future__ import annotations
+
+import logging
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+import pytest
+
+from tests.breathers import BREATHER_FREQUENCY, breather_case, breather_chain
+from tests.models import CLEARANCE, four_band_contact
+from vipetsc.modes.branches.files import read_branch
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.lattice import floquet
+from vipetsc.modes.lattice.floquet import largest_multipliers
+from vipetsc.modes.lattice.krylov import LatticeShooting
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.system import System
+
+
+def lattice_shooting() -> LatticeShooting:
+    chain = breather_chain()
+    system = System.from_chain(chain, four_band_contact(), dense=False)
+    return LatticeShooting(system, chain, MAPS["quarter"], MPI.COMM_SELF, 1e-12, 10)
+
+
+@pytest.fixture(scope="module")
+def breather():
+    """The shooting problem, and its orbit at 1600 rad/s."""
+    problem = lattice_shooting()
+    return problem, problem.breather(BREATHER_FREQUENCY)
+
+
+def test_the_breather_is_the_one_of_the_specification(breather):
+    """Amplitude and energy are those of SPEC, sec. 15, and the motion returns after one period."""
+    problem, point = breather
+    w = problem.system.contact_rows @ point.x
+    assert abs(w[0]) / CLEARANCE == pytest.approx(1.286, abs=5e-4)
+    assert point.energy == pytest.approx(0.0203, abs=5e-5)
+    assert point.residual < 1e-12
+    assert point.episodes == 1
+
+    start = np.append(point.x, 0 * point.x)
+    flow = problem.flow
+    end = flow.gather(flow.arc(flow.scatter(start), point.period).end)
+    assert np.abs((end - start)[: len(point.x)]).max() < 1e-8 * np.abs(point.x).max()
+
+
+def test_the_largest_multipliers_are_those_of_the_dense_map(breather):
+    problem, point = breather
+    flow = problem.flow
+    # Both halves of the period have the same map, by symmetry.
+    half = flow.arc(flow.scatter(np.append(point.x, 0 * point.x)), point.period / 2)
+    map_ = flow.gather(half.move(flow.scatter(np.eye(2 * problem.system.dofs)))).T
+    dense = np.linalg.eigvals(map_) ** 2
+
+    found = largest_multipliers(flow, problem.system, True, point.x, point.period, 4)
+
+    assert len(found) >= 2
+    assert found[:, 1].real.max() < 1e-8
+    for value in found[:, 0]:
+        assert np.abs(dense - value).min() < 1e-7
+    largest = np.abs(found[0, 0])
+    assert largest == pytest.approx(np.abs(dense).max(), rel=1e-8)
+    # An unstable one: a stable breather's would all be 1 in size.
+    assert largest > 1.3
+
+
+def test_the_product_is_the_derivative_of_the_residual(breather):
+    problem, point = breather
+    frame = problem.frame(point)
+    change = np.random.default_rng(4).standard_normal(len(point.x) + 1)
+    product = frame.product(frame.xi, change)
+    ahead = frame.residual(frame.xi + 1e-6 * change)
+    behind = frame.residual(frame.xi - 1e-6 * change)
+    np.testing.assert_allclose(product, (ahead - behind) / 2e-6, atol=1e-6 * np.abs(product).max())
+
+
+def test_a_linear_mode_is_continued_as_by_the_dense_method():
+    dense = Shooting(Dop853Flow(System.from_chain(breather_chain(), four_band_contact())), MAPS["quarter"])
+    point = linear_start(lattice_shooting(), 3, 1e-6)
+    expected = linear_start(dense, 3, 1e-6)
+    assert point.period == pytest.approx(expected.period, rel=1e-12)
+    np.testing.assert_allclose(point.x, expected.x, atol=1e-11 * np.abs(expected.x).max())
+
+
+@pytest.mark.slow
+def test_a_branch_is_stored_with_its_multipliers_and_resumed(tmp_path):
+    short = tmp_path / "short"
+    whole = tmp_path / "whole"
+    short.mkdir()
+    whole.mkdir()
+    (branch,) = follow_all(breather_case(multipliers=2), short, MPI.COMM_SELF)
+    assert branch.name == "breather-1600"
+    assert branch.ending.startswith("2 points reached")
+
+    stored = read_branch(short / "branch-breather-1600.h5")
+    assert [point.multiplier for point in stored.points] == [point.multiplier for point in branch.points]
+    np.testing.assert_array_equal(stored.points[0].multipliers, branch.points[0].multipliers)
+    assert min(point.multiplier for point in stored.points) > 1.3
+
+    longer = breather_case(multipliers=2, points=3)
+    (resumed,) = follow_all(longer, short, MPI.COMM_SELF, resume=True)
+    (once,) = follow_all(longer, whole, MPI.COMM_SELF)
+    energies = [point.energy for point in once.points]
+    assert [point.energy for point in resumed.points] == energies
+    assert np.all(np.diff(energies) > 0)
+
+
+def test_a_frequency_without_breather_fails_and_names_the_key(tmp_path):
+    # In a pass band, where Newton's method does not converge.
+    case = breather_case(start_frequency=[700.0], max_newton=2)
+    (branch,) = follow_all(case, tmp_path, MPI.COMM_SELF)
+    assert branch.ending.startswith("failed: no ")
+    assert "nnm.start_frequency" in branch.ending
+
+
+@pytest.mark.slow
+def test_hills_multipliers_of_a_breather_are_those_of_floquet(tmp_path):
+    """The largest pair is off the real axis and agrees to 1e-6 with that of the whole lattice's motion.
+
+    What the harmonics left out change is 1e-7, and what Hill's eliminated unknowns change is less than 1e-6. In the 14
+    cells other pairs of 1.05 and less lie near the circle, whose zeros and poles are .01 of a strip apart.
+    """
+    case = breather_case(system="condensed", points=1, truncation=1e-7, multipliers=2)
+    (branch,) = follow_all(case, tmp_path, MPI.COMM_SELF)
+    stored = read_branch(tmp_path / "branch-breather-1600.h5")
+    for point, other in zip(stored.points, branch.points, strict=True):
+        assert np.array_equal(point.multipliers, other.multipliers)
+        assert abs(point.multipliers[0, 0].imag) > 0.1
+        largest = np.abs(point.multipliers[:, 0]).max()
+        assert largest > 1.4
+        assert point.multiplier == other.multiplier == pytest.approx(largest, rel=1e-6)
+    header = (tmp_path / "branch-breather-1600.csv").read_text().splitlines()[0]
+    assert "multiplier_max" in header
+
+
+def raise_petsc_error(number: int):
+    """A function that raises a PETSc error, whatever it is called with."""
+
+    def raise_error(*arguments):
+        raise PETSc.Error(number)
+
+    return raise_error
+
+
+@pytest.mark.slow
+def test_where_slepc_fails_the_branch_continues_without_multipliers(tmp_path, monkeypatch, caplog):
+    # 73: an object in the wrong state, as of a search that has not converged.
+    monkeypatch.setattr(floquet, "_krylov_basis", raise_petsc_error(73))
+    with caplog.at_level(logging.WARNING):
+        (branch,) = follow_all(breather_case(multipliers=2), tmp_path, MPI.COMM_SELF)
+    assert branch.ending.startswith("2 points reached")
+    assert len(branch.points) == 3
+    assert np.isnan([point.multiplier for point in branch.points]).all()
+    assert caplog.text.count("has no multipliers: SLEPc") == 3
+
+
+@pytest.mark.slow
+def test_where_memory_runs_out_the_branch_does_not_continue(tmp_path, monkeypatch):
+    # 55: out of memory, maybe of one rank alone, for which others wait.
+    monkeypatch.setattr(floquet, "_krylov_basis", raise_petsc_error(55))
+    with pytest.raises(PETSc.Error):
+        follow_all(breather_case(multipliers=2), tmp_path, MPI.COMM_SELF)
