@@ -22,7 +22,7 @@ from vipetsc.paper import draw, make, steps
 from vipetsc.paper.build_record import read_record
 from vipetsc.paper.cell_search import search_design
 from vipetsc.paper.paper_figures import TRANSFER, PaperFigure
-from vipetsc.paper.plan import BEGUN, DONE, FULL, MISSING, RELATION, STALE, Plan, fingerprint, paper_plan
+from vipetsc.paper.plan import BEGUN, DONE, FULL, MISSING, RELATION, STALE, PaperStep, Plan, fingerprint, paper_plan
 from vipetsc.parallel import StoppedError, StopRequest
 
 ROOT = Path(__file__).parents[2]
@@ -30,8 +30,10 @@ PACKAGE = Path(vipetsc.__file__).parent
 
 
 def test_every_case_file_comes_with_the_package():
+    """Each step's case file, and no other, is a regular file of the package that its declaration installs."""
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
     shipped = {path for pattern in declared["vipetsc.paper"] for path in (PACKAGE / "paper").glob(pattern)}
+
     needed = {step.file for step in paper_plan(FULL).steps}
     assert needed <= shipped
     assert PACKAGE / "paper" / "report.html" in shipped
@@ -41,11 +43,13 @@ def test_every_case_file_comes_with_the_package():
 
 
 def test_examples_of_the_same_name_are_the_same_files():
+    """An example in ``runs`` with the name of a step's case is a link to it, so that they cannot differ."""
     for path in {step.file for step in paper_plan(FULL).steps}:
         assert (ROOT / "runs" / path.name).resolve() == path
 
 
 def test_every_step_is_a_case_that_can_be_used():
+    """Each step's text is read by its kind of case and written out unchanged."""
     for step in paper_plan(FULL).steps:
         assert step.kind.from_toml(step.text).to_toml() == step.text
 
@@ -55,99 +59,134 @@ SMALL = ("design.lambda.count=3", "design.eta.count=3", "design.wavenumbers=11")
 
 @pytest.fixture
 def searched(tmp_path) -> tuple[Plan, Path]:
-    """A plan of the search alone, done."""
-    step = next(step for step in paper_plan(FULL).steps if step.name == "design")
-    step = replace(step, changes=SMALL)
-    search_design(step.case, tmp_path / "design")
+    """Make the search of a plan that has no other step, and return the plan and its folder."""
     plan = paper_plan(FULL)
-    return replace(plan, steps=(step,), figures=[f for f in plan.figures if f.id in ("figS3", "fig10")]), tmp_path
+    step = replace(step_of(plan, "design"), changes=SMALL)
+    # One figure of the search, and one that needs no step.
+    figures = [figure for figure in plan.figures if figure.id in ("figS3", "fig10")]
+
+    search_design(step.case, tmp_path / "design")
+
+    return replace(plan, steps=(step,), figures=figures), tmp_path
 
 
-def touch(root: Path) -> None:
+def step_of(plan: Plan, name: str) -> PaperStep:
+    """Return the step of a name."""
+    return next(step for step in plan.steps if step.name == name)
+
+
+def test_times_of_files_make_nothing_stale(searched):
+    """A result stays done, with the same inputs to what is made from it, though its files are newer."""
+    plan, root = searched
+    before = plan.inputs(root)
+
     for path in root.rglob("*"):
         os.utime(path, ns=(2**61, 2**61))
 
-
-def test_times_of_files_make_nothing_stale(searched, monkeypatch):
-    plan, root = searched
-    before = plan.inputs(root)
-    touch(root)
     assert plan.steps[0].state(root) == DONE
     assert plan.inputs(root) == before
     assert set(before) == {"figS3", "fig10", "claims"}
 
 
 def test_a_result_of_other_content_is_another_input(searched):
+    """A byte more in the result of the search changes the inputs of its figure and of the claims alone."""
     plan, root = searched
     before = plan.inputs(root)
+
     path = root / "design" / "design.h5"
     path.write_bytes(path.read_bytes() + b"\0")
+
     after = plan.inputs(root)
     assert {key for key in before if before[key] != after[key]} == {"figS3", "claims"}
 
 
 def test_another_version_of_the_package_is_another_input(searched, monkeypatch):
+    """Another version of the package changes the inputs of everything."""
     plan, root = searched
     before = plan.inputs(root)
+
     monkeypatch.setattr(vipetsc, "__version__", "0.0.0")
     assert all(before[key] != value for key, value in plan.inputs(root).items())
 
 
 def test_another_case_is_another_input_and_a_stale_step(searched):
+    """A step whose case has changed is stale, begun once its folder is claimed, and done when it is made."""
     plan, root = searched
     step = replace(plan.steps[0], changes=(*SMALL, "design.eta.count=4"))
+
     assert step.state(root) == STALE
     assert step.identity(root) != plan.steps[0].identity(root)
     assert plan.steps[0].state(root / "none") == MISSING
+
+    # As a kill leaves it before it is made anew: what was begun is gone on with.
     with claimed(MPI.COMM_SELF, step.folder(root), SEARCH, step.text, force=True):
-        pass  # killed before it was made anew: what was begun is gone on with
+        pass
     assert step.state(root) == BEGUN
+
     with step.claimed(root, MPI.COMM_SELF, StopRequest(), False) as claimed_step:
         claimed_step.make(*step.parts)
     assert step.state(root) == DONE
 
 
 def test_a_relation_that_changes_is_another_input(tmp_path):
-    step = next(step for step in paper_plan(FULL).steps if step.name == TRANSFER)
+    """The scattering law that a prediction reads is a part of its identity."""
+    step = step_of(paper_plan(FULL), TRANSFER)
     (tmp_path / TRANSFER).mkdir()
     before = step.identity(tmp_path)
+
     (tmp_path / TRANSFER / RELATION).write_bytes(b"another")
     assert step.identity(tmp_path) != before
 
 
 def test_stale_pictures_go_before_new_ones_are_drawn(searched):
+    """A figure's pictures from other inputs are removed, those of another figure and of the same inputs are not."""
     plan, root = searched
-    (root / "figures").mkdir()
-    old, other = root / "figures" / "figS3-old.png", root / "figures" / "figS30-other.png"
+    figures = root / "figures"
+    figures.mkdir()
+    old = figures / "figS3-old.png"
+    other = figures / "figS30-other.png"
     old.touch()
     other.touch()
+
     draw._drop_stale(plan, root, plan.inputs(root))
-    assert not old.exists() and other.exists()
-    old.touch()  # drawn from the inputs of now
+    assert not old.exists()
+    assert other.exists()
+
+    # Now it was drawn from the inputs that were recorded.
+    old.touch()
     record = draw._drop_stale(plan, root, plan.inputs(root))
-    assert old.exists() and record == read_record(root)
+    assert old.exists()
+    assert record == read_record(root)
 
 
 def test_a_request_to_stop_makes_nothing_more_and_has_no_result(tmp_path):
-    stop, told = StopRequest(), []
+    """A request that comes first lets nothing be made or reported: only the folder is the plan's."""
+    stop = StopRequest()
     stop.requested = True
+    reported = []
+
     with pytest.raises(StoppedError):
-        make.make_paper(replace(paper_plan(FULL), figures=()), tmp_path, stop=stop, tell=told.append)
-    assert told == [] and [path.name for path in tmp_path.iterdir()] == ["plan.json"]
+        make.make_paper(replace(paper_plan(FULL), figures=()), tmp_path, stop=stop, tell=reported.append)
+
+    assert reported == []
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.json"]
 
 
 def test_fingerprints_tell_parts_apart():
+    """A fingerprint depends on where one part ends and the next begins; text counts as its bytes."""
     assert fingerprint("ab", "c") != fingerprint("a", "bc") != fingerprint("abc")
     assert fingerprint("ab") == fingerprint(b"ab")
 
 
 def test_the_plan_names_what_it_does_not_know():
+    """Figures that the plan lacks are refused with those it has; a claim in small letters is one, with its figures."""
     with pytest.raises(FolderError, match=r"--only fig99 C99: figures are fig01"):
         paper_plan(FULL).only(["fig99", "C99", "C1"])
     assert paper_plan(FULL).only(["c1"]).figures
 
 
 def test_a_search_is_done_when_its_file_has_its_case(searched):
+    """The search's file holds the case that it was made with, and is the step's result."""
     plan, root = searched
     with open_netcdf(root / "design" / "design.h5", "search") as search:
         assert tomllib.loads(search.attrs["case"]) == tomllib.loads(plan.steps[0].text)
@@ -157,37 +196,45 @@ def test_a_search_is_done_when_its_file_has_its_case(searched):
 @pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
 def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_path):
-    plan, root = searched[0], tmp_path / "paper"
-    plan = replace(plan, steps=(replace(plan.steps[0], name="other"), *plan.steps), measure=lambda root: [])
-    plan = replace(plan, figures=[figure for figure in plan.figures if figure.id == "fig10"])
+    """A step's failure is noted and costs no other step; files that were cut off are made again to the same bits."""
+    plan, _ = searched
+    root = tmp_path / "paper"
+    step = plan.steps[0]
+    figures = [figure for figure in plan.figures if figure.id == "fig10"]
+    plan = replace(plan, steps=(replace(step, name="other"), step), figures=figures, measure=lambda root: [])
     injector = Injector()
     injector.arm("member", 1, "exception")
-    result = make.make_paper(plan, root)
-    assert (
-        result.notes == ["failed: other: InjectedError: a fault at member"]
-        and result.new_steps == ("design",)
-        and not result.complete
-    )
+
+    failed = make.make_paper(plan, root)
+    assert failed.notes == ["failed: other: InjectedError: a fault at member"]
+    assert failed.new_steps == ("design",)
+    assert not failed.complete
+
+    # The same command makes what failed, and draws no picture again.
     whole = make.make_paper(plan, root)
-    assert whole.new_steps == ("other",) and whole.complete and not whole.drawn
-    assert (
-        set(read_record(root)["cpu"]["steps"]) == {"other", "design"}
-        and "CPU time" in (root / "report.html").read_text()
-    )
-    found, claims = datasets(root / "design" / "design.h5"), (root / "claims.json").read_bytes()
+    assert whole.new_steps == ("other",)
+    assert whole.complete
+    assert not whole.drawn
+    assert set(read_record(root)["cpu"]["steps"]) == {"other", "design"}
+    assert "CPU time" in (root / "report.html").read_text()
+
+    result = root / "design" / "design.h5"
+    before = datasets(result)
+    claims = (root / "claims.json").read_bytes()
     picture = next((root / "figures").glob("*.png"))
-    for path in (
-        root / "design" / "design.h5",
-        root / "claims.json",
-        root / "made.json",
-        root / "report.html",
-        picture,
-    ):
-        os.truncate(path, path.stat().st_size // 2 if path.suffix == ".h5" else 0)
-    again = make.make_paper(plan, root)
-    assert again.new_steps == ("design",) and again.complete and picture in again.drawn
-    assert_same_bits(datasets(root / "design" / "design.h5"), found)
-    assert (root / "claims.json").read_bytes() == claims and picture.read_bytes()[-8:-4] == b"IEND"
+    os.truncate(result, result.stat().st_size // 2)
+    for path in (root / "claims.json", root / "made.json", root / "report.html", picture):
+        os.truncate(path, 0)
+
+    repaired = make.make_paper(plan, root)
+    assert repaired.new_steps == ("design",)
+    assert repaired.complete
+    assert picture in repaired.drawn
+    assert_same_bits(datasets(result), before)
+    assert (root / "claims.json").read_bytes() == claims
+    # The last chunk of a PNG: it is whole.
+    assert picture.read_bytes()[-8:-4] == b"IEND"
+
     (root / "plan.json").write_text("")
     with pytest.raises(FolderError, match=r"plan\.json cannot be read; remove it if the folder holds"):
         make.make_paper(plan, root)
@@ -195,23 +242,26 @@ def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_
 
 @pytest.mark.slow
 def test_a_sample_has_members_of_different_curves_at_all_amplitudes_and_is_the_same_again():
+    """The members that ts computes as well are of different curves, spread over the amplitudes, and fixed."""
     steps = {step.name: step for step in paper_plan(FULL).steps}
-    assert {step.checks for step in steps.values() if step.checks} == {
-        "interband",
-        "scattering",
-        "scattering-neighbours",
-    }
+    checked = {step.checks for step in steps.values() if step.checks}
+    assert checked == {"interband", "scattering", "scattering-neighbours"}
 
     def curve(case: Case) -> str:
         return str((case.lattice.reading, case.contacts.law, case.contacts.sites, case.drive.cycles))
 
     for name in ("interband", "scattering-neighbours"):
-        sweep, step = steps[name].case, steps[f"{name}-ts"]
+        sweep = steps[name].case
+        step = steps[f"{name}-ts"]
         members, sample = ([member.case for member in case.members()] for case in (sweep, step.case))
         assert len(sample) == len(set(map(curve, sample))) == step.sample
+
+        # One member of each part of the range of amplitudes, if that is cut into as many parts as the sample has.
         amplitudes = sorted({case.drive.amplitude for case in members})
         places = sorted(amplitudes.index(case.drive.amplitude) for case in sample)
         assert [place * step.sample // len(amplitudes) for place in places] == list(range(step.sample))
+
+        # But for the engine each is a member of the sweep.
         assert {case.time.engine for case in sample} == {"ts"}
         tables = (case.model_dump(by_alias=True, exclude_none=True) | {"name": name} for case in sample)
         assert {case_id(Case.from_table(t, ["time.engine=auto"])) for t in tables} <= set(map(case_id, members))
@@ -221,43 +271,76 @@ def test_a_sample_has_members_of_different_curves_at_all_amplitudes_and_is_the_s
 @pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
 def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_path, monkeypatch):
-    plan, root = replace(searched[0], measure=lambda root: []), tmp_path / "paper"
+    """A second call looks at no figure; a lost picture costs its figure, a lost report the pictures in it."""
+    plan = replace(searched[0], measure=lambda root: [])
+    root = tmp_path / "paper"
     offered: list[str] = []
     encoded: list[int] = []
     ordered: list[str] = []
-    offers, quantize, draw_each = PaperFigure.offers, Image.Image.quantize, draw.draw_each
+    offers = PaperFigure.offers
+    quantize = Image.Image.quantize
+    draw_each = draw.draw_each
 
-    def drawn(drawings, *rest):
+    def offers_noted(figure, *rest):
+        offered.append(figure.id)
+        return offers(figure, *rest)
+
+    def quantize_noted(image, *arguments, **options):
+        encoded.append(image)
+        return quantize(image, *arguments, **options)
+
+    def order_noted(drawings, *rest):
         ordered.extend(stem for stem, _ in drawings)
         return draw_each(drawings, *rest)
 
-    monkeypatch.setattr(PaperFigure, "offers", lambda figure, *rest: offered.append(figure.id) or offers(figure, *rest))
-    monkeypatch.setattr(
-        Image.Image, "quantize", lambda image, *a, **k: encoded.append(image) or quantize(image, *a, **k)
-    )
-    monkeypatch.setattr(draw, "draw_each", drawn)
-    made = make.make_paper(plan, root)
-    assert ordered[0] == "figS3-design-cost-maps" and len(ordered) == 6  # the dearest first
-    assert sorted(offered) == ["fig10", "figS3"] and len(encoded) == 6 and len(made.drawn) == 18
+    monkeypatch.setattr(PaperFigure, "offers", offers_noted)
+    monkeypatch.setattr(Image.Image, "quantize", quantize_noted)
+    monkeypatch.setattr(draw, "draw_each", order_noted)
+
+    first = make.make_paper(plan, root)
+    # The dearest first: it would otherwise keep one rank at the end.
+    assert ordered[0] == "figS3-design-cost-maps"
+    assert len(ordered) == 6
+    assert sorted(offered) == ["fig10", "figS3"]
+    assert len(encoded) == 6
+    # A PNG, a PDF and the numbers of each.
+    assert len(first.drawn) == 3 * 6
     cpu = read_record(root)["cpu"]
     assert min(cpu["steps"]["design"], cpu["figures"], cpu["report"]) > 0
+
     offered.clear()
     encoded.clear()
-    assert make.make_paper(plan, root).drawn == () and offered == [] and encoded == []
+    assert make.make_paper(plan, root).drawn == ()
+    assert offered == []
+    assert encoded == []
+
     next((root / "figures").glob("fig10-*.png")).unlink()
-    assert len(make.make_paper(plan, root).drawn) == 3 and offered == ["fig10"] and encoded == []
+    assert len(make.make_paper(plan, root).drawn) == 3
+    assert offered == ["fig10"]
+    assert encoded == []
+
     (root / "report.html").unlink()
     make.make_paper(plan, root)
-    assert len(encoded) == 6 and (root / "report.html").read_text(encoding="utf-8").count("data-of") == 6
+    assert len(encoded) == 6
+    assert (root / "report.html").read_text(encoding="utf-8").count("data-of") == 6
 
 
 def test_parts_of_all_steps_are_shared_the_longest_first(tmp_path, monkeypatch):
-    shared: list[tuple[float, str, int]] = []
-    monkeypatch.setattr(steps.TaskPool, "run", lambda pool, jobs, *rest, **options: shared.extend(jobs) or {})
+    """The parts of all steps that have some are jobs of one pool, in the order of their cost."""
+    jobs: list[tuple[float, str, int]] = []
+
+    def note(pool, new_jobs, *rest, **options):
+        jobs.extend(new_jobs)
+        return {}
+
+    monkeypatch.setattr(steps.TaskPool, "run", note)
     plan = paper_plan(FULL)
-    parted = [step.name for step in plan.steps if step.parts]
-    plan = replace(plan, steps=[step for step in plan.steps if step.parts], figures=[], measure=lambda root: [])
-    make.make_paper(plan, tmp_path)
-    assert [job[1:] for job in shared[:2]] == [("nnm-hertz", 1), ("nnm-bilinear", 1)]
-    assert {name for _, name, _ in shared} == set(parted) and len(shared) == 7
-    assert [cost for cost, *_ in shared] == sorted((cost for cost, *_ in shared), reverse=True)
+    in_parts = [step for step in plan.steps if step.parts]
+
+    make.make_paper(replace(plan, steps=in_parts, figures=[], measure=lambda root: []), tmp_path)
+
+    assert len(jobs) == 7
+    assert {name for _, name, _ in jobs} == {step.name for step in in_parts}
+    assert [job[1:] for job in jobs[:2]] == [("nnm-hertz", 1), ("nnm-bilinear", 1)]
+    costs = [cost for cost, *_ in jobs]
+    assert costs == sorted(costs, reverse=True)
