@@ -34,6 +34,11 @@ class Model:
     gaps: Gaps = ()
 
     @property
+    def used_laws(self) -> tuple[Contact, ...]:
+        """The law of each site, or the one of all: not ``contact`` where each has its own, which may have no limit."""
+        return self.laws or (self.contact,)
+
+    @property
     def drive(self) -> Waveform:
         """The waveform of the first drive, by which frequency, wave and times are judged."""
         return self.drives[0].waveform

@@ -163,8 +163,7 @@ def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
         return
 
     # The stiffest law decides, at the speed of the undisturbed wave.
-    laws = {*(model.laws or (model.contact,))}
-    time = min(law.impact_time(speed, model.chain.cell.reduced_mass) for law in laws)
+    time = min(law.impact_time(speed, model.chain.cell.reduced_mass) for law in {*model.used_laws})
     # Options of PETSc are text in a case.
     step = float(petsc.get("ts_dt", DEFAULT_STEP / model.drive.frequency))
     if petsc.get("ts_adapt_type") == "none" and step > time / STEPS:

@@ -24,7 +24,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     bands = pass_bands(cell)
     gap_list = ", ".join(f"{low:.2f}-{high:.2f}" for low, high in gaps(bands))
     # Every one of a million sites may have a law: as many are named as a list shows.
-    laws = model.laws[:8] or (model.contact,)
+    laws = model.used_laws[:8]
     clearances = first_few(describe_stops(model.gaps, chain.clearances))
 
     return [

@@ -213,7 +213,8 @@ class Recorder(Observer):
             place = "the site that touches its stop" if sites == 1 else f"one of the {touching} sites that touch"
             return [f"no contact: nothing pressed {place} at rest"]
 
-        if radius is None or self.setup.model.contact.law != "hertz" or self.deepest <= radius:
+        is_hertz = any(law.law == "hertz" for law in self.setup.model.used_laws)
+        if radius is None or not is_hertz or self.deepest <= radius:
             return []
         beyond = f"the deepest indentation, {self.deepest:.3g} m, is beyond the contacts' radius of {radius:g} m"
         return [f"{beyond}: Hertz's law holds for indentations far below it"]

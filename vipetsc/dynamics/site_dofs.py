@@ -28,7 +28,8 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     gaps = np.vstack([gaps, [[np.inf] * 2]])[numbers]
     masses = np.array([*chain.reduced_masses(), chain.cell.reduced_mass])[numbers]
     joins_next_cell = np.array([*(pair.next_cell for pair in chain.contact_pairs), False])[numbers]
-    laws = [model.laws[i] if model.laws and i >= 0 else model.contact for i in numbers]
+    # A number below 0 takes any law that is used: without stops no law acts.
+    laws = [model.used_laws[i if model.laws and i >= 0 else 0] for i in numbers]
     sites = create_contacts(laws, gaps, masses, model.scale)
 
     least = gaps.min(axis=1)

@@ -89,8 +89,8 @@ class Integrator(Engine):
         self._interval = model.sample_interval
         self._breaks = np.unique(np.concatenate([drive.waveform.breaks for drive in model.drives]))
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
-        laws = model.laws or (model.contact,)
-        fraction, order = LINEAR_ONSET if all(law.onset_exponent == 1 for law in laws) else OTHER_ONSET
+        begin_linearly = all(law.onset_exponent == 1 for law in model.used_laws)
+        fraction, order = LINEAR_ONSET if begin_linearly else OTHER_ONSET
         self._onset_fraction = min(fraction * (model.rtol / 1e-10) ** (1 / order), LONGEST_ONSET)
         self.observe(self.tracker.start)
 
