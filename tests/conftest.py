@@ -71,6 +71,11 @@ DIFFERING = {
 }
 
 
+def with_sections(table: dict[str, Any], sections: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The ``table`` of a case with its sections updated by ``sections``; neither is changed."""
+    return table | {name: table.get(name, {}) | values for name, values in sections.items()}
+
+
 def small_case(**sections) -> Case:
     """A four-band lattice of 24 cells in which contacts begin early; ``sections`` update its table."""
     table = {
@@ -80,9 +85,7 @@ def small_case(**sections) -> Case:
         "drive": {"amplitude": 24.33, "cycles": 6},
         "time": {"end": 0.05},
     }
-    for name, values in sections.items():
-        table[name] = table.get(name, {}) | values
-    return Case.from_table(table)
+    return Case.from_table(with_sections(table, sections))
 
 
 def simulated(case: Case, observers: Sequence[type[Observer]] = ()) -> tuple[xr.Dataset, Result]:
@@ -110,9 +113,7 @@ def search_table(cells: int, sites: list[int], **sections: dict[str, Any]) -> di
         "time": {"end": 0.03, "rtol": 1e-7},
         "optimise": {"budget": 14, "curve": [20.0], "variables": {"clearance": [1e-5, 1e-3]}},
     }
-    for name, values in sections.items():
-        table[name] = table[name] | values
-    return table
+    return with_sections(table, sections)
 
 
 # A second objective that the first one contradicts.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from tests.conftest import with_sections
 from tests.models import THREE_MASS_CELL
 from vipetsc.case import LawCase
 from vipetsc.case.predict import PredictCase
@@ -16,7 +17,7 @@ LATTICES = {
 # A table of few points, each of one run.
 COARSE = {"largest": 2.0, "samples": 1, "tolerance": 0.3, "finest": 0.2}
 
-PREDICTION = {
+PREDICTION: dict[str, Any] = {
     "name": "small",
     "lattice": {"preset": "four-band", "cells": 120},
     "contacts": {"sites": [40, 70], "clearance": [2e-3, 1.8e-3]},
@@ -38,14 +39,9 @@ def law_case(lattice: str = "four-band", law: dict[str, Any] = COARSE, **section
         "time": {"rtol": 1e-9},
         "law": law,
     }
-    for name, values in sections.items():
-        table[name] = table.get(name, {}) | values
-    return LawCase.from_table(table)
+    return LawCase.from_table(with_sections(table, sections))
 
 
 def prediction_case(**sections: dict[str, Any]) -> PredictCase:
     """Two sites of a four-band lattice at four amplitudes; ``sections`` update the table of the case."""
-    table: dict[str, Any] = dict(PREDICTION)
-    for name, values in sections.items():
-        table[name] = table.get(name, {}) | values
-    return PredictCase.from_table(table)
+    return PredictCase.from_table(with_sections(PREDICTION, sections))

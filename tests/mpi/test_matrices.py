@@ -23,44 +23,51 @@ from vipetsc.lattice.modes import mode_frequency, mode_shape
 from vipetsc.studies.linear_modes import find_modes
 
 COMM = MPI.COMM_WORLD
+# A cell of whole numbers, whose sums are exact in any order.
 WHOLE = UnitCell((1.0, 2.0, 4.0), (Spring(0, 0, 3.0, True), Spring(0, 1, 5.0), Spring(2, 1, 7.0, True)), 0, 1)
 
 
 def stencil(chain: Chain, u: np.ndarray) -> np.ndarray:
     """-M u'' (cell, dof) of this rank's cells by the right-hand side that PETSc calls."""
     model = small_case(drive={"amplitude": 1e-3}).model()
-    model = type(model)(**vars(model) | {"chain": chain, "drives": (replace(model.drives[0], mass=0),)})
+    model = replace(model, chain=chain, drives=(replace(model.drives[0], mass=0),))
     layout = Layout(model, COMM)
     engine = Integrator(model, layout)
     layout.place(np.hstack([u, 0 * u])[layout.start : layout.stop], 0.0, engine.state.array)
     rate = engine.state.duplicate()
     engine.ts.computeRHSFunction(0.0, engine.state, rate)
     engine.destroy()
+
+    # Rates of the velocities lie behind those of the displacements, mass by mass.
     d = layout.dofs
     n = layout.owned
-    return -rate.array[d * n : 2 * d * n].reshape(d, n).T * np.asarray(chain.cell.masses)
+    acceleration = rate.array[d * n : 2 * d * n].reshape(d, n).T
+    return -acceleration * np.asarray(chain.cell.masses)
 
 
 @pytest.mark.parallel([1, 2, 3])
 @pytest.mark.parametrize("ends", [*on_two("fixed", "free"), "periodic"])
 @pytest.mark.parametrize("cells", [2, 3, 25])
-def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells):
-    """To the last bit in whole numbers, where sums are exact in any order; otherwise to their rounding."""
+@pytest.mark.parametrize(("cell", "rounding"), [(WHOLE, 0), (four_band(), 1e-10)], ids=["whole", "four-band"])
+def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells, cell, rounding):
+    """They agree to the last bit in whole numbers, otherwise to the rounding of their sums."""
     rng = np.random.default_rng(3)
-    for cell, u in ((WHOLE, rng.integers(-99, 99, (cells, 3)) * 1.0), (four_band(), rng.standard_normal((cells, 4)))):
-        chain = Chain(cell, cells, ends)
-        matrices = LatticeMatrices(chain, COMM)
-        mine = slice(matrices.start, matrices.stop)
-        product = (matrices.stiffness * matrices.vector(u[mine])).array_r.reshape(u[mine].shape)
-        expected = stencil(chain, u)
+    u = rng.standard_normal((cells, cell.dofs))
+    if cell is WHOLE:
+        u = np.round(99 * u)
+    chain = Chain(cell, cells, ends)
+    matrices = LatticeMatrices(chain, COMM)
+    own = u[matrices.start : matrices.stop]
 
-        assert np.abs(product - expected).max(initial=0) <= (0 if cell is WHOLE else 1e-10)
+    force = (matrices.stiffness * matrices.vector(own)).array_r.reshape(own.shape)
+    assert np.abs(force - stencil(chain, u)).max(initial=0) <= rounding
 
-        momentum = (matrices.mass * matrices.vector(u[mine])).array_r.reshape(u[mine].shape)
-        assert np.array_equal(momentum, u[mine] * np.asarray(cell.masses))
-        # Exactly as many entries as were needed are there.
-        assert matrices.stiffness.getInfo()["nz_unneeded"] == 0
-        matrices.destroy()
+    momentum = (matrices.mass * matrices.vector(own)).array_r.reshape(own.shape)
+    assert np.array_equal(momentum, own * np.asarray(cell.masses))
+
+    # Exactly as many entries as were needed are there.
+    assert matrices.stiffness.getInfo()["nz_unneeded"] == 0
+    matrices.destroy()
 
 
 @pytest.mark.parallel([1, 2, 3])
@@ -69,15 +76,21 @@ def test_the_matrix_and_the_stencil_are_one_stiffness(ends, cells):
     [*on_two(("fixed", 60, 2034.0, 4), ("free", 40, 0.0, 3)), ("periodic", 60, 1000.0, 7), ("fixed", 3, 900.0, 12)],
 )
 def test_modes_near_a_frequency_are_those_of_the_lattice_with_all_their_copies(ends, cells, near, count):
+    """Frequencies are those of the closed form, modes that have one frequency are all found, and shapes orthonormal."""
     chain = Chain(four_band("calibrated"), cells, ends)
     matrices = LatticeMatrices(chain, COMM)
-    taken = []
+    starts = []
     vector = matrices.vector
-    matrices.vector = lambda *cells: taken.append(1) or vector(*cells)
+
+    def counted(*cells):
+        starts.append(cells)
+        return vector(*cells)
+
+    matrices.vector = counted
     modes = modes_near(matrices, count, near)
 
-    assert len(taken) <= count + 3  # it ends with the first mode that is not nearer
-
+    # The search ends with the first mode that is not nearer.
+    assert len(starts) <= count + 3
     every = np.array([mode_frequency(chain, number) for number in range(1, matrices.rows + 1)])
     nearest = np.sort(every[np.argsort(np.abs(every**2 - near**2), kind="stable")[:count]])
     assert modes.frequency == pytest.approx(nearest, rel=1e-9, abs=1e-3)
@@ -95,8 +108,8 @@ def test_the_edge_modes_of_the_lattice_and_their_file(folder):
     case = small_case(lattice={"cells": 100}, contacts={"sites": [30]})
     found = find_modes(case, 3, 2034.0, folder, COMM)
     assert (found is None) == (COMM.rank > 0)
-
     COMM.Barrier()
+
     with xr.open_dataset(folder / "modes.h5", engine="h5netcdf") as data:
         assert data["frequency"].values[:2] == pytest.approx(2034.8251, abs=1e-4)
         assert data["kind"].values.tolist() == ["edge", "edge", "bulk"]
@@ -105,6 +118,7 @@ def test_the_edge_modes_of_the_lattice_and_their_file(folder):
         assert data["participation"].values[:2].max() < 4 < 50 < data["participation"].values[2]
         assert (data["left"] + data["right"]).values[:2] == pytest.approx(1.0, abs=1e-6)
 
+        # The third one is a mode of the closed form.
         bulk = mode_shape(Chain(four_band("calibrated"), 100), 202)
         shape = data["shape"].values[2]
         assert np.abs(shape / np.abs(shape).max()) == pytest.approx(np.abs(bulk), abs=1e-6)
@@ -115,17 +129,19 @@ def test_where_energy_is_counts_with_the_masses_of_each_cell(folder):
     profiles = {"masses[1]": [0.005, 0.02], "springs[2].stiffness": [1e4, 3e4]}
     case = small_case(lattice={"cells": 2, "profiles": profiles}, contacts={"sites": [1]})
     data = find_modes(case, 8, 900.0, folder, COMM)
+
     chain = case.model().chain
     stiffness = chain.stiffness_matrix().toarray()
     masses = chain.masses()
-
     assert data["frequency"].values ** 2 == pytest.approx(eigvalsh(stiffness, np.diag(masses)), rel=1e-9)
-    assert (data["left"] + data["right"]).values == pytest.approx(1.0, abs=1e-12)  # a tenth is one cell of two
+    # The outer tenths of two cells are one cell each: together they hold all.
+    assert (data["left"] + data["right"]).values == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parallel([1])
-def test_refused(monkeypatch, folder):
+def test_modes_that_cannot_be_found_are_refused(monkeypatch, folder):
     case = small_case()
+    # 24 cells have 96 modes.
     for count, near, key in ((0, 1.0, "--modes"), (97, 1.0, "--modes"), (2, -1.0, "--near")):
         with pytest.raises(CaseError, match=key):
             find_modes(case, count, near, folder, COMM)
@@ -135,6 +151,7 @@ def test_refused(monkeypatch, folder):
         find_modes(pressed, 2, 1.0, folder, COMM)
 
     monkeypatch.setattr(eigen, "RESTARTS", 1)
+    long = LatticeMatrices(Chain(four_band("calibrated"), 2000), COMM)
     with pytest.raises(CaseError, match="of 6 modes come out"):
-        modes_near(LatticeMatrices(Chain(four_band("calibrated"), 2000), COMM), 6, 2034.0)
+        modes_near(long, 6, 2034.0)
     assert not (folder / "modes.h5").exists()

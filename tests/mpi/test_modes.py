@@ -1,4 +1,4 @@
-"""Branches shared over ranks: the same bits on 1 and on 2, a failure on one leaves the others."""
+"""Branches that ranks follow side by side: the same bits on 1 and on 2 ranks; a failure on one leaves the others."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from vipetsc.parallel import StopRequest
 
 
 def three_cells(**nnm) -> NnmCase:
+    """Two branches of twelve degrees of freedom, from the lowest modes through grazing; ``nnm`` updates its section."""
     table = {
         "name": "cells",
         "lattice": {"preset": "four-band", "reading": "printed", "cells": 3},
@@ -25,23 +26,25 @@ def three_cells(**nnm) -> NnmCase:
 
 @pytest.mark.parallel([1, 2])
 def test_same_bits_on_every_number_of_ranks(folder):
-    """Twelve degrees of freedom, the two lowest modes through grazing; rank 0 repeats them alone."""
     comm = MPI.COMM_WORLD
     case = three_cells()
     branches = follow_all(case, folder, comm)
     comm.Barrier()
-    if comm.rank == 0:
-        assert [b.name for b in branches] == ["mode-1", "mode-2"]
-        assert all(b.points[-1].episodes > 0 for b in branches)
-        alone = folder / "alone"
-        alone.mkdir()
-        follow_all(case, alone, MPI.COMM_SELF)
-        for b in branches:
-            name = f"branch-{b.name}"
-            assert (folder / f"{name}.csv").read_text() == (alone / f"{name}.csv").read_text()
-            assert_same_bits(datasets(folder / f"{name}.h5"), datasets(alone / f"{name}.h5"))
-    else:
+    if comm.rank:
+        # Rank 0 collects the branches of all.
         assert branches == []
+        return
+
+    assert [branch.name for branch in branches] == ["mode-1", "mode-2"]
+    assert all(branch.points[-1].episodes > 0 for branch in branches)
+
+    alone = folder / "alone"
+    alone.mkdir()
+    follow_all(case, alone, MPI.COMM_SELF)
+    for branch in branches:
+        name = f"branch-{branch.name}"
+        assert (folder / f"{name}.csv").read_text() == (alone / f"{name}.csv").read_text()
+        assert_same_bits(datasets(folder / f"{name}.h5"), datasets(alone / f"{name}.h5"))
 
 
 @pytest.mark.parallel([1, 2])
@@ -49,14 +52,18 @@ def test_a_branch_that_fails_keeps_its_points_and_the_others_go_on(folder):
     """A half-trace that may not move at all stops the branches at their first contact, with their points on disk."""
     comm = MPI.COMM_WORLD
     case = three_cells(smallest_step=1e-3, guards={"half_trace": 1e-3})
+
     branches = follow_all(case, folder, comm)
+
     comm.Barrier()
     if comm.rank == 0:
-        for b in branches:
-            assert b.ending.startswith("failed: step below")
-            assert "nnm.guards.half_trace" in b.ending
-            rows = (folder / f"branch-{b.name}.csv").read_text().splitlines()
-            assert len(rows) == len(b.points) + 1 > 2
+        assert len(branches) == 2
+        for branch in branches:
+            assert branch.ending.startswith("failed: step below")
+            assert "nnm.guards.half_trace" in branch.ending
+            # A row of names, then one a point.
+            rows = (folder / f"branch-{branch.name}.csv").read_text().splitlines()
+            assert len(rows) == len(branch.points) + 1 > 2
 
 
 @pytest.mark.parallel([1, 2])
@@ -71,6 +78,7 @@ def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
 
     stopped = follow_all(case, folder, comm, listener=listener, stop=stop)
     comm.Barrier()
+
     whole = folder / "whole"
     if comm.rank == 0:
         first, second = stopped
@@ -79,6 +87,7 @@ def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
         assert second.ending.startswith("20 points reached")
         whole.mkdir()
     comm.Barrier()
+
     follow_all(case, folder, comm, resume=True)
     follow_all(case, whole, comm)
     comm.Barrier()

@@ -12,7 +12,8 @@ from vipetsc.parallel import StoppedError, StopRequest
 from vipetsc.studies.optimum_search import run_search
 
 
-def plan(*changes):
+def plan(*changes: str) -> OptimiseCase:
+    """A search for clearances and cells of two sites; ``changes`` are overrides of its case."""
     bounds = {"variables": {"clearance": [1e-5, 1e-3], "sites": [3, 12]}}
     table = search_table(16, [4, 9])
     return OptimiseCase.from_table(table | {"optimise": table["optimise"] | bounds}, changes)
@@ -20,7 +21,7 @@ def plan(*changes):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """What one rank finds."""
+    """The optimum that one rank finds."""
     folder = tmp_path_factory.mktemp("whole")
     run_search(plan(), folder, MPI.COMM_SELF)
     return datasets(folder / "optimum.h5")
@@ -30,6 +31,7 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize("team", [*on_two(1), 2])
 def test_the_optimum_does_not_depend_on_the_ranks(folder, whole, team):
     text = run_search(plan(f"optimise.ranks={team}"), folder, MPI.COMM_WORLD)
+
     assert "14 designs" in text
     assert_same_bits(datasets(folder / "optimum.h5"), whole)
     MPI.COMM_WORLD.Barrier()
@@ -41,6 +43,7 @@ def test_a_front_does_not_depend_on_the_ranks(folder, tmp_path_factory):
     case = plan(TWO, "optimise.population=6")
     run_search(case, alone, MPI.COMM_SELF)
     run_search(case, folder, MPI.COMM_WORLD)
+
     assert_same_bits(datasets(folder / "optimum.h5"), datasets(alone / "optimum.h5"))
     MPI.COMM_WORLD.Barrier()
 
@@ -50,11 +53,14 @@ def test_a_front_does_not_depend_on_the_ranks(folder, tmp_path_factory):
 def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder, whole, looks):
     comm = MPI.COMM_WORLD
     stop = StopAt(looks) if comm.rank == comm.size - 1 else StopRequest()
+
     with pytest.raises(StoppedError, match="the same command goes on"):
         run_search(plan(), folder, comm, stop=stop)
     assert not (folder / "optimum.h5").exists()
 
+    # No rank goes on while another one still looks for the file.
     comm.Barrier()
     run_search(plan(), folder, comm, resume=True)
+
     assert_same_bits(datasets(folder / "optimum.h5"), whole)
     comm.Barrier()

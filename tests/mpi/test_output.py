@@ -1,4 +1,4 @@
-"""Ranks that write together: attributes that all agree on, failures that all hear of, files that are whole."""
+"""Ranks that write together agree on attributes, learn of each other's failures, and leave whole files."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ COMM = MPI.COMM_WORLD
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("writer", ["gather", in_parallel])
-def test_all_ranks_agree_on_what_is_told_in_the_file(folder, monkeypatch, writer):
+def test_all_ranks_agree_on_the_attributes_of_the_file(folder, monkeypatch, writer):
     """HDF5 fails to close a file whose attributes, such as the seconds a run took, differ between ranks."""
     finish = RunFolder.finish
-    told = []
+    outcome = []
 
     def watch(output, attributes, summary):
-        told.append(dict(attributes))
+        outcome.append(dict(attributes))
         finish(output, attributes, summary)
 
     monkeypatch.setattr(RunFolder, "finish", watch)
     result = simulate(small_case(output={"writer": writer}, time={"end": 0.01}), folder / "run")
-    told.append([result.sentence, result.statistics, result.warnings])
-    assert len(set(COMM.allgather(json.dumps(told)))) == 1
+    outcome.append([result.sentence, result.statistics, result.warnings])
+    assert len(set(COMM.allgather(json.dumps(outcome)))) == 1
 
     with h5py.File(folder / "run" / "run.h5") as file:
         assert json.loads(file.attrs["statistics"]) == result.statistics
@@ -52,23 +52,25 @@ def test_a_run_in_memory_is_gathered_on_rank_0(folder):
     if COMM.rank:
         assert memory.dataset is None
         return
-    run = datasets(folder / "run" / "run.h5")
-    held = memory.dataset.drop_vars(["end/displacement", "end/velocity"])  # of all cells, whatever is recorded
 
+    run = datasets(folder / "run" / "run.h5")
+    # The state at the end is in memory alone.
+    held = memory.dataset.drop_vars(["end/displacement", "end/velocity"])
     assert_same_bits(run, {str(name): item.values for name, item in held.variables.items()})
 
 
 @needs_parallel_hdf5
 @pytest.mark.parallel([2, 3])
 def test_ranks_that_write_together_write_what_one_gathers(folder, monkeypatch):
-    """Several sites a rank, named in no order; several chunks; fields of a window; open and closed episodes."""
+    """The files agree for several sites a rank in no order, several chunks, fields of a window, open episodes."""
     monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 20)
     sites = {"sites": [13, 5, 6, 18, 12, 2], "clearance": [2e-4, 1e-4, 3e-5, 1e-4, 5e-5, 2e-4]}
     for writer in ("gather", "parallel"):
         output = {"writer": writer, "window": [2, 20], "every": 2, "stride": 3}
         simulate(small_case(contacts=sites, output=output, time={"end": 0.04}), folder / writer)
-    gathered, together = (datasets(folder / name / "run.h5") for name in ("gather", "parallel"))
 
+    gathered = datasets(folder / "gather" / "run.h5")
+    together = datasets(folder / "parallel" / "run.h5")
     assert len(gathered["impacts/onset"]) > 20
     assert (gathered["energy/dissipated_by_site"][-1] > 0).sum() > 2
     assert_same_bits(gathered, together)
@@ -81,11 +83,11 @@ def test_rows_are_sorted_over_ranks_and_none_has_all():
     table = np.zeros(900, [("onset", float), ("site", np.int64)])
     table["onset"] = random.integers(300, size=900) / 7
     table["site"] = random.permutation(900)
-    rows, first, total = sort_over_ranks(
-        COMM, table[[slice(700), slice(700, 900), slice(0)][COMM.rank]], ("onset", "site")
-    )
-    expected = np.sort(table, order=("onset", "site"))
+    begin, end = ((0, 700), (700, 900), (900, 900))[COMM.rank]
 
+    rows, first, total = sort_over_ranks(COMM, table[begin:end], ("onset", "site"))
+
+    expected = np.sort(table, order=("onset", "site"))
     assert total == len(expected)
     assert 0 < len(rows) < 1.1 * total / COMM.size + 10
     np.testing.assert_array_equal(rows, expected[first : first + len(rows)])
@@ -97,6 +99,8 @@ def test_a_rank_that_cannot_write_stops_all_and_nothing_is_lost(folder, monkeypa
     path = folder / "run"
     simulate(small_case(time={"end": 0.01}), path)
     before = (path / "run.h5").read_bytes()
+
+    # Gathered files are written by rank 0.
     failing = COMM.size - 1 if writer == "parallel" else 0
     case = small_case(output={"writer": writer}, time={"end": 0.02})
 
@@ -151,19 +155,20 @@ def test_only_checkpoints_that_all_ranks_wrote_count(folder):
         chunks.save_state({"number": np.array(number)})
     COMM.Barrier()
 
-    assert sorted(path.name for path in parts.glob(f"state-*-{COMM.rank}-2.npy")) == [
-        f"state-00000{number}-{COMM.rank}-2.npy" for number in (2, 3)
-    ]
-
+    # The last two are kept: of the very last one a rank may have been killed in the midst.
+    kept = sorted(path.name for path in parts.glob(f"state-*-{COMM.rank}-2.npy"))
+    assert kept == [f"state-000002-{COMM.rank}-2.npy", f"state-000003-{COMM.rank}-2.npy"]
     COMM.Barrier()
+
     if COMM.rank == 1:
-        (parts / "state-000003-1-2.npy").unlink()  # killed while it wrote the last one
+        (parts / "state-000003-1-2.npy").unlink()
     COMM.Barrier()
     again = RunFolder(folder, COMM)
 
-    assert [share["number"] for share in again.last_state()] == [2, 2]
+    assert [state["number"] for state in again.last_state()] == [2, 2]
     assert again.count == 3
-    assert not list(parts.glob("part-000003-*"))  # another number of ranks would leave them there
+    # Another number of ranks would leave chunks behind the checkpoint there.
+    assert not list(parts.glob("part-000003-*"))
 
 
 @pytest.mark.parallel(2)
@@ -173,6 +178,8 @@ def test_a_checkpoint_that_one_rank_cannot_read_is_refused_on_all(folder):
     output.begin(case)
     output.append({"x": np.zeros(1)})
     output.save_state({"number": np.array(1)})
+
+    # Cut off within its header.
     if COMM.rank == 1:
         (state,) = (folder / "run" / "parts").glob("state-*-1-2.npy")
         state.write_bytes(state.read_bytes()[:20])

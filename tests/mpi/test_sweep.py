@@ -40,15 +40,20 @@ amplitude = [0.1, 20.0, 40.0]
 
 @pytest.fixture(scope="module")
 def injector():
+    """Faults at chosen phases; it patches the package, and so stands once."""
     return Injector()
+
+
+def sweep(*changes: str) -> Sweep:
+    """The sweep of the table; ``changes`` are overrides of its case."""
+    return Sweep.from_table(tomllib.loads(TABLE), list(changes))
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The ensemble of the sweep as one rank makes it."""
-    plan = Sweep.from_table(tomllib.loads(TABLE))
+    """The ensemble of the sweep that one rank makes."""
     folder = tmp_path_factory.mktemp("whole")
-    run_sweep(plan, folder, MPI.COMM_SELF)
+    run_sweep(sweep(), folder, MPI.COMM_SELF)
     return datasets(folder / "ensemble.h5")
 
 
@@ -56,8 +61,9 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize("team", [1, 2])
 def test_the_ensemble_does_not_depend_on_the_ranks(folder, whole, team):
     comm = MPI.COMM_WORLD
-    plan = Sweep.from_table(tomllib.loads(TABLE), [f"sweep.ranks={team}"])
-    result = run_sweep(plan, folder, comm)
+
+    result = run_sweep(sweep(f"sweep.ranks={team}"), folder, comm)
+
     assert result.complete
     assert result.status.size == 6
     assert len(result.busy) == comm.size
@@ -72,17 +78,23 @@ def test_samples_differ_and_neither_ranks_nor_order_change_a_bit(folder):
     table = tomllib.loads(TABLE) | {"contacts": {"sites": [4, 9], "clearance": 2e-4}}
     table |= {"disorder": {"clearance": {"relative": 0.05}}, "sweep": {"disorder": {"seed": {"count": 3}}}}
     table["drive"] = table["drive"] | {"amplitude": 20.0}
+
     run_sweep(Sweep.from_table(table), folder / "all", comm)
     run_sweep(Sweep.from_table(table, ["sweep.disorder.seed=[2, 0, 1]"]), folder / "turned", comm)
     comm.Barrier()
+
     if comm.rank == 0:
         run_sweep(Sweep.from_table(table), folder / "alone", MPI.COMM_SELF)
-        found, turned, alone = (datasets(folder / name / "ensemble.h5") for name in ("all", "turned", "alone"))
-        assert_same_bits(found, alone)
-        assert turned["ibtet"].tolist() == found["ibtet"][[2, 0, 1]].tolist()
-        assert len({*turned["ibtet"]}) == 3
-        assert found["statistics/samples"] == 3
-        assert (folder / "all" / "members.jsonl").read_bytes().count(b'"envelope"') == 1  # one linear run for all
+        together = datasets(folder / "all" / "ensemble.h5")
+        assert_same_bits(together, datasets(folder / "alone" / "ensemble.h5"))
+        assert together["statistics/samples"] == 3
+
+        turned = datasets(folder / "turned" / "ensemble.h5")["ibtet"]
+        assert turned.tolist() == together["ibtet"][[2, 0, 1]].tolist()
+        assert len({*turned}) == 3
+
+        # Clearances are scattered, the lattice is not: one linear run serves all samples.
+        assert (folder / "all" / "members.jsonl").read_bytes().count(b'"envelope"') == 1
     comm.Barrier()
 
 
@@ -93,18 +105,23 @@ def test_samples_differ_and_neither_ranks_nor_order_change_a_bit(folder):
 )
 def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, injector, whole, team, phase, kind):
     comm = MPI.COMM_WORLD
-    plan = Sweep.from_table(tomllib.loads(TABLE), [f"sweep.ranks={team}"])
-    # The first record is that of the linear run; a team's rank 0 measures and writes for it.
-    if comm.rank == (0 if team == 2 else 1):
-        injector.arm(phase, {"append": 3 - comm.rank, "step": 2, "analyse": 2}[phase], kind)
+    plan = sweep(f"sweep.ranks={team}")
+    # A team's rank 0 measures and writes for it; alone, rank 1 is the one that fails.
+    failing = 0 if team == 2 else 1
+    if comm.rank == failing:
+        # The first record of rank 0 is that of the linear run: it fails one record later.
+        time_of_fault = {"append": 3 - comm.rank, "step": 2, "analyse": 2}
+        injector.arm(phase, time_of_fault[phase], kind)
 
     if kind == "full-disk":
         with pytest.raises(OSError, match="No space left"):
             run_sweep(plan, folder / "out", comm)
     else:
         result = run_sweep(plan, folder / "out", comm)
-        ((reason),) = {row["reason"] for row in json.loads((folder / "out" / "index.json").read_text())["failed"]}
-        assert ("a fault at analyse" if kind == "exception" else "MemoryError: Unable to allocate") in reason
+        failed = json.loads((folder / "out" / "index.json").read_text())["failed"]
+        (reason,) = {row["reason"] for row in failed}
+        expected = {"exception": "a fault at analyse", "memory": "MemoryError: Unable to allocate"}
+        assert expected[kind] in reason
         assert not result.complete
         assert not result.resumable
         assert result.count(2) < 6
@@ -120,8 +137,9 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
 @pytest.mark.parametrize(("team", "looks"), [*on_two((1, 1)), (2, 1)])
 def test_one_rank_that_is_asked_to_stop_stops_all(folder, whole, team, looks):
     comm = MPI.COMM_WORLD
-    plan = Sweep.from_table(tomllib.loads(TABLE), [f"sweep.ranks={team}"])
+    plan = sweep(f"sweep.ranks={team}")
     stop = StopAt(looks) if comm.rank == comm.size - 1 else StopRequest()
+
     stopped = run_sweep(plan, folder / "out", comm, stop=stop)
 
     assert stopped.resumable
@@ -141,9 +159,9 @@ def test_every_number_is_drawn_once():
     drawn = []
     while (number := counter.draw()) < 200:
         drawn.append(number)
-    everything = [number for share in comm.allgather(drawn) for number in share]
 
-    assert sorted(everything) == list(range(200))
+    of_all_ranks = [number for numbers in comm.allgather(drawn) for number in numbers]
+    assert sorted(of_all_ranks) == list(range(200))
     counter.free()
 
 
@@ -154,6 +172,7 @@ def test_after_a_request_on_one_rank_no_rank_begins_another_job():
     pool = TaskPool(comm, MPI.COMM_SELF, stop)
 
     def work(job: int) -> None:
+        # So long that the other rank sees the request before it has done its half.
         time.sleep(0.01)
         stop.requested = comm.rank == 1
 
@@ -173,8 +192,12 @@ def test_blocks_of_jobs_hold_every_job_once():
         if job % 10 == 3:
             raise ValueError("three")
 
-    made = TaskPool(comm, MPI.COMM_SELF, StopRequest()).run(range(1007), work, fail=lambda job, why: failed.append(job))
+    pool = TaskPool(comm, MPI.COMM_SELF, StopRequest())
+    completed = pool.run(range(1007), work, fail=lambda job, why: failed.append(job))
+
     assert sorted(job for jobs in comm.allgather(done) for job in jobs) == list(range(1007))
     assert sorted(job for jobs in comm.allgather(failed) for job in jobs) == list(range(3, 1007, 10))
-    assert made == 1007 - 101
-    assert comm.size > 1 or done == list(range(1007))  # the first come first
+    assert completed == 1007 - 101
+    if comm.size == 1:
+        # The first come first.
+        assert done == list(range(1007))

@@ -46,6 +46,7 @@ class Branch(NamedTuple):
             guess = frame.xi + length * frame.direction(point)
             attempt = frame.solve(guess, frame.tangent, frame.tangent @ guess)
             assert attempt.converged, attempt.history
+            # The tangent spans the null space of the Jacobian.
             tangent = np.linalg.svd(frame.jacobian(attempt.xi))[2][-1]
             point = frame.measures(attempt, tangent)
 
@@ -60,6 +61,7 @@ def follow(system: System, mode: int, start: float, **control) -> Branch:
     continuation = Continuation(problem, first, NnmTable(**{"points": 20000} | control))
     chart = control.get("chart", "relative")
 
+    # The continuation does not yield its start.
     points = [continuation.point]
     special = []
     for point in continuation:

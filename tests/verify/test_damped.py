@@ -9,7 +9,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.conftest import run_of, small_case
+from tests.conftest import run_of, small_case, with_sections
 from vipetsc.case import Case, CaseError, LawCase
 from vipetsc.case.inhomogeneity import lobe_reflection
 from vipetsc.case.warnings import losses
@@ -200,6 +200,7 @@ def test_profiles_defects_and_scatter_of_a_case():
     assert Case.from_toml(case.to_toml()) == case
     assert case.model().chain == small_case(lattice=lattice, disorder=scattered).model().chain
 
+    # Another seed scatters anew, and leaves what profiles give.
     other = small_case(lattice=lattice, disorder=scattered | {"seed": 4}).model().chain.variation
     assert np.all(other.masses[:, 0] != varied.masses[:, 0])
     assert np.array_equal(other.masses[:, 1], varied.masses[:, 1])
@@ -286,6 +287,7 @@ def test_a_loss_by_bands_is_resolved_to_dashpots():
     assert mean == pytest.approx(0.02, rel=1e-3)
     assert not any("loss" in sentence for sentence in case.warnings())
 
+    # No dashpots meet the loss in both bands.
     flat = small_case(lattice={"damping": {"loss": {"1": 0.02, "2": 0.02}}})
     assert any("band 1 0.00" in sentence and "asked 0.02" in sentence for sentence in flat.warnings())
 
@@ -301,6 +303,7 @@ def test_a_loss_that_cannot_be_is_refused(damping):
     assert len(error.value.problems) == 1
 
 
+# A chain that contacts alone hold together.
 BEADS = {"cell": {"masses": [1e-3]}, "cells": 20}
 TOUCHING = {"sites": [3], "stiffness": 1e6, "next_cell": True, "side": "minus", "clearance": 0.0}
 
@@ -327,9 +330,8 @@ def test_nonsense_has_one_message(key, sections):
         }
         table = {"contacts": TOUCHING}
         sections = sections | times
-    for name, values in sections.items():
-        table[name] = table.get(name, {}) | values
 
     with pytest.raises(CaseError, match=key) as error:
-        Case.from_table(table)
+        Case.from_table(with_sections(table, sections))
+
     assert len(error.value.problems) == 1

@@ -189,6 +189,7 @@ def test_a_moved_end_against_another_integrator(engine, end):
 
     def rate(t, y):
         u = y[:n]
+        # The waveform gives the wall's displacement; its speed is a central difference.
         h = 1e-7
         wall = float(wave.force(t))
         speed = float(wave.force(t + h) - wave.force(t - h)) / (2 * h)
@@ -212,12 +213,13 @@ def test_a_moved_end_against_another_integrator(engine, end):
 
     u = run["displacement"].values.reshape(len(time), -1)
     assert relative_error(u, expected[:, :n]) < 1e-8
-    # The speed of the wall is a difference in the reference.
+    # That difference has an error of its own.
     assert relative_error(run["energy/work"].values, expected[:, -1]) < 1e-7
     assert ledger_error(run) < 1e-9
 
 
 def test_a_moved_end_stays_where_its_samples_end():
+    """Unlike a force a displacement does not end with its samples."""
     samples = {"time": [0.0, 1e-3, 2e-3], "value": [0.0, 0.5, 1.0]}
     wave = waveform_of(case_of({"waveform": "samples", "samples": samples, "end": "left", "amplitude": 1e-5}).drive)
     assert wave.duration == np.inf

@@ -1,4 +1,4 @@
-"""Results as other programs read them: XDMF by its references into run.h5, CSV, ``vipetsc.open``, plain xarray."""
+"""Results in other programs: XDMF by its references into run.h5, CSV, ``vipetsc.open``, plain xarray."""
 
 from __future__ import annotations
 
@@ -33,21 +33,24 @@ def folder(tmp_path_factory):
     return path
 
 
+def sizes(item: ElementTree.Element) -> list[int]:
+    """The dimensions of an element."""
+    return [int(size) for size in item.get("Dimensions").split()]
+
+
 def slab(item: ElementTree.Element, folder) -> np.ndarray:
-    """What a hyperslab of the XDMF format refers to, checked against the dataset in the file."""
+    """The values to which a hyperslab of the XDMF format refers, whose description is that of the dataset."""
     selection, source = item.findall("DataItem")
-    start, stride, count = np.array(selection.text.split(), int).reshape(
-        [int(n) for n in selection.get("Dimensions").split()]
-    )
+    start, stride, count = np.array(selection.text.split(), int).reshape(sizes(selection))
     name, _, path = source.text.strip().partition(":")
     with h5py.File(folder / name) as file:
         dataset = file[path]
-        assert [int(n) for n in source.get("Dimensions").split()] == list(dataset.shape)
+        assert sizes(source) == list(dataset.shape)
         assert source.get("NumberType") == "Float"
         assert int(source.get("Precision")) == dataset.dtype.itemsize
         assert all(start + (count - 1) * stride < dataset.shape)
         part = dataset[tuple(slice(a, a + n * s, s) for a, n, s in zip(start, count, stride, strict=True))]
-    return part.reshape([int(n) for n in item.get("Dimensions").split()])
+    return part.reshape(sizes(item))
 
 
 def test_every_reference_of_the_mesh_leads_to_its_field(folder):
@@ -65,17 +68,21 @@ def test_every_reference_of_the_mesh_leads_to_its_field(folder):
         fields = {item.get("Name"): slab(item.find("DataItem"), folder) for item in grid.findall("Attribute")}
         assert fields["displacement (m)"].tobytes() == displacement[row].tobytes()
         assert fields["velocity (m/s)"].tobytes() == velocity[row].tobytes()
-        assert [int(n) for n in grid.find("Topology").get("Dimensions").split()] == list(displacement.shape[1:])
+
+        # Cells and masses are a grid whose first coordinate is the number of the cell.
+        assert sizes(grid.find("Topology")) == list(displacement.shape[1:])
         origin, spacing = ([float(x) for x in item.text.split()] for item in grid.findall("Geometry/DataItem"))
         assert (origin[0] + spacing[0] * np.arange(len(cells))).tolist() == cells.tolist()
 
 
 def test_long_runs_show_every_nth_sample_to_the_end(folder, monkeypatch):
+    """Of a long run every nth sample is listed, from the first on, so that frames are no more than MOST_FRAMES."""
     monkeypatch.setattr(export, "MOST_FRAMES", 7)
     export.write_xdmf(folder)
     grids = ElementTree.parse(folder / "run.xdmf").getroot().findall("Domain/Grid/Grid")
     with open_run(folder / "run.h5") as run:
         times = run["field_time"].values
+
     shown = [float(grid.find("Time").get("Value")) for grid in grids]
 
     assert len(shown) <= 7
@@ -88,6 +95,7 @@ def test_a_run_without_fields_has_no_mesh(tmp_path):
 
 
 def test_groups_carry_their_time_in_plain_xarray(folder):
+    """Plain xarray opens one group at a time: coordinates of the file are linked into each."""
     with xr.open_dataset(folder / "run.h5", engine="h5netcdf") as run:
         time = run.time.values
     with xr.open_dataset(folder / "run.h5", engine="h5netcdf", group="energy") as energy:
@@ -100,6 +108,7 @@ def test_groups_carry_their_time_in_plain_xarray(folder):
 
 
 def test_links_are_no_variables_and_give_way_to_one(tmp_path):
+    """A group's variable that has the name of a coordinate stays: no link takes its place."""
     data = {
         "time": variable("time", [0.0, 1.0], "s", "time"),
         "site": variable("site", [1, 2, 3], "1", "site"),
@@ -107,6 +116,7 @@ def test_links_are_no_variables_and_give_way_to_one(tmp_path):
         "g/site": variable("time", [5.0, 6.0], "1", "not the coordinate"),
     }
     write_netcdf(tmp_path / "x.h5", xr.Dataset(data))
+
     with open_netcdf(tmp_path / "x.h5", "file") as back:
         assert set(back.variables) == {"time", "site", "g/a", "g/site"}
         assert back["g/site"].values.tolist() == [5.0, 6.0]
@@ -127,6 +137,7 @@ def test_open_gives_units_and_the_case(folder):
 def test_open_names_what_it_cannot_choose(tmp_path):
     with pytest.raises(ValueError, match="no results"):
         package.open(tmp_path)
+
     for name in ("branch-a.h5", "branch-b.h5"):
         (tmp_path / name).touch()
     with pytest.raises(ValueError, match=r"branch-a.h5, branch-b.h5; name a file"):
@@ -135,9 +146,12 @@ def test_open_names_what_it_cannot_choose(tmp_path):
 
 def test_curves_are_tables_with_units_and_every_digit(folder, in_process):
     before = datasets(folder / "run.h5")
+
     ended = in_process("export", folder)
+
     assert ended.returncode == 0, ended.stderr
 
+    # Pandas' faster parser loses the last digit.
     ledger = pd.read_csv(folder / "curves/run-time.csv", float_precision="round_trip")
     impacts = pd.read_csv(folder / "curves/run-episode.csv", float_precision="round_trip")
     with open_run(folder / "run.h5") as run:
@@ -157,7 +171,8 @@ def test_a_sweep_is_one_table_of_members(tmp_path):
     plan = Sweep.from_table(table | {"drive": {"cycles": 3}, "time": {"end": 0.02}, "sweep": axes})
     run_sweep(plan, tmp_path, MPI.COMM_SELF)
 
-    assert [path.name for path in export.write_curves(tmp_path) if "members" in path.name] == ["ensemble-members.csv"]
+    written = [path.name for path in export.write_curves(tmp_path)]
+    assert [name for name in written if "members" in name] == ["ensemble-members.csv"]
 
     members = pd.read_csv(tmp_path / "curves/ensemble-members.csv", float_precision="round_trip")
     with package.open(tmp_path) as ensemble:

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 from scipy.interpolate import CubicSpline
 
-from tests.conftest import StopAt, assert_same_bits, datasets, simulated
+from tests.conftest import StopAt, assert_same_bits, datasets, simulated, with_sections
 from tests.models import CLEARANCE
 from vipetsc.case import Case, CaseError, NnmCase
 from vipetsc.dynamics import simulate
@@ -28,10 +28,13 @@ ENGINES = ("ts", "propagator")
 
 def moving(initial: dict, **sections) -> Case:
     """A four-band lattice that nothing drives."""
-    table = {"lattice": {"preset": "four-band", "cells": 40}, "contacts": {"sites": 0}, "initial": initial}
-    for name, values in sections.items():
-        table[name] = table.get(name, {}) | values
-    return Case.from_table({"name": "moving"} | table)
+    table = {
+        "name": "moving",
+        "lattice": {"preset": "four-band", "cells": 40},
+        "contacts": {"sites": 0},
+        "initial": initial,
+    }
+    return Case.from_table(with_sections(table, sections))
 
 
 def run(case: Case) -> xr.Dataset:

@@ -17,7 +17,9 @@ TWO_DRIVES = {"more": [{"amplitude": 1.0, "frequency": 1500.0, "cycles": 6, "cel
 
 def laboratory(**time) -> Case:
     """24 damped cells that all differ, and three sites of which each has a law and stops of its own."""
+    # Each site loses energy, so that the restitutions of all three can be scattered either way.
     each = DIFFERING | {"restitution": [0.6, 0.8, 0.9]}
+
     return small_case(
         lattice={
             "damping": {"loss": {"2": 0.01}},

@@ -92,7 +92,7 @@ def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
     assert b'"linear"' in lines[0][:10]
 
     # Without the linear run the two members that are scaled from it are made too.
-    for number, made in ((0, 2), (2, 1), (6, 1)):
+    for number, missing in ((0, 2), (2, 1), (6, 1)):
         damaged = lines.copy()
         damaged[number] = lines[number].replace(b"2", b"3", 1)
         (out / "members.jsonl").write_bytes(b"".join(damaged))
@@ -100,7 +100,7 @@ def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
         again = run_sweep(plan, out)
 
         assert again.complete
-        assert again.newly_made == made
+        assert again.newly_made == missing
         (warning,) = (text for text in again.warnings if "meets the right end" not in text)
         assert warning == f"{out}/members.jsonl, line {number + 1}: cut off or damaged; what it told is made again"
         assert_same_bits(before, datasets(out / "ensemble.h5"))

@@ -1,4 +1,4 @@
-"""Where a run goes: chunks of any length, a folder or memory, and what is left when writing fails."""
+"""Runs go to a folder or to memory, in chunks of any length; what is left where writing fails."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from tests.conftest import assert_same_bits, datasets, small_case
+from tests.conftest import assert_same_bits, datasets, run_of, small_case
 from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics import recorder, simulate
 from vipetsc.dynamics.recorder import Recorder
@@ -24,9 +24,12 @@ PART = {"output": {"window": [3, 17], "every": 4, "stride": 5}}
 def test_the_length_of_a_chunk_does_not_show(folder, monkeypatch, sections):
     case = small_case(**sections, time={"end": 0.04})
     simulate(case, folder / "long")
+
+    # A divisor neither of the number of samples nor of the strides.
     monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 7)
     simulate(case, folder / "short")
-    assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("long", "short")))
+
+    assert_same_bits(datasets(folder / "long" / "run.h5"), datasets(folder / "short" / "run.h5"))
 
 
 @pytest.mark.parametrize("sections", [{}, PART, {"contacts": {"sites": []}}, {"output": {"writer": "parallel"}}])
@@ -37,7 +40,8 @@ def test_a_run_in_memory_is_the_run_of_the_file(folder, sections):
     assert simulate(case, memory).folder is None
     assert memory.dataset is not None
 
-    held = memory.dataset.drop_vars(["end/displacement", "end/velocity"])  # of all cells, whatever is recorded
+    # The state at the end, which is in memory alone, has all cells, whatever is recorded.
+    held = memory.dataset.drop_vars(["end/displacement", "end/velocity"])
     with open_netcdf(folder / "run" / "run.h5", "run") as run:
         assert held.variables.keys() == run.variables.keys()
         for name, item in run.variables.items():
@@ -57,16 +61,17 @@ def test_a_run_in_memory_cannot_be_resumed():
 
 
 def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, monkeypatch):
+    """A disk that is full at the end of a run costs nothing: with room again the run goes on from its chunks."""
     path = folder / "run"
     simulate(small_case(time={"end": 0.01}), path)
     before = (path / "run.h5").read_bytes()
     case = small_case(time={"end": 0.02})
 
-    def fails(field, *_):
+    def full_disk(field, *_):
         field[0] = 1.0
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(chunks, "put_chunks", fails)
+    monkeypatch.setattr(chunks, "put_chunks", full_disk)
     monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 16)
     with pytest.raises(OSError, match=r"run\.h5 could not be written: No space"):
         simulate(case, path, force=True)
@@ -77,7 +82,7 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
     assert simulate(case, path, resume=True).complete
 
     simulate(case, folder / "straight")
-    assert_same_bits(*(datasets(folder / name / "run.h5") for name in ("straight", "run")))
+    assert_same_bits(datasets(folder / "straight" / "run.h5"), datasets(path / "run.h5"))
 
 
 def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch):
@@ -85,7 +90,8 @@ def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch
 
     def killed(path, **options):
         if path.name == ".parts.old" and path.exists():
-            (next(path.iterdir())).unlink()
+            # One of its files is gone when the signal comes.
+            next(path.iterdir()).unlink()
             raise InterruptedError
 
     case = small_case(time={"end": 0.01})
@@ -95,7 +101,6 @@ def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch
             simulate(case, folder / "run")
 
     assert (folder / "run" / ".parts.old").exists()
-
     run = datasets(folder / "run" / "run.h5")
     for resume in (True, False):
         assert simulate(case, folder / "run", resume=resume).complete
@@ -104,7 +109,7 @@ def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch
 
 
 def test_episodes_stand_in_the_order_of_their_onsets():
-    """Ranks and chunks give them in any order; of two at the same time the lower site comes first."""
+    """Ranks and chunks bring episodes in any order; of two at the same time the lower site comes first."""
     given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4), "sites/cell": np.arange(1, 4)}
     memory = RunMemory()
     memory.begin("")
@@ -140,24 +145,28 @@ def test_arrays_come_back_as_they_were(tmp_path):
         np.testing.assert_array_equal(back[name], values)
     assert load_arrays(tmp_path / "x.npy", ["d"]).keys() == {"d"}
 
-    mapped = load_arrays(tmp_path / "x.npy", copy=False)["a"]  # a rank reads only its own part of the others' states
+    # Mapped, so that a rank reads only its own part of the others' states.
+    mapped = load_arrays(tmp_path / "x.npy", copy=False)["a"]
     assert not mapped.flags.writeable
     np.testing.assert_array_equal(mapped, arrays["a"])
     assert [p.name for p in tmp_path.iterdir()] == ["x.npy"]
 
 
 def test_contacts_that_still_last_at_the_end_are_logged(folder):
+    """A run that ends within a contact logs it, without a separation."""
     simulate(small_case(), folder / "whole")
-    log = datasets(folder / "whole" / "run.h5")
-    onset = log["impacts/onset"]
-    separation = log["impacts/separation"]
+    whole = datasets(folder / "whole" / "run.h5")
+    onset = whole["impacts/onset"]
+    separation = whole["impacts/separation"]
+
+    # The first sample that lies in a contact.
     interval = small_case().model().sample_interval
-    lasting = np.flatnonzero(np.floor(separation / interval) > np.ceil(onset / interval))
-    end = float(np.ceil(onset[lasting[0]] / interval) * interval)  # the first sample in a contact
+    holds_a_sample = np.floor(separation / interval) > np.ceil(onset / interval)
+    end = float(np.ceil(onset[holds_a_sample][0] / interval) * interval)
     result = simulate(small_case(time={"end": end}), folder / "cut")
+
     cut = datasets(folder / "cut" / "run.h5")
     expected = onset <= end
-
     assert cut["impacts/onset"].tolist() == onset[expected].tolist()
     assert np.isnan(cut["impacts/separation"]).tolist() == (separation[expected] > end).tolist()
     assert np.isnan(cut["impacts/separation"]).any()
@@ -166,19 +175,26 @@ def test_contacts_that_still_last_at_the_end_are_logged(folder):
 
 def test_engines_are_given_contiguous_room_whatever_is_kept_already(monkeypatch):
     """For other arrays kernels would be compiled once more; blocks of samples do not show in what is recorded."""
-    given = []
-    runs = []
+    rooms = []
     room = Recorder.room
-    monkeypatch.setattr(Recorder, "room", lambda *arguments: given.append(room(*arguments)) or given[-1])
+
+    def watched(*arguments):
+        rooms.append(room(*arguments))
+        return rooms[-1]
+
+    monkeypatch.setattr(Recorder, "room", watched)
     case = small_case(time={"end": 0.004, "engine": "propagator"}, output={"stride": 2})
-    for cells in (1_000_000, 24 * 6):  # a block of all samples, and of six
-        monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", cells)
-        runs.append(RunMemory())
-        simulate(case, runs[-1])
 
-    assert len(given) == 1 + 4
-    assert all(samples.fields.flags.c_contiguous for samples in given)
+    # One block of all 21 samples, and four of six at most.
+    monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 1_000_000)
+    whole = run_of(case)
+    monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 24 * 6)
+    blocks = run_of(case)
 
+    assert len(rooms) == 1 + 4
+    assert all(samples.fields.flags.c_contiguous for samples in rooms)
     for name in ("displacement", "velocity", "field_time"):
-        whole, blocks = (run.dataset[name].values for run in runs)
-        assert len(whole) == 11 and whole[-1].any() and whole.tobytes() == blocks.tobytes(), name
+        values = whole[name].values
+        assert len(values) == 11
+        assert values[-1].any()
+        assert values.tobytes() == blocks[name].values.tobytes(), name

@@ -21,7 +21,7 @@ from vipetsc.studies.response import BINS, SiteResponse, in_contact
 
 
 class Prediction(NamedTuple):
-    """A prediction as it was made: its folder, its case and its content."""
+    """A prediction: its folder, its case and its content."""
 
     folder: Path
     case: PredictCase
@@ -41,8 +41,8 @@ class Prediction(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Prediction:
-    """A small prediction, for which all runs were made."""
+def prediction(tmp_path_factory) -> Prediction:
+    """A small prediction, for which all runs were prediction."""
     folder = tmp_path_factory.mktemp("prediction")
     case = prediction_case()
     return Prediction(folder, case, predict(case, folder))
@@ -54,8 +54,8 @@ def composed_from(case: PredictCase, linear: dict[str, Any], answers: list[dict[
 
 
 @pytest.mark.slow
-def test_energy_is_whole_and_no_share_is_negative(made):
-    data = made.data
+def test_energy_is_whole_and_no_share_is_negative(prediction):
+    data = prediction.data
 
     predicted = data["predicted/bands"].sum("band") + data["predicted/dissipated"]
     np.testing.assert_allclose(predicted, 1, atol=1e-12)
@@ -65,17 +65,17 @@ def test_energy_is_whole_and_no_share_is_negative(made):
     np.testing.assert_allclose(simulated, 1, atol=5e-3)
 
 
-def test_below_the_onset_the_run_is_linear(made):
-    data = made.data
+def test_below_the_onset_the_run_is_linear(prediction):
+    data = prediction.data
     assert data["amplitude"][0] < data.attrs["onset_amplitude"] < data["amplitude"][1]
 
     np.testing.assert_allclose(data["predicted/bands"][0], data["simulated/bands"][0], atol=1e-9)
     assert float(data["predicted/dissipated"][0]) == 0
 
 
-def test_the_small_prediction_is_near_the_simulation(made):
+def test_the_small_prediction_is_near_the_simulation(prediction):
     """Nothing is fitted: upper bands are met within .15 decades, what is dissipated within .05 of the energy."""
-    data = made.data
+    data = prediction.data
 
     assert data.attrs["rms_upper"] < 0.15
     assert data.attrs["worst_dissipated"] < 0.05
@@ -83,23 +83,23 @@ def test_the_small_prediction_is_near_the_simulation(made):
 
 
 @pytest.mark.parametrize(("factor", "touches"), [(0.9999, False), (1.0001, True)])
-def test_the_first_contact_is_exact(made, factor, touches):
-    table = made.case.model_dump(by_alias=True, exclude_none=True)
+def test_the_first_contact_is_exact(prediction, factor, touches):
+    table = prediction.case.model_dump(by_alias=True, exclude_none=True)
     # A case has no sections of other verbs.
     del table["law"]
     del table["predict"]
-    table["drive"]["amplitude"] = factor * made.data.attrs["onset_amplitude"]
+    table["drive"]["amplitude"] = factor * prediction.data.attrs["onset_amplitude"]
 
     _, result = simulated(Case.from_table(table))
 
     assert (result.statistics["episodes"] > 0) == touches
 
 
-def test_one_site_alone_is_what_its_run_gave(made):
+def test_one_site_alone_is_what_its_run_gave(prediction):
     """In a lattice from whose ends nothing returns energies are those of the run of one site at the same z."""
-    _, answers = made.records()
-    clearance = made.case.law.clearance
-    site = made.site()
+    _, answers = prediction.records()
+    clearance = prediction.case.law.clearance
+    site = prediction.site()
     contacts = {"sites": [200], "clearance": [clearance]}
     long = prediction_case(lattice={"cells": 400}, contacts=contacts, time={"end": 0.75})
     network = Network(long.model())
@@ -107,41 +107,42 @@ def test_one_site_alone_is_what_its_run_gave(made):
     for record in answers[6::4]:
         amplitude = record["z"] * clearance / np.abs(network.linear).max()
         outcome = network.compose(amplitude, site)
-        lost, *into = np.array(record["totals"]) * made.case.model().sample_interval
+        # Totals are sums over samples of powers: lost, then by band.
+        lost, *into = np.array(record["totals"]) * prediction.case.model().sample_interval
         assert outcome.dissipated == pytest.approx(lost, rel=0.2)
         assert outcome.into[2:].sum() == pytest.approx(sum(into[2:]), rel=0.2)
 
 
-def test_without_loss_nothing_is_lost(made):
+def test_without_loss_nothing_is_lost(prediction):
     """Records of r = 1 dissipate nothing, and neither does what is composed of them."""
-    linear, answers = made.records()
+    linear, answers = prediction.records()
     for record in answers:
         record["sums"][6] = [0.0] * BINS
         record["totals"][0] = 0.0
 
-    data = composed_from(made.case, linear, answers)
+    data = composed_from(prediction.case, linear, answers)
 
     assert float(np.abs(data["predicted/dissipated"]).max()) == 0
     assert float(data["predicted/upper"].max()) > 0.05
 
 
-def test_the_order_of_the_sites_in_the_file_does_not_matter(made):
-    linear, answers = made.records()
+def test_the_order_of_the_sites_in_the_file_does_not_matter(prediction):
+    linear, answers = prediction.records()
     swapped = prediction_case(contacts={"sites": [70, 40], "clearance": [1.8e-3, 2e-3]})
 
-    first = composed_from(made.case, linear, answers)
+    first = composed_from(prediction.case, linear, answers)
     second = composed_from(swapped, linear | {"reached": linear["reached"][::-1]}, answers)
 
     np.testing.assert_allclose(first["predicted/bands"], second["predicted/bands"], atol=2e-4)
 
 
-def test_a_site_that_nothing_reaches_changes_nothing(made):
-    linear, answers = made.records()
+def test_a_site_that_nothing_reaches_changes_nothing(prediction):
+    linear, answers = prediction.records()
     more = prediction_case(contacts={"sites": [40, 70, 100], "clearance": [2e-3, 1.8e-3, 1.0]})
 
     data = composed_from(more, linear | {"reached": [*linear["reached"], 1e-4]}, answers)
 
-    np.testing.assert_allclose(data["predicted/bands"], made.data["predicted/bands"], atol=2e-3)
+    np.testing.assert_allclose(data["predicted/bands"], prediction.data["predicted/bands"], atol=2e-3)
 
 
 def test_contact_goes_on_until_release():
@@ -154,25 +155,25 @@ def test_contact_goes_on_until_release():
     assert is_in_contact[1].tolist() == [False, True, True, False, False, False]
 
 
-def test_the_release_is_where_the_last_contact_of_a_run_ended(made):
+def test_the_release_is_where_the_last_contact_of_a_run_ended(prediction):
     """Records hold it, and the response interpolates it over the largest z; without contacts it is the onset."""
-    _, answers = made.records()
+    _, answers = prediction.records()
     assert all(0 < record["release"] < 1 for record in answers[4:])
 
     z = np.array([record["z"] for record in answers])
-    release = made.site().over_bursts(z).release
+    release = prediction.site().over_bursts(z).release
     np.testing.assert_allclose(release, [record["release"] for record in answers])
 
 
-def test_runs_that_are_there_are_not_made_again(made, tmp_path, monkeypatch):
-    (tmp_path / "prediction-runs.jsonl").write_bytes((made.folder / "prediction-runs.jsonl").read_bytes())
-    (tmp_path / "case.toml").write_text(made.case.to_toml())
+def test_runs_that_are_there_are_not_made_again(prediction, tmp_path, monkeypatch):
+    (tmp_path / "prediction-runs.jsonl").write_bytes((prediction.folder / "prediction-runs.jsonl").read_bytes())
+    (tmp_path / "case.toml").write_text(prediction.case.to_toml())
     monkeypatch.setattr(RecordedRuns, "run_in_memory", lambda *_: pytest.fail("a run was made"))
 
-    again = predict(made.case, tmp_path)
+    again = predict(prediction.case, tmp_path)
 
     for name in ("predicted/bands", "simulated/bands"):
-        np.testing.assert_array_equal(again[name], made.data[name])
+        np.testing.assert_array_equal(again[name], prediction.data[name])
 
 
 def test_amplitudes_and_points_by_default():

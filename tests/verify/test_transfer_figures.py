@@ -1,4 +1,6 @@
-"""The pictures of inter-band transfer show what the sweep's files hold, and nothing where files lack."""
+"""Figures of inter-band transfer show what the sweep's files hold, and nothing where files lack."""
+
+from __future__ import annotations
 
 from mpi4py import MPI
 
@@ -42,8 +44,10 @@ def swept(folder, **options):
 
 @pytest.fixture(scope="module")
 def reduced(tmp_path_factory):
-    """A sweep over both laws and seven amplitudes without fields, and a branch of the Hertz law beside it."""
+    """A sweep over both laws and seven amplitudes without fields, related to a branch of the Hertz law."""
     folder = swept(tmp_path_factory.mktemp("reduced"))
+
+    # A branch with a law of exponent -1 in region III.
     branch = tmp_path_factory.mktemp("branch")
     energy = GRAZING * np.concatenate([[0.1, 1.0], np.geomspace(1.001, 1e6, 60)])
     region = np.select([energy <= GRAZING, energy < 1.2 * GRAZING, energy < 1e5], [1, 2, 3], 4)
@@ -66,7 +70,14 @@ def whole(tmp_path_factory):
     return swept(tmp_path_factory.mktemp("whole"), **table)
 
 
+@pytest.fixture(scope="module")
+def transfer_pictures(whole):
+    """The figures of both members' fields: drawing them costs more than all that is read from them."""
+    return offered_figures("transfer", whole)
+
+
 def contact_motion(folder):
+    """Motion of the contact cell's two masses, as phase portraits show it."""
     with MemberRun.open(folder) as member:
         return transfer_curves.ContactMotion.of(member)
 
@@ -97,9 +108,10 @@ def panel(figure, text):
 
 
 @pytest.mark.slow
-def test_a_relation_says_what_its_values_are(reduced):
+def test_values_of_a_relation_have_units_and_names(reduced):
     with open_netcdf(reduced / "backbone.h5", "relation") as relation:
-        assert {"energy", "ibtet", "fitted"} <= {str(name).rpartition("/")[2] for name in relation.variables}
+        names = {str(name).rpartition("/")[2] for name in relation.variables}
+        assert {"energy", "ibtet", "fitted"} <= names
         assert all(item.attrs["units"] and item.attrs["long_name"] for item in relation.variables.values())
 
 
@@ -113,8 +125,10 @@ def test_ibtet_shows_the_ensembles_values(reduced):
             np.testing.assert_array_equal(x, AMPLITUDES)
             np.testing.assert_array_equal(y, select(open_ensemble(reduced), law=law)["ibtet"])
 
-    assert panel(figure, "(a.1)").get_xscale() == panel(figure, "(a.1)").get_yscale() == "linear"
-    assert panel(figure, "(a.2)").get_xscale() == panel(figure, "(a.2)").get_yscale() == "log"
+    linear = panel(figure, "(a.1)")
+    logarithmic = panel(figure, "(a.2)")
+    assert linear.get_xscale() == linear.get_yscale() == "linear"
+    assert logarithmic.get_xscale() == logarithmic.get_yscale() == "log"
 
 
 def test_floor_is_that_of_members_without_contact(reduced):
@@ -144,8 +158,10 @@ def test_shares_are_the_ensembles_and_sum_to_one(reduced):
 
 
 def test_backbone_is_aligned_exactly(reduced):
+    """Energies are those of the branch at grazing, the slope is divided by the fitted divisor, its power law drawn."""
     figures = offered_figures("ibtet_backbone", reduced)
-    assert list(figures) == ["calibrated-1-site-4-cycles"]  # no branch of the bilinear law was given
+    # No branch of the bilinear law was given.
+    assert list(figures) == ["calibrated-1-site-4-cycles"]
 
     (axes,) = all_axes(figures["calibrated-1-site-4-cycles"])
     assert "branch of the printed reading" in axes.get_title(loc="left")
@@ -153,16 +169,16 @@ def test_backbone_is_aligned_exactly(reduced):
     with h5py.File(reduced / "backbone.h5") as file:
         assert "bilinear" in file.attrs["left_out"]
         (group,) = file.values()
-        about = dict(group.attrs)
+        fit = dict(group.attrs)
+
     _, number = next(curves(open_ensemble(reduced)))
     start = initiation_of(reduced, Sweep.load(reduced / "case.toml").case(number))
     curve = select(open_ensemble(reduced), law="hertz")
     work = curve["work"].values
     touched = curve["contact_episodes"] > 0
-
     np.testing.assert_array_equal(touched, np.array(AMPLITUDES) > start.amplitude)
-    assert about["initiation_energy"] == start.energy
-    assert about["onset_amplitude"] == start.amplitude
+    assert fit["initiation_energy"] == start.energy
+    assert fit["onset_amplitude"] == start.amplitude
     # Work grows with the amplitude's square until the first contact comes back to the drive.
     assert start.energy / start.amplitude**2 == pytest.approx(work[0], rel=1e-6)
 
@@ -170,18 +186,20 @@ def test_backbone_is_aligned_exactly(reduced):
     np.testing.assert_allclose(shown["lattice"][0], work * GRAZING / start.energy, rtol=1e-12)
 
     grey = shown["slope + floor"]
-    floor = about["floor"]
+    floor = fit["floor"]
     assert np.all(grey[1][grey[0] <= GRAZING] == floor)
 
     moving = grey[0] > GRAZING
-    np.testing.assert_allclose(grey[1][moving], 700.0 / grey[0][moving] / about["divisor"] + floor, rtol=1e-12)
+    np.testing.assert_allclose(grey[1][moving], 700.0 / grey[0][moving] / fit["divisor"] + floor, rtol=1e-12)
 
     red = shown["in region III"]
     (green,) = [xy for label, xy in shown.items() if "adj." in label]
-    np.testing.assert_allclose(green[1], about["factor"] * red[0] ** about["exponent"], rtol=1e-12)
+    np.testing.assert_allclose(green[1], fit["factor"] * red[0] ** fit["exponent"], rtol=1e-12)
 
+    # Least squares in logarithms: the residual is orthogonal to a constant and to the logarithm of the energy.
     residual = np.log(red[1] / green[1])
-    assert abs(residual.sum()) < 1e-9 and abs(residual @ np.log(red[0])) < 1e-8  # least squares in logarithms
+    assert abs(residual.sum()) < 1e-9
+    assert abs(residual @ np.log(red[0])) < 1e-8
 
 
 def test_backbone_of_another_sweep_is_passed_over(reduced, tmp_path):
@@ -208,11 +226,11 @@ def test_nothing_to_draw_from_nothing():
 
 
 @pytest.mark.slow
-def test_transfer_has_a_panel_a_band_and_both_segments(whole):
-    figures = offered_figures("transfer", whole)
-    assert list(figures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
+def test_transfer_has_a_panel_a_band_and_both_segments(whole, transfer_pictures):
+    assert list(transfer_pictures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
 
-    figure = figures["hertz-calibrated-1-site-4-cycles-60N"]
+    figure = transfer_pictures["hertz-calibrated-1-site-4-cycles-60N"]
+    # Matplotlib before 3.8 has no public way to a figure's title.
     heading = figure.get_suptitle() if hasattr(figure, "get_suptitle") else figure._suptitle.get_text()
     assert heading == "Hertz, calibrated, 1 site, 4 cycles, 60 N"
 
@@ -233,16 +251,16 @@ def test_transfer_has_a_panel_a_band_and_both_segments(whole):
 
 
 @pytest.mark.slow
-def test_transfer_spectrum_is_that_of_the_cells_velocity(whole):
-    figure = offered_figures("transfer", whole)["hertz-calibrated-1-site-4-cycles-60N"]
+def test_transfer_spectrum_is_that_of_the_cells_velocity(whole, transfer_pictures):
+    figure = transfer_pictures["hertz-calibrated-1-site-4-cycles-60N"]
     axes = panel(figure, "cell 10")
     with open_run(member_folder(open_ensemble(whole).isel(law=0, amplitude=1)) / "run.h5") as run:
         velocity = run["velocity"][:, 9].values
         driven = 1e-3 * Case.of(run).model().drive.frequency
-    (inset,) = axes.child_axes
 
-    for j, line in enumerate(inset.lines):
-        np.testing.assert_array_equal(line.get_ydata(), velocity[:, j])
+    (inset,) = axes.child_axes
+    for mass, line in enumerate(inset.lines):
+        np.testing.assert_array_equal(line.get_ydata(), velocity[:, mass])
 
     x, y = lines(panel(figure, "cell 5"))["mass 1"]
     assert abs(x[np.argmax(y)] - driven) < 0.2 * driven
@@ -269,24 +287,27 @@ def test_band_energies_sum_to_the_total(whole):
             energy = file["bands/energy"][...]
             total = file["bands/total"][...]
         assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=0.01)
+
     shown = lines(panel(figures["hertz-calibrated-1-site-4-cycles-60N"], "(a)"))
     parts = sum(y for label, (_, y) in shown.items() if label.startswith(("band", "gap", "above")))
-
     np.testing.assert_allclose(shown["sum of parts"][1], parts, rtol=1e-9)
 
 
 def test_closing_error_is_exact_for_parts_in_quadrature():
-    """cos a t + cos b t: the cross term averages out over a common period, and only there."""
+    """Of cos 3t + cos 5t the cross term averages out over a common period, 400 samples, and only there."""
     t = 2 * np.pi * np.arange(4000) / 400
     parts = np.array([np.cos(3 * t) ** 2, np.cos(5 * t) ** 2])
     total = (np.cos(3 * t) + np.cos(5 * t)) ** 2
+
     assert np.nanmax(closing_error(parts, total, 400)) < 1e-12
     assert np.nanmax(closing_error(parts, total, 130)) > 0.1
+    # Where there is no energy there is nothing to divide by.
     assert np.isnan(closing_error(parts, np.append(total[:-500], np.zeros(500)), 10)[-1])
 
 
 @pytest.mark.slow
 def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
+    """Two points on the transfer's curve, and for each the phase portrait of host and resonator."""
     (figure,) = offered_figures("phase_regimes", whole, reduced).values()
     curve, first, second = (a for a in all_axes(figure) if a.get_title(loc="left"))
     grey = curve.lines[0].get_xydata().T
@@ -316,6 +337,7 @@ def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
 
 @pytest.mark.slow
 def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatch):
+    # So short a portrait would miss the largest displacement unless it stood about it.
     monkeypatch.setattr(transfer_curves, "PERIODS", 0.1)
     folder = member_folder(open_ensemble(whole).isel(law=0, amplitude=1))
     with open_run(folder / "run.h5") as run:
@@ -327,9 +349,11 @@ def test_a_portrait_is_about_the_largest_relative_displacement(whole, monkeypatc
 
 
 @pytest.mark.slow
-def test_regimes_without_an_ensemble_beside_them(whole):
+def test_regimes_without_an_ensemble(whole):
     (figure,) = offered_figures("phase_regimes", whole).values()
-    assert len(all_axes(figure)[0].lines) == 2  # the two points themselves
+
+    # The two points themselves, without a curve.
+    assert len(all_axes(figure)[0].lines) == 2
 
 
 @pytest.mark.slow
@@ -338,7 +362,8 @@ def test_files_are_named_by_figure_and_suffix(reduced, kind):
     written = draw("sweep", [reduced], ["ibtet", "ibtet_backbone"], [kind])
     stems = ("ibtet-calibrated", "ibtet_backbone-calibrated-1-site-4-cycles")
     assert [p.name for p in written] == [f"{stem}.{kind}" for stem in stems]
-    assert all(p.stat().st_size > 10_000 for p in written)
+    # An empty page is smaller.
+    assert all(path.stat().st_size > 10_000 for path in written)
 
 
 def test_curves_of_a_sweep(reduced):

@@ -1,0 +1,88 @@
+"""Single impacts: their restitution and loss, forces that are clipped, approach velocities below a floor."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from tests.conftest import simulated, small_case
+from vipetsc.case import Case
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.ts.integrator import Integrator
+
+
+def effective_restitution(r: float) -> float:
+    """Restitution of x'' = -k x^n (1 + c x'/v0), c = 3 (1 - r)/2, by separation of x and x'.
+
+    The integral of v dv/(1 + c v/v0) has the same value over approach and rebound.
+    """
+    c = 1.5 * (1 - r)
+
+    def imbalance(e: float) -> float:
+        return 1 - np.log1p(c) / c + e + np.log1p(-c * e) / c
+
+    return brentq(imbalance, 1e-9, min(1, 1 / c) - 1e-12)
+
+
+@pytest.mark.parametrize("law", ["hertz", "bilinear"])
+@pytest.mark.parametrize("restitution", [0.95, 0.7, 0.3])
+def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
+    # Springs so soft that they do nothing during one impact.
+    soft = 1e-9
+    springs = [{"start": 1, "end": 1, "stiffness": soft, "next_cell": True}, {"start": 1, "end": 2, "stiffness": soft}]
+    masses = [0.01, 0.004]
+    table = {
+        "lattice": {"cells": 2, "ends": "free", "cell": {"masses": masses, "springs": springs, "contact": [1, 2]}},
+        "contacts": {"law": law, "stiffness": 5e6, "restitution": restitution, "sites": [1], "clearance": 1e-3},
+        "drive": {"amplitude": 1e-30, "frequency": 1e-3, "cycles": 1},
+        "time": {"end": 1.0, "sample_interval": 0.1, "atol": 1e-13},
+    }
+    model = Case.from_table(table).model()
+    layout = Layout(model, MPI.COMM_SELF)
+    integrator = Integrator(model, layout)
+
+    # Velocities lie behind the displacements, mass by mass: the resonator of cell 1 moves at 1 m/s.
+    first_velocity = layout.dofs * layout.owned
+    integrator.state.array[first_velocity + layout.owned] = 1.0
+    integrator.step = 1e-5
+    integrator.free_step = 1e-5
+    integrator._first_step = 1e-5
+    integrator.observe(integrator.tracker.start)
+    # The impact is over after 1.1 ms or so; after 3 ms the rebound meets the other side.
+    integrator.advance(0.0025)
+
+    (episode,) = integrator.take_episodes()
+    velocity = integrator.state.array_r[first_velocity:]
+    rebound = -(velocity[layout.owned] - velocity[0])
+    assert episode["approach_velocity"] == pytest.approx(1.0, abs=1e-9)
+    assert episode["onset"] == pytest.approx(1e-3, abs=1e-9)
+    assert rebound == pytest.approx(effective_restitution(restitution), abs=1e-8)
+    # The law is made for r near 1: its own error is of second order in 1 - r.
+    assert abs(rebound - restitution) < (1 - restitution) ** 2
+
+    reduced_mass = masses[0] * masses[1] / sum(masses)
+    assert episode["loss"] == pytest.approx(0.5 * reduced_mass * (1 - rebound**2), rel=1e-7)
+
+
+def test_clipped_contacts_never_pull():
+    """With restitution 0 the law pulls late in an impact; clipping holds the force at zero there instead."""
+    _, allowed = simulated(small_case(contacts={"restitution": 0.0, "adhesion": "allow"}))
+    _, clipped = simulated(small_case(contacts={"restitution": 0.0, "adhesion": "clip"}))
+
+    assert allowed.statistics["pulled"] > 0
+    assert allowed.statistics["clipped"] == 0
+    assert clipped.statistics["pulled"] == 0
+    assert clipped.statistics["clipped"] > 0
+    assert allowed.statistics["ledger_error"] < 1e-8
+    assert clipped.statistics["ledger_error"] < 1e-8
+
+
+def test_a_floor_on_the_approach_velocity_is_counted():
+    run, result = simulated(small_case(contacts={"approach_floor": 0.3}))
+
+    slow = np.abs(run["impacts/approach_velocity"].values) < 0.3
+    assert slow.any()
+    assert result.statistics["floored"] == slow.sum()
