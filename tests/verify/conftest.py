@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -32,12 +33,11 @@ class Branch(NamedTuple):
 
     def at_energy(self, energy: float) -> Point:
         """The point at an ``energy``, corrected there; of a branch that turns, on the last stretch that passes it."""
-        before = [
-            number
-            for number, (a, b) in enumerate(zip(self.points[:-1], self.points[1:], strict=True))
-            if a.energy <= energy < b.energy
-        ]
-        point = self.points[before[-1]]
+        point = None
+        for a, b in pairwise(self.points):
+            if a.energy <= energy < b.energy:
+                point = a
+        assert point is not None
 
         # Newton's method in the energy along the branch.
         for _ in range(8):
