@@ -16,6 +16,7 @@ import pytest
 
 import vipetsc as package
 from tests.conftest import clean_environment
+from vipetsc.__main__ import BUILT_FOR_MPI
 
 ROOT = Path(package.__file__).parents[1]
 BUILD = "import sys; from setuptools.build_meta import build_sdist; print(build_sdist(sys.argv[1]))"
@@ -118,10 +119,10 @@ def test_the_wheel_runs_away_from_the_source(site, tmp_path):
 
 def test_what_pip_cannot_bring_is_named(site, tmp_path):
     """Without the libraries that are built for MPI: a sentence, no traceback."""
-    hidden = (
-        f"import sys; sys.path = [p for p in sys.path if 'dist-packages' not in p]; sys.path.insert(0, {str(site)!r})"
+    code = (
+        f"import sys; sys.path.insert(0, {str(site)!r}); sys.modules.update(dict.fromkeys({BUILT_FOR_MPI}));"
+        " from vipetsc.__main__ import main; sys.exit(main(['doctor']))"
     )
-    code = f"{hidden}; from vipetsc.__main__ import main; sys.exit(main(['doctor']))"
     ended = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert "petsc4py" in ended.stderr and "apt install" in ended.stderr

@@ -39,7 +39,7 @@ PACKAGES = (
     Package("matplotlib", "3.6", "3.11"),
     Package("jinja2", "3.1", "3.1"),
     Package("numba", "0.60", "0.68"),
-    Package("pillow", "9", "12", module="PIL"),
+    Package("pillow", "9", "13", module="PIL"),
     Package("pydantic", "2.7", "2.14"),
     Package("tqdm", "4.66", "4.70"),
     Package("tomli-w", "1.0", "1.2", module="tomli_w"),
