@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.unit.test_figures import INTERVAL, NT, SHAPES, write_run
+from tests.unit.test_figures import INTERVAL, SAMPLES, SHAPES, write_run
 from vipetsc.cli.main import main
 from vipetsc.figures import movie
 from vipetsc.figures.movie_frames import FADE, Shot, movie_frames
@@ -178,7 +178,7 @@ def test_frames_show_the_nearest_samples_and_read_no_others(folder, opened, monk
 def test_a_gif_holds_every_frame_for_its_time(clear, stage):
     """A GIF has the frames of the stage, within the colours that it can hold, and lasts as long as they do."""
     count = len(stage.content.time)
-    assert count == int((NT - 1) * INTERVAL / 0.016 * 3) + 1
+    assert count == int((SAMPLES - 1) * INTERVAL / 0.016 * 3) + 1
 
     (path,) = movie.write_movie(stage, 3.0, [clear / "figures" / "movie.gif"])
     assert [p.name for p in path.parent.iterdir()] == ["movie.gif"]
@@ -274,7 +274,7 @@ def test_movies_that_cannot_be_are_refused_and_write_nothing(clear, words, capsy
 @pytest.mark.parametrize("shape", ["no sites", "window after the site", "single cell", "every third sample"])
 def test_every_run_with_velocities_has_a_movie(shape, tmp_path):
     """Runs without sites, with a window behind them, of every third sample or of one cell have moving frames."""
-    write_run(tmp_path / "run.h5", **SHAPES[shape])
+    write_run(tmp_path / "run.h5", SHAPES[shape])
     shot = Shot("velocity", rate=0.3, width=320)
 
     with rc_style(), open_run(tmp_path / "run.h5") as run:

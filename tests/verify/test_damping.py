@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import simulated, small_case
-from tests.unit.test_inhomogeneity import CELLS, ENDS, varied
+from tests.unit.test_inhomogeneity import CELLS, ENDS, scattered_chain
 from vipetsc.case import Case
 from vipetsc.contact.law import CLOSED
 from vipetsc.dynamics.energies import EnergyMeter, measure
@@ -31,17 +31,17 @@ def damped_case(**sections) -> Case:
 def varied_model(ends: str, has_dashpots: bool):
     """A lattice whose cells all differ, with one site, driven at the second mass of DRIVEN."""
     sections = {"lattice": {"cells": CELLS}, "contacts": {"sites": [SITE]}, "drive": {"cell": DRIVEN, "mass": 2}}
-    bare = {}
-    if not has_dashpots:
-        bare = {"damping": np.zeros((CELLS, 4)), "grounding": np.zeros((CELLS, 4))}
-    chain = replace(varied(ends, **bare), sites=(SITE - 1,), clearances=(1e-5,))
+    chain = replace(scattered_chain(ends), sites=(SITE - 1,), clearances=(1e-5,))
     if not has_dashpots:
         springs = tuple(replace(spring, damping=0.0) for spring in chain.cell.springs)
-        chain = replace(chain, cell=replace(chain.cell, grounding=(), springs=springs))
+        cell = replace(chain.cell, grounding=(), springs=springs)
+        none = np.zeros((CELLS, 4))
+        variation = replace(chain.variation, damping=none, grounding=none)
+        chain = replace(chain, cell=cell, variation=variation)
     return replace(small_case(**sections).model(), chain=chain)
 
 
-@pytest.mark.parametrize("ends", ENDS)
+@ENDS
 @pytest.mark.parametrize("has_dashpots", [True, False])
 def test_rates_and_energies_are_those_of_the_equations(ends, has_dashpots):
     """At a random state with a closed contact M u'' = -K u - C u' + forces, and energies are their quadratic forms."""
