@@ -1,9 +1,10 @@
-"""Cases: strict, complete, resolved, and the same after a round trip."""
+"""Cases are strict, complete, resolved, and the same after a round trip."""
 
 from __future__ import annotations
 
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from vipetsc.case import Case, CaseError, DesignCase, LawCase, case_id
 from vipetsc.case.resolve import _round_down
 from vipetsc.lattice import Contact
 
+# A lattice of one's own, for which nothing has a default.
 PLAIN = {
     "name": "plain",
     "lattice": {
@@ -35,37 +37,43 @@ PLAIN = {
 RUNS = Path(__file__).parents[2] / "runs"
 
 
-def problems(table: dict, *overrides: str) -> dict[str, str]:
+def problems(table: dict[str, Any], *overrides: str) -> dict[str, str]:
+    """The problems of a case by their keys, as they are printed."""
     with pytest.raises(CaseError) as caught:
         Case.from_table(table, overrides)
-    return {p.key: str(p) for p in caught.value.problems}
+    return {problem.key: str(problem) for problem in caught.value.problems}
 
 
-def test_the_builtin_case_is_the_papers():
+def test_the_builtin_case_has_the_papers_contacts_and_drive():
+    """Clearances, stiffness, frequency and speed are those of SPEC sections 1 to 4."""
     case = Case.load()
     assert case.contacts.sites == [75, 106, 138, 169, 200]
     np.testing.assert_allclose(case.contacts.clearance, np.geomspace(10**-2.65, 10**-2.75, 5), rtol=1e-12)
     assert case.contacts.stiffness == pytest.approx(5180269.459, rel=1e-9)
     assert case.drive.frequency == pytest.approx(1023.27, abs=5e-3)
-    model = case.model()
+    assert case.model().contact == Contact("hertz", case.contacts.stiffness, 0.7, "allow", 0.0)
+
+
+def test_the_builtin_case_lasts_until_the_wave_has_crossed():
+    model = Case.load().model()
     assert model.speed == pytest.approx(428.7, abs=0.05)
+    # The burst of 30 cycles, and 300 cells at the group velocity.
     assert model.end == pytest.approx(2 * np.pi * 30 / 1023.2717 + 300 / 428.682, rel=1e-6)
     assert model.samples == 4421
     assert model.scale == pytest.approx(2.42261e-3, rel=1e-5)
-    assert model.contact == Contact("hertz", case.contacts.stiffness, 0.7, "allow", 0.0)
 
 
-@pytest.mark.parametrize(("preset", "count", "sites"), [("four-band", 1, [100]), ("diatomic", 1, [150])])
-def test_single_sites_and_their_clearance(preset, count, sites):
-    case = Case.from_table({"lattice": {"preset": preset}, "contacts": {"sites": count}})
-    assert case.contacts.sites == sites
-    assert case.contacts.clearance == [pytest.approx({"four-band": 10**-2.75, "diatomic": 2e-4}[preset])]
+@pytest.mark.parametrize(("preset", "site", "clearance"), [("four-band", 100, 10**-2.75), ("diatomic", 150, 2e-4)])
+def test_a_single_site_has_the_papers_cell_and_clearance(preset, site, clearance):
+    case = Case.from_table({"lattice": {"preset": preset}, "contacts": {"sites": 1}})
+    assert case.contacts.sites == [site]
+    assert case.contacts.clearance == [pytest.approx(clearance)]
 
 
-def test_diatomic_drive_by_wavenumber():
-    for wavenumber in ("5pi/9", "5*pi/9", 5 * np.pi / 9):
-        table = {"lattice": {"preset": "diatomic", "reading": "printed"}, "drive": {"wavenumber": wavenumber}}
-        assert Case.from_table(table).drive.frequency == pytest.approx(5520.026, abs=1e-3)
+@pytest.mark.parametrize("wavenumber", ["5pi/9", "5*pi/9", 5 * np.pi / 9])
+def test_a_drive_may_be_given_by_its_wavenumber(wavenumber):
+    table = {"lattice": {"preset": "diatomic", "reading": "printed"}, "drive": {"wavenumber": wavenumber}}
+    assert Case.from_table(table).drive.frequency == pytest.approx(5520.026, abs=1e-3)
 
 
 @pytest.mark.parametrize("path", sorted(RUNS.glob("*.toml")), ids=lambda p: p.stem)
@@ -80,8 +88,11 @@ def test_the_model_of_a_case_is_built_once_and_not_carried_by_copies():
     model = case.model()
     assert case.model() is model
     assert case == Case.load()
+
     weaker = case.model_copy(update={"drive": case.drive.model_copy(update={"amplitude": 1.0})})
     assert weaker.model().drive.amplitude == 1.0
+
+    # What is sent to another rank is the keys alone.
     sent = pickle.loads(pickle.dumps(case))
     assert sent == case
     assert sent.__dict__.keys() == case.model_dump().keys() == Case.model_fields.keys()
@@ -91,8 +102,13 @@ def test_a_varied_case_is_that_of_a_run_with_other_values():
     law = LawCase.load(RUNS / "law.toml", ["output.stride=2", "time.rtol=1e-9"])
     varied = law.varied(name="ring", without=("output",), lattice={"ends": "periodic"}, drive={"amplitude": 3.0})
     assert type(varied) is Case
-    assert (varied.name, varied.lattice.ends, varied.drive.amplitude) == ("ring", "periodic", 3.0)
-    assert (varied.output.stride, varied.time) == (1, law.time)
+    assert varied.name == "ring"
+    assert varied.lattice.ends == "periodic"
+    assert varied.drive.amplitude == 3.0
+
+    # Sections left out begin with their defaults, all others stay.
+    assert varied.output.stride == 1
+    assert varied.time == law.time
     assert varied.drive.frequency == law.drive.frequency
     assert law.varied(overrides=["output.stride=4"]).output.stride == 4
 
@@ -102,15 +118,21 @@ def test_a_varied_case_is_resolved_again():
     nine = case.varied(contacts={"sites": 9, "clearance": None}, time={"rtol": None})
     assert nine.contacts == Case.load(overrides=["contacts.sites=9"]).contacts
     assert nine.time == case.time
+
     with pytest.raises(CaseError, match="outside the lattice"):
         case.varied(lattice={"cells": 10})
 
 
 def test_tolerances_scale_with_the_drive():
-    weak, strong = (Case.load(overrides=[f"drive.amplitude={a}"]).model() for a in (2.0**-10, 2.0**3))
+    # Powers of two, so that nothing is rounded.
+    weak = Case.load(overrides=[f"drive.amplitude={2.0**-10}"]).model()
+    strong = Case.load(overrides=[f"drive.amplitude={2.0**3}"]).model()
     assert strong.atol[0] == weak.atol[0] * 2**13
     assert strong.atol[0] == 0.1 * strong.rtol * strong.scale
     assert strong.atol[1] == strong.atol[0] * strong.drive.frequency
+
+
+def test_tolerances_of_the_paper_are_a_billionth_of_its_amplitude():
     assert Case.load(overrides=["time.atol=paper"]).model().atol == (24.33e-9, 24.33e-9)
 
 
@@ -135,7 +157,7 @@ def test_an_override_below_a_value_is_refused():
 def test_a_check_that_rests_on_an_invalid_key_is_left_out():
     with pytest.raises(CaseError) as caught:
         Case.from_table(PLAIN | {"contacts": PLAIN["contacts"] | {"clearance": -1.0}})
-    assert [p.key for p in caught.value.problems] == ["contacts.clearance"]
+    assert [problem.key for problem in caught.value.problems] == ["contacts.clearance"]
     assert "greater than or equal to 0" in str(caught.value)
 
 
@@ -145,10 +167,12 @@ def test_samples_are_counted_and_held_against_the_bands():
 
 
 def test_automatic_sample_intervals_are_round():
-    assert [_round_down(value) for value in (5.6e-4, 4.9e-4, 1.9e-3, 0.01)] == [5e-4, 2e-4, 1e-3, 0.01]
+    found = [_round_down(value) for value in (5.6e-4, 4.9e-4, 1.9e-3, 0.01)]
+    assert found == [5e-4, 2e-4, 1e-3, 0.01]
 
 
 def test_the_identity_of_a_case_stays_what_folders_on_disk_bear():
+    # Another number here would make the program run again what lies in users' folders.
     assert case_id(Case.from_table(PLAIN)) == "7b0b028bc7785b85"
     assert case_id(Case.from_table(PLAIN, ["drive.amplitude=2.0"])) != case_id(Case.from_table(PLAIN))
 
@@ -158,7 +182,7 @@ def test_a_result_names_its_case():
     assert Case.of(xr.Dataset(attrs={"case": case.to_toml()})) == case
 
 
-def test_eta_stays_below_one():
+def test_the_design_searches_eta_below_one():
     eta = DesignCase.load().design.eta.values()
     assert len(eta) == 36
     assert eta.max() == 0.975
@@ -196,41 +220,34 @@ def test_eta_stays_below_one():
 def test_impossible_values_name_their_key(override, key):
     found = problems({"lattice": {"preset": "four-band"}}, override)
     assert key in found
+    # Without a wavenumber the drive has no frequency either.
     assert len(found) == 1 or override.startswith("drive.wavenumber")
 
 
-def test_what_does_not_fit_together_is_named():
+def test_values_that_contradict_each_other_are_named():
     assert "shorter than one sample" in problems({"time": {"end": 1e-5, "sample_interval": 1e-4}})["time.end"]
     assert "give one of" in problems({"drive": {"frequency": 900.0, "band": 2}})["drive.band"]
-    springs = [{"start": 1, "end": 2, "stiffness": 1.0, "next_cell": True}]
-    found = problems({"lattice": {"cell": {"masses": [1.0, 1.0], "springs": springs, "contact": [1, 2]}}})
-    assert list(found) == ["drive.frequency"]
-    assert "give one of" in found["drive.frequency"]
     with pytest.raises(CaseError, match=r"must be above design\.eta\.first = 0\.1"):
         DesignCase.load(overrides=["design.eta.last=0.05"])
 
 
+def test_a_cell_of_ones_own_needs_a_frequency():
+    springs = [{"start": 1, "end": 2, "stiffness": 1.0, "next_cell": True}]
+    found = problems({"lattice": {"cell": {"masses": [1.0, 1.0], "springs": springs, "contact": [1, 2]}}})
+    assert list(found) == ["drive.frequency"]
+    assert "give one of" in found["drive.frequency"]
+
+
 def test_a_cell_of_ones_own_is_checked_whole():
-    found = problems(
-        {
-            "lattice": {
-                "cell": {
-                    "masses": [1.0, -2.0],
-                    "springs": [{"start": 1, "end": 3, "stiffness": 0.0}],
-                    "contact": [1, 1],
-                }
-            },
-            "drive": {"frequency": 10.0},
-        }
-    )
-    assert {"lattice.cell.masses[2]", "lattice.cell.springs[1]", "lattice.cell.contact", "lattice.cell.springs"} <= {
-        *found
-    }
+    cell = {"masses": [1.0, -2.0], "springs": [{"start": 1, "end": 3, "stiffness": 0.0}], "contact": [1, 1]}
+    found = problems({"lattice": {"cell": cell}, "drive": {"frequency": 10.0}})
+    keys = {"lattice.cell.masses[2]", "lattice.cell.springs[1]", "lattice.cell.contact", "lattice.cell.springs"}
+    assert keys <= found.keys()
 
 
 def test_a_frequency_in_a_gap_is_a_warning_only():
     case = Case.load(overrides=["drive.frequency=650.0"])
-    assert any("no pass band" in w for w in case.warnings())
+    assert any("no pass band" in warning for warning in case.warnings())
     assert not Case.load().warnings()
 
 
@@ -243,7 +260,7 @@ def test_errors_travel_between_ranks():
 @pytest.mark.slow
 @given(st.text(max_size=30), st.text(max_size=10))
 def test_any_override_is_taken_or_refused(key, value):
-    """Nonsense never escapes as anything but a CaseError."""
+    """Nonsense raises a CaseError and nothing else."""
     try:
         Case.load(overrides=[f"{key}={value}"])
     except CaseError as error:
@@ -253,20 +270,24 @@ def test_any_override_is_taken_or_refused(key, value):
 def test_exact_damping_is_chosen_by_the_case():
     exact = Case.load(overrides=["contacts.damping=exact"]).model().contact
     assert exact.effective_restitution == pytest.approx(0.7)
+    # The paper's damping returns more than is asked.
     assert Case.load().model().contact.effective_restitution == pytest.approx(0.768, abs=1e-4)
     assert case_id(Case.load(overrides=["contacts.damping=paper"])) == case_id(Case.load())
+
+
+def test_the_exact_damping_needs_some_restitution():
     found = problems({}, "contacts.damping=exact", "contacts.restitution=0")
     assert "the exact damping grows without bound" in found["contacts.restitution"]
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("output.stride=10", "resolve 1570.8 of 3644.8 rad/s: dispersion, bands and ibtet are not"),
         ("output.every=4", "shorter than 8 cells"),
         ("output.window=[1, 40]", "holds none of the contact sites"),
     ],
 )
-def test_what_is_kept_too_coarsely_is_a_warning(override, said):
+def test_an_output_too_coarse_to_measure_is_a_warning(override, message):
     (warning,) = Case.load(overrides=[override]).warnings()
-    assert said in warning
+    assert message in warning

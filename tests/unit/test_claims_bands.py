@@ -103,6 +103,7 @@ def put_bands(
         energy = part_energies(v, masses, TIME[1], parts.edges)
         if case.contacts.law in laws:
             energy = change(energy)
+
         return {
             "bands/sample": TIME,
             "frequency": spectrum.frequency,

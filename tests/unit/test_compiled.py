@@ -1,4 +1,4 @@
-"""Compiled kernels are kept until what they are made of changes; importing the package changes nothing outside."""
+"""Compiled kernels are kept until their sources change; importing the package changes nothing outside."""
 
 from __future__ import annotations
 
@@ -52,10 +52,15 @@ print(json.dumps([values, hits, environment == dict(os.environ) and folder == nu
 
 @pytest.fixture
 def package(tmp_path):
-    """A package with kernels of two files, and what a fresh Python gets from it: values, cache hits, no traces."""
+    """A package with kernels of two files, and a function that imports it in a fresh Python.
+
+    The function returns values of the kernels, their cache hits, and whether the import changed nothing outside.
+    """
     folder = tmp_path / "vipetsc"
     folder.mkdir()
     (folder / "__init__.py").write_text("")
+
+    # A constant, and a table from which one is read: both are frozen into compiled code.
     (folder / "constants.py").write_text(CONSTANTS)
     (folder / "constants.csv").write_text("1.0")
     (folder / "inner.py").write_text(INNER)
@@ -63,7 +68,7 @@ def package(tmp_path):
     (folder / "plain.py").write_text("import numpy\n")
     shutil.copy(compiled.__file__, folder)
 
-    def ask():
+    def ask() -> list:
         done = subprocess.run([sys.executable, "-c", ASK], cwd=tmp_path, env={"PYTHONPATH": "."}, capture_output=True)
         assert done.returncode == 0, done.stderr.decode()
         return json.loads(done.stdout)
@@ -72,23 +77,32 @@ def package(tmp_path):
 
 
 @pytest.mark.slow
-def test_kernels_are_found_again_until_what_they_are_made_of_changes(package):
+def test_kernels_are_found_again_until_their_sources_change(package):
+    """Hits are those of the kernel in ``inner``, of the one in ``outer`` that calls it, and of the callback."""
     folder, ask = package
     assert ask() == [[12.0, 7.0], [0, 0, 0], True]
+
+    # A file without kernels does not matter.
     (folder / "plain.py").write_text("import scipy\n")
     assert ask() == [[12.0, 7.0], [1, 1, 1], True]
+
+    # A kernel that others call.
     (folder / "inner.py").write_text(INNER.replace("SCALE * x", "SCALE * x + 1.0"))
     assert ask() == [[15.0, 8.0], [0, 0, 0], True]
+
+    # Kernels that none calls.
     (folder / "outer.py").write_text(OUTER.replace("+ SHIFT", "+ SHIFT + 0.0"))
     assert ask() == [[15.0, 8.0], [1, 0, 0], True]
     (folder / "constants.py").write_text(CONSTANTS.replace("2.0", "3.0"))
     assert ask() == [[31.0, 11.0], [0, 0, 0], True]
     (folder / "constants.csv").write_text("2.0")
     assert ask() == [[31.0, 12.0], [0, 0, 0], True]
-    assert len(list(folder.glob("__pycache__/kernels-*"))) == 4 + 5  # of inner.py and of outer.py
+
+    # Four versions of inner.py, and five of outer.py.
+    assert len(list(folder.glob("__pycache__/kernels-*"))) == 4 + 5
 
 
-def test_a_chosen_folder_holds_them(package, tmp_path):
+def test_kernels_may_be_kept_in_a_chosen_folder(package, tmp_path):
     folder, _ = package
     file = folder / "outer.py"
     chosen = compiled.kernel_cache(folder, file, str(tmp_path / "chosen"))
@@ -96,22 +110,30 @@ def test_a_chosen_folder_holds_them(package, tmp_path):
 
 
 def test_tables_of_numbers_come_with_the_package():
-    declared = tomllib.loads((ROOT.parent / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    assert set(ROOT.rglob("*.csv")) == {*(ROOT / "modes" / "shooting").glob(*declared["vipetsc.modes.shooting"])}
+    project = tomllib.loads((ROOT.parent / "pyproject.toml").read_text())
+    declared = project["tool"]["setuptools"]["package-data"]["vipetsc.modes.shooting"]
+    assert set(ROOT.rglob("*.csv")) == set((ROOT / "modes" / "shooting").glob(*declared))
 
 
 def test_importing_the_package_changes_no_environment():
-    code = "import os; before = dict(os.environ); import vipetsc; assert before == dict(os.environ); import sys; "
-    code += "assert not {'numba', 'petsc4py', 'mpi4py'} & sys.modules.keys()"
+    code = """
+import os
+import sys
+before = dict(os.environ)
+import vipetsc
+assert before == dict(os.environ)
+assert not {"numba", "petsc4py", "mpi4py"} & sys.modules.keys()
+"""
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT.parent)
 
 
 def test_every_kernel_is_kept_this_way():
     for path in ROOT.rglob("*.py"):
+        if path.name == "compiled.py":
+            continue
+        # Numba's own decorators would keep kernels by their files alone.
         text = path.read_text(encoding="utf-8")
-        assert path.name == "compiled.py" or not re.search(r"from numba import .*jit|numba\.(n?jit|cfunc)\b", text), (
-            path
-        )
+        assert not re.search(r"from numba import .*jit|numba\.(n?jit|cfunc)\b", text), path
 
 
 @pytest.mark.slow

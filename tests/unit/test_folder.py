@@ -1,11 +1,13 @@
-"""Claiming output folders: what may be begun, replaced, gone on with; whatever had happened in them before."""
+"""Output folders are begun, replaced and resumed by what they hold, whatever had happened in them before."""
 
 import logging
 import os
+import shutil
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from threading import Timer
 
@@ -13,22 +15,31 @@ from mpi4py import MPI
 
 import pytest
 
+from tests.conftest import modified
 from vipetsc.io import lock
 from vipetsc.io.atomic import atomic_write
-from vipetsc.io.folder import BRANCHES, KINDS, PAPER, RUN, SEARCH, SWEEP, FolderError, claimed
+from vipetsc.io.folder import BRANCHES, KINDS, PAPER, RUN, SEARCH, SWEEP, Claim, FolderError, claimed
 from vipetsc.io.lock import PATIENCE, locked
 
 ROOT = Path(__file__).parents[2]
+# A file by which a folder of each kind is known.
 SHOWN = {RUN: "run.h5", BRANCHES: "branch-x.h5", SEARCH: "design.h5", SWEEP: "index.json", PAPER: "plan.json"}
+# Cases of the results that are there, and of those that a command is to make.
 OLD = "a = 1\n"
-ANEW = "a = 2\n"
+NEW = "a = 2\n"
 
 
-def claim(*arguments, **options):
+def claim(*arguments, **options) -> AbstractContextManager[Claim]:
     return claimed(MPI.COMM_SELF, *arguments, **options)
 
 
-def visible(folder):
+def assert_refused(match: str, *arguments, **options) -> None:
+    """A claim with these arguments is refused with a message."""
+    with pytest.raises(FolderError, match=match), claim(*arguments, **options):
+        pass
+
+
+def names_in(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
@@ -39,156 +50,184 @@ def run(tmp_path):
     with claim(folder, RUN, OLD):
         for name in ("run.h5", "summary.json", "analysis.h5", "notes.txt"):
             (folder / name).write_text("old")
+
         (folder / "figures").mkdir()
         (folder / "figures" / "ledger.png").touch()
     return folder
 
 
-def test_a_new_folder_gets_its_marker(tmp_path):
-    for kind in KINDS:
-        folder = tmp_path / "deep" / kind.noun
-        with claim(folder, kind, OLD) as right:
-            assert not right.going_on
-            assert right.folder == folder
-        assert visible(folder) == {kind.marker}
-        assert (folder / kind.marker).read_text() == OLD
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.noun)
+def test_a_new_folder_gets_its_marker(tmp_path, kind):
+    folder = tmp_path / "deep" / "new"
+    with claim(folder, kind, OLD) as work:
+        assert not work.going_on
+        assert work.folder == folder
+    assert names_in(folder) == {kind.marker}
+    assert (folder / kind.marker).read_text() == OLD
 
 
 def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(FolderError, match="is a file"), claim(tmp_path / "file", RUN, OLD, force=True):
-        pass
-    with pytest.raises(FolderError, match="of this kind"), claim(tmp_path, RUN, OLD, force=True):
-        pass
+    assert_refused("is a file", tmp_path / "file", RUN, OLD, force=True)
+    assert_refused("of this kind", tmp_path, RUN, OLD, force=True)
+
     for kind, file in SHOWN.items():
         folder = tmp_path / kind.noun
         with claim(folder, kind, OLD):
             (folder / file).touch()
         for other in KINDS:
             if other is not kind:
-                with pytest.raises(FolderError, match="of this kind"), claim(folder, other, OLD, force=True):
-                    pass
-        assert visible(folder) == {kind.marker, file}
+                assert_refused("of this kind", folder, other, OLD, force=True)
+        assert names_in(folder) == {kind.marker, file}
 
 
-def test_the_same_case_goes_on_and_another_is_refused(run):
+def test_the_same_case_is_resumed_and_nothing_is_touched(run):
     before = (run / "case.toml").stat()
     for resume in (False, True):
-        with claim(run, RUN, OLD, resume=resume) as right:
-            assert right.going_on
-            assert right.folder == run
-    assert (run / "case.toml").stat() == before  # going on touches nothing
-    for resume in (False, True):
-        message = "holds another run: a = 1 there, 2 here; --force replaces it, --out chooses another folder"
-        with pytest.raises(FolderError, match=message), claim(run, RUN, ANEW, resume=resume):
-            pass
-    with pytest.raises(FolderError, match="holds no run to resume; leave out --resume"):
-        claim(run.parent / "deep" / "none", RUN, OLD, resume=True).__enter__()
-    assert visible(run.parent) == {"run"}
+        with claim(run, RUN, OLD, resume=resume) as work:
+            assert work.going_on
+            assert work.folder == run
+    assert (run / "case.toml").stat() == before
 
 
-def test_what_may_differ_is_the_caller_s_to_say(tmp_path):
-    with claim(tmp_path / "nnm", BRANCHES, OLD):
+@pytest.mark.parametrize("resume", [False, True])
+def test_another_case_is_refused_with_the_difference(run, resume):
+    message = "holds another run: a = 1 there, 2 here; --force replaces it, --out chooses another folder"
+    assert_refused(message, run, RUN, NEW, resume=resume)
+
+
+def test_a_folder_that_is_not_there_is_not_resumed(tmp_path):
+    message = "holds no run to resume; leave out --resume"
+    assert_refused(message, tmp_path / "deep" / "none", RUN, OLD, resume=True)
+    assert not names_in(tmp_path)
+
+
+def test_the_caller_decides_which_cases_differ(tmp_path):
+    folder = tmp_path / "nnm"
+    with claim(folder, BRANCHES, OLD):
         pass
-    with pytest.raises(FolderError, match="another system: a = 1"):
-        claim(tmp_path / "nnm", BRANCHES, ANEW, difference=lambda earlier: f"another system: {earlier}").__enter__()
-    with claim(tmp_path / "nnm", BRANCHES, ANEW, resume=True, difference=lambda earlier: None) as right:
-        assert right.going_on
-    assert (tmp_path / "nnm" / "case.toml").read_text() == ANEW
+    message = "another system: a = 1"
+    assert_refused(message, folder, BRANCHES, NEW, difference=lambda earlier: f"another system: {earlier}")
+
+    with claim(folder, BRANCHES, NEW, resume=True, difference=lambda earlier: None) as work:
+        assert work.going_on
+    assert (folder / "case.toml").read_text() == NEW
 
 
-def begin_anew(folder):
-    """Make new results beside the old ones, to the last but one step."""
-    with claim(folder, RUN, ANEW, force=True) as right:
-        assert not right.going_on
-        assert right.folder == folder / ".new"
-        (right.folder / "run.h5").write_text("new")
-        (right.folder / "figures").mkdir()
-        yield right
+def replacing(folder: Path) -> Iterator[Claim]:
+    """Make new results in a folder that holds old ones, to the last but one step."""
+    with claim(folder, RUN, NEW, force=True) as work:
+        assert not work.going_on
+        assert work.folder == folder / ".new"
+        (work.folder / "run.h5").write_text("new")
+        (work.folder / "figures").mkdir()
+        yield work
 
 
 def test_new_results_replace_the_old_ones_whole(run):
-    for right in begin_anew(run):
+    for work in replacing(run):
         assert (run / "case.toml").read_text() == OLD
         assert (run / "run.h5").read_text() == "old"
-        right.publish()
-        assert right.folder == run
-    assert visible(run) == {"case.toml", "run.h5", "figures", "notes.txt"}
-    assert (run / "case.toml").read_text() == ANEW
+        work.publish()
+        assert work.folder == run
+
+    # A file of the user's stays.
+    assert names_in(run) == {"case.toml", "run.h5", "figures", "notes.txt"}
+    assert (run / "case.toml").read_text() == NEW
     assert (run / "run.h5").read_text() == "new"
-    assert not visible(run / "figures")
+    assert not names_in(run / "figures")
 
 
 class KilledError(Exception):
     """Stands for a kill: what comes after is not done."""
 
 
+def publish_and_be_killed(folder: Path, monkeypatch, renamings: int) -> bool:
+    """Replace a folder's results and be killed after so many ``renamings``; whether it came to that."""
+    remaining = renamings
+
+    def rename(source, target, replace=os.replace):
+        nonlocal remaining
+        remaining -= 1
+        if remaining < 0:
+            raise KilledError
+        replace(source, target)
+
+    with monkeypatch.context() as context:
+        try:
+            for work in replacing(folder):
+                context.setattr(os, "replace", rename)
+                work.publish()
+        except KilledError:
+            return True
+    return False
+
+
 def test_a_swap_killed_anywhere_is_finished_by_the_next_command(run, monkeypatch, tmp_path):
-    """The names change one by one: killed before each of them, before the removal, and not at all."""
-    for count in range(12):
-        folder = tmp_path / f"killed-{count}"
-        subprocess.run(["cp", "-r", run, folder], check=True)
-        left = count
+    """The names change one by one: the command is killed before each of them, before the removal, and not at all."""
+    # Twelve are more than there are: the last of these commands comes to its end.
+    for renamings in range(12):
+        folder = tmp_path / f"killed-{renamings}"
+        shutil.copytree(run, folder)
+        killed = publish_and_be_killed(folder, monkeypatch, renamings)
 
-        def rename(source, target, replace=os.replace):
-            nonlocal left
-            left -= 1
-            if left < 0:
-                raise KilledError
-            replace(source, target)
-
-        killed = False
-        with monkeypatch.context() as context:
-            try:
-                for right in begin_anew(folder):
-                    context.setattr(os, "replace", rename)
-                    right.publish()
-            except KilledError:
-                killed = True
-        text = OLD if count == 0 else ANEW  # the first renaming decides
-        with claim(folder, RUN, text) as right:
-            assert right.going_on
-        assert (folder / "run.h5").read_text() == ("old" if count == 0 else "new")
-        if count:
-            assert visible(folder) == {"case.toml", "run.h5", "figures", "notes.txt"}, count
-    assert not killed  # there are fewer steps than that
+        # The first renaming decides which results there are.
+        case, content = (NEW, "new") if renamings else (OLD, "old")
+        with claim(folder, RUN, case) as work:
+            assert work.going_on
+        assert (folder / "run.h5").read_text() == content
+        if renamings:
+            assert names_in(folder) == {"case.toml", "run.h5", "figures", "notes.txt"}, renamings
+    assert not killed
 
 
-def test_what_was_begun_anew_is_gone_on_with_or_dropped(run):
-    for _ in begin_anew(run):
+def test_old_results_stay_while_new_ones_are_made(run):
+    for _ in replacing(run):
         pass
-    with claim(run, RUN, OLD) as right:  # the case of the old results: they are there
-        assert right.folder == run
-    for resume in (False, True):
-        with claim(run, RUN, ANEW, resume=resume) as right:
-            assert right.going_on
-            assert right.folder == run / ".new"
-            assert (right.folder / "run.h5").read_text() == "new"
-    with claim(run, RUN, ANEW, force=True) as right:
-        assert visible(right.folder) == {"case.toml"}
+    with claim(run, RUN, OLD) as work:
+        assert work.folder == run
 
 
-def test_what_a_killed_command_leaves_is_no_dead_end(tmp_path):
+@pytest.mark.parametrize("resume", [False, True])
+def test_new_results_that_were_begun_are_resumed(run, resume):
+    for _ in replacing(run):
+        pass
+    with claim(run, RUN, NEW, resume=resume) as work:
+        assert work.going_on
+        assert work.folder == run / ".new"
+        assert (work.folder / "run.h5").read_text() == "new"
+
+
+def test_new_results_that_were_begun_are_dropped_by_force(run):
+    for _ in replacing(run):
+        pass
+    with claim(run, RUN, NEW, force=True) as work:
+        assert names_in(work.folder) == {"case.toml"}
+
+
+def test_files_that_a_killed_command_leaves_are_removed(tmp_path):
     for name in ("parts", "figures"):
         (tmp_path / name).mkdir()
     for name in (".lock", ".run.h5.part", ".run.h5.host-7-ab.part", "figures/.ledger.png.host-7-cd.part"):
         (tmp_path / name).touch()
     (tmp_path / ".parts.old").mkdir()
     (tmp_path / ".parts.old" / "part-000000-0.npy").touch()
-    with claim(tmp_path, RUN, OLD) as right:
-        assert not right.going_on
-    assert visible(tmp_path) == {"case.toml", "parts", "figures"}
-    assert not visible(tmp_path / "figures")
+
+    with claim(tmp_path, RUN, OLD) as work:
+        assert not work.going_on
+    assert names_in(tmp_path) == {"case.toml", "parts", "figures"}
+    assert not names_in(tmp_path / "figures")
 
 
 def test_a_file_that_another_command_writes_stays(tmp_path):
-    """A sweep below a paper's folder has a lock of its own."""
+    """A sweep below a paper's folder has a lock of its own, by which its temporary files are known."""
     with claim(tmp_path, PAPER, OLD):
         pass
-    with locked(MPI.COMM_SELF, tmp_path / "step"), atomic_write(tmp_path / "step" / "a") as aside:
-        aside.touch()
+
+    with locked(MPI.COMM_SELF, tmp_path / "step"), atomic_write(tmp_path / "step" / "a") as temporary:
+        temporary.touch()
         with claim(tmp_path, PAPER, OLD):
-            assert aside.exists()
+            assert temporary.exists()
 
 
 HOLDER = """
@@ -203,8 +242,8 @@ with locked(MPI.COMM_SELF, Path(sys.argv[1])):
 
 
 @contextmanager
-def held(folder):
-    """Another process works in the folder; gives it."""
+def held(folder: Path) -> Iterator[subprocess.Popen]:
+    """Let another process work in the folder until the block ends, or its standard input is closed."""
     pipe = subprocess.PIPE
     with subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdin=pipe, stdout=pipe) as process:
         try:
@@ -228,18 +267,16 @@ def held(folder):
     ],
 )
 def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, command, monkeypatch):
-    """The other is named with its host; a lock that a killed process has left is nobody's."""
+    """The other process is named with its host; a lock that a killed process has left is nobody's."""
     monkeypatch.setattr("vipetsc.io.lock.PATIENCE", 0.1)
 
-    def state():
-        return sorted((path, path.stat().st_mtime_ns) for path in run.rglob("*"))
-
     with held(run) as process:
-        before = state()
+        before = modified(run)
         ended = in_process(*command, "--out", run)
         assert ended.returncode == 2
         assert f"process {process.pid} on {os.uname().nodename} is working in it" in ended.stderr
-        assert state() == before
+        assert modified(run) == before
+
         process.kill()
         process.wait()
         assert (run / ".lock").exists()
@@ -249,8 +286,8 @@ def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, c
 
 
 @pytest.mark.parametrize("folder_is_new", [False, True])
-def test_a_command_waits_for_a_process_that_ends_and_says_so(run, tmp_path, caplog, folder_is_new):
-    """As after ``kill -9`` of a rank: mpirun returns while another rank, which has the lock, is still ending."""
+def test_a_command_waits_for_a_process_that_is_ending(run, tmp_path, caplog, folder_is_new):
+    """After ``kill -9`` of a rank, mpirun returns while another rank, which has the lock, is still ending."""
     folder = tmp_path / "new" if folder_is_new else run
     with held(folder) as process, caplog.at_level(logging.INFO, logger="vipetsc"):
         Timer(0.3, process.stdin.close).start()
@@ -258,9 +295,11 @@ def test_a_command_waits_for_a_process_that_ends_and_says_so(run, tmp_path, capl
         with locked(MPI.COMM_SELF, folder):
             assert 0.2 < time.monotonic() - begin < PATIENCE
             assert (folder / ".lock").read_text().startswith(f"process {os.getpid()} ")
-    assert folder.exists() != folder_is_new  # created by the other, removed by it, and again by this one
-    (told,) = caplog.messages
-    assert f"{folder}: process {process.pid} on {os.uname().nodename} is working in it; waiting up to 5 s" in told
+
+    # A new folder was created by the other, removed by it, and created and removed again by this one.
+    assert folder.exists() != folder_is_new
+    (message,) = caplog.messages
+    assert f"{folder}: process {process.pid} on {os.uname().nodename} is working in it; waiting up to 5 s" in message
 
 
 def test_a_folder_that_its_holder_removes_before_it_can_be_locked_is_created_again(tmp_path, monkeypatch):
@@ -268,6 +307,7 @@ def test_a_folder_that_its_holder_removes_before_it_can_be_locked_is_created_aga
     try_to_lock = lock._try_to_lock
     removed = []
 
+    # As the holder does between the creation of the folder by this process and its lock.
     def remove_once(path):
         if not removed:
             path.rmdir()
@@ -277,17 +317,20 @@ def test_a_folder_that_its_holder_removes_before_it_can_be_locked_is_created_aga
     monkeypatch.setattr(lock, "_try_to_lock", remove_once)
     with locked(MPI.COMM_SELF, folder):
         assert (folder / ".lock").exists()
-    assert removed == [folder] and not folder.exists()
+    assert removed == [folder]
+    assert not folder.exists()
 
 
-def test_a_command_waits_no_longer_than_it_says_for_a_process_that_stays(run, caplog, monkeypatch):
+def test_a_command_waits_only_as_long_as_announced_for_a_process_that_stays(run, caplog, monkeypatch):
     monkeypatch.setattr("vipetsc.io.lock.PATIENCE", 0.4)
     with held(run), caplog.at_level(logging.INFO, logger="vipetsc"):
         begin = time.monotonic()
         with pytest.raises(FolderError, match="is working in it; wait until it has ended"), locked(MPI.COMM_SELF, run):
             pass
+        # Many times the patience, for a machine that is busy.
         assert 0.4 <= time.monotonic() - begin < 1.5
-    assert len(caplog.messages) == 1  # said once, however often it looks
+    # It looks often and logs once.
+    assert len(caplog.messages) == 1
 
 
 def test_a_folder_that_cannot_be_locked_is_not_left_behind(tmp_path, monkeypatch):
