@@ -11,6 +11,7 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 
+from tests.assembly import assembled_stiffness
 from tests.conftest import small_case
 from vipetsc.case import Case, Model
 from vipetsc.contact.law import CLOSED
@@ -20,34 +21,11 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.io.store import RunMemory
-from vipetsc.lattice import Chain
 
 CELLS = 7
 # Counted from 1.
 DRIVEN_CELL = 3
 CONTACT_CELLS = (3, 7)
-
-
-def stiffness_matrix(chain: Chain) -> np.ndarray:
-    """The matrix (cells * dofs) squared in N/m; a wall holds the other end of a spring that leaves a fixed lattice."""
-    n = chain.cells
-    d = chain.cell.dofs
-    matrix = np.zeros((n * d, n * d))
-    for spring in chain.cell.springs:
-        for left in range(-1 if spring.next_cell else 0, n):
-            right = left + spring.next_cell
-            if chain.ends == "periodic":
-                if left < 0:
-                    continue
-                right = right % n
-            ends = [(left, spring.start), (right, spring.end)]
-            inside = [cell * d + mass for cell, mass in ends if 0 <= cell < n]
-            if len(inside) < 2 and chain.ends == "free":
-                continue
-            stretch = np.zeros(n * d)
-            stretch[inside] = [1, -1][: len(inside)]
-            matrix += spring.stiffness * np.outer(stretch, stretch)
-    return matrix
 
 
 def energies_of(model: Model, layout: Layout, state: PETSc.Vec) -> Energies:
@@ -106,7 +84,7 @@ class ClosedContact:
 
     def accelerations(self) -> np.ndarray:
         """Accelerations (cell, dof) in m/s^2 by springs, the drive and the closed contact."""
-        force = -(stiffness_matrix(self.chain) @ self.u.ravel()).reshape(self.u.shape)
+        force = -(assembled_stiffness(self.chain) @ self.u.ravel()).reshape(self.u.shape)
         force[DRIVEN_CELL - 1, 1] += float(self.model.drive.force(self.time))
         site = CONTACT_CELLS[0] - 1
         force[site, self.pair[0]] += self.contact_force()
@@ -152,7 +130,7 @@ def test_energies_are_those_of_the_state_and_of_its_ledger(lattice):
     kinetic = 0.5 * np.sum(np.array(lattice.chain.cell.masses) * lattice.v**2)
     contact = float(lattice.model.contact.potential(3e-5, lattice.clearance))
     assert energies.kinetic == pytest.approx(kinetic, rel=1e-12)
-    assert energies.spring == pytest.approx(0.5 * u @ stiffness_matrix(lattice.chain) @ u, rel=1e-12)
+    assert energies.spring == pytest.approx(0.5 * u @ assembled_stiffness(lattice.chain) @ u, rel=1e-12)
     # Energies are summed in whole units, of which the contact's is a small number.
     assert energies.contact == pytest.approx(contact, rel=1e-10)
     assert energies.work[0] == lattice.work

@@ -1,12 +1,12 @@
 """Dashpots and cells that differ: matrices against an assembly spring by spring, and the keys of a case file."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.assembly import assembled
 from vipetsc.case import Case, CaseError
 from vipetsc.lattice import Chain, UnitCell, Variation, four_band
 
@@ -27,36 +27,6 @@ def scattered_chain(ends: str = "fixed", seed: int = 1) -> Chain:
     for (name, array), factor in zip(reference.items(), factors, strict=True):
         values[name] = factor * array
     return Chain(cell, CELLS, ends, variation=Variation(**values))
-
-
-def assembled(chain: Chain, per_cell: np.ndarray, of_reference: Sequence[float]) -> np.ndarray:
-    """The matrix of springs or dashpots that are added one by one.
-
-    ``per_cell`` (cell, spring) are their coefficients; those from the wall on the left have the reference cell's.
-    """
-    n = chain.cells
-    d = chain.cell.dofs
-    matrix = np.zeros((n * d, n * d))
-    for left in range(-1, n):
-        for number, spring in enumerate(chain.cell.springs):
-            right = left + spring.next_cell
-            if chain.ends == "periodic":
-                right = right % n
-            # The wall on the left, cell -1, holds springs of fixed ends to the first cell only.
-            if left < 0 and (chain.ends == "periodic" or not spring.next_cell):
-                continue
-            is_inside = left >= 0 and right < n
-            if chain.ends == "free" and not is_inside:
-                continue
-
-            row = np.zeros(n * d)
-            if right < n:
-                row[right * d + spring.end] += 1
-            if left >= 0:
-                row[left * d + spring.start] -= 1
-            coefficient = per_cell[left, number] if left >= 0 else of_reference[number]
-            matrix += coefficient * np.outer(row, row)
-    return matrix
 
 
 @ENDS
