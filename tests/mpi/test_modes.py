@@ -70,6 +70,7 @@ def test_a_branch_that_fails_keeps_its_points_and_the_others_go_on(folder):
 def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
     """A request that one rank gets ends its branch at the next point, whole on disk; the other rank goes on."""
     comm = MPI.COMM_WORLD
+    # On two ranks each follows one branch: only that with mode-1 sees the request.
     case = three_cells(points=20)
     stop = StopRequest()
 

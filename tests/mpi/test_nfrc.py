@@ -25,6 +25,7 @@ def test_curves_are_the_same_on_any_number_of_ranks(folder):
 
     curves = follow_all(case, together, comm)
 
+    # Rank 0 collects the curves of all.
     assert len(curves) == (2 if comm.rank == 0 else 0)
     if comm.rank == 0:
         follow_all(case, alone, MPI.COMM_SELF)

@@ -49,6 +49,7 @@ def test_a_front_does_not_depend_on_the_ranks(folder, tmp_path_factory):
 
 
 @pytest.mark.parallel([1, 2])
+# At the first look of the search, and after some designs.
 @pytest.mark.parametrize("looks", [1, 12])
 def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder, whole, looks):
     comm = MPI.COMM_WORLD

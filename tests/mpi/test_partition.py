@@ -114,6 +114,7 @@ class Spoiler(Observer):
     """Makes one number of the last rank's state NaN after the first block."""
 
     name = "test-spoiler"
+    # Samples of a block: the state turns invalid behind the first one.
     longest = 61
 
     def observe(self, block):

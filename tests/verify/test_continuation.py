@@ -39,6 +39,7 @@ def test_degenerate_tangent_is_named():
         Continuation(problem, frame.measures(attempt), NnmTable())
 
 
+@pytest.mark.slow
 def test_without_guards_the_branch_jumps_and_the_detector_finds_it():
     problem = Shooting(Dop853Flow(reduced_model()), MAPS["quarter"])
     start = linear_start(problem, IN_PHASE, 3e-3)
@@ -123,6 +124,7 @@ def test_a_failure_states_where_it_stopped_why_and_what_to_change():
     assert "turn nnm." in text
 
 
+@pytest.mark.slow
 def test_contacts_change_at_grazing_points(in_phase, monkeypatch):
     """On either side of a grazing point the contacts are those of that end; bisection finds the same points."""
     problem = in_phase.problem

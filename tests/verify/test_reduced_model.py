@@ -109,6 +109,7 @@ def test_in_phase_through_the_first_tongues(in_phase):
     assert not any(monitor.check(point) for point in points)
 
 
+@pytest.mark.slow
 def test_in_phase_through_every_odd_tongue_towards_the_limit(in_phase):
     """At the tip of the k:1 tongue the resonator strikes (k + 1)/2 times in a quarter period, for every odd k."""
     problem = in_phase.problem
