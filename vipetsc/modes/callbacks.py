@@ -1,7 +1,9 @@
 """Exceptions of Python functions that PETSc calls, as its solvers for equations do.
 
 An exception that crosses PETSc's own frames leaves locked vectors behind, and comes out as itself, as "error code -1"
-or as "error code 101", by PETSc's version. So none crosses them: PETSc is given NaN, on which its solvers give up.
+or as "error code 101", by PETSc's version. So PETSc is given NaN, on which its solvers give up, where all ranks of the
+solver give it. What may be one rank's own, while others wait in the same callback, has to leave at once; the program
+ends then.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,6 +12,8 @@ from contextlib import contextmanager
 from petsc4py import PETSc
 
 import numpy as np
+
+from vipetsc.modes.problem import FlowError
 
 
 class CallbackErrors:
@@ -23,7 +27,7 @@ class CallbackErrors:
         return self._first is not None
 
     def keep(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """The ``callback(solver, x, result, ...)`` as PETSc is given it: nothing it raises leaves it.
+        """The ``callback(solver, x, result, ...)`` as PETSc is given it; FlowError is raised by all ranks or none.
 
         After a failure the result is NaN, that of all later callbacks too: they would be evaluated at what follows from
         NaN.
@@ -35,6 +39,8 @@ class CallbackErrors:
                     return callback(solver, x, result, *others)
                 except BaseException as error:
                     self._first = error
+                    if x.comm.size > 1 and not isinstance(error, FlowError):
+                        raise
             if isinstance(result, PETSc.Vec):
                 result.set(np.nan)
             else:
