@@ -123,7 +123,7 @@ def test_validate_prints_the_table_of_the_verb_that_reads_the_case(in_process):
     response = in_process("validate", example_case("nfrc")).stdout
     assert re.search(r"^  nfrc +3 curves over the amplitude, 0.4 to 1.6 of the clearance$", response, flags=re.M)
     assert re.search(r"^  lattice +infinite, ", response, flags=re.M)
-    assert not re.search(r"^  (samples|burst, end|engine|disk)", response, flags=re.M)  # of a run
+    assert not re.search(r"^  (samples|burst, end|drive, end|engine|disk)", response, flags=re.M)  # of a run
 
     prediction = in_process("validate", example_case("predict")).stdout
     assert re.search(r"^  predict +19 amplitudes, 17 to 1500 N$", prediction, flags=re.M)

@@ -243,8 +243,19 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
         if not equals or not all(path.split(".")):
             problems.append(Problem("--set", override, "write section.key=value"))
             continue
+        if _has_more_keys(text):
+            problems.append(Problem("--set", override, "gives one key: what follows in other lines needs a --set each"))
+            continue
         problems += [replace(p, key=f"--set {p.key}") for p in put(table, path, _value_of(text))]
     return table, problems
+
+
+def _has_more_keys(text: str) -> bool:
+    """Whether further lines of a value's ``text`` are keys or sections of TOML."""
+    try:
+        return len(tomllib.loads(f"value = {text}")) > 1
+    except (ValueError, RecursionError):
+        return False
 
 
 def _value_of(text: str) -> Any:

@@ -52,6 +52,7 @@ def check_per_site(
     if has_material and lacking:
         yield Problem(f"contacts.{lacking[0]}", None, "missing; the stiffness of each site needs it")
     yield from _check_laws(contacts, count)
+    yield from _check_sides(contacts, count)
     yield from _check_stops(contacts, gaps, at_rest)
 
 
@@ -78,14 +79,27 @@ def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
             yield Problem(_path_of(contacts, "restitution"), restitution, remedy)
 
 
+def _check_sides(contacts: ContactsTable, count: int) -> Iterator[Problem]:
+    """The problem of a clearance on a side on which none of ``count`` sites has a stop."""
+    is_given = contacts.clearance_minus is not None or "clearance_minus" in lists_of(contacts)
+    if is_given and count and set(values_of_sites(contacts, "side", count)) == {"plus"}:
+        remedy = 'with side = "plus" no site has a stop on the side -; leave it out'
+        yield Problem(_path_of(contacts, "clearance_minus"), contacts.clearance_minus, remedy)
+
+
 def _check_stops(contacts: ContactsTable, gaps: list[float], at_rest: Sequence[bool]) -> Iterator[Problem]:
     """Problems with contacts that are closed at rest: a second stop, or a dissipation that has no limit."""
     restitutions = values_of_sites(contacts, "restitution", len(gaps))
+    precompressions = values_of_sites(contacts, "precompression", len(gaps))
     stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
     for number, (plus, minus) in enumerate(stops, 1):
         if min(plus, minus) <= 0 and max(plus, minus) < np.inf:
             remedy = "contacts that touch or are pressed have a stop on one side alone: contacts.side"
             yield Problem("contacts.clearance", min(plus, minus), f"site {number}: {remedy}")
+            return
+        if precompressions[number - 1] and max(plus, minus) < np.inf:
+            remedy = f"site {number} has stops on both sides, and one alone can be pressed: contacts.side"
+            yield Problem(_path_of(contacts, "precompression"), precompressions[number - 1], remedy)
             return
         if min(plus, minus) < 0 and restitutions[number - 1] < 1:
             remedy = "a contact that is pressed together has no approach velocity: its restitution must be 1"
@@ -152,15 +166,22 @@ def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
 
 
 def describe_stops(gaps: Gaps, clearances: tuple[float, ...]) -> list[str]:
-    """The stops of each site in words, in mm: by their side where ``gaps`` differ, else the ``clearances``."""
+    """The stops of each site in words: by their side where ``gaps`` differ, else the ``clearances``."""
     if not gaps:
-        return [f"{1e3 * gap:.4g}" for gap in clearances]
+        return [f"{1e3 * gap:.4g} mm" for gap in clearances]
 
     texts = []
     for plus, minus in gaps:
-        stops = [f"{side}{1e3 * gap:.4g}" for side, gap in (("+", plus), ("-", minus)) if gap < np.inf]
+        stops = [_describe_stop(side, gap) for side, gap in (("+", plus), ("-", minus)) if gap < np.inf]
         texts.append(" ".join(stops))
     return texts
+
+
+def _describe_stop(side: str, gap: float) -> str:
+    """The stop of one ``side`` in words: at how many mm, touching, or pressed by so many."""
+    if gap > 0:
+        return f"{side}{1e3 * gap:.4g} mm"
+    return f"touches on side {side}" if gap == 0 else f"pressed by {-1e3 * gap:.4g} mm on side {side}"
 
 
 def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple[Pair, ...]:

@@ -120,6 +120,9 @@ def check_initial(
     dofs = lattice.cells * cell.dofs if cell and valid("lattice.cells") else None
     if dofs and initial.number and initial.number > dofs:
         yield Problem("initial.number", initial.number, f"the lattice has {dofs} modes")
+    elif initial.kind in ("mode", "packet") and cell and not cell.springs:
+        remedy = 'a lattice without springs has no modes and no waves; kind = "file" begins with a state of your own'
+        yield Problem("initial.kind", initial.kind, remedy)
     elif initial.kind == "mode" and (lattice.profiles or lattice.scatter):
         remedy = "the mode of a lattice whose cells differ; a packet, or a state in a file"
         yield Problem("initial.kind", "mode", remedy)

@@ -312,7 +312,8 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
 def check_unsprung(drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
     """A lattice that contacts alone join has no bands from which times could follow."""
     remedy = "missing; without springs there are no bands that it follows from"
-    if drive.frequency is None:
+    # The frequency of other waveforms follows from their own keys.
+    if drive.frequency is None and drive.is_sine:
         yield Problem("drive.frequency", None, remedy)
     if time.end == "traverse":
         yield Problem("time.end", time.end, remedy)

@@ -22,6 +22,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     if case.lattice.preset:
         lattice += f", reading {case.lattice.reading}"
     bands = pass_bands(cell)
+    band_list = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)
     gap_list = ", ".join(f"{low:.2f}-{high:.2f}" for low, high in gaps(bands))
     # Every one of a million sites may have a law: as many are named as a list shows.
     laws = model.used_laws[:8]
@@ -30,12 +31,12 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     return [
         ("case", case.name),
         ("lattice", lattice),
-        ("pass bands", ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands) + " rad/s"),
-        ("gaps", f"{gap_list} rad/s" if gap_list else "none"),
+        ("pass bands", f"{band_list} rad/s" if cell.springs else "none, as contacts alone join the masses"),
+        ("gaps", f"{gap_list} rad/s" if gap_list else ("none" if cell.springs else "")),
         ("loss", describe_losses(case)),
         ("contact", "; ".join(dict.fromkeys(map(str, laws)))),
         ("sites", first_few([cell + 1 for cell in chain.sites])),
-        ("clearance", f"{clearances} mm" if chain.sites else "none"),
+        ("clearance", clearances),
     ]
 
 

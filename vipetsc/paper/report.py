@@ -26,6 +26,8 @@ COLOURS = 256  # of a picture of lines in the page
 WIDTH = 1000  # pixels of a picture of maps
 QUALITY = 50  # of a picture of maps in WebP
 ENCODED = re.compile(r'<img data-of="(\w+)" src="([^"]+)"')
+# What several claims do that each have a verdict.
+OF_SEVERAL = {HOLDS: "hold", IN_PART: "hold in part", FAILS: "do not hold", UNMEASURED: "not measured"}
 VERDICTS = (HOLDS, IN_PART, FAILS, UNMEASURED)
 
 
@@ -73,6 +75,7 @@ def write_report(path: Path, contents: ReportContents) -> None:
         versions=contents.versions,
         rows=by_reading(contents.claims),
         readings=readings,
+        of_several=OF_SEVERAL,
         counts={r: [(v, verdicts[r, v]) for v in VERDICTS if verdicts[r, v]] for r in readings},
         figure_of=figure_of,
         sweeps={name: row for name, row in statistics.items() if "members" in row},

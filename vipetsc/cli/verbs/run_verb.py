@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vipetsc.case import Case, Sweep
+from vipetsc.case.waveforms import DEFAULT
 from vipetsc.cli.arguments import CASE, OF_STUDIES, argument
 from vipetsc.cli.case_rows import describe_initial, lattice_rows
 from vipetsc.cli.drawing import Pictures
@@ -82,7 +83,9 @@ def run_rows(case: Case, ranks: int) -> Rows:
         f"band {band}, kappa = {kappa / np.pi:.4f} pi, v_g = {speed:.2f} cells/s"
         for band, kappa, speed in waves_at(chain.cell, model.drive.frequency)
     ]
-    burst = max(drive.waveform.duration for drive in model.drives)
+    drive_end = max(drive.waveform.duration for drive in model.drives)
+    drive_words = f"{drive_end:.6g} s" if drive_end < np.inf else "it goes on"
+    noun = "burst" if all(drive.kind == DEFAULT for _, drive in case.drive.every) else "drive"
 
     # Doubles: fields at every stride-th sample, and what each site has dissipated at all samples. The rest is small.
     columns = len(recorded_cells(case.output, chain.cells)) * chain.cell.dofs * len(case.output.fields)
@@ -105,8 +108,8 @@ def run_rows(case: Case, ranks: int) -> Rows:
         *lattice_rows(case),
         ("begins with", describe_initial(case.initial)),
         *(("drive", drive.describe()) for _, drive in case.drive.every),
-        ("waves at Om", "; ".join(waves) or "none: in a gap"),
-        ("burst, end", f"{burst:.6g} s, {model.end:.6g} s"),
+        ("waves at Om", ("; ".join(waves) or "none: in a gap") if chain.cell.springs else ""),
+        (f"{noun}, end", f"{drive_words}, {model.end:.6g} s"),
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
         ("engine", f"{cost.engine}: {cost.note}" if cost.note else cost.engine),

@@ -77,6 +77,19 @@ def step_series(model: Model) -> StepSeries | None:
     return best
 
 
+def _no_step(model: Model) -> str:
+    """Why not even the shortest step suits ``model``: too few cells for its band, or waves too fast for its series."""
+    tolerance = max(SERIES_TOLERANCE * model.rtol, LEAST_TOLERANCE)
+    series = StepSeries(model.chain, model.sample_interval / MOST_PARTS, tolerance)
+    step = f"a step of {series.interval:.3g} s, time.sample_interval over {MOST_PARTS},"
+    if model.chain.cells < series.width:
+        return f"{model.chain.cells} cells are fewer than the {series.width} that {step} acts on"
+
+    bursts = [drive.waveform.highest for drive in model.drives if isinstance(drive.waveform, ToneBurst)]
+    fastest = max([series.omega_max_h / series.interval, *bursts])
+    return f"{step} is too long for {fastest:.5g} rad/s, of the drive or the lattice"
+
+
 PROGRESS = np.dtype([(name, np.int64) for name in ("steps", "last", "failed", "cluster")] + [("time", float)])
 """Steps done and the last one to do; of a failure its step (beyond the last one if there is none), its cluster (-1 if
 the state is not finite), its time in s."""
@@ -204,10 +217,7 @@ class Propagator(Engine):
             return "its steps are those of linear springs, and some have a quadratic or cubic part"
         series = step_series(model)
         if series is None:
-            shortest = StepSeries(model.chain, model.sample_interval / MOST_PARTS, model.rtol)
-            if model.chain.cells >= shortest.width:
-                return f"drive.frequency = {model.drive.frequency:g} rad/s is too fast for the sample interval"
-            return f"{model.chain.cells} cells are fewer than the propagator's band"
+            return _no_step(model)
 
         numbers, first = group_dofs(model, series.reach)
         counts = np.add.reduceat(numbers >= 0, first[:-1], dtype=np.int64)

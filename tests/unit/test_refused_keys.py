@@ -1,0 +1,124 @@
+"""Keys that would be accepted and ignored, motions that a lattice does not have, and words that describe a case."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.conftest import small_case
+from vipetsc.case import Case, CaseError
+from vipetsc.case.contacts import describe_stops
+from vipetsc.cli.verbs.run_verb import run_rows
+from vipetsc.dynamics.propagator.engine import Propagator
+
+
+def unsprung_table(**sections: dict[str, Any]) -> dict[str, Any]:
+    """Beads that only their contacts join, struck by half a sine; ``sections`` update the table."""
+    table: dict[str, Any] = {
+        "lattice": {"cell": {"masses": [1e-3]}, "cells": 4, "ends": "free"},
+        "contacts": {"stiffness": 1e8, "clearance": 0.0, "next_cell": True, "side": "minus", "sites": [1, 2, 3]},
+        "drive": {"waveform": "impulse", "amplitude": 1e-3, "duration": 1e-5},
+        "time": {"end": 1e-3, "sample_interval": 1e-5},
+    }
+    return table | {name: table.get(name, {}) | values for name, values in sections.items()}
+
+
+def problem_of(table: dict[str, Any], overrides: tuple[str, ...] = ()) -> tuple[str, str]:
+    """Key and remedy of the one problem of a case."""
+    with pytest.raises(CaseError) as error:
+        Case.from_table(table, overrides)
+    [problem] = error.value.problems
+    return problem.key, problem.remedy
+
+
+@pytest.mark.parametrize(
+    ("contacts", "key"),
+    [
+        # One that is smaller than the clearances was dropped.
+        ({"precompression": 1e-5}, "contacts.precompression"),
+        ({"each": {"precompression": [0.0, 1e-5]}}, "contacts.each.precompression"),
+        ({"side": "plus", "clearance_minus": 1e-5}, "contacts.clearance_minus"),
+        ({"each": {"side": ["plus", "plus"], "clearance_minus": [1e-5, 1e-5]}}, "contacts.each.clearance_minus"),
+    ],
+)
+def test_a_key_of_a_stop_that_does_nothing_is_refused(contacts, key):
+    stops = {"sites": [4, 9], "clearance": 3e-5, "restitution": 1.0}
+    with pytest.raises(CaseError) as error:
+        small_case(contacts=stops | contacts)
+    assert [problem.key for problem in error.value.problems] == [key]
+
+
+def test_a_clearance_of_the_side_minus_is_taken_where_one_site_has_a_stop_there():
+    case = small_case(contacts={"sites": [4, 9], "clearance": 3e-5, "clearance_minus": 1e-5,
+                                "each": {"side": ["plus", "both"]}})  # fmt: skip
+    assert case.model().gaps[1] == (3e-5, 1e-5)
+
+
+def test_what_follows_in_other_lines_of_an_override_is_refused():
+    key, remedy = problem_of(Case.builtin_table, ("drive.amplitude=2.0\ntime.end=5",))
+    assert key == "--set" and "--set each" in remedy
+
+
+def test_an_override_may_be_a_list_over_lines():
+    case = Case.from_table(Case.builtin_table, ("contacts.sites=[\n10,\n20]",))
+    assert case.contacts.sites == [10, 20]
+
+
+def test_the_frequency_of_an_impulse_follows_from_its_duration_without_springs_too():
+    case = Case.from_table(unsprung_table())
+    assert case.drive.frequency == pytest.approx(3.141592653589793e5)
+
+
+def test_a_burst_without_springs_needs_its_frequency():
+    table = unsprung_table() | {"drive": {"amplitude": 1.0}}
+    with pytest.raises(CaseError) as error:
+        Case.from_table(table)
+    assert {problem.key for problem in error.value.problems} == {"drive.frequency"}
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        {"kind": "mode", "number": 2, "amplitude": 1e-5},
+        {"kind": "packet", "band": 1, "wavenumber": 1.0, "cell": 2, "width": 1.0, "amplitude": 1e-5},
+    ],
+)
+def test_a_lattice_without_springs_begins_with_no_mode_and_no_packet(motion):
+    key, remedy = problem_of(unsprung_table(initial=motion))
+    assert key == "initial.kind" and "without springs" in remedy
+
+
+def test_stops_are_described_by_what_they_are():
+    gaps = ((float("inf"), 0.0), (-2e-6, float("inf")), (2e-4, 3e-4))
+    expected = ["touches on side -", "pressed by 0.002 mm on side +", "+0.2 mm -0.3 mm"]
+    assert describe_stops(gaps, (0.0, 0.0, 2e-4)) == expected
+    assert describe_stops((), (2e-4,)) == ["0.2 mm"]
+
+
+def test_a_drive_without_an_end_is_said_to_go_on():
+    case = small_case(drive={"waveform": "harmonic", "cycles": 30})
+    rows = dict(run_rows(case, 1))
+    assert rows["drive, end"] == "it goes on, 0.05 s"
+    assert "burst, end" in dict(run_rows(small_case(), 1))
+
+
+def test_beads_have_no_bands_and_no_waves():
+    rows = dict(run_rows(Case.from_table(unsprung_table()), 1))
+    assert rows["pass bands"].startswith("none")
+    assert not rows["gaps"] and not rows["waves at Om"]
+
+
+@pytest.mark.parametrize(
+    ("cells", "frequency", "reason"),
+    [(3, 500.0, "3 cells are fewer than the 9"), (60, 2e5, "is too long for 3e+05 rad/s")],
+)
+def test_the_propagator_names_what_no_step_of_its_own_suits(cells, frequency, reason):
+    springs = [{"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}]
+    case = Case.from_table({
+        "lattice": {"cell": {"masses": [1e-3], "springs": springs}, "cells": cells},
+        "contacts": {"sites": []},
+        "drive": {"frequency": frequency, "cycles": 2},
+        "time": {"end": 0.01, "sample_interval": 2e-4},
+    })  # fmt: skip
+    assert reason in str(Propagator.refusal(case.model()))
