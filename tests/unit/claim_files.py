@@ -1,4 +1,4 @@
-"""Result files with known contents from which the paper's claims are measured in tests."""
+"""Result files with prescribed contents from which the paper's claims are measured in tests."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -50,6 +50,7 @@ tolerance = 1e-11
 """
 
 
+@pytest.mark.slow
 def test_a_mass_between_two_stops_has_its_period_in_closed_form():
     """Between the stops the mass moves with k, beyond them with k + kc about another middle."""
     k = 3.0

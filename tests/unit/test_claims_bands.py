@@ -1,4 +1,4 @@
-"""Claim C13, that energies of the bands add up, measured from fields with known spectra; claim C10 on the design."""
+"""Claim C13, that energies of the bands add up, from fields with prescribed spectra; claim C10 on the design."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -57,7 +57,7 @@ def on_an_edge(case: Case) -> np.ndarray:
     return beat[:, None, None] * np.ones((case.lattice.cells, 4))
 
 
-# Errors of a split, made on energies (part, t).
+# Errors that a split may have, of energies (part, t).
 
 
 def as_it_is(energy: np.ndarray) -> np.ndarray:
@@ -169,7 +169,7 @@ def test_energy_is_counted_in_its_own_band():
 
 
 def test_no_motion_misses_the_modal_energies_by_more_than_the_bound(monkeypatch):
-    """The bound holds for a lattice with its own modes, and where shapes or frequencies are wrong by a known part."""
+    """The bound holds for a lattice with its own modes, and where shapes or frequencies are wrong by 1 or 2 %."""
     case = Case.from_table({"lattice": {"preset": "four-band", "cells": 12}})
     chain = case.model().chain
     modes = linear_modes(chain)

@@ -1,4 +1,4 @@
-"""Claims C15 to C17 on the reduced model's branches and on the lattice's motion, from files with known branches."""
+"""Claims C15 to C17 on the reduced model and on the lattice's motion, from files with prescribed branches."""
 
 import json
 from pathlib import Path

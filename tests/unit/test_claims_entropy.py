@@ -1,4 +1,4 @@
-"""Claims C7 to C9 on the entropy's decay with the amplitude, measured from sweeps with known entropies."""
+"""Claims C7 to C9 on the entropy's decay with the amplitude, measured from sweeps with prescribed entropies."""
 
 import shutil
 from collections.abc import Callable, Sequence

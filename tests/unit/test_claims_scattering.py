@@ -1,4 +1,4 @@
-"""Claims C1 to C6 on the diatomic lattice at low, medium and high amplitude, from runs with known spectra."""
+"""Claims C1 to C6 on the diatomic lattice at low, medium and high amplitude, from runs with prescribed spectra."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Claims C11, C12, C14 and C18 on transfer to higher bands, measured from sweeps with known transfer."""
+"""Claims C11, C12, C14 and C18 on transfer to higher bands, measured from sweeps with prescribed transfer."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -240,8 +240,8 @@ def transfer_of_members() -> np.ndarray:
     return values.reshape(5, 7)
 
 
-@pytest.fixture
-def ensemble(tmp_path):
+@pytest.fixture(scope="module")
+def ensemble(tmp_path_factory):
     """The finished sweep of these transfers, each with 1e-4 of floor."""
     transfer = transfer_of_members().ravel()
 
@@ -257,8 +257,9 @@ def ensemble(tmp_path):
         }
         return {"statistics": statistics, "measures": {"ibtet": transfer[number] + 1e-4}}
 
-    put_members(tmp_path / "out", Sweep.from_table(SWEEP), outcome)
-    return open_ensemble(tmp_path / "out")
+    folder = tmp_path_factory.mktemp("sweep")
+    put_members(folder, Sweep.from_table(SWEEP), outcome)
+    return open_ensemble(folder)
 
 
 def test_statistics_are_those_of_the_samples_that_came_out(ensemble):

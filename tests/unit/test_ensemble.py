@@ -43,7 +43,7 @@ def transfer_of(case: Case) -> float:
 def put_sweep(
     folder: Path, plan: Sweep, failing: Collection[int] = (), transfer: Callable[[Case], float] = transfer_of
 ) -> Path:
-    """A finished sweep whose members were not simulated, but have what an ensemble is made of."""
+    """A finished sweep whose members were not simulated, but have all that an ensemble holds."""
 
     def outcome(number: int, case: Case) -> dict[str, Any] | str:
         if number in failing:

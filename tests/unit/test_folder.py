@@ -21,7 +21,7 @@ from vipetsc.io.folder import BRANCHES, KINDS, PAPER, RUN, SEARCH, SWEEP, Claim,
 from vipetsc.io.lock import PATIENCE, locked
 
 ROOT = Path(__file__).parents[2]
-# A file by which a folder of each kind is known.
+# A file that shows of which kind a folder is.
 SHOWN = {RUN: "run.h5", BRANCHES: "branch-x.h5", SEARCH: "design.h5", SWEEP: "index.json", PAPER: "plan.json"}
 # Cases of the results that are there, and of those that a command is to make.
 OLD = "a = 1\n"
@@ -219,7 +219,7 @@ def test_files_that_a_killed_command_leaves_are_removed(tmp_path):
 
 
 def test_a_file_that_another_command_writes_stays(tmp_path):
-    """A sweep below a paper's folder has a lock of its own, by which its temporary files are known."""
+    """A sweep below a paper's folder has a lock of its own: its temporary files are in use."""
     with claim(tmp_path, PAPER, OLD):
         pass
 

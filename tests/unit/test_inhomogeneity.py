@@ -72,7 +72,7 @@ def test_cells_beyond_fixed_ends_are_reference_cells():
     assert np.array_equal(found, np.vstack([reference, fixed.variation.stiffness, reference]))
 
 
-def test_a_chain_knows_which_cells_differ():
+def test_cells_that_differ_from_the_reference_are_marked():
     masses = np.tile(four_band().masses, (CELLS, 1))
     masses[4, 2] *= 1.1
     chain = Chain(four_band(), CELLS, "fixed", variation=Variation(masses))
