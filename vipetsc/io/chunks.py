@@ -43,7 +43,7 @@ LARGE = {
     "impacts/site": ("episode", "1", "site, counted from 1"),
     "impacts/side": ("episode", "1", "side of the clearance: +1 or -1"),
     "impacts/onset": ("episode", "s", "time of onset"),
-    "impacts/approach_velocity": ("episode", "m/s", "relative velocity at onset, w'_minus"),
+    "impacts/approach_velocity": ("episode", "m/s", "relative velocity w'_minus at onset, of the sign of the side"),
     "impacts/separation": ("episode", "s", "time of separation; NaN if still in contact"),
     "impacts/indentation": ("episode", "m", "largest indentation"),
     "impacts/force": ("episode", "N", "largest contact force"),

@@ -22,7 +22,7 @@ MODAL = {
     "bands/modal_energy": ("bands/part bands/instant", "J", "energy of the linear modes in a part"),
     "bands/bin": ("bands/bin", "1", "wavenumber bin, of twelve from 0 to pi"),
     "bands/bin_energy": ("bands/bin bands/instant", "J", "energy of the linear modes in a wavenumber bin"),
-    "bands/drive_work": ("bands/part", "J", "what the drive gave to a part beside the contacts' transfers"),
+    "bands/drive_work": ("bands/part", "J", "change of a part over the run less the transfers"),
     "bands/cluster": ("bands/cluster", "1", "cluster of contact episodes, by onset"),
     "bands/transfer": ("bands/cluster bands/part", "J", "energy that a cluster gave to a part"),
     "bands/cluster_begin": ("bands/cluster", "s", "last sample before a cluster"),

@@ -138,7 +138,10 @@ def measured(run: xr.Dataset, statistics: dict[str, Any], objectives: Sequence[O
 
 
 def _energy_beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray) -> float:
-    """Energy in J of the cells beyond the site that is farthest from the drive; of springs at the border about half."""
+    """Energy in J of the cells beyond the site that is farthest from the drive.
+
+    Springs between these cells count whole. Of one at the cut, of stiffness k, k u_b (u_b - u_a)/2 counts, u_b beyond.
+    """
     chain = model.chain
     sites = np.array(chain.sites)
     farthest = sites[np.argmax(np.abs(sites - model.drive_cell))]
