@@ -209,6 +209,14 @@ class StopAt(StopRequest):
 NAMES_OF_RANKS = re.compile(r"(OMPI|PMIX|PRTE)_(?!MCA_|ALLOW_RUN_AS_ROOT)")
 
 
+def set_words(*changes: str) -> list[str]:
+    """Return the words of the command line that change keys of a case: ``--set section.key=value`` for each."""
+    words = []
+    for change in changes:
+        words += ["--set", change]
+    return words
+
+
 def clean_environment() -> dict[str, str]:
     """The environment without what this process's own MPI put into it: a child may then be an mpirun.
 

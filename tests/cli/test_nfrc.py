@@ -21,26 +21,60 @@ harmonics = 5
 pytestmark = pytest.mark.parallel(1)
 
 
-def test_files_picture_refusal_and_a_curve_that_cannot_go_on(in_process, tmp_path):
-    case, out = tmp_path / "small.toml", tmp_path / "out"
-    case.write_text(CASE)
-    done = in_process("nfrc", case, "--out", out)
-    assert done.returncode == 0, done.stderr
-    assert "folds              1.00" in done.stdout and "reached the end of nfrc.range" in done.stdout
+# A curve is named by its restitution and by what it keeps, here the frequency in rad/s.
+STEM = "branch-r1-1023.27"
+
+
+@pytest.fixture
+def case(tmp_path):
+    path = tmp_path / "small.toml"
+    path.write_text(CASE)
+    return path
+
+
+@pytest.mark.slow
+def test_a_curve_leaves_its_files_and_its_picture_and_is_not_computed_twice(in_process, case, tmp_path):
+    """The verb leaves case, curve, table and picture; the same command writes nothing, another case is refused."""
+    out = tmp_path / "out"
+    ended = in_process("nfrc", case, "--out", out)
+    assert ended.returncode == 0, ended.stderr
+    assert "folds              1.00" in ended.stdout
+    assert "reached the end of nfrc.range" in ended.stdout
     names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
-    stem = "branch-r1-1023.27"
-    assert names == {"case.toml", f"{stem}.h5", f"{stem}.csv", f"figures/{stem}.png"}
-    header = (out / f"{stem}.csv").read_text().splitlines()[0].split(",")
-    assert header[:3] == ["frequency", "amplitude", "largest"] and header[-1] == "kind"
+    assert names == {"case.toml", f"{STEM}.h5", f"{STEM}.csv", f"figures/{STEM}.png"}
+    header = (out / f"{STEM}.csv").read_text().splitlines()[0].split(",")
+    assert header[:3] == ["frequency", "amplitude", "largest"]
+    assert header[-1] == "kind"
+
     written = modified(out)
     assert in_process("nfrc", case, "--out", out).returncode == 0
-    assert modified(out) == written  # complete: nothing is made again
+    assert modified(out) == written
+
     assert in_process("plot", out).returncode == 0
+
     other = in_process("nfrc", case, "--out", out, "--set", "nfrc.harmonics=7")
-    assert other.returncode == 2 and "--force" in other.stderr
-    bad = in_process("nfrc", case, "--out", tmp_path / "none", "--set", "nfrc.range=[2.0, 1.0]")
-    assert bad.returncode == 2 and "nfrc.range" in bad.stderr and not (tmp_path / "none").exists()
-    stuck = in_process("nfrc", case, "--out", tmp_path / "stuck", "--set", "nfrc.smallest_step=0.005")
-    assert stuck.returncode == 1
-    assert "last good point" in stuck.stderr and "nfrc.smallest_step" in stuck.stderr
-    assert (tmp_path / "stuck" / f"{stem}.h5").exists() and (tmp_path / "stuck/figures" / f"{stem}.png").exists()
+    assert other.returncode == 2
+    assert "--force" in other.stderr
+
+
+def test_a_range_that_descends_is_refused(in_process, case, tmp_path):
+    """A wrong value ends with exit code 2, its key and no folder."""
+    ended = in_process("nfrc", case, "--out", tmp_path / "none", "--set", "nfrc.range=[2.0, 1.0]")
+
+    assert ended.returncode == 2
+    assert "nfrc.range" in ended.stderr
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.slow
+def test_a_curve_that_cannot_go_on_keeps_its_points(in_process, case, tmp_path):
+    """Steps that must not be as short as a fold needs end the curve: its points and their picture are there."""
+    out = tmp_path / "stuck"
+
+    ended = in_process("nfrc", case, "--out", out, "--set", "nfrc.smallest_step=0.005")
+
+    assert ended.returncode == 1
+    assert "last good point" in ended.stderr
+    assert "nfrc.smallest_step" in ended.stderr
+    assert (out / f"{STEM}.h5").exists()
+    assert (out / "figures" / f"{STEM}.png").exists()

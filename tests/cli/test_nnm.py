@@ -30,12 +30,15 @@ def case(tmp_path):
     return path
 
 
-def test_branch_files_picture_and_refusal(vipetsc, in_process, case, tmp_path):
+@pytest.mark.slow
+def test_a_branch_leaves_its_files_and_its_picture_and_is_not_computed_twice(vipetsc, in_process, case, tmp_path):
+    """The same command writes nothing, mends what was cut off, and replaces another case's branch by force alone."""
     out = tmp_path / "out"
     done = vipetsc(0, "nnm", case, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "fold-energy: 2" in done.stdout
-    assert "Newton" in done.stderr  # the live table
+    # The live table.
+    assert "Newton" in done.stderr
     names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
     assert names == {
         "case.toml",
@@ -43,28 +46,36 @@ def test_branch_files_picture_and_refusal(vipetsc, in_process, case, tmp_path):
         "branch-out-of-phase.csv",
         "figures/branch-out-of-phase.png",
     }
+
     written = modified(out)
-    again = in_process("nnm", case, "--out", out)
-    assert again.returncode == 0
-    assert again.stdout == done.stdout.rpartition("  /")[0].rpartition("\n")[0] + "\n"
-    assert modified(out) == written  # complete: nothing is made again
+    second = in_process("nnm", case, "--out", out)
+    assert second.returncode == 0
+    # But for the last line, which names the pictures that were drawn.
+    assert second.stdout == done.stdout.rpartition("  /")[0].rpartition("\n")[0] + "\n"
+    assert modified(out) == written
+
     (out / "branch-out-of-phase.h5").write_text("cut")
     assert in_process("nnm", case, "--out", out).returncode == 0
     assert modified(out).keys() == written.keys()
-    other = in_process("nnm", case, "--out", out, "--set", "nnm.energy=[0.0, 0.5]")
-    assert other.returncode == 2
-    assert "--force" in other.stderr
-    assert in_process("nnm", case, "--out", out, "--set", "nnm.energy=[0.0, 0.5]", "--force").returncode == 0
+
+    shorter = ("--set", "nnm.energy=[0.0, 0.5]")
+    refused = in_process("nnm", case, "--out", out, *shorter)
+    assert refused.returncode == 2
+    assert "--force" in refused.stderr
+    assert in_process("nnm", case, "--out", out, *shorter, "--force").returncode == 0
     assert modified(out).keys() == written.keys()
 
 
 def test_resumed_branch_is_the_uninterrupted_one(in_process, case, tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    """A branch of 30 points that is resumed to 80 has the bits of one that was followed to 80 at once."""
+    whole = tmp_path / "whole"
+    parts = tmp_path / "parts"
     assert in_process("nnm", case, "--out", whole, "--set", "nnm.points=80").returncode == 0
     assert in_process("nnm", case, "--out", parts, "--set", "nnm.points=30").returncode == 0
     assert in_process("nnm", case, "--out", parts, "--set", "nnm.points=80", "--resume").returncode == 0
-    first, second = (datasets(p / "branch-out-of-phase.h5") for p in (whole, parts))
-    assert_same_bits(first, second)
+
+    expected = datasets(whole / "branch-out-of-phase.h5")
+    assert_same_bits(datasets(parts / "branch-out-of-phase.h5"), expected)
 
 
 @pytest.mark.parametrize(
@@ -72,6 +83,7 @@ def test_resumed_branch_is_the_uninterrupted_one(in_process, case, tmp_path):
     [("nnm.modes=[7]", "2 modes"), ("nnm.flow=rk4", "nnm.flow"), ("nmn.flow=1", "did you mean nnm")],
 )
 def test_bad_cases_write_nothing(in_process, case, tmp_path, change, message):
+    """A wrong key or value ends with exit code 2, what is right, and no folder."""
     done = in_process("nnm", case, "--out", tmp_path / "out", "--set", change)
     assert done.returncode == 2
     assert message in done.stderr
@@ -80,8 +92,11 @@ def test_bad_cases_write_nothing(in_process, case, tmp_path, change, message):
 
 @pytest.mark.mpirun
 def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
+    """A branch whose steps become too short ends with exit code 1, the key to change, and its points in the file."""
     out = tmp_path / "out"
+
     done = vipetsc(2, "nnm", case, "--out", out, "--set", "nnm.smallest_step=1e-3")
+
     assert done.returncode == 1
     assert "turn nnm.smallest_step" in done.stdout
     assert len((out / "branch-out-of-phase.csv").read_text().splitlines()) > 5
@@ -116,10 +131,12 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.mark.mpirun
 def test_an_error_of_one_rank_ends_all_that_follow_a_branch_together(vipetsc, tmp_path):
+    """Where one of two ranks raises, both end, with its message: neither waits for the other."""
     (tmp_path / "fails.py").write_text(FAILS_ON_RANK_1)
     (tmp_path / "chain.toml").write_text(CHAIN)
     paths = f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '.')}"
     options = {"module": "fails", "env": clean_environment() | {"PYTHONPATH": paths}, "timeout": 100}
+
     done = vipetsc(2, "nnm", tmp_path / "chain.toml", "--out", tmp_path / "out", **options)
     assert done.returncode == 1
     assert "of rank 1 alone" in done.stderr
@@ -127,8 +144,10 @@ def test_an_error_of_one_rank_ends_all_that_follow_a_branch_together(vipetsc, tm
 
 @alone_and_on_two_ranks
 def test_a_file_that_is_no_branch_is_refused_on_all_ranks(on_ranks, tmp_path, ranks):
+    """An HDF5 file of another kind under a branch's name ends with exit code 2 and no traceback."""
     with h5py.File(tmp_path / "branch-x.h5", "w") as file:
         file["energy"] = [1.0]
+
     done = on_ranks(ranks, "plot", tmp_path)
     assert done.returncode == 2
     assert "is not a branch" in done.stderr
@@ -137,14 +156,17 @@ def test_a_file_that_is_no_branch_is_refused_on_all_ranks(on_ranks, tmp_path, ra
 
 def test_branches_and_runs_never_share_a_folder(in_process, tmp_path):
     """--force replaces results of its own kind only."""
-    run, branches = tmp_path / "run", tmp_path / "branches"
+    run = tmp_path / "run"
+    branches = tmp_path / "branches"
     for folder, evidence in ((run, "run.h5"), (branches, "branch-mode-1.h5")):
         folder.mkdir()
         (folder / "case.toml").write_text("")
         (folder / evidence).write_text("results")
+
     for arguments in (("nnm", "runs/nnm-cubic.toml", "--out", run), ("run", "--out", branches)):
         ended = in_process(*arguments, "--force")
         assert ended.returncode == 2
         assert "of this kind" in ended.stderr
+
     assert (run / "run.h5").read_text() == "results"
     assert (branches / "branch-mode-1.h5").read_text() == "results"

@@ -16,7 +16,7 @@ import vipetsc as package
 from vipetsc.case import keys
 from vipetsc.case.case_file import CaseError, read_section, sections_in
 from vipetsc.case.drive import DriveTable
-from vipetsc.case.verb_cases import SECTIONS
+from vipetsc.case.verb_cases import SECTIONS, load_every
 from vipetsc.cli.verbs.verb_list import VERBS
 
 ROOT = Path(package.__file__).parents[1]
@@ -24,27 +24,38 @@ CASES = sorted([*(ROOT / "runs").glob("*.toml"), *(ROOT / "vipetsc/paper/cases")
 
 
 def classes() -> dict[str, set[str]]:
-    """The keys that the validator knows of every class of a section, tables within tables as well."""
-    found, left = {}, list(SECTIONS.values())
-    while left:
-        table = left.pop()
-        if table.__name__ not in found:
-            found[table.__name__] = {field.alias or name for name, field in table.model_fields.items()}
-            left += [inner for field in table.model_fields.values() for inner in sections_in(field.annotation)]
-    return found
+    """Return the keys that the validator takes in every class of a section, tables within tables as well."""
+    keys_of = {}
+    waiting = list(SECTIONS.values())
+    while waiting:
+        table = waiting.pop()
+        if table.__name__ in keys_of:
+            continue
+
+        keys_of[table.__name__] = {field.alias or name for name, field in table.model_fields.items()}
+        for field in table.model_fields.values():
+            waiting += sections_in(field.annotation)
+    return keys_of
 
 
-def test_schema_manual_texts_and_validator_name_the_same_keys():
+def test_schema_and_texts_have_the_keys_of_the_validator():
+    """Every class of the schema has the keys that the validator takes, and each of them a text."""
     schema = keys.json_schema()
     assert set(schema["properties"]) == {"name", *SECTIONS}
-    validator, varied = classes(), set(schema["$defs"]["SweepTable"]["properties"]) & set(SECTIONS)
-    assert {name: set(item.get("properties", {})) for name, item in schema["$defs"].items()} == validator | {
-        "SweepTable": validator["SweepTable"] | varied
-    }
-    assert {name: set(texts) for name, texts in keys.texts().items()} == {
-        name: names for name, names in (validator | {"CaseFile": {"name"}}).items() if names
-    }
 
+    validator = classes()
+    # The schema of a sweep also has the sections whose keys may vary.
+    varied = set(schema["$defs"]["SweepTable"]["properties"]) & set(SECTIONS)
+    expected = validator | {"SweepTable": validator["SweepTable"] | varied}
+    assert {name: set(item.get("properties", {})) for name, item in schema["$defs"].items()} == expected
+
+    with_keys = {name: names for name, names in (validator | {"CaseFile": {"name"}}).items() if names}
+    assert {name: set(texts) for name, texts in keys.texts().items()} == with_keys
+
+
+def test_the_chapter_on_keys_has_those_of_the_validator():
+    """The manual's table of each section has the keys that the validator takes there, once."""
+    validator = classes()
     shown = {}
     for path, text in re.findall(r"^## \[(\S+)\]\n(.*?)(?=^## |\Z)", keys.chapter(), flags=re.M | re.S):
         shown.setdefault(path, set()).update(re.findall(r"^\| `(\w+)` \|", text, flags=re.M))
@@ -54,6 +65,7 @@ def test_schema_manual_texts_and_validator_name_the_same_keys():
 
 
 def test_a_refused_key_names_those_of_the_schema():
+    """The keys that a refusal proposes are those of the schema."""
     _, problems = read_section(DriveTable, {"xyzzy": 1}, "drive")
     named = set(problems[0].remedy.removeprefix("unknown key; valid keys: ").split(", "))
     assert named == set(keys.json_schema()["$defs"]["DriveTable"]["properties"])
@@ -61,6 +73,7 @@ def test_a_refused_key_names_those_of_the_schema():
 
 @pytest.mark.parametrize("path", CASES, ids=lambda path: path.stem)
 def test_the_schema_takes_every_case_file(path):
+    """Every case file in ``runs`` and of the paper is valid by the schema, as an editor would check it."""
     jsonschema.validate(tomllib.loads(path.read_text(encoding="utf-8")), keys.json_schema())
 
 
@@ -81,26 +94,28 @@ def test_the_schema_takes_every_case_file(path):
     ],
 )
 def test_what_the_validator_refuses_of_one_key_the_schema_refuses(text):
-    from vipetsc.case.verb_cases import load_every
-
-    table = tomllib.loads(text)
+    """A key or value that is wrong by itself is refused by the schema and by the validator."""
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(table, keys.json_schema())
+        jsonschema.validate(tomllib.loads(text), keys.json_schema())
+
     key, value = text.split(" = ")
     with pytest.raises(CaseError):
         load_every(None, [f"{key}={value}"])
 
 
 def test_multiples_of_pi_are_wavenumbers_in_the_schema():
+    """Multiples of pi may be written as text, in any of the forms that the validator reads."""
     for value in ("5pi/9", "pi", ".5 pi", 1.0):
         jsonschema.validate({"drive": {"wavenumber": value}}, keys.json_schema())
 
 
 def test_the_verb_schema_prints_it(in_process):
+    """``vipetsc schema`` prints the schema as JSON."""
     assert json.loads(in_process("schema").stdout) == json.loads(json.dumps(keys.json_schema()))
 
 
 def test_bash_completes_verbs_options_and_files(in_process, tmp_path):
+    """In bash the completion proposes verbs, files for a case, and the shells that it is for."""
     script = in_process("completion", "bash").stdout
     (tmp_path / "case.toml").touch()
 
@@ -116,22 +131,30 @@ def test_bash_completes_verbs_options_and_files(in_process, tmp_path):
 
 
 def test_zsh_reads_its_completion(in_process):
+    """The completion for zsh is marked as such, and zsh, where it is installed, finds no error in it."""
     script = in_process("completion", "zsh").stdout
+
     assert script.startswith("#compdef vipetsc")
     if shutil.which("zsh"):
         subprocess.run(["zsh", "-n"], input=script, text=True, check=True)
 
 
 def test_the_manual_at_the_prompt(in_process):
+    """Chapters are listed and shown at the prompt, their links as commands; one that is not there is refused."""
     listed = in_process("manual").stdout
     index = (ROOT / "vipetsc/manual/index.md").read_text(encoding="utf-8")
     names = {"case-keys", *re.findall(r"\]\(([\w-]+)\.md\)", index)}
     assert set(re.findall(r"^  ([\w-]+) ", listed, flags=re.M)) == names
+
     shown = in_process("manual", "case-keys").stdout
     assert re.search(r"^`frequency` +number > 0 +rad/s +angular frequency", shown, flags=re.M)
     trust = in_process("manual", "trust").stdout
-    assert "performance (manual performance)" in trust and "](" not in trust
+    assert "performance (manual performance)" in trust
+    assert "](" not in trust
     study = in_process("manual", "gallery/designed").stdout
-    assert study.startswith("# A designed lattice") and "optimise (manual optimise)" in study
+    assert study.startswith("# A designed lattice")
+    assert "optimise (manual optimise)" in study
+
     wrong = in_process("manual", "cooking")
-    assert wrong.returncode == 2 and ", case-file, case-keys" in wrong.stderr
+    assert wrong.returncode == 2
+    assert ", case-file, case-keys" in wrong.stderr
