@@ -6,17 +6,22 @@ import sys
 from importlib.util import find_spec
 
 from vipetsc.cli.streams import check_standard_streams
+from vipetsc.process import end_on_request
 
 BUILT_FOR_MPI = "mpi4py", "petsc4py", "h5py"  # which no wheel brings
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one verb on all ranks; returns the exit code: 0 done, 2 bad input, 75 stopped on request, 1 failed."""
+    # Before modules are loaded, which takes a second or more.
+    end_on_request()
     check_standard_streams()
 
     # One thread a rank: the ranks are the parallelism, and threads would fight over the cores.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    # Pictures go into files: the backend that a notebook names for its windows need not even be there.
+    os.environ["MPLBACKEND"] = "agg"
     logging.basicConfig(format="%(message)s")
     logging.getLogger("vipetsc").setLevel(logging.INFO)
 

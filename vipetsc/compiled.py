@@ -7,8 +7,10 @@ modules from which it takes kernels or constants, and of the tables of numbers: 
 
 import ast
 import hashlib
+import logging
 import os
 import re
+import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -16,7 +18,11 @@ from typing import Any, TypeVar, overload
 
 import numba
 
+from vipetsc.process import launched_rank
+
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+logger = logging.getLogger(__name__)
 
 HAS_KERNELS = re.compile(rb"^(from|import) (vipetsc\.compiled|numba)\b", re.MULTILINE)
 
@@ -44,9 +50,10 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
         config: Any = numba.config
         chosen = config.CACHE_DIR
         file = Path(function.__code__.co_filename)
-        config.CACHE_DIR = str(kernel_cache(Path(__file__).parent, file, chosen))
+        folder = kernel_cache(Path(__file__).parent, file, chosen)
+        config.CACHE_DIR = str(folder)
         try:
-            return compiler(*signature, cache=True, **options)(function)
+            return compiler(*signature, cache=_can_keep(folder.parent), **options)(function)
         finally:
             config.CACHE_DIR = chosen
 
@@ -70,6 +77,23 @@ def kernel_cache(package: Path, file: Path, chosen: str = "") -> Path:
     else:
         parent = Path.home() / ".cache" / package.name
     return parent / f"kernels-{digest.hexdigest()[:16]}"
+
+
+@cache
+def _can_keep(parent: Path) -> bool:
+    """Whether kernels can be written below ``parent``; says so where they cannot."""
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=parent).close()
+    except OSError as error:
+        # Once, on one rank: every command compiles for up to a minute then.
+        if not launched_rank():
+            reason = error.strerror or error
+            logger.warning(
+                "vipetsc: compiling kernels at every start; the cache %s cannot be written: %s", parent, reason
+            )
+        return False
+    return True
 
 
 def kernel_sources(package: Path, file: Path) -> set[Path]:

@@ -16,11 +16,12 @@ from mpi4py import MPI
 import numpy as np
 from tqdm import tqdm
 
+from vipetsc.process import STOP_SIGNALS
+
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
 BAR = "vipetsc.bar"  # the logger whose level switches bars off
 LINE_EVERY = 5.0  # s between lines of the log where there is no terminal
-STOP_SIGNALS = signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1
 
 
 def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
@@ -56,6 +57,17 @@ def wait_for_all(comm: MPI.Comm) -> None:
     while not barrier.Test():
         if time.monotonic() - begin > 1e-3:
             time.sleep(1e-3)
+
+
+def all_meet(comm: MPI.Comm, patience: float) -> bool:
+    """Whether all ranks of ``comm`` call this within ``patience`` s: one that was killed never does."""
+    barrier = comm.Ibarrier()
+    deadline = time.monotonic() + patience
+    while not barrier.Test():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(1e-3)
+    return True
 
 
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:

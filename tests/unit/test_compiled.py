@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import vipetsc
-from vipetsc import compiled
+from vipetsc import compiled, process
 from vipetsc.dynamics.ts.right_hand_side import compile_callback
 
 ROOT = Path(vipetsc.__file__).parent
@@ -67,6 +67,7 @@ def package(tmp_path):
     (folder / "outer.py").write_text(OUTER)
     (folder / "plain.py").write_text("import numpy\n")
     shutil.copy(compiled.__file__, folder)
+    shutil.copy(process.__file__, folder)
 
     def ask() -> list:
         done = subprocess.run([sys.executable, "-c", ASK], cwd=tmp_path, env={"PYTHONPATH": "."}, capture_output=True)
@@ -141,3 +142,30 @@ def test_the_callback_of_petsc_is_found_again():
     compile_callback()
     code = "from vipetsc.dynamics.ts.right_hand_side import compile_callback; print(compile_callback().cache_hits)"
     assert int(subprocess.check_output([sys.executable, "-c", code], cwd=ROOT.parent)) == 1
+
+
+def test_a_cache_that_cannot_be_written_is_named_once(caplog, monkeypatch):
+    folder = Path("/proc/no-folder")
+    compiled._can_keep.cache_clear()
+    for _ in range(2):
+        assert not compiled._can_keep(folder)
+    (record,) = caplog.records
+    assert f"compiling kernels at every start; the cache {folder} cannot be written" in record.getMessage()
+
+    # Of several ranks the first says it for all.
+    compiled._can_keep.cache_clear()
+    monkeypatch.setenv("OMPI_COMM_WORLD_RANK", "1")
+    assert not compiled._can_keep(folder)
+    assert len(caplog.records) == 1
+    compiled._can_keep.cache_clear()
+
+
+@pytest.mark.slow
+def test_kernels_work_without_a_cache(package, tmp_path):
+    folder, _ = package
+    environment = {"PYTHONPATH": ".", "NUMBA_CACHE_DIR": "/proc/no-folder"}
+    done = subprocess.run([sys.executable, "-c", ASK], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)[0] == [12.0, 7.0]
+    assert done.stderr.count("cannot be written") == 1
+    assert not list(folder.glob("__pycache__/kernels-*"))

@@ -28,6 +28,7 @@ FLOORS = (
     "lattice",
     "parallel",
     "compiled",
+    "process",
     "__init__",
 )
 SERIAL = ("lattice", "spectra", "figures")

@@ -14,9 +14,10 @@ from vipetsc.cli.messages import echo, reporting
 from vipetsc.cli.streams import report_unwritten
 from vipetsc.cli.verb import BAD_INPUT, STOPPED
 from vipetsc.cli.verbs.verb_list import VERBS
-from vipetsc.io.folder import FolderError
-from vipetsc.parallel import StoppedError, StopRequest, on_root
+from vipetsc.io.errors import FolderError, ResultFileError
+from vipetsc.parallel import StoppedError, StopRequest, all_meet, on_root
 
+PATIENCE = 5.0  # s in which ranks that stopped have to meet; a launcher kills those that are left sooner
 ABOUT_THE_PROGRAM = "-h", "--help", "--version"
 
 
@@ -71,13 +72,19 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
         with StopRequest().listening(at_once=not verb.is_stoppable) as stop:
             return int(verb.call(options, MPI.COMM_WORLD, stop))
 
+    except ResultFileError as error:
+        remedy = "; move it away, or --force begins anew" if hasattr(options, "force") else ""
+        echo(MPI.COMM_WORLD, f"vipetsc: {error}{remedy}", sys.stderr)
+        return BAD_INPUT
     except (CaseError, FolderError) as error:
         # Every rank gets here: bad input is found on one rank and raised on all.
         echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return BAD_INPUT
     except StoppedError as error:
-        how = "; leave out --force, which begins anew" if getattr(options, "force", False) else ""
-        echo(MPI.COMM_WORLD, f"vipetsc: {error}{how}", sys.stderr)
+        # The launcher asks ranks to stop when one of them was killed: then nobody has stopped on request.
+        if all_meet(MPI.COMM_WORLD, PATIENCE):
+            how = "; leave out --force, which begins anew" if getattr(options, "force", False) else ""
+            echo(MPI.COMM_WORLD, f"vipetsc: {error}{how}", sys.stderr)
         return STOPPED
 
 

@@ -1,0 +1,71 @@
+"""Requests to stop before the program is there, and those that a launcher sends because a rank was killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from tests.conftest import clean_environment
+from vipetsc.parallel import STOP_SIGNALS
+
+# A module that takes for ever to load.
+ENDLESS = "import sys, time\nprint('loading', flush=True)\ntime.sleep(100)\n"
+RANK_1_IS_KILLED = """
+import os, signal, sys
+from dataclasses import replace
+from vipetsc import __main__ as front_door
+from vipetsc.cli.verbs.verb_list import VERBS
+from vipetsc.parallel import StoppedError
+
+def stop(options, comm, request):
+    if comm.rank == 1 and "kill" in sys.argv:
+        os.kill(os.getpid(), signal.SIGKILL)
+    raise StoppedError("stopped on request")
+
+VERBS["doctor"] = replace(VERBS["doctor"], function=stop, is_stoppable=True)
+sys.exit(front_door.main(["doctor"]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", STOP_SIGNALS)
+def test_a_request_while_modules_load_is_one(tmp_path, number):
+    package = tmp_path / "petsc4py"
+    package.mkdir()
+    (package / "__init__.py").write_text(ENDLESS)
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    environment = clean_environment() | {"PYTHONPATH": path}
+    command = [sys.executable, "-m", "vipetsc", "doctor"]
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "loading\n"
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 75
+    assert errors == "vipetsc: stopped on request\n"
+
+
+@pytest.mark.slow
+def test_what_nohup_ignores_stays_ignored(tmp_path):
+    script = (
+        "import signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); from vipetsc.process import end_on_request;"
+    )
+    script += "end_on_request(); signal.raise_signal(signal.SIGHUP); sys.exit(3)"
+    ended = subprocess.run([sys.executable, "-c", script], env=clean_environment(), timeout=60, check=False)
+    assert ended.returncode == 3
+
+
+@pytest.mark.mpirun
+@pytest.mark.parametrize("ending", ["kill", "request"])
+def test_nobody_stops_on_request_where_a_rank_was_killed(tmp_path, ending):
+    script = tmp_path / "killed.py"
+    script.write_text(RANK_1_IS_KILLED)
+    command = ["mpirun", "--oversubscribe", "-n", "2", sys.executable, str(script), "--", ending]
+    ended = subprocess.run(command, capture_output=True, text=True, env=clean_environment(), timeout=100, check=False)
+    assert ended.stderr.count("stopped on request") == (ending == "request")
+    assert ended.returncode == (75 if ending == "request" else 128 + signal.SIGKILL)
