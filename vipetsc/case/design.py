@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid
-from vipetsc.case.schema import Positive
+from vipetsc.case.schema import OutputTable, Positive
 
 LARGEST = 20_000_000  # Bloch problems (lambda, eta, kappa) of a reading whose bands fit in memory and on disk
 
@@ -49,6 +49,8 @@ class DesignCase(CaseFile):
     """A case of the verb ``design``, all of whose keys have defaults; the search is of the four-band cell."""
 
     design: DesignTable
+    # No part of the case: results that are drawn or not are the same.
+    output: Annotated[OutputTable, Field(exclude=True)]
 
     verb = section = "design"
     builtin_table: ClassVar[Table] = {"name": "design"}
@@ -62,6 +64,11 @@ class DesignCase(CaseFile):
             remedy = "only the four-band preset has a lambda and an eta to search"
             problems.append(Problem("lattice", lattice.get("preset", "a cell of one's own"), remedy))
         return fields, problems
+
+    @property
+    def wants_pictures(self) -> bool:
+        """Whether the search is drawn, ``output.figures``."""
+        return self.output.figures
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:

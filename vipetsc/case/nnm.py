@@ -20,7 +20,7 @@ from vipetsc.case.resolve import (
     with_default_preset,
     with_preset,
 )
-from vipetsc.case.schema import Finite, LatticeTable, Positive, once
+from vipetsc.case.schema import Finite, LatticeTable, OutputTable, Positive, once
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Contact, contact_stiffness, pass_bands
 from vipetsc.lattice.cell import connected_groups
@@ -148,6 +148,8 @@ class NnmCase(CaseFile):
     lattice: LatticeTable
     contacts: ContactsTable
     nnm: NnmTable
+    # No part of the case: results that are drawn or not are the same.
+    output: Annotated[OutputTable, Field(exclude=True)]
 
     verb = section = "nnm"
     kept_by_resume: ClassVar[str] = "the system, map and flow that its branches were begun with"
@@ -173,6 +175,11 @@ class NnmCase(CaseFile):
             count = 1 if fields["nnm"].system == "reduced" else len(site_cells(lattice, contacts))
             fields["contacts"] = contacts.model_copy(update={"clearance": clearances(lattice, contacts, count)})
         return fields, problems
+
+    @property
+    def wants_pictures(self) -> bool:
+        """Whether the branches are drawn, ``output.figures``."""
+        return self.output.figures
 
     def warnings(self) -> list[str]:
         """Sentences about keys of the case that normal modes ignore."""

@@ -177,12 +177,13 @@ def plan_table(plan: Plan, root: Path, ranks: int) -> str:
     all_steps = f"all steps on {ranks} {'rank' if ranks == 1 else 'ranks'}"
     lines += [f"{all_steps:<36}{duration(total):>9}", ""]
 
-    lines.append(f"{'figure':<8}{'paper':<9}{'pictures':<10}{'state':<9}claims      shows")
+    width = max([len("paper"), *(len(figure.label) for figure in plan.figures)]) + 2
+    lines.append(f"{'figure':<8}{'paper':<{width}}{'pictures':<10}{'state':<9}claims      shows")
     record = read_record(root)["figures"]
     inputs = plan.inputs(root)
     for figure in plan.figures:
         drawn, state = _figure_state(root, figure, record.get(figure.id), inputs[figure.id])
-        row = f"{figure.id:<8}{figure.label:<9}{drawn:<10}{state:<9}{' '.join(figure.claims):<12}"
+        row = f"{figure.id:<8}{figure.label:<{width}}{drawn:<10}{state:<9}{' '.join(figure.claims):<12}"
         lines.append(row + figure.title)
     return "\n".join(lines)
 

@@ -1,0 +1,70 @@
+"""Pictures that are not wanted, tables whose columns fit, files that another program has open."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from tests.conftest import clean_environment
+from tests.faults.scenarios import BRANCHES, DESIGN, RUN
+from vipetsc.case import NnmCase
+from vipetsc.case.design import DesignCase
+
+
+@pytest.mark.parametrize("kind", [NnmCase, DesignCase])
+def test_pictures_are_no_part_of_a_case_that_simulates_nothing(kind):
+    table = {"nnm": {"modes": [1]}, "design": {"wavenumbers": 11}}
+    drawn = kind.from_table(table)
+    undrawn = kind.from_table(table, ["output.figures=false"])
+    assert drawn.wants_pictures
+    assert not undrawn.wants_pictures
+    assert drawn.to_toml() == undrawn.to_toml()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("verb", "text"), [("nnm", BRANCHES), ("design", DESIGN)])
+def test_branches_and_searches_need_not_be_drawn(in_process, tmp_path, verb, text):
+    case = tmp_path / "case.toml"
+    case.write_text(text)
+    out = tmp_path / "out"
+    words = [verb, case, "--out", out]
+    ended = in_process(*words, "--set", "output.figures=false")
+    assert ended.returncode == 0, ended.stderr
+    assert not (out / "figures").exists()
+
+    # The same case without it only draws.
+    assert in_process(*words).returncode == 0
+    assert any((out / "figures").glob("*.png"))
+
+
+def test_columns_of_the_list_of_the_paper_are_apart(in_process, tmp_path):
+    listed = in_process("paper", "--list", "--out", tmp_path / "paper").stdout.splitlines()
+    (title,) = (line for line in listed if line.startswith("figure"))
+    figures = listed[listed.index(title) + 1 :]
+    for column in ("paper", "pictures", "state", "claims"):
+        start = title.index(column)
+        assert {line[start - 1] for line in figures} == {" "}, column
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", ["plot", "analyse", "export"])
+def test_a_run_that_another_program_writes_is_one(in_process, tmp_path, verb):
+    case = tmp_path / "case.toml"
+    case.write_text(RUN)
+    out = tmp_path / "out"
+    assert in_process("run", case, "--out", out, "--set", "output.figures=false").returncode == 0
+    script = f"import h5py; file = h5py.File({str(out / 'run.h5')!r}, 'a'); print('open', flush=True); input()"
+    command = [sys.executable, "-c", script]
+    with subprocess.Popen(
+        command, env=clean_environment(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "open\n"
+        ended = in_process(verb, out)
+        other.communicate("\n", timeout=60)
+    assert ended.returncode == 2
+    assert "run.h5 cannot be opened as a run: another program has it open for writing" in ended.stderr
+    assert "is not a run" not in ended.stderr
+    assert json.loads((out / "summary.json").read_text())["complete"]
