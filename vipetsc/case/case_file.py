@@ -20,6 +20,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args
 import tomli_w
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from vipetsc.case.changes import has_more_keys, value_of
+from vipetsc.case.nesting import DEEPEST, TOO_DEEP, is_deeper
+from vipetsc.io.names import readable
+
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -214,12 +218,16 @@ def read_toml(path: str | Path) -> Table:
     path = Path(path)
     try:
         # utf-8-sig: editors on Windows begin files with a byte order mark, which TOML does not allow.
-        return {"name": path.stem} | tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        table = {"name": readable(path.stem)} | tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         remedy = f"{error.strerror}; a case file (TOML) is needed"
     except (ValueError, RecursionError) as error:  # tomllib's and the decoder's errors are ValueErrors
         remedy = f"not a TOML file ({error})"
-    raise CaseError([Problem(str(path), None, remedy)])
+    else:
+        if not is_deeper(table):
+            return table
+        remedy = TOO_DEEP
+    raise CaseError([Problem(readable(path), None, remedy)])
 
 
 def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
@@ -238,38 +246,19 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
     # The table may be the built-in one, which later cases read too.
     table = copy.deepcopy(table)
     problems: list[Problem] = []
-    for override in overrides:
+    for override in map(readable, overrides):
         path, equals, text = (part.strip() for part in override.partition("="))
-        if not equals or not all(path.split(".")):
+        keys = path.split(".")
+        value = value_of(text)
+        if not equals or not all(keys):
             problems.append(Problem("--set", override, "write section.key=value"))
-            continue
-        if _has_more_keys(text):
+        elif has_more_keys(text):
             problems.append(Problem("--set", override, "gives one key: what follows in other lines needs a --set each"))
-            continue
-        problems += [replace(p, key=f"--set {p.key}") for p in put(table, path, _value_of(text))]
+        elif len(keys) > DEEPEST or is_deeper(value, DEEPEST - len(keys)):
+            problems.append(Problem("--set", override, TOO_DEEP))
+        else:
+            problems += [replace(p, key=f"--set {p.key}") for p in put(table, path, value)]
     return table, problems
-
-
-def _has_more_keys(text: str) -> bool:
-    """Whether further lines of a value's ``text`` are keys or sections of TOML."""
-    try:
-        return len(tomllib.loads(f"value = {text}")) > 1
-    except (ValueError, RecursionError):
-        return False
-
-
-def _value_of(text: str) -> Any:
-    """Value written in ``text``: TOML, a number such as .5, or a bare word; None if ``text`` is empty."""
-    try:
-        # TOML first: only TOML distinguishes lists, tables, booleans and quoted text.
-        return tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        pass
-    try:
-        # TOML allows neither .5 nor 5. as a number.
-        return float(text)
-    except ValueError:
-        return text or None
 
 
 def put(table: Table, path: str, value: Any) -> list[Problem]:

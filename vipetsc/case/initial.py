@@ -11,6 +11,7 @@ from pydantic import Field
 
 from vipetsc.case.case_file import CaseError, Problem, Section, Valid
 from vipetsc.case.schema import LatticeTable, Positive, Wavenumber
+from vipetsc.io.names import path_named, readable
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, UnitCell, bloch
 from vipetsc.lattice.modes import mode_frequency, mode_shape, number_near
@@ -177,7 +178,7 @@ def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
     if initial.sha256 and initial.amplitude and frequency:
         return Beginning(initial, frequency, cell=1)
 
-    path = Path(str(initial.path)).resolve()
+    path = path_named(str(initial.path)).resolve()
     state, digest = _read_state(path, initial)
     _check_state(state, path, initial, chain)
     frequency = frequency or state.frequency()
@@ -188,7 +189,13 @@ def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
     amplitude, cell = state.largest(frequency)
     if amplitude == 0:
         raise CaseError([Problem("initial.path", initial.path, "the state in it is at rest")])
-    update = {"path": str(path), "sha256": digest, "amplitude": amplitude, "time": state.time, "orbit": state.orbit}
+    update = {
+        "path": readable(path),
+        "sha256": digest,
+        "amplitude": amplitude,
+        "time": state.time,
+        "orbit": state.orbit,
+    }
     return Beginning(initial.model_copy(update=update), frequency, cell)
 
 

@@ -11,6 +11,7 @@ from pydantic import Field
 from vipetsc.case.case_file import LARGEST, Problem, Section, Table
 from vipetsc.case.initial import file_hash
 from vipetsc.case.schema import Finite
+from vipetsc.io.names import path_named, readable
 
 MOST_SAMPLES = 100_000
 
@@ -55,7 +56,7 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
     key = f"{path}.samples.file"
     if {"time", "value"} & samples.keys():
         return drive, [Problem(key, samples["file"], "give it or time and value, not both")]
-    file = Path(samples["file"]).resolve()
+    file = path_named(samples["file"]).resolve()
     try:
         rows = _read(file, samples.get("dataset"))
         digest = file_hash(file)
@@ -64,7 +65,7 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
 
     # Numbers smaller than a case may have are noise about 0.
     times, values = np.where(np.abs(rows) < 1 / LARGEST, 0.0, rows).T.tolist()
-    filled = {"file": str(file), "sha256": digest, "time": times, "value": values}
+    filled = {"file": readable(file), "sha256": digest, "time": times, "value": values}
     return drive | {"samples": samples | filled}, []
 
 

@@ -52,6 +52,9 @@ def draw_pictures(
     def draw_part() -> list[Path]:
         try:
             return draw(pictures.source, folders, names, formats, rank=comm.rank, ranks=comm.size, newest=newest)
+        except FolderError:
+            # The message says which file, and why.
+            raise
         except (OSError, KeyError, ValueError) as error:
             # What `prepare` has checked is no matter of the folder: an error then is one of the program.
             if pictures.prepare:

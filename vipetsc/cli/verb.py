@@ -22,6 +22,7 @@ from vipetsc.cli.drawing import Pictures, draw_pictures
 from vipetsc.cli.messages import echo, echo_paths, echo_warnings
 from vipetsc.io.folder import FolderKind
 from vipetsc.io.lock import locked
+from vipetsc.io.names import path_named
 from vipetsc.parallel import StopRequest, on_root
 
 # 2 is what argparse exits with; EX_TEMPFAIL asks a batch script to queue the job again.
@@ -130,7 +131,7 @@ class StudyVerb(Verb):
         """Compute, draw and report; returns the exit code."""
         # Before anything is written: what is refused leaves no folder behind.
         case = on_root(comm, lambda: self.checked_case(options))
-        folder = options.out or Path("runs") / f"{case.name}{self.suffix}"
+        folder = options.out or Path("runs") / path_named(f"{case.name}{self.suffix}")
         work = Work(options, folder, comm, stop)
         # On rank 0, since warnings compute the bands of the cell.
         work.warn(on_root(comm, case.warnings))

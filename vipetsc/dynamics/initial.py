@@ -11,6 +11,7 @@ from vipetsc.dynamics.energies import measure
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.observers import Setup
 from vipetsc.dynamics.site_dofs import relative_motion
+from vipetsc.io.names import path_named
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain
 from vipetsc.lattice.modes import mode_shape
@@ -67,16 +68,16 @@ def _fields(model: Model, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
 
 def _read_fields(initial: Any, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """The fields of the file that ``initial`` names; its hash must be that with which the case was resolved."""
-    path = str(initial.path)
+    path = path_named(str(initial.path))
 
     def check() -> None:
         try:
             digest = file_hash(path)
         except OSError as error:
-            raise CaseError([Problem("initial.path", path, error.strerror or str(error))]) from None
+            raise CaseError([Problem("initial.path", initial.path, error.strerror or str(error))]) from None
         if digest != initial.sha256:
             remedy = f"its SHA-256 is {digest}, not the case's {initial.sha256}: it has changed since"
-            raise CaseError([Problem("initial.path", path, remedy)])
+            raise CaseError([Problem("initial.path", initial.path, remedy)])
 
     # Hashed once, by one rank; read by each, which keeps its own cells only and sends none.
     on_root(layout.comm, check)

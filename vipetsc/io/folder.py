@@ -29,6 +29,7 @@ import numpy as np
 import vipetsc
 from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.lock import LOCK, FolderError, locked
+from vipetsc.io.names import readable
 from vipetsc.parallel import on_root
 
 FORMAT_VERSION = 1
@@ -157,7 +158,7 @@ def _claim(
         folder = aside if filled else path
         folder.mkdir(exist_ok=True)
 
-    if not going_on or (folder / kind.marker).read_text(encoding="utf-8") != text:
+    if not going_on or _text_of(folder / kind.marker) != text:
         write_text(folder / kind.marker, text)
     _remove_temporary_files(folder)
     return folder, going_on
@@ -185,7 +186,7 @@ def _results(folder: Path) -> list[Path]:
 
 def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference | None) -> str | None:
     """Message why the results in ``folder`` are not results of ``text``; None if they are."""
-    earlier = (folder / kind.marker).read_text(encoding="utf-8")
+    earlier = _text_of(folder / kind.marker)
     if difference:
         return difference(earlier)
     if earlier == text:
@@ -194,7 +195,7 @@ def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference |
     try:
         then = dict(_keys(tomllib.loads(earlier)))
         now = dict(_keys(tomllib.loads(text)))
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         return f"its {kind.marker} cannot be read ({error}); {remedy}"
 
     differing = []
@@ -206,6 +207,11 @@ def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference |
         return None
     more = f"; and {len(differing) - MOST_NAMED} more" if len(differing) > MOST_NAMED else ""
     return f"holds another {kind.noun}: {'; '.join(differing[:MOST_NAMED])}{more}; {remedy}"
+
+
+def _text_of(path: Path) -> str:
+    """The text of a file; where another program damaged it, bytes that are no UTF-8 become replacement characters."""
+    return path.read_text(encoding="utf-8", errors="replace")
 
 
 def _keys(table: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
@@ -264,7 +270,7 @@ def origin() -> dict[str, Any]:
         "hdf5_version": h5py.version.hdf5_version,
         "numpy_version": np.__version__,
         "python_version": platform.python_version(),
-        "command": " ".join(["vipetsc", *sys.argv[1:]]),
+        "command": " ".join(["vipetsc", *map(readable, sys.argv[1:])]),
         "petsc_options": given or "none",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "host": platform.node(),

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
+from vipetsc.io.errors import FolderError
 from vipetsc.parallel import on_root
 
 logger = logging.getLogger(__name__)
@@ -23,10 +24,6 @@ TOKEN = secrets.token_hex(8)  # this process: in two containers on one host, two
 # it sends them SIGTERM and, a second later, SIGKILL, and one with much memory takes a moment more.
 PATIENCE = 5.0
 LOOK_EVERY = 0.05  # s between two attempts while a holder may be ending
-
-
-class FolderError(ValueError):
-    """An output folder that cannot be used as asked."""
 
 
 @contextmanager

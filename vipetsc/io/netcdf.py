@@ -20,6 +20,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.io.atomic import atomic_write
+from vipetsc.io.errors import ResultFileError, UnreadableFileError
 
 Variables = dict[str, xr.Variable]
 """Variables of a dataset by name."""
@@ -101,15 +102,17 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     """Open a file as a flat dataset, a context manager; values are read when they are used.
 
     Messages call the file a ``kind``, as "run" or "branch"; ``needs`` are the variables (by path), groups and root
-    attributes that a file of this kind must have. Raises OSError if the file cannot be opened as HDF5, ValueError if it
-    is not of this kind.
+    attributes that a file of this kind must have. Raises UnreadableFileError, an OSError, if the file cannot be opened
+    as HDF5, ResultFileError, a ValueError, if it is not of this kind.
     """
     sys.audit("vipetsc.read", str(path))
     try:
         groups = xr.open_groups(path, engine="h5netcdf", phony_dims="access", decode_cf=False)
         links = _links(path)
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise OSError(f"{path} cannot be opened as a {kind}: {error}") from error
+    # Files of other programs have types and links that h5netcdf does not know, and meets with any exception.
+    except Exception as error:
+        reason = "another program has it open for writing" if "unable to lock" in str(error) else error
+        raise UnreadableFileError(f"{path} cannot be opened as a {kind}: {reason}") from error
     data = _flat(groups, links)
     closing = ExitStack()
     for group in groups.values():
@@ -123,7 +126,7 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     missing = [name for name in needs if name not in present and name not in data.attrs]
     if missing:
         data.close()  # nobody else would
-        raise ValueError(f"{path} is not a {kind} of vipetsc: it has no {', '.join(missing)}")
+        raise ResultFileError(f"{path} is not a {kind} of vipetsc: it has no {', '.join(missing)}")
     return data
 
 

@@ -159,7 +159,7 @@ class PaperStep:
     def _is_case_of(self, folder: Path) -> bool:
         """Whether a ``folder`` is there for results of this case."""
         marker = folder / "case.toml"
-        return marker.exists() and self._is_same_case(marker.read_text(encoding="utf-8"))
+        return marker.exists() and self._is_same_case(marker.read_text(encoding="utf-8", errors="replace"))
 
     def _is_complete(self, path: Path) -> bool:
         """Whether a result is of this case; a branch has ended, by itself or in a failure that it names."""
@@ -171,7 +171,10 @@ class PaperStep:
 
     def _is_same_case(self, text: str) -> bool:
         """Whether a case in TOML is this step's, in whatever order its keys stand."""
-        return tomllib.loads(text) == tomllib.loads(self.text)
+        # One that cannot be read is another's: the step says so when it claims its folder.
+        with suppress(tomllib.TOMLDecodeError, RecursionError):
+            return tomllib.loads(text) == tomllib.loads(self.text)
+        return False
 
     def identity(self, root: Path) -> str:
         """Hash of the case and of what the results hold."""

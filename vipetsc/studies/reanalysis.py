@@ -98,6 +98,9 @@ def _measurable(path: Path) -> Iterator[MeasurableRun]:
             with open_run(file) as run:
                 if not sweep or keeps_all(Case.of(run)):
                     yield MeasurableRun(file.parent, file.parents[1], measures)
+        except FolderError:
+            # The message says which file, and why.
+            raise
         except (OSError, ValueError, KeyError) as error:
             raise FolderError(f"{file}: is not a run of vipetsc ({error})") from None
 

@@ -134,7 +134,7 @@ class SweepRuns:
             """Keep what is there of a run that was cut off, if it is of the same case."""
             marker = folder / "case.toml"
             text = case.to_toml()
-            if fields and not (marker.exists() and marker.read_text(encoding="utf-8") == text):
+            if fields and not (marker.exists() and marker.read_bytes() == text.encode()):
                 discard(folder)
                 folder.mkdir()
                 write_text(marker, text)

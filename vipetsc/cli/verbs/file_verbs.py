@@ -51,8 +51,8 @@ def write_exports(path: Path) -> list[Path]:
         # A folder of branches is the one kind with several files of curves.
         for source in branches or [path]:
             written += write_curves(source)
-    # h5py raises OSError for files that were cut off or are no HDF5.
-    except (OSError, ValueError) as error:
+    # OSError: a file that was cut off or is no HDF5. TypeError: another program's, of types that no table can hold.
+    except (OSError, TypeError, ValueError) as error:
         raise FolderError(str(error)) from error
     return written
 

@@ -171,6 +171,9 @@ def measure_where_missing(folders: Sequence[Path]) -> None:
         raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
     try:
         measured = is_measured(folder)
+    except FolderError:
+        # The message says which file, and why.
+        raise
     # OSError: no HDF5 file. ValueError or KeyError: a file of another program.
     except (OSError, ValueError, KeyError) as error:
         raise FolderError(f"{run}: is not a run of vipetsc ({error})") from None

@@ -1,0 +1,14 @@
+"""How deep tables and lists of a case file may stand in one another: copying and sending them descends by recursion."""
+
+from typing import Any
+
+DEEPEST = 50
+TOO_DEEP = f"tables and lists stand more than {DEEPEST} deep in one another; no key of a case does"
+
+
+def is_deeper(value: Any, levels: int = DEEPEST) -> bool:
+    """Whether tables and lists stand more than so many ``levels`` deep in ``value``."""
+    if not isinstance(value, dict | list):
+        return False
+    items = value.values() if isinstance(value, dict) else value
+    return levels == 0 or any(is_deeper(item, levels - 1) for item in items)
