@@ -288,8 +288,7 @@ def judge(mutation: Mutation, path: Path, seconds: int = 20) -> Verdict:
             check_options(cases[0])
             for case in cases:
                 verb_of(case).table(case, 1)
-                if isinstance(case, Case):
-                    case.warnings()
+                case.warnings()
                 assert type(case).from_toml(case.to_toml()).to_toml() == case.to_toml()  # a NaN differs from itself
     except CaseError as error:
         return Verdict(refusal=str(error), seconds=time.process_time() - begin)

@@ -71,6 +71,36 @@ springs = [
 ]
 smooth = [{ start = 0, end = 1, cubic = 0.5 }]
 """
+# The two ways of following motions of a lattice: by the harmonics of its sites, and by shooting on all ranks together.
+CONDENSED = """
+[lattice]
+preset = "four-band"
+[contacts]
+restitution = 1.0
+sites = [100]
+[nnm]
+system = "condensed"
+start_frequency = [1420.0, 3700.0]
+direction = "down"
+energy = [1e-4, 0.3]
+points = 4
+first_step = 1e-2
+"""
+SHOT = """
+[lattice]
+preset = "four-band"
+cells = 16
+[contacts]
+restitution = 1.0
+sites = [7]
+[nnm]
+system = "chain"
+start_frequency = [1600.0]
+frequency = [240.0, 290.0]
+energy = [1e-4, 10.0]
+points = 3
+first_step = 1e-2
+"""
 DESIGN = """
 [design]
 lambda = { first = 0.1, last = 1.0, count = 2 }
@@ -164,6 +194,8 @@ SCENARIOS = {
         Scenario("sweep", SWEEP, f"sweep {OUT}"),
         Scenario("sweep-team", TEAM, f"sweep {OUT}", ranks=3),
         Scenario("nnm", BRANCHES, f"nnm {OUT}", ranks=2),
+        Scenario("nnm-condensed", CONDENSED, f"nnm {OUT} {PLAIN}"),
+        Scenario("nnm-chain", SHOT, f"nnm {OUT} {PLAIN}"),
         Scenario("nfrc", NFRC, f"nfrc {OUT} {PLAIN}", ranks=2),
         Scenario("design", DESIGN, f"design {OUT}", ranks=2),
         Scenario("law", LAW, f"law {OUT} {PLAIN}", ranks=2),
@@ -171,8 +203,10 @@ SCENARIOS = {
         Scenario("optimise", OPTIMISE, f"optimise {OUT} {PLAIN}", ranks=3),
         Scenario("analyse", TEAM.replace("ranks = 2", ""), "analyse {out}", before=f"sweep {OUT}"),
         Scenario("plot", RUN, "plot {out}", before=f"run {OUT} {PLAIN}"),
+        Scenario("movie", RUN, "plot {out} --movie --format gif --width 320", before=f"run {OUT} {PLAIN}"),
         Scenario("export", RUN, "export {out}", before=f"run {OUT} {PLAIN}"),
         Scenario("bands", RUN, f"bands {OUT}"),
+        Scenario("bands-modes", RUN, f"bands {OUT} --modes 2 --near 300"),
         Scenario("validate", SWEEP, "validate {case}"),
         Scenario("paper", "", "paper --quick --out {out}", ranks=2),
     )

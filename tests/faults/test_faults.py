@@ -5,6 +5,9 @@
 
 from __future__ import annotations
 
+import tomllib
+from typing import get_args
+
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
@@ -14,6 +17,7 @@ from tests.faults.phases import phases
 from tests.faults.scenarios import SCENARIOS, prepare
 from tests.faults.trials import ROOT, Crew, judge, last_words, matrix, processes_of, references
 from vipetsc.case import Case
+from vipetsc.case.nnm import NnmTable
 from vipetsc.cli.verbs.verb_list import VERBS, study_verbs
 from vipetsc.dynamics import simulate
 
@@ -22,6 +26,7 @@ ON_RANKS: dict[int, list[str]] = {}
 for scenario in SCENARIOS.values():
     if scenario.ranks:
         ON_RANKS.setdefault(scenario.ranks, []).append(scenario.name)
+ONE_CELL = {"reduced"}  # a system of one's own, as far as faults are concerned
 KILLS = 2  # every one ends a worker and costs seconds
 
 
@@ -30,6 +35,20 @@ def test_every_verb_that_leaves_results_meets_faults_and_kills():
     assert {verb.name for verb in study_verbs()} < leaving
     assert {scenario.verb.name for scenario in SCENARIOS.values() if scenario.ranks} == leaving
     assert {SCENARIOS[name].verb.name for name in KILLED} == leaving
+
+
+def test_every_verb_that_reads_or_writes_files_meets_faults():
+    """A new verb cannot be left out: what takes a case, a folder or a file needs a scenario."""
+    flags = {"case", "path", "--out"}
+    with_files = {verb.name for verb in VERBS.values() if flags & {argument.flag for argument in verb.arguments}}
+    assert with_files > {verb.name for verb in study_verbs()}
+    assert {scenario.verb.name for scenario in SCENARIOS.values()} == with_files
+
+
+def test_every_system_of_normal_modes_meets_faults():
+    systems = {tomllib.loads(scenario.case)["nnm"].get("system", "reduced")
+               for scenario in SCENARIOS.values() if scenario.verb.name == "nnm"}  # fmt: skip
+    assert systems == {*get_args(NnmTable.model_fields["system"].annotation)} - ONE_CELL
 
 
 @pytest.mark.mpirun

@@ -6,9 +6,10 @@ from itertools import islice
 
 import pytest
 
-from tests.faults.mutations import judge, mutations
+from tests.faults.mutations import judge, known_keys, mutations, parents
 from vipetsc.case import CaseError
-from vipetsc.case.verb_cases import load_every
+from vipetsc.case.verb_cases import VERB_CASES, load_every
+from vipetsc.cli.verbs.verb_list import study_verbs
 
 # Sweeps of thousands of members, each of which takes seconds to resolve.
 SWEEPS = ("interband", "scattering", "scattering-neighbours")
@@ -119,3 +120,18 @@ def test_a_sweep_may_give_what_a_run_lacks(tmp_path):
 
     assert run.drive.frequency == 0.5
     assert sweep.shape == (2,)
+
+
+@pytest.mark.parametrize("kind", VERB_CASES, ids=lambda kind: kind.verb or "run")
+def test_every_key_of_every_verb_is_spoilt(kind):
+    """The list follows from the verbs: a section that a new verb reads cannot be left out."""
+    sections = {path[0] for path in known_keys()}
+    assert kind.sections().keys() <= sections
+
+    # Each verb has a file of its own among those that are spoilt.
+    if kind.section:
+        assert any(kind.section in table for table in parents().values())
+
+
+def test_every_verb_that_reads_a_case_has_its_case_among_them():
+    assert {verb.case for verb in study_verbs()} == {*VERB_CASES}
