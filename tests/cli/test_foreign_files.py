@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 from tests.faults.scenarios import SCENARIOS, prepare, words_of
+from vipetsc.cli.verbs.verb_list import VERBS
+from vipetsc.io.errors import ResultFileError, UnreadableFileError
 
 CONTENTS: dict[str, Any] = {
     "numbers": np.arange(3),
@@ -40,22 +43,27 @@ def test_pictures_of_a_foreign_file_are_refused(in_process, tmp_path, name, cont
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("verb", "name"), [("design", "design.h5"), ("nfrc", "branch-*.h5"), ("optimise", "optimum.h5"), ("law", "law.h5")]
-)
-def test_a_command_does_not_go_on_with_a_foreign_file(in_process, tmp_path, verb, name):
-    scenario = SCENARIOS[verb]
-    case = prepare(scenario, tmp_path)
+def test_a_search_in_whose_place_a_foreign_file_lies_is_made_again(in_process, tmp_path):
+    scenario = SCENARIOS["design"]
     out = tmp_path / "out"
-    words = words_of(scenario.words, case, out)
+    words = words_of(scenario.words, prepare(scenario, tmp_path), out)
     assert in_process(*words).returncode == 0
-    (path,) = sorted(out.glob(name))[:1]
-    for contents in CONTENTS:
-        path.unlink()
-        put_foreign(path, contents)
+
+    for contents in ("numbers", "link to itself"):
+        put_foreign(out / "design.h5", contents)
         ended = in_process(*words)
-        assert path.name in ended.stderr
-        # A file that was cut off is made again where that takes no more than what is asked for.
-        assert ("made again" if ended.returncode == 0 else "--force begins anew") in ended.stderr
-        assert ended.returncode in (0, 2), contents
-    assert in_process(*words, "--force").returncode == 0
+        assert ended.returncode == 0, contents
+        assert "design.h5" in ended.stderr
+        assert "made again" in ended.stderr
+
+
+@pytest.mark.parametrize("kind", [ResultFileError, UnreadableFileError])
+def test_a_study_that_cannot_read_earlier_results_says_what_to_do(in_process, monkeypatch, tmp_path, kind):
+    def study(case: object, work: object) -> None:
+        raise kind("law.h5 is of another program")
+
+    monkeypatch.setitem(VERBS, "law", replace(VERBS["law"], study=study))
+    case = prepare(SCENARIOS["law"], tmp_path)
+    ended = in_process("law", case, "--out", tmp_path / "out")
+    assert ended.returncode == 2
+    assert ended.stderr.endswith("law.h5 is of another program; move it away, or --force begins anew\n")
