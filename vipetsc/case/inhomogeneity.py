@@ -6,22 +6,18 @@ A quantity is named as in a cell's table: ``masses[2]``, ``springs[1].stiffness`
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 
 from vipetsc.case.case_file import LARGEST, Problem
 from vipetsc.case.inhomogeneity_sections import AbsorbingTable, AnyProfile, Deviation, Profile
 from vipetsc.case.schema import LatticeTable
-from vipetsc.lattice import Chain, Coefficients, ToneBurst, UnitCell, Variation, waves_at
-from vipetsc.lattice.chain import Ends
-from vipetsc.lattice.damped import absorber, reflection
+from vipetsc.lattice import Chain, Coefficients, UnitCell, Variation
+from vipetsc.lattice.ends import absorber
 
 QUANTITY = re.compile(r"(masses|grounding)\[([1-9]\d*)\]|springs\[([1-9]\d*)\]\.(stiffness|damping)")
 MOST_VARIED = 10**8  # cells that may differ: every rank holds them all
-# Cells of an absorbing end that are tried, and logarithms of the energy that comes back from it.
-LENGTHS = (10, 20, 40, 80, 160)
-LOSSES = (8.0, 10.0, 13.0, 17.0)
 
 
 def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
@@ -174,47 +170,3 @@ def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: S
     inside = [cell for cell in driven if not low < cell <= high]
     if inside:
         yield Problem("lattice.absorbing.end", absorbing.end, f"the driven cell {inside[0]} is in the absorbing end")
-
-
-# Cached: each verb that reads a case resolves it, and each end that is tried costs reflections over the lobe.
-@lru_cache
-def designed_end(
-    table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: tuple[tuple[float, int], ...], most: int
-) -> AbsorbingTable:
-    """``table`` with cells, at ``most`` so many, and a strength; raises ValueError if none will do.
-
-    ``drives`` are frequencies in rad/s and cycles; those in gaps send no wave.
-    """
-    waves = [wave for frequency, _ in drives for wave in waves_at(cell, frequency)]
-    if not waves:
-        raise ValueError("the drive is in a gap: no wave comes to the end")
-
-    speed = max(wave[2] for wave in waves)
-    lengths = [table.cells] if table.cells else [length for length in LENGTHS if length <= most]
-    best = np.inf
-    for cells in lengths:
-        # The dashpots take exp(-loss) of a wave's energy: the integral of strength x^3 through the end and back.
-        strengths = [table.strength] if table.strength else [2 * speed * loss / cells for loss in LOSSES]
-        for strength in strengths:
-            end = absorber(cell, ends, cells, strength)
-            # The drives in gaps have NaN: they send no wave.
-            back = float(np.nanmax([lobe_reflection(end, *drive) for drive in drives]))
-            best = min(best, back)
-            if back <= table.reflection:
-                return table.model_copy(update={"cells": cells, "strength": strength})
-    raise ValueError(f"no end of up to {most} cells has it ({best:.2g} comes back): allow more, or more cells")
-
-
-def lobe_reflection(chain: Chain, frequency: float, cycles: int) -> float:
-    """Fraction of a burst's energy that comes back from the right end of ``chain``.
-
-    Mean over the pass bands in the main lobe of its spectrum, weighted with the square of that; NaN if there are none.
-    """
-    lobe = frequency * (1 + np.linspace(-2, 2, 17)[1:-1] / cycles)
-    lobe = lobe[lobe > 0]
-    reflected = np.array([reflection(chain, omega, chain.cells - 1) for omega in lobe.tolist()])
-    is_wave = np.isfinite(reflected)
-    if not is_wave.any():
-        return np.nan
-    weights = np.abs(ToneBurst(1.0, frequency, cycles).spectrum(lobe)) ** 2
-    return float(np.average(reflected[is_wave], weights=weights[is_wave]))

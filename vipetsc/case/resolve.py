@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from vipetsc.case.absorbing import designed_end
 from vipetsc.case.case_file import Problem, Table, Valid
 from vipetsc.case.contacts import check_per_site, pairs_of_sites, resolved_per_site
-from vipetsc.case.drive import DriveTable, packet_speed, resolve_drives, waveform_of
-from vipetsc.case.inhomogeneity import cell_variation, designed_end
+from vipetsc.case.drive import DriveTable, build_drives, packet_speed, resolve_drives, waveform_of
+from vipetsc.case.inhomogeneity import cell_variation
 from vipetsc.case.initial import Beginning, InitialTable
 from vipetsc.case.schema import CONTACTS, PRESETS, DampingTable, LatticeTable, TimeTable
 from vipetsc.case.sites import ContactsTable, Span
@@ -259,12 +260,12 @@ def _resolved_drive(drive: DriveTable, cell: UnitCell, cells: int, beginning: Be
 
 
 def _resolved_lattice(lattice: LatticeTable, cell: UnitCell, drive: DriveTable) -> LatticeTable:
-    """The lattice with an absorbing end that does for the bursts of the ``drive``, and with fitted dashpots."""
+    """The lattice with an absorbing end that does for the ``drive``, and with fitted dashpots."""
     update: dict[str, Any] = {}
     absorbing = lattice.absorbing
     if absorbing and not (absorbing.cells and absorbing.strength):
-        bursts = tuple((one.frequency or 0.0, one.cycles) for _, one in drive.every)
-        update["absorbing"] = designed_end(absorbing, cell, lattice.ends, bursts, lattice.cells // 3)
+        drives = build_drives(drive, Chain(cell, lattice.cells, lattice.ends))
+        update["absorbing"] = designed_end(absorbing, cell, lattice.ends, drives, lattice.cells)
 
     damping = lattice.damping
     if damping and damping.loss:

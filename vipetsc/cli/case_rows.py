@@ -3,13 +3,12 @@
 import numpy as np
 
 from vipetsc.case import Case
+from vipetsc.case.absorbing import reflected, reflected_at, sections_of, sources_of
 from vipetsc.case.contacts import describe_stops
-from vipetsc.case.inhomogeneity import lobe_reflection
 from vipetsc.case.initial import InitialTable
 from vipetsc.case.warnings import losses
 from vipetsc.cli.tables import first_few
 from vipetsc.lattice import gaps, pass_bands
-from vipetsc.lattice.damped import absorber, reflection
 
 
 def lattice_rows(case: Case) -> list[tuple[str, str]]:
@@ -41,27 +40,27 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
 
 
 def describe_ends(case: Case) -> str:
-    """Ends in words; for an absorbing end, the energy that comes back at each drive's frequency."""
+    """Ends in words; for an absorbing end, the energy that comes back at each drive's frequency and of all."""
     lattice = case.lattice
     absorbing = lattice.absorbing
     if absorbing is None or not (absorbing.cells and absorbing.strength):
         return f"{lattice.ends} ends"
 
-    # Once for each pair of frequency and cycles: drives that share them send the same waves to the end.
-    end = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength)
+    cell = lattice.unit_cell()
+    sections = sections_of(absorbing, cell, lattice.ends, absorbing.cells, absorbing.strength)
     reflections = []
-    for omega, cycles in dict.fromkeys((drive.frequency or 0.0, drive.cycles) for _, drive in case.drive.every):
-        back = reflection(end, omega, absorbing.cells)
-        lobe = lobe_reflection(end, omega, cycles)
-        if np.isfinite(lobe):
-            reflections.append(f"{back:.1e} of the energy comes back at {omega:.6g} rad/s, {lobe:.1e} of the burst's")
-        else:
-            reflections.append(f"no wave comes to it at {omega:.6g} rad/s")
+    for source in sources_of(case.model().drives, cell, lattice.ends, lattice.cells):
+        omega = source.waveform.frequency
+        back = reflected_at(omega, sections)
+        sentence = f"{back:.1e} of the energy comes back at {omega:.6g} rad/s"
+        if not np.isfinite(back):
+            sentence = f"no wave comes to it at {omega:.6g} rad/s"
+        reflections.append(f"{sentence}, {reflected(source, sections):.1e} of all that the drive sends")
 
     which = "both ends absorb"
     if absorbing.end != "both":
         which = f"{lattice.ends} ends, the {absorbing.end} one absorbs"
-    return f"{which} over {absorbing.cells} cells: {'; '.join(reflections)}"
+    return f"{which} over {absorbing.cells} cells: {'; '.join(dict.fromkeys(reflections))}"
 
 
 def describe_losses(case: Case) -> str:

@@ -51,13 +51,18 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     After them further ones are sought, a few restarts long, until none is nearer: a Krylov space may miss copies of a
     mode. Raises CaseError where modes lie so close, as at the edge of a band, that not all can be separated.
     """
+
+    def distance(value: complex) -> float:
+        return float(abs(np.sqrt(max(value.real, 0.0)) - near))
+
     eps = load_slepc().EPS().create(matrices.comm)
-    square = near**2
     eps.setOperators(matrices.stiffness, matrices.mass)
     eps.setProblemType(eps.ProblemType.GHEP)
-    eps.setWhichEigenpairs(eps.Which.TARGET_MAGNITUDE)
+    # The modes nearest in Om are not those nearest in Om^2, which are lower ones.
+    eps.setWhichEigenpairs(eps.Which.USER)
+    eps.setEigenvalueComparison(lambda one, other, *_: int(np.sign(distance(one) - distance(other))))
     # The shifted matrix would be singular if the frequency were exactly that of a mode.
-    eps.setTarget(square - SHIFT * matrices.largest)
+    eps.setTarget(near**2 - SHIFT * matrices.largest)
     _solve_directly(eps.getST())
 
     pairs: list[tuple[float, PETSc.Vec]] = []
@@ -69,12 +74,12 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
         eps.solve()
 
         before = len(pairs)
-        farthest = max((abs(value - square) for value, _ in pairs), default=np.inf)
+        farthest = max((distance(value) for value, _ in pairs), default=np.inf)
         for i in range(min(eps.getConverged(), wanted)):
             vector = matrices.vector()
             value = eps.getEigenpair(i, vector).real
             # Of later searches only what is nearer than the modes so far can be one that was missed.
-            if abs(value - square) < farthest:
+            if distance(value) < farthest:
                 pairs.append((value, vector))
         if not before and len(pairs) < count:
             remedy = f"only {len(pairs)} of {count} modes come out, the others crowd: ask for fewer, or for another"
@@ -83,7 +88,7 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
         wanted = int(before != len(pairs) < matrices.rows)
     eps.destroy()
 
-    nearest = sorted(pairs, key=lambda pair: abs(pair[0] - square))[:count]
+    nearest = sorted(pairs, key=lambda pair: distance(pair[0]))[:count]
     modes = [_mode(matrices, value, vector) for value, vector in sorted(nearest, key=lambda pair: pair[0])]
     frequency, shapes, residual = zip(*modes, strict=True)
     return NearModes(np.array(frequency), np.array(shapes), np.array(residual))

@@ -1,4 +1,4 @@
-r"""Bloch waves of a cell with dashpots, and what an end sends back.
+r"""Bloch waves of a cell with dashpots, and the dashpots that give bands a loss.
 
 At a real wavenumber (s^2 M + s C(kappa) + K(kappa)) u = 0 for motion exp(s t): each wave has a damping ratio
 -Re s/|s| and decays by 1/e in -1/Re s. At a real frequency, motion exp(i omega t), the cells obey
@@ -7,7 +7,7 @@ coupling to the next cell: a wave decays by 1/e in 1/|log |lambda|| cells. Cf. M
 """
 
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,8 +16,6 @@ from scipy.optimize import nnls
 
 from vipetsc.lattice.bands import bloch
 from vipetsc.lattice.cell import UnitCell
-from vipetsc.lattice.chain import Chain, Ends
-from vipetsc.lattice.variation import Variation
 from vipetsc.lattice.waves import NEUTRAL
 
 KAPPAS = np.pi * (np.arange(60) + 0.5) / 60  # wavenumbers at which the loss of bands is fitted
@@ -94,21 +92,29 @@ def fitted_dashpots(cell: UnitCell, loss: tuple[tuple[int, float], ...]) -> tupl
 class Waves(NamedTuple):
     """All waves of a cell at a real frequency; those that decay or carry energy to higher cells come first.
 
-    ``factor`` lambda (wave,), ``shape`` (dof, wave), ``flux`` in W to higher cells, and ``coupling`` B.
+    ``factor`` lambda (wave,), ``shape`` (dof, wave), ``flux`` in W to higher cells, and the matrices of the equation of
+    motion, ``dynamic`` D and ``coupling`` B.
     """
 
     factor: np.ndarray
     shape: np.ndarray
     flux: np.ndarray
+    dynamic: np.ndarray
     coupling: np.ndarray
+
+
+@lru_cache
+def _three_matrices(cell: UnitCell) -> tuple[np.ndarray, np.ndarray]:
+    """Bloch stiffness and damping at three wavenumbers: enough for the parts of 0, kappa and -kappa.."""
+    kappa = np.array([0.0, np.pi / 2, np.pi])
+    return cell.stiffness_matrix(kappa), cell.damping_matrix(kappa)
 
 
 def damped_waves(cell: UnitCell, omega: float) -> Waves:
     """The waves at ``omega`` in rad/s."""
     d = cell.dofs
-    # The Bloch matrix is inside + B exp(i kappa) + B^T exp(-i kappa): three wavenumbers give its parts.
-    kappa = np.array([0.0, np.pi / 2, np.pi])
-    zero, quarter, half = cell.stiffness_matrix(kappa) + 1j * omega * cell.damping_matrix(kappa)
+    stiffness, damping = _three_matrices(cell)
+    zero, quarter, half = stiffness + 1j * omega * damping
     inside = (zero + half) / 2
     coupling = ((zero - half) / 2 - 1j * (quarter - inside)) / 2  # of B + B^T and i (B - B^T)
     dynamic = inside - omega**2 * np.diag(cell.masses)
@@ -128,7 +134,7 @@ def damped_waves(cell: UnitCell, omega: float) -> Waves:
     flux = omega / 2 * np.imag(factor * np.einsum("dw,de,ew->w", shape.conj(), coupling, shape))
     growth = np.log(np.abs(factor))
     order = np.argsort(np.where(np.abs(growth) < NEUTRAL, -np.sign(flux) * NEUTRAL, growth))
-    return Waves(factor=factor[order], shape=shape[:, order], flux=flux[order], coupling=coupling)
+    return Waves(factor=factor[order], shape=shape[:, order], flux=flux[order], dynamic=dynamic, coupling=coupling)
 
 
 def decay_length(cell: UnitCell, omega: float) -> float:
@@ -136,83 +142,3 @@ def decay_length(cell: UnitCell, omega: float) -> float:
     growth = np.abs(np.log(np.abs(damped_waves(cell, omega).factor)))
     slowest = growth.min()
     return float(1 / slowest) if slowest > NEUTRAL else np.inf
-
-
-def reflection(chain: Chain, omega: float, cells: int, end: Literal["left", "right"] = "right") -> float:
-    """Largest fraction of a wave's energy at ``omega`` (rad/s) that comes back from the last ``cells`` at an ``end``.
-
-    The cells before go on for ever, as the reference cell; the outermost of ``cells`` must be one of them. Incoming
-    are waves that do not decay, in a damped cell the one that decays least. NaN in a gap.
-    """
-    waves = damped_waves(chain.cell, omega)
-    half = len(waves.factor) // 2
-    towards = slice(0, half)
-    back = slice(half, None)
-    if end == "left":
-        towards, back = back, towards
-
-    # Which of the waves that go towards the section carry energy to it.
-    growth = np.abs(np.log(np.abs(waves.factor[towards])))
-    flux = np.abs(waves.flux)
-    incoming = (growth <= max(growth.min() * (1 + 1e-9), NEUTRAL)) & (flux[towards] > 0)
-    if not chain.cell.is_damped:
-        incoming &= growth < NEUTRAL
-    if not incoming.any():
-        return np.nan
-
-    amplitudes = _sent_back(chain, omega, cells, end, waves)
-    returned = (flux[back, None] * np.abs(amplitudes) ** 2).sum(axis=0)
-    return float((returned[incoming] / flux[towards][incoming]).max())
-
-
-def _sent_back(chain: Chain, omega: float, cells: int, end: Literal["left", "right"], waves: Waves) -> np.ndarray:
-    """Amplitudes (wave back, wave towards) at the cell next to the section of the last ``cells`` at an ``end``.
-
-    Half of the waves go towards the section, the others come back. Unknowns are the section's displacements and these
-    amplitudes. Its cells obey the equations of motion; the displacement of the section's first cell must be that of the
-    waves, as far as the coupling feels it.
-    """
-    d = chain.cell.dofs
-    half = len(waves.factor) // 2
-    size = cells * d
-    if end == "right":
-        first = chain.cells - cells
-        edge = slice(0, d)
-        towards = slice(0, half)
-        back = slice(half, None)
-        coupling = waves.coupling
-        step = waves.factor
-    else:
-        first = 0
-        edge = slice(size - d, size)
-        towards = slice(half, None)
-        back = slice(0, half)
-        coupling = waves.coupling.T
-        step = waves.factor ** (-1)
-
-    stiffness = chain.stiffness_rows(first, first + cells) + 1j * omega * chain.damping_rows(first, first + cells)
-    masses = chain.masses()[first * d : first * d + size]
-    matrix = np.zeros((size + half, size + half), complex)
-    loads = np.zeros((size + half, half), complex)
-    matrix[:size, :size] = stiffness.toarray()[:, first * d : first * d + size] - np.diag(omega**2 * masses)
-    matrix[edge, size:] = coupling.T @ waves.shape[:, back]
-    loads[edge] = -coupling.T @ waves.shape[:, towards]
-
-    # The coupling has rank ``half``: only its range is compared, in an orthonormal basis.
-    ranges = np.linalg.svd(coupling)[0][:, :half].conj().T @ coupling
-    inner = ranges @ (waves.shape * step)
-    matrix[size:, edge] = ranges
-    matrix[size:, size:] = -inner[:, back]
-    loads[size:] = inner[:, towards]
-    return np.asarray(np.linalg.solve(matrix, loads)[size:])
-
-
-def absorber(cell: UnitCell, ends: Ends, cells: int, strength: float, before: int = 1) -> Chain:
-    """An end of ``cells`` with dashpots to ground, ``strength`` (1/s) x^3 times each mass, and cells ``before`` it.
-
-    x goes from 0 to 1 over the cells, taken in their middles.
-    """
-    x = np.concatenate([np.zeros(before), (np.arange(cells) + 0.5) / cells])
-    present = np.array(cell.grounding or (0.0,) * cell.dofs)
-    grounding = np.outer(strength * x**3, cell.masses) + present
-    return Chain(cell, cells + before, ends, variation=Variation(grounding=grounding))

@@ -55,6 +55,11 @@ class ToneBurst:
         return self.duration
 
     @property
+    def repeats(self) -> bool:
+        """Whether it is a sine that does not end: a burst ends."""
+        return False
+
+    @property
     def window_amplitude(self) -> float:
         """The factor in N before 1 - cos."""
         return self.amplitude if self.envelope == "paper" else self.amplitude / 2
@@ -184,16 +189,25 @@ class Pieces:
         value = value * np.sin(piece["phase"] + x * (piece["frequency"] + 0.5 * piece["rate"] * x))
         return np.where((number >= 0) & (t < self.duration), value, 0.0)
 
+    @property
+    def repeats(self) -> bool:
+        """Whether it is a sine that does not end; a constant that does not end is held."""
+        last = self.table[-1]
+        return not np.isfinite(self.duration) and bool(last["frequency"] or last["rate"])
+
     def spectrum(self, frequency: ArrayLike) -> np.ndarray:
         """Fourier transform in N s at ``frequency`` w in rad/s, by quadrature: the integral of F(t) exp(-i w t).
 
-        Raises ValueError for a waveform that does not end.
+        What is held at the end for ever has the transform of a step. Raises ValueError for a sine that does not end.
         """
-        if not np.isfinite(self.duration):
+        if self.repeats:
             raise ValueError("a waveform that does not end has no spectrum; give it a duration")
         w = np.asarray(frequency, float)
-        values = self.response(w.ravel(), 0.0, self.duration).reshape(w.shape)
-        return np.asarray(values * np.exp(-1j * w * self.duration))
+        end = self.settled
+        values = self.response(w.ravel(), 0.0, end).reshape(w.shape)
+        if not np.isfinite(self.duration):
+            values = values + self.force(end) / (1j * w)
+        return np.asarray(values * np.exp(-1j * w * end))
 
     def response(self, frequency: np.ndarray, start: float, stop: float) -> np.ndarray:
         """The integral from ``start`` to ``stop`` of exp(i w (stop - s)) F(s) ds, (w,), by Gauss's quadrature."""

@@ -1,0 +1,85 @@
+"""Ends that absorb: what of a drive's energy comes back from them, and the first of a few ends that keep a bound."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from vipetsc.case.inhomogeneity_sections import AbsorbingTable
+from vipetsc.lattice import Drive, ToneBurst, UnitCell, Waveform, waves_at
+from vipetsc.lattice.chain import Ends
+from vipetsc.lattice.ends import Section, absorbing_section, reflection
+from vipetsc.lattice.sent import Source
+
+# Cells of an absorbing end that are tried, and logarithms of the energy that is left of a wave on both of its passes.
+LENGTHS = (10, 20, 40, 80, 160, 320, 640)
+LOSSES = (8.0, 10.0, 13.0, 17.0)
+
+
+def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) -> list[Source]:
+    """The ``drives`` of a lattice as sources of waves: a wall that several springs are tied to is one."""
+    loads: dict[tuple[Waveform, int], np.ndarray] = {}
+    for drive in drives:
+        waveform = drive.waveform
+        if isinstance(waveform, ToneBurst):
+            # The amplitude cancels, and is 0 where a lattice begins in motion.
+            waveform = replace(waveform, amplitude=1.0)
+        load = loads.setdefault((waveform, drive.cell), np.zeros(cell.dofs))
+        load[drive.mass] += drive.stiffness or 1.0
+    return [Source(cell, ends, cells, place, load, waveform) for (waveform, place), load in loads.items()]
+
+
+def sections_of(table: AbsorbingTable, cell: UnitCell, ends: Ends, cells: int, strength: float) -> list[Section]:
+    """The sections of ``cells`` that absorb."""
+    sections = []
+    if table.end != "right":
+        sections.append(absorbing_section(cell, ends, cells, strength, "left"))
+    if table.end != "left":
+        sections.append(absorbing_section(cell, ends, cells, strength, "right"))
+    return sections
+
+
+def reflected_at(omega: float, sections: Sequence[Section]) -> float:
+    """Largest fraction of a wave's energy at ``omega`` (rad/s) that comes back from a section; NaN in a gap."""
+    return max(reflection(chain, omega, cells, end) for chain, cells, end in sections)
+
+
+def reflected(source: Source, sections: Sequence[Section]) -> float:
+    """Fraction of what a ``source`` sends to the ``sections`` that comes back; of an endless sine, at its frequency."""
+    if source.waveform.repeats:
+        return reflected_at(source.waveform.frequency, sections)
+    return source.reflected(sections)
+
+
+# Cached: each verb that reads a case resolves it, and each end that is tried costs hundreds of reflections.
+@lru_cache
+def designed_end(
+    table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: tuple[Drive, ...], cells: int
+) -> AbsorbingTable:
+    """``table`` with a length, up to a third of ``cells``, and a strength; raises ValueError if none will do.
+
+    Heeded are all ``drives`` whose frequencies are in pass bands.
+    """
+    waves = {source: waves_at(cell, source.waveform.frequency) for source in sources_of(drives, cell, ends, cells)}
+    sources = [source for source, found in waves.items() if found]
+    if not sources:
+        raise ValueError("the drive is in a gap: no wave comes to the end")
+
+    speed = max(wave[2] for found in waves.values() for wave in found)
+    most = cells // 3
+    lengths = [table.cells] if table.cells else [length for length in LENGTHS if length <= most]
+    best = np.inf
+    for length in lengths:
+        # The dashpots take exp(-loss) of a wave's energy: the integral of strength x^3 through the end and back.
+        strengths = [table.strength] if table.strength else [2 * speed * loss / length for loss in LOSSES]
+        for strength in strengths:
+            sections = sections_of(table, cell, ends, length, strength)
+            back = max(reflected(source, sections) for source in sources)
+            best = min(best, back)
+            if back <= table.reflection:
+                return table.model_copy(update={"cells": length, "strength": strength})
+    raise ValueError(
+        f"no end of up to {most} cells has it, {best:.2g} comes back, mostly slow waves at band edges; allow more,"
+        " lengthen the lattice, or drive more cycles or a frequency farther from the edges"
+    )

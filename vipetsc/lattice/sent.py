@@ -1,0 +1,185 @@
+r"""The energy that a drive sends to the ends of a lattice, by frequency, and what of it comes back from them.
+
+In an infinite lattice a force exp(i omega t) makes waves of amplitude a_j to each side. An end is met by those of its
+side, and by those of the other side once the other end has sent them back: near to the drive in phase with the first
+ones, so that a wall takes from them, else with energies added, since phases turn fast with the frequency. A force F(t)
+sends 2/pi |F(omega)|^2 flux_j |a_j|^2 at the frequency omega, in J s/rad, and all of it is the force's work.
+
+At the edges of bands waves stand, and absorbing ends send them back. How much a drive sends there decides what comes
+back: densities are integrated adaptively, from edge to edge, over every wave that propagates.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+
+from vipetsc.lattice.bands import pass_bands
+from vipetsc.lattice.cell import UnitCell
+from vipetsc.lattice.chain import Chain, Ends
+from vipetsc.lattice.damped import Waves, damped_waves
+from vipetsc.lattice.drive import Waveform
+from vipetsc.lattice.ends import End, Section, Side, amplitudes_back, condensed, reflections
+from vipetsc.lattice.waves import NEUTRAL
+
+NEAR = 32  # cells up to which the waves that the other end sends back are in phase with those of the drive
+LOBES = (-8, -2, 0, 2, 8)  # detunings, in widths of a waveform's spectrum, between which it is smooth
+# Quadrature: nodes of a panel, error of an integral, and halvings of a panel at most.
+NODES = 8
+ACCURACY = 1e-2
+HALVINGS = 12
+
+
+class Source:
+    """A force with a ``waveform`` on the masses of a cell, in proportion to ``load`` (dof,).
+
+    ``place`` is its cell, from 0, in a lattice of ``cells`` equal ones; waves are computed once a frequency.
+    """
+
+    def __init__(
+        self, cell: UnitCell, ends: Ends, cells: int, place: int, load: np.ndarray, waveform: Waveform
+    ) -> None:
+        self.cell = cell
+        self.cells = cells
+        self.place = place
+        self.load = load
+        self.waveform = waveform
+        self._uniform = Chain(cell, 1, ends)
+        self._waves: dict[float, Waves] = {}
+        self._sent: dict[tuple[float, End, bool], np.ndarray] = {}
+
+    def reflected(self, sections: Sequence[Section]) -> float:
+        """Fraction of the energy that arrives at the ``sections`` which comes back; NaN if nothing arrives."""
+        absorbs = len(sections) == 2
+
+        def densities(omegas: np.ndarray) -> np.ndarray:
+            return np.sum([self._densities(omegas, section, absorbs) for section in sections], axis=0)
+
+        arriving, back = integrate(densities, self.edges())
+        return float(back / arriving) if arriving > 0 else np.nan
+
+    def edges(self) -> np.ndarray:
+        """Frequencies in rad/s between which densities are smooth: edges of bands and of the spectrum's lobes."""
+        bands = pass_bands(self.cell)
+        edges = [0.0, *(band.low for band in bands), *(band.high for band in bands)]
+        main = self.waveform.frequency
+        lobes = [main * (1 + lobe / self.waveform.cycles) for lobe in LOBES]
+        return np.unique([*edges, *(w for w in lobes if 0 < w < max(edges))])
+
+    def sent(self, omegas: np.ndarray, end: End, absorbs: bool = False) -> np.ndarray:
+        """Energies (omega, wave) in J s/rad of the waves towards an ``end`` next to the driven cell.
+
+        The other end sends back what comes to it, unless it ``absorbs``, too.
+        """
+        new = [omega for omega in omegas.tolist() if (omega, end, absorbs) not in self._sent]
+        if new:
+            other: End = "left" if end == "right" else "right"
+            walls = condensed(Section(self._uniform, 1, other), np.array(new))
+            force = 2 / np.pi * np.abs(self.waveform.spectrum(np.array(new))) ** 2
+            for omega, wall, size in zip(new, walls, force, strict=True):
+                energy = self._energy_of_a_unit(omega, end, None if absorbs else wall)
+                self._sent[omega, end, absorbs] = size * energy
+        return np.array([self._sent[omega, end, absorbs] for omega in omegas.tolist()])
+
+    def _waves_at(self, omega: float) -> Waves:
+        if omega not in self._waves:
+            self._waves[omega] = damped_waves(self.cell, omega)
+        return self._waves[omega]
+
+    def _energy_of_a_unit(self, omega: float, end: End, wall: np.ndarray | None) -> np.ndarray:
+        """Energies (wave,) towards an ``end`` by a unit force, with the ``wall`` (dof, dof) of the other end."""
+        waves = self._waves_at(omega)
+        side = Side.at(end, waves)
+        flux = np.abs(waves.flux[side.towards])
+        if not self.cell.is_damped:
+            flux = flux * (side.decay() < NEUTRAL)
+        if not flux.any():
+            return flux
+
+        ahead, behind = self._amplitudes(waves, side)
+        if wall is None:
+            return np.asarray(flux * np.abs(ahead) ** 2)
+
+        # Cells from the driven one to the one next to the last at the other end.
+        distance = (self.place if end == "right" else self.cells - 1 - self.place) - 1
+        other: End = "left" if end == "right" else "right"
+        there = behind * side.step[side.back] ** -distance
+        image = side.step[side.towards] ** distance * (amplitudes_back(wall, waves, other) @ there)
+        if distance < NEAR:
+            return np.asarray(flux * np.abs(ahead + image) ** 2)
+        return np.asarray(flux * (np.abs(ahead) ** 2 + np.abs(image) ** 2))
+
+    def _amplitudes(self, waves: Waves, side: Side) -> tuple[np.ndarray, np.ndarray]:
+        """Amplitudes at the driven cell of an infinite lattice: of the waves towards an end, and of the others."""
+        towards, back, coupling, step = side
+        d = self.cell.dofs
+        half = len(waves.factor) // 2
+        scale = np.abs(waves.dynamic).max()
+
+        # Unknowns are the cell's displacement and the amplitudes: equation of motion, what the couplings feel of it.
+        matrix = np.zeros((3, d, d + 2 * half), complex)
+        matrix[0, :, :d] = waves.dynamic
+        matrix[0, :, d : d + half] = coupling @ (waves.shape * step)[:, towards]
+        matrix[0, :, d + half :] = coupling.T @ (waves.shape / step)[:, back]
+        matrix[1, :, :d] = coupling.T
+        matrix[1, :, d : d + half] = -coupling.T @ waves.shape[:, towards]
+        matrix[2, :, :d] = coupling
+        matrix[2, :, d + half :] = -coupling @ waves.shape[:, back]
+        right = np.concatenate([self.load / scale, np.zeros(2 * d)])
+        amplitudes = np.linalg.lstsq(matrix.reshape(3 * d, -1) / scale, right, rcond=None)[0][d:]
+        return amplitudes[:half], amplitudes[half:]
+
+    def _densities(self, omegas: np.ndarray, section: Section, absorbs: bool) -> np.ndarray:
+        """Energies (2, omega) in J s/rad that arrive at a ``section`` and that come back from it."""
+        end = section.end
+        last = self.place if end == "left" else self.cells - 1 - self.place
+        distance = max(last - section.cells, 0)
+        sent = self.sent(omegas, end, absorbs)
+        (sends,) = np.nonzero(sent.any(axis=1))
+
+        out = np.zeros((2, len(omegas)))
+        for i, z in zip(sends.tolist(), condensed(section, omegas[sends]), strict=True):
+            waves = self._waves_at(float(omegas[i]))
+            # What does not decay arrives as it is sent.
+            arriving = sent[i] * np.exp(-2 * distance * Side.at(end, waves).decay())
+            out[:, i] = arriving.sum(), arriving @ reflections(z, waves, end)
+        return out
+
+
+def integrate(densities: Callable[[np.ndarray], np.ndarray], edges: np.ndarray) -> np.ndarray:
+    """Integrals (n,) of ``densities`` (n, x) from the first to the last of the ``edges``, each to ``ACCURACY``.
+
+    Next to an edge they may be as the square root of the distance to it, or its inverse: x = a + (b - a) sin^2 angle.
+    """
+    points, weights = leggauss(NODES)
+
+    def gauss(panels: np.ndarray) -> np.ndarray:
+        """Integrals (n, panel) over ``panels`` (panel, 4): two edges, and two angles between them."""
+        a, b, begin, end = panels.T[:, :, None]
+        angle = begin + (end - begin) * (points + 1) / 2
+        weight = weights * (end - begin) / 2 * (b - a) * np.sin(2 * angle)
+        x = a + (b - a) * np.sin(angle) ** 2
+        values = densities(x.ravel()).reshape(-1, *x.shape)
+        return np.asarray((values * weight).sum(axis=-1))
+
+    count = len(edges) - 1
+    panels = np.column_stack([edges[:-1], edges[1:], np.zeros(count), np.full(count, np.pi / 2)])
+    whole = gauss(panels)
+    done = np.zeros(len(whole))
+    for _ in range(HALVINGS):
+        middle = panels[:, 2:].mean(axis=1)
+        halves = np.concatenate([panels, panels])
+        halves[: len(panels), 3] = middle
+        halves[len(panels) :, 2] = middle
+        values = gauss(halves)
+
+        both = values[:, : len(panels)] + values[:, len(panels) :]
+        total = done + both.sum(axis=1)
+        rough = (np.abs(both - whole) > ACCURACY / len(panels) * total[:, None]).any(axis=0)
+        if not rough.any():
+            return np.asarray(total)
+        done = done + both[:, ~rough].sum(axis=1)
+        again = np.concatenate([rough, rough])
+        panels = halves[again]
+        whole = values[:, again]
+    return np.asarray(done + whole.sum(axis=1))
