@@ -57,6 +57,11 @@ def test_what_a_drive_sends_is_its_work(cell, mass):
     assert sent == pytest.approx(work, rel=1e-3)
 
 
+def stated(of):
+    source, sections = source_and_sections(of)
+    return reflected([source], sections)
+
+
 def returning(source, section, slowest):
     """Fractions of what is sent that come back as waves faster than each of ``slowest`` (cells/s), on a fixed grid."""
     angles = (np.arange(100) + 0.5) / 100 * np.pi / 2
@@ -113,7 +118,7 @@ def test_what_comes_back_in_a_run_is_what_is_stated(strength):
     source, (section,) = source_and_sections(with_end)
     burst = source.waveform.duration
     every, some, least = returning(source, section, [0, 2 * before / end, 2 * (before + length) / (end - burst)])
-    assert reflected(source, [section]) == pytest.approx(every, rel=0.01)
+    assert reflected([source], [section]) == pytest.approx(every, rel=0.01)
     assert 0.98 * least < measured < 1.02 * some
     assert (least > 0.9 * every) == (strength < 100)
     assert measured > 0.35 * every
@@ -126,7 +131,7 @@ def test_the_end_that_is_chosen_keeps_its_bound():
     (back,) = returning(source, sections[0], [0])
     assert of.lattice.absorbing.cells > 160
     assert back < 1.01e-3
-    assert f"{reflected(source, sections):.1e} of all that the drive sends" in describe_ends(of)
+    assert f"{reflected([source], sections):.1e} of all that the drive sends" in describe_ends(of)
 
 
 def test_both_ends_absorb_what_each_of_them_gets():
@@ -134,11 +139,11 @@ def test_both_ends_absorb_what_each_of_them_gets():
         case({"cells": 300, "absorbing": {"end": end, "cells": 20, "strength": 200.0}}, BURST | {"cell": 150})
         for end in ("right", "both")
     )
-    fractions = [reflected(*source_and_sections(of)) for of in (one, both)]
+    fractions = [stated(of) for of in (one, both)]
     assert fractions[1] == pytest.approx(fractions[0], rel=0.02)
     # Next to a wall that the end does not replace, waves at the band's edge are not sent at all.
     at_wall = case({"cells": 300, "absorbing": {"cells": 20, "strength": 200.0}}, BURST)
-    assert reflected(*source_and_sections(at_wall)) < 0.2 * fractions[0]
+    assert stated(at_wall) < 0.2 * fractions[0]
 
 
 def test_where_no_end_keeps_the_bound_the_message_names_the_remedy():
@@ -154,7 +159,7 @@ def test_drives_without_an_end_or_a_sine():
     z = condensed(sections[0], np.array([1023.0]))[0]
     waves = damped_waves(source.cell, 1023.0)
     carries = Side.at("right", waves).decay() < 1e-7
-    assert reflected(source, sections) == pytest.approx(reflections(z, waves, "right")[carries].max())
+    assert reflected([source], sections) == pytest.approx(reflections(z, waves, "right")[carries].max())
 
     step = case(end, {"waveform": "step", "ramp": 0.01})
     held, sections = source_and_sections(step)
@@ -164,4 +169,4 @@ def test_drives_without_an_end_or_a_sine():
     sums = trapezoid(waveform.force(times) * np.exp(-1j * omegas[:, None] * times), times)
     tail = np.exp(-1j * omegas * waveform.settled) / (1j * omegas)
     assert waveform.spectrum(omegas) == pytest.approx(sums + tail, rel=1e-5)
-    assert 0 < reflected(held, sections) < 1
+    assert 0 < reflected([held], sections) < 1

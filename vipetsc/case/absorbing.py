@@ -22,8 +22,8 @@ def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) 
     loads: dict[tuple[Waveform, int], np.ndarray] = {}
     for drive in drives:
         waveform = drive.waveform
-        if isinstance(waveform, ToneBurst):
-            # The amplitude cancels, and is 0 where a lattice begins in motion.
+        if isinstance(waveform, ToneBurst) and (len(drives) == 1 or not waveform.amplitude):
+            # The amplitude of one cancels, and is 0 where a lattice begins in motion.
             waveform = replace(waveform, amplitude=1.0)
         load = loads.setdefault((waveform, drive.cell), np.zeros(cell.dofs))
         load[drive.mass] += drive.stiffness or 1.0
@@ -45,11 +45,19 @@ def reflected_at(omega: float, sections: Sequence[Section]) -> float:
     return max(reflection(chain, omega, cells, end) for chain, cells, end in sections)
 
 
-def reflected(source: Source, sections: Sequence[Section]) -> float:
-    """Fraction of what a ``source`` sends to the ``sections`` that comes back; of an endless sine, at its frequency."""
-    if source.waveform.repeats:
-        return reflected_at(source.waveform.frequency, sections)
-    return source.reflected(sections)
+def reflected(sources: Sequence[Source], sections: Sequence[Section]) -> float:
+    """Fraction of what ``sources`` send to the ``sections`` that comes back, largest with that of each endless sine.
+
+    NaN if nothing arrives.
+    """
+    endless = [source.waveform.frequency for source in sources if source.waveform.repeats]
+    fractions = [reflected_at(omega, sections) for omega in endless]
+    energies = [source.energies(sections) for source in sources if not source.waveform.repeats]
+    if energies:
+        arriving, back = np.sum(energies, axis=0)
+        fractions.append(back / arriving if arriving > 0 else np.nan)
+    finite = [fraction for fraction in fractions if np.isfinite(fraction)]
+    return float(max(finite, default=np.nan))
 
 
 # Cached: each verb that reads a case resolves it, and each end that is tried costs hundreds of reflections.
@@ -59,14 +67,14 @@ def designed_end(
 ) -> AbsorbingTable:
     """``table`` with a length, up to a third of ``cells``, and a strength; raises ValueError if none will do.
 
-    Heeded are all ``drives`` whose frequencies are in pass bands.
+    What comes back is counted over all ``drives`` together.
     """
-    waves = {source: waves_at(cell, source.waveform.frequency) for source in sources_of(drives, cell, ends, cells)}
-    sources = [source for source, found in waves.items() if found]
-    if not sources:
+    sources = sources_of(drives, cell, ends, cells)
+    waves = [wave for source in sources for wave in waves_at(cell, source.waveform.frequency)]
+    if not waves:
         raise ValueError("the drive is in a gap: no wave comes to the end")
 
-    speed = max(wave[2] for found in waves.values() for wave in found)
+    speed = max(wave[2] for wave in waves)
     most = cells // 3
     lengths = [table.cells] if table.cells else [length for length in LENGTHS if length <= most]
     best = np.inf
@@ -75,7 +83,7 @@ def designed_end(
         strengths = [table.strength] if table.strength else [2 * speed * loss / length for loss in LOSSES]
         for strength in strengths:
             sections = sections_of(table, cell, ends, length, strength)
-            back = max(reflected(source, sections) for source in sources)
+            back = reflected(sources, sections)
             best = min(best, back)
             if back <= table.reflection:
                 return table.model_copy(update={"cells": length, "strength": strength})

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Problem, Section, Table, Valid
+from vipetsc.case.names import distinct
 from vipetsc.case.resolve import check_stiffness
 from vipetsc.case.schema import Positive, once
 from vipetsc.lattice import Contact, UnitCell, waves_at
@@ -128,7 +129,9 @@ class NfrcCase(Case):
 
     def curves(self) -> list[tuple[str, float, float]]:
         """Name, restitution and the fixed parameter of every curve."""
-        return [(f"r{r:g}-{f:.6g}", r, f) for r, f in itertools.product(self.nfrc.restitutions, self.nfrc.fixed)]
+        restitutions = zip(distinct(self.nfrc.restitutions), self.nfrc.restitutions, strict=True)
+        fixed = zip(distinct(self.nfrc.fixed), self.nfrc.fixed, strict=True)
+        return [(f"r{of_r}-{of_f}", r, f) for (of_r, r), (of_f, f) in itertools.product(restitutions, fixed)]
 
 
 def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:

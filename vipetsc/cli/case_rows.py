@@ -52,10 +52,11 @@ def describe_ends(case: Case) -> str:
     for source in sources_of(case.model().drives, cell, lattice.ends, lattice.cells):
         omega = source.waveform.frequency
         back = reflected_at(omega, sections)
-        sentence = f"{back:.1e} of the energy comes back at {omega:.6g} rad/s"
-        if not np.isfinite(back):
-            sentence = f"no wave comes to it at {omega:.6g} rad/s"
-        reflections.append(f"{sentence}, {reflected(source, sections):.1e} of all that the drive sends")
+        everything = f"{reflected([source], sections):.1e} of all that the drive sends"
+        if np.isfinite(back):
+            reflections.append(f"{back:.1e} of the energy comes back at {omega:.6g} rad/s, {everything}")
+        else:
+            reflections.append(f"no wave comes to it at {omega:.6g} rad/s; {everything} comes back")
 
     which = "both ends absorb"
     if absorbing.end != "both":

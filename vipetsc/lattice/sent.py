@@ -48,15 +48,14 @@ class Source:
         self._waves: dict[float, Waves] = {}
         self._sent: dict[tuple[float, End, bool], np.ndarray] = {}
 
-    def reflected(self, sections: Sequence[Section]) -> float:
-        """Fraction of the energy that arrives at the ``sections`` which comes back; NaN if nothing arrives."""
+    def energies(self, sections: Sequence[Section]) -> np.ndarray:
+        """Energies (2,) in J that arrive at the ``sections`` and that come back from them."""
         absorbs = len(sections) == 2
 
         def densities(omegas: np.ndarray) -> np.ndarray:
             return np.sum([self._densities(omegas, section, absorbs) for section in sections], axis=0)
 
-        arriving, back = integrate(densities, self.edges())
-        return float(back / arriving) if arriving > 0 else np.nan
+        return integrate(densities, self.edges())
 
     def edges(self) -> np.ndarray:
         """Frequencies in rad/s between which densities are smooth: edges of bands and of the spectrum's lobes."""

@@ -8,6 +8,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import NnmCase
+from vipetsc.case.names import distinct
 from vipetsc.case.nnm import NnmTable
 from vipetsc.case.resolve import build_chain
 from vipetsc.io.branch_kinds import CONDENSED
@@ -80,7 +81,7 @@ class CondensedMethod(NnmMethod):
     def name(self, job: int) -> str:
         """The name of the branch of a mode, or of a start frequency."""
         if self.system is None or self.options.start_frequency:
-            return f"breather-{self.options.start_frequency[job]:g}"
+            return f"breather-{distinct(self.options.start_frequency)[job]}"
         return self.system.branch_name(job)
 
     def problem(self, job: int) -> ConservativeMotions:

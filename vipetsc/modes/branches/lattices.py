@@ -5,6 +5,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import NnmCase
+from vipetsc.case.names import distinct
 from vipetsc.case.resolve import build_chain
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
@@ -42,7 +43,7 @@ class LatticeMethod(NnmMethod):
     def name(self, job: int) -> str:
         """The name of the branch of a mode, or of a start frequency."""
         frequencies = self.options.start_frequency
-        return f"breather-{frequencies[job]:g}" if frequencies else self.system.branch_name(job)
+        return f"breather-{distinct(frequencies)[job]}" if frequencies else self.system.branch_name(job)
 
     def problem(self, job: int) -> LatticeShooting:
         """The shooting equations of the lattice."""

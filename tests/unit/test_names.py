@@ -1,0 +1,39 @@
+"""Names of files after numbers: as many digits as tell them apart."""
+
+from mpi4py import MPI
+
+import pytest
+
+from tests.unit.test_floquet import case as breather
+from tests.verify.test_nfrc import case
+from vipetsc.case.names import distinct
+from vipetsc.modes.branches.condensed import CondensedMethod
+from vipetsc.modes.branches.lattices import LatticeMethod
+
+
+@pytest.mark.parametrize(
+    ("numbers", "names"),
+    [
+        ([1023.27, 1023.2701], ["1023.27", "1023.2701"]),
+        ([0.7, 0.7000001, 0.3], ["0.7", "0.7000001", "0.3"]),
+        ([1420.0, 1420.001], ["1420", "1420.001"]),
+        # Names of before stay where six digits tell all apart, and beside numbers that they do not.
+        ([1 / 3, 1000 / 3, 1e7], ["0.333333", "333.333", "1e+07"]),
+        ([1 / 3, 1420.0, 1420.001], ["0.333333", "1420", "1420.001"]),
+        ([1.0, 1.0 + 2**-52], ["1", "1.0000000000000002"]),
+    ],
+)
+def test_numbers_that_differ_have_names_that_differ(numbers, names):
+    assert distinct(numbers) == names
+
+
+def test_curves_that_agree_in_six_digits_have_files_of_their_own():
+    curves = case(fixed=[1023.27, 1023.2701], restitutions=[0.7, 0.7000001]).curves()
+    assert len({name for name, *_ in curves}) == 4
+    assert curves[0] == ("r0.7-1023.27", 0.7, 1023.27)
+
+
+@pytest.mark.parametrize(("method", "options"), [(CondensedMethod, {"system": "condensed"}), (LatticeMethod, {})])
+def test_breathers_that_agree_in_six_digits_have_files_of_their_own(method, options):
+    of = breather(start_frequency=[1600.0, 1600.001], **options)
+    assert [method(of, MPI.COMM_SELF).name(job) for job in (0, 1)] == ["breather-1600", "breather-1600.001"]
