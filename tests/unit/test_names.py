@@ -4,8 +4,8 @@ from mpi4py import MPI
 
 import pytest
 
-from tests.unit.test_floquet import case as breather
-from tests.verify.test_nfrc import case
+from tests.breathers import breather_case
+from tests.steady_states import nfrc_case
 from vipetsc.case.names import distinct
 from vipetsc.modes.branches.condensed import CondensedMethod
 from vipetsc.modes.branches.lattices import LatticeMethod
@@ -28,12 +28,12 @@ def test_numbers_that_differ_have_names_that_differ(numbers, names):
 
 
 def test_curves_that_agree_in_six_digits_have_files_of_their_own():
-    curves = case(fixed=[1023.27, 1023.2701], restitutions=[0.7, 0.7000001]).curves()
+    curves = nfrc_case(fixed=[1023.27, 1023.2701], restitutions=[0.7, 0.7000001]).curves()
     assert len({name for name, *_ in curves}) == 4
     assert curves[0] == ("r0.7-1023.27", 0.7, 1023.27)
 
 
 @pytest.mark.parametrize(("method", "options"), [(CondensedMethod, {"system": "condensed"}), (LatticeMethod, {})])
 def test_breathers_that_agree_in_six_digits_have_files_of_their_own(method, options):
-    of = breather(start_frequency=[1600.0, 1600.001], **options)
+    of = breather_case(start_frequency=[1600.0, 1600.001], **options)
     assert [method(of, MPI.COMM_SELF).name(job) for job in (0, 1)] == ["breather-1600", "breather-1600.001"]
