@@ -9,7 +9,7 @@ import numpy as np
 from vipetsc.case.inhomogeneity_sections import AbsorbingTable
 from vipetsc.lattice import Drive, ToneBurst, UnitCell, Waveform, waves_at
 from vipetsc.lattice.chain import Ends
-from vipetsc.lattice.ends import Section, absorbing_section, reflection
+from vipetsc.lattice.ends import EndSection, absorbing_section, reflection
 from vipetsc.lattice.sent import Source
 
 # Cells of an absorbing end that are tried, and logarithms of the energy that is left of a wave on both of its passes.
@@ -30,7 +30,7 @@ def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) 
     return [Source(cell, ends, cells, place, load, waveform) for (waveform, place), load in loads.items()]
 
 
-def sections_of(table: AbsorbingTable, cell: UnitCell, ends: Ends, cells: int, strength: float) -> list[Section]:
+def sections_of(table: AbsorbingTable, cell: UnitCell, ends: Ends, cells: int, strength: float) -> list[EndSection]:
     """The sections of ``cells`` that absorb."""
     sections = []
     if table.end != "right":
@@ -40,12 +40,12 @@ def sections_of(table: AbsorbingTable, cell: UnitCell, ends: Ends, cells: int, s
     return sections
 
 
-def reflected_at(omega: float, sections: Sequence[Section]) -> float:
+def reflected_at(omega: float, sections: Sequence[EndSection]) -> float:
     """Largest fraction of a wave's energy at ``omega`` (rad/s) that comes back from a section; NaN in a gap."""
     return max(reflection(chain, omega, cells, end) for chain, cells, end in sections)
 
 
-def reflected(sources: Sequence[Source], sections: Sequence[Section]) -> float:
+def reflected(sources: Sequence[Source], sections: Sequence[EndSection]) -> float:
     """Fraction of what ``sources`` send to the ``sections`` that comes back, largest with that of each endless sine.
 
     NaN if nothing arrives.

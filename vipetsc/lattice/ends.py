@@ -45,7 +45,7 @@ class Side(NamedTuple):
         return np.asarray(np.abs(np.log(np.abs(self.step[self.towards]))))
 
 
-class Section(NamedTuple):
+class EndSection(NamedTuple):
     """The last ``cells`` of a ``chain`` at an ``end``; those before them are as its reference cell."""
 
     chain: Chain
@@ -53,7 +53,7 @@ class Section(NamedTuple):
     end: End
 
 
-def condensed(section: Section, omegas: np.ndarray) -> np.ndarray:
+def condensed(section: EndSection, omegas: np.ndarray) -> np.ndarray:
     """Z (omega, dof, dof) in N/m of a ``section`` at ``omegas`` in rad/s, on its innermost cell."""
     chain, cells, end = section
     d = chain.cell.dofs
@@ -120,7 +120,7 @@ def reflection(chain: Chain, omega: float, cells: int, end: End = "right") -> fl
         incoming &= growth < NEUTRAL
     if not incoming.any():
         return np.nan
-    z = condensed(Section(chain, cells, end), np.array([omega]))[0]
+    z = condensed(EndSection(chain, cells, end), np.array([omega]))[0]
     return float(reflections(z, waves, end)[incoming].max())
 
 
@@ -135,11 +135,11 @@ def absorber(cell: UnitCell, ends: Ends, cells: int, strength: float, before: in
     return Chain(cell, cells + before, ends, variation=Variation(grounding=grounding))
 
 
-def absorbing_section(cell: UnitCell, ends: Ends, cells: int, strength: float, end: End) -> Section:
+def absorbing_section(cell: UnitCell, ends: Ends, cells: int, strength: float, end: End) -> EndSection:
     """The section of an ``absorber`` at an ``end``."""
     right = absorber(cell, ends, cells, strength, before=0)
     if end == "right":
-        return Section(right, cells, end)
+        return EndSection(right, cells, end)
     assert right.variation is not None and right.variation.grounding is not None
     mirrored = Variation(grounding=right.variation.grounding[::-1])
-    return Section(Chain(cell, cells, ends, variation=mirrored), cells, end)
+    return EndSection(Chain(cell, cells, ends, variation=mirrored), cells, end)

@@ -19,7 +19,7 @@ from vipetsc.lattice.cell import UnitCell
 from vipetsc.lattice.chain import Chain, Ends
 from vipetsc.lattice.damped import Waves, damped_waves
 from vipetsc.lattice.drive import Waveform
-from vipetsc.lattice.ends import End, Section, Side, amplitudes_back, condensed, reflections
+from vipetsc.lattice.ends import End, EndSection, Side, amplitudes_back, condensed, reflections
 from vipetsc.lattice.waves import NEUTRAL
 
 NEAR = 32  # cells up to which the waves that the other end sends back are in phase with those of the drive
@@ -48,7 +48,7 @@ class Source:
         self._waves: dict[float, Waves] = {}
         self._sent: dict[tuple[float, End, bool], np.ndarray] = {}
 
-    def energies(self, sections: Sequence[Section]) -> np.ndarray:
+    def energies(self, sections: Sequence[EndSection]) -> np.ndarray:
         """Energies (2,) in J that arrive at the ``sections`` and that come back from them."""
         absorbs = len(sections) == 2
 
@@ -73,7 +73,7 @@ class Source:
         new = [omega for omega in omegas.tolist() if (omega, end, absorbs) not in self._sent]
         if new:
             other: End = "left" if end == "right" else "right"
-            walls = condensed(Section(self._uniform, 1, other), np.array(new))
+            walls = condensed(EndSection(self._uniform, 1, other), np.array(new))
             force = 2 / np.pi * np.abs(self.waveform.spectrum(np.array(new))) ** 2
             for omega, wall, size in zip(new, walls, force, strict=True):
                 energy = self._energy_of_a_unit(omega, end, None if absorbs else wall)
@@ -102,8 +102,8 @@ class Source:
         # Cells from the driven one to the one next to the last at the other end.
         distance = (self.place if end == "right" else self.cells - 1 - self.place) - 1
         other: End = "left" if end == "right" else "right"
-        there = behind * side.step[side.back] ** -distance
-        image = side.step[side.towards] ** distance * (amplitudes_back(wall, waves, other) @ there)
+        at_wall = behind * side.step[side.back] ** -distance
+        image = side.step[side.towards] ** distance * (amplitudes_back(wall, waves, other) @ at_wall)
         if distance < NEAR:
             return np.asarray(flux * np.abs(ahead + image) ** 2)
         return np.asarray(flux * (np.abs(ahead) ** 2 + np.abs(image) ** 2))
@@ -128,7 +128,7 @@ class Source:
         amplitudes = np.linalg.lstsq(matrix.reshape(3 * d, -1) / scale, right, rcond=None)[0][d:]
         return amplitudes[:half], amplitudes[half:]
 
-    def _densities(self, omegas: np.ndarray, section: Section, absorbs: bool) -> np.ndarray:
+    def _densities(self, omegas: np.ndarray, section: EndSection, absorbs: bool) -> np.ndarray:
         """Energies (2, omega) in J s/rad that arrive at a ``section`` and that come back from it."""
         end = section.end
         last = self.place if end == "left" else self.cells - 1 - self.place
@@ -178,7 +178,7 @@ def integrate(densities: Callable[[np.ndarray], np.ndarray], edges: np.ndarray) 
         if not rough.any():
             return np.asarray(total)
         done = done + both[:, ~rough].sum(axis=1)
-        again = np.concatenate([rough, rough])
-        panels = halves[again]
-        whole = values[:, again]
+        refined = np.concatenate([rough, rough])
+        panels = halves[refined]
+        whole = values[:, refined]
     return np.asarray(done + whole.sum(axis=1))
