@@ -10,7 +10,7 @@ from vipetsc.case.case_file import Problem, Table, Valid
 from vipetsc.case.samples import SamplesTable
 from vipetsc.case.schema import LatticeTable, TimeTable
 from vipetsc.case.waveforms import DEFAULT, OneDrive, waveform_of
-from vipetsc.lattice import Chain, Drive, UnitCell, bloch, max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice import Chain, Drive, UnitCell, bloch, fastest_speed, max_group_velocity, pass_bands, waves_at
 
 STANDING = 1e-6  # of the cell's fastest group velocity, below which a wave stands
 WAVE_REMEDY = 'give one of: frequency; wavenumber and band; band and at = "max-group-velocity"'
@@ -166,7 +166,7 @@ def packet_speed(cell: UnitCell, drive: OneDrive) -> float:
 def wave_speed(cell: UnitCell, frequency: float) -> float:
     """Group velocity in cells/s of the fastest wave at ``frequency``; in a gap, the cell's fastest."""
     speed = max((wave[2] for wave in waves_at(cell, frequency)), default=0.0)
-    return speed or max(max_group_velocity(cell, band + 1)[2] for band in range(cell.dofs))
+    return speed or fastest_speed(cell)
 
 
 def check_wave(cell: UnitCell, drive: OneDrive, time: TimeTable) -> Iterator[Problem]:

@@ -1,6 +1,6 @@
 """The physics of a contact lattice in plain numpy: cells, contacts, drives, Bloch bands, finite chains."""
 
-from vipetsc.lattice.bands import Band, BlochPoint, bloch, gaps, max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice.bands import Band, BlochPoint, bloch, fastest_speed, gaps, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.cell import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.compliance import DenseCompliance, IncidentWave, WaveCompliance

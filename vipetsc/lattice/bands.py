@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +13,11 @@ from scipy.optimize import brentq, minimize_scalar
 from vipetsc.lattice.cell import UnitCell
 
 GRID = np.linspace(0, np.pi, 721)  # wavenumbers between which extremes and waves are searched
+# Cells of more masses have fewer of them, as each costs the cube: bands of long cells are folded, and nearly straight.
+MANY_MASSES = 32
+FEWEST = 61
+BLOCK = 16  # wavenumbers whose matrices are held at once
+NEARLY_FASTEST = 0.9  # of the largest group velocity on the grid, below which no refined one is larger
 OFF_ZERO = 3e-4  # smallest wavenumber at which group velocities are computed
 
 
@@ -49,8 +55,12 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     squared, vectors = np.linalg.eigh(cell.stiffness_matrix(kappa) * scale)
 
     # Closer to zero, rounding of omega^2 (eps times the top band's) outweighs that of the acoustic branch.
-    off_zero = np.where(np.abs(kappa) < OFF_ZERO, OFF_ZERO, kappa)
-    eigenvalue, u = np.linalg.eigh(cell.stiffness_matrix(off_zero) * scale)
+    near_zero = np.abs(kappa) < OFF_ZERO
+    off_zero = np.where(near_zero, OFF_ZERO, kappa)
+    eigenvalue = squared.copy()
+    u = vectors.copy()
+    if near_zero.any():
+        eigenvalue[near_zero], u[near_zero] = np.linalg.eigh(cell.stiffness_matrix(OFF_ZERO) * scale)
     stiffness_slope = np.zeros((*kappa.shape, cell.dofs, cell.dofs), complex)
     for mass, offset, other, stiffness, *_ in cell.couplings():
         stiffness_slope[..., mass, other] -= 1j * offset * stiffness * np.exp(1j * off_zero * offset)
@@ -62,29 +72,57 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     )
 
 
+class BandGrid(NamedTuple):
+    """Frequencies and group velocities (kappa, band) at the wavenumbers ``kappa`` from 0 to pi."""
+
+    kappa: np.ndarray
+    frequency: np.ndarray
+    group_velocity: np.ndarray
+
+
+@lru_cache(maxsize=16)
+def _grid(cell: UnitCell) -> BandGrid:
+    """The bands of a cell where extremes and waves are searched."""
+    kappa = GRID
+    if cell.dofs > MANY_MASSES:
+        count = max(FEWEST, len(GRID) * MANY_MASSES // cell.dofs)
+        kappa = np.linspace(0, np.pi, count)
+    blocks = [bloch(cell, kappa[i : i + BLOCK]) for i in range(0, len(kappa), BLOCK)]
+    return BandGrid(
+        kappa=kappa,
+        frequency=np.concatenate([block.frequency for block in blocks]),
+        group_velocity=np.concatenate([block.group_velocity for block in blocks]),
+    )
+
+
 def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
     """Frequency in rad/s of ``band`` (from 1) at ``kappa``; ``sign`` -1 makes the lower edge a maximum."""
     return sign * float(bloch(cell, kappa).frequency[band - 1])
 
 
-def _maximum(function: Callable[[float], float], values: np.ndarray) -> tuple[float, float]:
-    """Argument in [0, pi] and value of a function's maximum: the best of its ``values`` on GRID, refined."""
+def _maximum(function: Callable[[float], float], values: np.ndarray, kappa: np.ndarray) -> tuple[float, float]:
+    """Argument in [0, pi] and value of a function's maximum: the best of its ``values`` at ``kappa``, refined."""
     best = int(np.argmax(values))
-    bracket = GRID[max(best - 1, 0)], GRID[min(best + 1, len(GRID) - 1)]
+    last = len(kappa) - 1
+    if last + 1 < len(GRID) and best in (0, last):
+        # Bands of long cells have their extremes at 0 and pi.
+        return float(kappa[best]), float(values[best])
+    bracket = kappa[max(best - 1, 0)], kappa[min(best + 1, last)]
     refined = minimize_scalar(lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10})
     if -refined.fun > values[best]:
         return refined.x, -refined.fun
     # A bounded search does not reach the ends of its bracket, where an extreme at 0 or pi lies.
-    return float(GRID[best]), float(values[best])
+    return float(kappa[best]), float(values[best])
 
 
 @lru_cache
 def pass_bands(cell: UnitCell) -> tuple[Band, ...]:
     """Pass bands, lowest first; edges are the extremes over kappa in [0, pi], refined off the grid."""
+    grid = _grid(cell)
     bands = []
-    for number, frequency in enumerate(bloch(cell, GRID).frequency.T, 1):
-        _, high = _maximum(partial(_frequency, cell, number), frequency)
-        _, low = _maximum(partial(_frequency, cell, number, sign=-1), -frequency)
+    for number, frequency in enumerate(grid.frequency.T, 1):
+        _, high = _maximum(partial(_frequency, cell, number), frequency, grid.kappa)
+        _, low = _maximum(partial(_frequency, cell, number, sign=-1), -frequency, grid.kappa)
         bands.append(Band(number=number, low=max(-low, 0.0), high=high))
     return tuple(bands)
 
@@ -97,20 +135,32 @@ def gaps(bands: Sequence[Band]) -> list[tuple[float, float]]:
 @lru_cache
 def max_group_velocity(cell: UnitCell, band: int) -> tuple[float, float, float]:
     """Wavenumber (rad per cell), frequency (rad/s) and |v_g| (cells/s) at which ``band`` (1-based) is fastest."""
-    speeds = np.abs(bloch(cell, GRID).group_velocity[:, band - 1])
-    fastest, largest = _maximum(lambda kappa: float(abs(bloch(cell, kappa).group_velocity[band - 1])), speeds)
+    grid = _grid(cell)
+    speeds = np.abs(grid.group_velocity[:, band - 1])
+    fastest, largest = _maximum(
+        lambda kappa: float(abs(bloch(cell, kappa).group_velocity[band - 1])), speeds, grid.kappa
+    )
     return fastest, _frequency(cell, band, fastest), largest
+
+
+@lru_cache
+def fastest_speed(cell: UnitCell) -> float:
+    """The largest group velocity of all bands in cells/s."""
+    speeds = np.abs(_grid(cell).group_velocity).max(axis=0)
+    (near,) = np.nonzero(speeds >= NEARLY_FASTEST * speeds.max())
+    return max(max_group_velocity(cell, int(band) + 1)[2] for band in near)
 
 
 @lru_cache
 def waves_at(cell: UnitCell, frequency: float) -> tuple[tuple[int, float, float], ...]:
     """Propagating waves of ``frequency`` (rad/s): (band, kappa in (0, pi), |v_g| in cells/s); () in a gap."""
     waves = []
-    for number, offset in enumerate((bloch(cell, GRID).frequency - frequency).T, 1):
+    grid = _grid(cell)
+    for number, offset in enumerate((grid.frequency - frequency).T, 1):
         for i in np.nonzero(offset[:-1] * offset[1:] <= 0)[0]:
             if offset[i] == 0 and i > 0:
                 continue  # a root on the grid, which the interval before has given
-            root = brentq(lambda x, n=number: _frequency(cell, n, x) - frequency, GRID[i], GRID[i + 1], xtol=1e-13)
+            root = brentq(lambda x, n=number: _frequency(cell, n, x) - frequency, *grid.kappa[i : i + 2], xtol=1e-13)
             speed = float(abs(bloch(cell, root).group_velocity[number - 1]))
             waves.append((number, root, speed))
     return tuple(waves)

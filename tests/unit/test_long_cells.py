@@ -1,0 +1,33 @@
+"""Cells of many masses: their bands cost the cube of the masses, with the edges and the speeds of the folded chain."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vipetsc.lattice import Spring, UnitCell, bands, fastest_speed, pass_bands
+
+
+def folded(masses: int) -> UnitCell:
+    """A chain of equal masses and springs, ``masses`` of them in a cell."""
+    springs = tuple(Spring(i, (i + 1) % masses, 1e4, next_cell=i == masses - 1) for i in range(masses))
+    return UnitCell(masses=(0.01,) * masses, springs=springs, host=0, resonator=1)
+
+
+@pytest.mark.parametrize("masses", [8, 40])
+def test_bands_of_a_folded_chain(masses):
+    """Band edges lie at j pi over the masses of the chain's own zone, the long waves are the fastest."""
+    top = 2 * np.sqrt(1e4 / 0.01)
+    edges = top * np.sin(np.arange(masses + 1) * np.pi / masses / 2)
+    found = pass_bands(folded(masses))
+    assert [band.low for band in found] == pytest.approx(edges[:-1].tolist(), rel=1e-6, abs=1e-2)
+    assert [band.high for band in found] == pytest.approx(edges[1:].tolist(), rel=1e-6, abs=1e-2)
+    assert fastest_speed(folded(masses)) == pytest.approx(top / 2 / masses, rel=1e-3)
+
+
+def test_the_fastest_speed_does_not_cost_a_grid_a_band(monkeypatch):
+    solved = []
+    original = bands.bloch
+    monkeypatch.setattr(bands, "bloch", lambda cell, kappa: solved.append(np.size(kappa)) or original(cell, kappa))
+    fastest_speed(folded(41))
+    assert sum(solved) < 3 * len(bands.GRID)
