@@ -44,7 +44,8 @@ class Browser:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        self.home, self.base = folder, f"http://127.0.0.1:{port}"
+        self.home = folder
+        self.base = f"http://127.0.0.1:{port}"
         log = (folder / "driver.log").open("w")
         self.driver = subprocess.Popen(
             ["chromedriver", f"--port={port}"], stdout=log, stderr=log, start_new_session=True
@@ -72,7 +73,8 @@ class Browser:
         switches = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
                     "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
                     f"--user-data-dir={self.home}/{len(self.sessions)}"]  # fmt: skip
-        phone = width < 600  # whose mouse is a finger
+        # The mouse of a phone is a finger.
+        phone = width < 600
         metrics = {
             "deviceMetrics": {"width": width, "height": height, "pixelRatio": 1.0, "mobile": phone, "touch": phone}
         }
@@ -103,8 +105,12 @@ class Browser:
     def drag(self, session: str, *places: tuple[float, float]) -> None:
         """The pressed mouse from the first of ``places`` (x, y in the window) to the others; one place: no button."""
         moves = [{"type": "pointerMove", "duration": 0, "x": round(x), "y": round(y)} for x, y in places]
-        down, up = [{"type": "pointerDown", "button": 0}], [{"type": "pointerUp", "button": 0}]
-        steps = moves if len(moves) == 1 else [moves[0], *down, *moves[1:], *up]
+        steps = moves
+        if len(moves) > 1:
+            down = {"type": "pointerDown", "button": 0}
+            up = {"type": "pointerUp", "button": 0}
+            steps = [moves[0], down, *moves[1:], up]
+
         self.call(f"{session}/actions", {"actions": [{"type": "pointer", "id": "mouse", "actions": steps}]})
 
     def processes(self) -> list[int]:

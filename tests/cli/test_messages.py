@@ -30,40 +30,51 @@ STAMP = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3}"
 
 
 def test_every_verb_has_an_example_that_it_takes(in_process):
+    """The example in each verb's help is understood by the parser, and its case file exists."""
     for verb in VERBS.values():
         words = shlex.split(verb.example.partition(" > ")[0])
         options = _parser().parse_args(words)
         assert options.verb == verb.name
         if getattr(options, "case", None):
             assert (ROOT / options.case).exists(), verb.example
+
     shown = in_process("law", "--help")
-    assert shown.returncode == 0 and "example: vipetsc law runs/law.toml" in shown.stdout
+    assert shown.returncode == 0
+    assert "example: vipetsc law runs/law.toml" in shown.stdout
 
 
 def test_quiet_tells_nothing_but_warnings(in_process, tmp_path):
+    """--quiet leaves warnings and refusals on stderr, and what a verb is called for on stdout."""
     ended = in_process("run", *TINY, "--out", tmp_path / "run", "--quiet")
-    assert ended.returncode == 0 and (tmp_path / "run/run.h5").exists()
+    assert ended.returncode == 0
+    assert (tmp_path / "run/run.h5").exists()
     assert ended.stdout == ""
     assert all(line.startswith("vipetsc: warning: ") for line in ended.stderr.splitlines())
+
     other = in_process("run", *TINY, "--out", tmp_path / "run", "--quiet", "--set", "drive.amplitude=3")
-    assert other.returncode == 2 and "holds another run" in other.stderr
-    assert "GB on a rank" in in_process("validate", "--quiet").stdout  # what is asked for
+    assert other.returncode == 2
+    assert "holds another run" in other.stderr
+
+    assert "GB on a rank" in in_process("validate", "--quiet").stdout
 
 
 def test_the_log_holds_all_that_is_told_with_its_time(in_process, tmp_path):
+    """The log has results and warnings with their times, whatever is printed, and later calls add to it."""
     log = tmp_path / "run.log"
     first = in_process("run", *TINY, "--out", tmp_path / "run", "--log", log, "--quiet")
     assert first.returncode == 0, first.stderr
     text = log.read_text()
     assert re.search(rf"^{STAMP} INFO complete: 101 samples", text, flags=re.M)
+
     second = in_process("run", *TINY, "--out", tmp_path / "run", "--set", "drive.amplitude=3", "--log", log)
     assert second.returncode == 2
-    assert log.read_text().startswith(text)  # it is added to
+    assert log.read_text().startswith(text)
     assert re.search(rf"^{STAMP} WARNING vipetsc: .*holds another run", log.read_text(), flags=re.M)
     assert not logging.getLogger("vipetsc").handlers
 
 
 def test_a_log_that_cannot_be_written_is_bad_input(in_process, tmp_path):
+    """A log in a folder that does not exist ends with exit code 2 before anything is written."""
     ended = in_process("run", *TINY, "--out", tmp_path / "run", "--log", tmp_path / "no" / "run.log")
     assert ended.returncode == 2
     assert ended.stderr.startswith(f"vipetsc: --log {tmp_path / 'no' / 'run.log'}: No such file")
@@ -71,43 +82,55 @@ def test_a_log_that_cannot_be_written_is_bad_input(in_process, tmp_path):
 
 
 def test_what_ends_a_verb_stands_in_its_log(in_process, tmp_path, monkeypatch):
+    """An exception that ends a verb is in the log as critical."""
+
     def fail(*arguments: object) -> int:
         raise RuntimeError("the disk is on fire")
 
     monkeypatch.setitem(VERBS, "doctor", replace(VERBS["doctor"], function=fail))
+
     with pytest.raises(RuntimeError):
         in_process("doctor", "--log", tmp_path / "log")
+
     assert re.search(rf"^{STAMP} CRITICAL vipetsc: the disk is on fire", (tmp_path / "log").read_text(), flags=re.M)
 
 
 def test_verbose_tells_phases_and_statistics(in_process, tmp_path):
+    """--verbose prints the phases of its own call and the integrator's statistics; the next call is as before."""
     ended = in_process("run", *TINY, "--out", tmp_path / "run", "--verbose")
     for text in ("set-up four-band", "claim ", "analyse", 'statistics {"samples": 101'):
         assert re.search(rf"^{re.escape(text)}", ended.stderr, flags=re.M), text
+
     after = in_process("run", *TINY, "--out", tmp_path / "more")
     assert "set-up" not in after.stderr
 
 
 @pytest.mark.parametrize(("quiet", "bar"), [(False, True), (True, False)])
 def test_a_bar_on_a_terminal_unless_quiet(monkeypatch, quiet, bar):
+    """On a terminal progress is a bar, which --quiet leaves out."""
     outer, inner = pty.openpty()
     termios.tcsetwinsize(inner, (24, 80))
+
     with os.fdopen(inner, "w") as terminal:
         monkeypatch.setattr(sys, "stderr", terminal)
         monkeypatch.setattr(logging.getLogger(BAR), "level", logging.CRITICAL if quiet else logging.NOTSET)
         progress = Progress(MPI.COMM_SELF, 1.0, "s")
         progress.update(0.5)
         progress.close()
+
+        # A terminal has no end of its own: this one is read up to a mark.
         terminal.write("end")
         terminal.flush()
         shown = b""
         while not shown.endswith(b"end"):
             shown += os.read(outer, 10_000)
     os.close(outer)
+
     assert (b" 50%|" in shown) == bar
 
 
 def test_lines_elsewhere_come_every_five_seconds(monkeypatch, caplog):
+    """Where stderr is no terminal, progress of 20 s is a line every five seconds of the clock."""
     now = [0.0]
     monkeypatch.setattr(parallel.time, "monotonic", lambda: now[0])
     with caplog.at_level(logging.INFO, logger="vipetsc"):
@@ -115,4 +138,5 @@ def test_lines_elsewhere_come_every_five_seconds(monkeypatch, caplog):
         for second in range(20):
             now[0] = float(second)
             progress.update(float(second))
+
     assert [record.getMessage().split("  ")[0].strip() for record in caplog.records] == ["25 %", "50 %", "75 %"]

@@ -23,13 +23,13 @@ pytestmark = pytest.mark.parallel(1)
 
 
 def example_case(name: str) -> Path:
-    """The case file of a verb's example."""
+    """Return the case file of a verb's example."""
     return ROOT / shlex.split(VERBS[name].example)[1]
 
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The sources of pictures that were asked for; nothing is drawn."""
+    """Keep the sources of pictures that are asked for, and draw nothing."""
     sources = []
 
     def draw(pictures, folders, comm, afresh):
@@ -57,6 +57,7 @@ def finish(case, work) -> Outcome:
 
 
 def test_the_case_of_every_verb_is_in_the_list_of_cases():
+    """The cases of the verbs are those that files are read as, and their results are a kind of folder."""
     assert {verb.case for verb in study_verbs()} == set(VERB_CASES)
     for verb in study_verbs():
         assert verb.name == verb.case.verb
@@ -65,6 +66,7 @@ def test_the_case_of_every_verb_is_in_the_list_of_cases():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_warnings_are_printed_once_and_the_folder_is_locked(call, monkeypatch, name):
+    """Warnings of the case and of the results are printed once each; the folder is locked while a study runs."""
     monkeypatch.setattr(VERBS[name].case, "warnings", lambda case: ["beware", "beware", "and mind the gap"])
 
     def study(case, work):
@@ -73,6 +75,7 @@ def test_warnings_are_printed_once_and_the_folder_is_locked(call, monkeypatch, n
         return Outcome()
 
     ended = call(name, study)
+
     assert ended.returncode == DONE, ended.stderr
     warnings = re.findall(r"^vipetsc: warning: (.*)$", ended.stderr, flags=re.M)
     assert warnings == ["beware", "and mind the gap", "of the result"]
@@ -80,30 +83,38 @@ def test_warnings_are_printed_once_and_the_folder_is_locked(call, monkeypatch, n
 
 @pytest.mark.parametrize("name", NAMES)
 def test_petsc_options_of_what_is_simulated_are_checked(call, tmp_path, name):
+    """A wrong PETSc option is refused before anything is written, by every verb that simulates."""
     ended = call(name, finish, "--set", "petsc.ts_rk_type=magic")
     if VERBS[name].case.load(example_case(name)).runs():
         assert ended.returncode == 2
         assert "petsc.ts_rk_type = 'magic'" in ended.stderr
         assert not (tmp_path / "out").exists()
     else:
-        assert name in ("nnm", "design")  # which step nothing by PETSc's options
+        # These step nothing by PETSc's options.
+        assert name in ("nnm", "design")
         assert ended.returncode == DONE
 
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_pictures_are_drawn_where_they_are_wanted_and_can_be(call, drawn, name):
+    """Pictures are drawn of results that can be, unless the case says not to."""
     ended = call(name, finish)
     assert drawn == [VERBS[name].pictures.source]
     assert "figures/picture.png" in ended.stdout
+
     assert call(name, lambda case, work: Outcome(drawable=False)).returncode == DONE
     assert len(drawn) == 1
-    if VERBS[name].case.verb not in ("nnm", "design"):  # which have no [output]
+
+    # The cases of these have no [output].
+    if VERBS[name].case.verb not in ("nnm", "design"):
         call(name, finish, "--set", "output.figures=false")
         assert len(drawn) == 1
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_exit_codes_say_how_a_study_ended(call, drawn, name):
+    """Failures and incomplete results end with 1 and are named; a request to stop ends with 75 and draws nothing."""
+
     def stop(case, work):
         work.stop.requested = True
         return Outcome()
@@ -112,6 +123,7 @@ def test_exit_codes_say_how_a_study_ended(call, drawn, name):
     assert failed.returncode == FAILED
     assert failed.stderr.endswith("vipetsc: curve 2: failed: no convergence\n")
     assert call(name, lambda case, work: Outcome(complete=False)).returncode == FAILED
+
     drawn.clear()
     stopped = call(name, stop)
     assert stopped.returncode == STOPPED
@@ -120,21 +132,25 @@ def test_exit_codes_say_how_a_study_ended(call, drawn, name):
 
 
 def test_validate_prints_the_table_of_the_verb_that_reads_the_case(in_process):
+    """The table has the rows that concern the verb, each once, and none of a run that the verb does not make."""
     response = in_process("validate", example_case("nfrc")).stdout
     assert re.search(r"^  nfrc +3 curves over the amplitude, 0.4 to 1.6 of the clearance$", response, flags=re.M)
     assert re.search(r"^  lattice +infinite, ", response, flags=re.M)
-    assert not re.search(r"^  (samples|burst, end|drive, end|engine|disk)", response, flags=re.M)  # of a run
+    # Rows of a run.
+    assert not re.search(r"^  (samples|burst, end|drive, end|engine|disk)", response, flags=re.M)
 
     prediction = in_process("validate", example_case("predict")).stdout
     assert re.search(r"^  predict +19 amplitudes, 17 to 1500 N$", prediction, flags=re.M)
     assert re.search(r"^  composed of +24 runs of one site ", prediction, flags=re.M)
     assert not re.search(r"^  law ", prediction, flags=re.M)
+    # Both run and predict read the case, and have the rows of the lattice in common.
     rows = re.findall(r"^  (\w[\w ]*?)  ", prediction, flags=re.M)
-    assert len(rows) == len(set(rows))  # run and predict read it, and share the rows of the lattice
+    assert len(rows) == len(set(rows))
 
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_results_are_recognised_by_their_file(tmp_path, name):
+    """A folder, and a file that has a fixed name, are recognised as the verb's results."""
     pictures = VERBS[name].pictures
     file = tmp_path / pictures.file.replace("*", "x")
     file.touch()
@@ -144,29 +160,35 @@ def test_results_are_recognised_by_their_file(tmp_path, name):
 
 
 def test_a_verb_may_have_nothing_to_draw(call, monkeypatch, drawn):
+    """A verb without pictures ends well and draws none."""
     monkeypatch.setitem(VERBS, "law", replace(VERBS["law"], pictures=None))
     assert call("law", finish).returncode == DONE
     assert drawn == []
 
 
 def test_only_sweeps_and_branches_share_a_page(tmp_path):
+    """Folders of branches, or with a sweep among them, are drawn together; others are refused."""
     folders = [tmp_path / "a", tmp_path / "b"]
     for folder in folders:
         folder.mkdir()
         (folder / "branch-x.h5").touch()
     assert pictures_of(folders)[0].source == "branches"
+
     (folders[0] / "ensemble.h5").touch()
     (folders[0] / "branch-x.h5").unlink()
     assert pictures_of(folders)[0].source == "sweep"
+
     (folders[0] / "ensemble.h5").rename(folders[0] / "law.h5")
     with pytest.raises(FolderError, match="only sweeps and folders of branches can share a page"):
         pictures_of(folders)
 
 
 def test_a_folder_that_holds_nothing_known_is_taken_for_a_run(tmp_path):
+    """An empty folder is looked at as a run, whose missing file is then named."""
     assert pictures_of([tmp_path])[0].source == "run"
 
 
 def test_the_verb_of_a_case_is_found_by_its_class():
+    """A case leads to the verb that it was read for."""
     assert verb_of(Case.load(example_case("run"))) is VERBS["run"]
     assert verb_of(VERBS["predict"].case.load(example_case("predict"))) is VERBS["predict"]
