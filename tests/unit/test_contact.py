@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-import vipetsc
 from vipetsc.contact import changes, search
 from vipetsc.contact.law import (
     CLIPPED,
@@ -356,59 +354,3 @@ def test_a_site_found_beyond_its_clearance_is_in_contact_even_if_it_recedes():
     assert tracker.switch(0.0, np.zeros(1)) == 1
     assert tracker.contacts["mode"].tolist() == [CLOSED]
     assert tracker.counts["grazes"].sum() == 0
-
-
-def integrated_restitution(contact: Contact) -> float:
-    """Speed after an impact over the speed before it, by the compiled force."""
-    speed = 0.3
-    contacts = closed_sites(contact, 1, speed)
-
-    def rates(t: float, z: np.ndarray) -> list[float]:
-        return [z[1], -contact_force(contacts, 0, CLEARANCE + z[0], z[1])[0] / MASS]
-
-    def separates(t: float, z: np.ndarray) -> float:
-        # It begins at zero, too.
-        return z[0] if t > 1e-6 else 1.0
-
-    separates.terminal = True
-    separates.direction = -1
-    impact = solve_ivp(rates, (0, 1), [0.0, speed], rtol=1e-11, atol=1e-14, events=separates, first_step=2e-6)
-    return -impact.y[1, -1] / speed
-
-
-@LAWS
-@pytest.mark.parametrize(
-    ("asked", "effective"), [(0.0, 0.4877413), (0.3, 0.5812880), (0.5, 0.6629622), (0.7, 0.7679998), (0.9, 0.9090157)]
-)
-def test_the_papers_damping_returns_more_than_is_asked(law, asked, effective):
-    contact = Contact(law, STIFFNESS, asked)
-    assert integrated_restitution(contact) == pytest.approx(contact.effective_restitution, rel=1e-6)
-    assert contact.effective_restitution == pytest.approx(effective, rel=1e-6)
-
-
-@LAWS
-@pytest.mark.parametrize("asked", [0.1, 0.3, 0.5, 0.7, 0.9])
-def test_the_exact_damping_returns_what_is_asked(law, asked):
-    contact = Contact(law, STIFFNESS, asked, factor="exact")
-    assert integrated_restitution(contact) == pytest.approx(contact.effective_restitution, rel=1e-6)
-    assert contact.effective_restitution == pytest.approx(asked, rel=1e-6)
-
-
-def test_the_exact_damping_meets_every_restitution():
-    asked = np.linspace(0.05, 1, 200)
-    found = [Contact("hertz", STIFFNESS, restitution, factor="exact").effective_restitution for restitution in asked]
-    assert found == pytest.approx(asked, abs=1e-7)
-
-
-def test_the_manual_has_a_table_of_effective_restitutions():
-    lines = (Path(vipetsc.__file__).parent / "manual/case-file.md").read_text(encoding="utf-8").splitlines()
-    first = next(number for number, line in enumerate(lines) if line.startswith("| restitution"))
-
-    def numbers(line: str) -> list[float]:
-        return [float(cell) for cell in line.split("|")[2:-1]]
-
-    # The line between the two is the table's rule.
-    asked = numbers(lines[first])
-    printed = numbers(lines[first + 2])
-    found = [round(Contact("hertz", STIFFNESS, restitution).effective_restitution, 3) for restitution in asked]
-    assert found == printed
