@@ -154,3 +154,12 @@ def test_all_modes_of_a_lattice_may_be_asked_for():
     assert np.all(np.diff(modes.frequency) > 0)
     assert modes.residual.max() < 1e-9
     matrices.destroy()
+
+
+def test_all_modes_but_one_may_be_asked_for():
+    """The search for further copies is then left with one dimension."""
+    matrices = matrices_of("fixed", 4)
+    modes = modes_near(matrices, matrices.rows - 1, 0.5)
+    assert len(modes.frequency) == matrices.rows - 1
+    assert modes.residual.max() < 1e-9
+    matrices.destroy()

@@ -68,7 +68,9 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     pairs: list[tuple[float, PETSc.Vec]] = []
     wanted = count
     while wanted:
-        eps.setDimensions(wanted, min(max(3 * wanted, 20), matrices.rows - len(pairs)))
+        # SLEPc wants one vector more than modes, if there is one, also where the last mode alone is left.
+        left = max(matrices.rows - len(pairs), min(wanted + 1, matrices.rows))
+        eps.setDimensions(wanted, min(max(3 * wanted, 20), left))
         eps.setTolerances(TOLERANCE, COPY_RESTARTS if pairs else RESTARTS)
         eps.setDeflationSpace([vector for _, vector in pairs])
         eps.solve()
