@@ -289,6 +289,12 @@ def describing_amplitude(forces: SiteForces, place: int, g: float, omega: float)
 
     Raises ContinuationError where there is none.
     """
+    spring = place - len(forces.contacts)
+    if spring >= 0 and forces.springs[spring].cubic == 0:
+        raise ContinuationError(
+            f"no breather begins at {omega:g} rad/s on a spring without a cubic part: of a harmonic motion its "
+            "quadratic force has a mean and a second harmonic alone; give it a cubic part, or begin at another place"
+        )
     z = np.zeros((forces.pairs, 2), complex)
 
     def balance(amplitude: float) -> float:

@@ -281,13 +281,13 @@ class SiteForces:
     def amplitude_scale(self, place: int, g: float) -> float:
         """Amplitude in m at which the pair ``place`` with the compliance ``g`` in m/N begins to feel its force.
 
-        That of a contact is the clearance. For a spring |g c| a^2 = 1, with its cubic coefficient c (1 m if that is 0):
-        of its force at z = a cos theta only the cubic part has a first harmonic.
+        That of a contact is the clearance. For a spring |g c| a^2 = 1, with its cubic coefficient c, which is not 0: of
+        its force at z = a cos theta only the cubic part has a first harmonic.
         """
         if place < len(self.contacts):
             return self.contacts[place][1]
         cubic = self.springs[place - len(self.contacts)].cubic
-        return float(1 / np.sqrt(np.abs(g * cubic) or 1.0))
+        return float(1 / np.sqrt(np.abs(g * cubic)))
 
     def series(self, z: np.ndarray, omega: float) -> ForceSeries:
         """The forces of elongations with the harmonics ``z`` (pairs, K + 1) complex in m, at ``omega`` in rad/s.
