@@ -33,6 +33,13 @@ def write_branch(branch: Branch[Any], folder: Path, about: dict[str, Any]) -> No
     write_netcdf(folder / f"branch-{branch.name}.h5", to_dataset(branch).assign_attrs(about))
 
 
+def restore_table(branch: Branch[Any], folder: Path) -> None:
+    """Write the ``.csv`` of a branch whose HDF5 file is there if somebody has removed it."""
+    path = folder / f"branch-{branch.name}.csv"
+    if not path.exists():
+        write_text(path, str(LAYOUTS[branch.kind].table(branch)))
+
+
 def to_dataset(branch: Branch[Any]) -> xr.Dataset:
     """The branch as the dataset of its file."""
     layout = LAYOUTS[branch.kind]

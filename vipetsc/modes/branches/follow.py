@@ -17,7 +17,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.io.folder import BRANCHES, Claim, claimed, provenance
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.condensed import CondensedMethod
-from vipetsc.modes.branches.files import read_branch, write_branch
+from vipetsc.modes.branches.files import read_branch, restore_table, write_branch
 from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.method import CrossingBranch, Method
 from vipetsc.modes.branches.orbits import ShootingMethod
@@ -244,6 +244,8 @@ class Follower:
             try:
                 # Read by one rank: the others must not find another file, or none.
                 branch = on_root(self.comm, lambda: read_branch(path))
+                # A branch that is complete is not written again, and its table would stay away.
+                on_root(self.comm, lambda: restore_table(branch, self.folder))
                 return replace(branch, case=self.case.to_toml(), about=fresh.about, extra=fresh.extra)
             except OSError as error:
                 logger.warning("vipetsc: warning: %s; made again", error)
