@@ -98,7 +98,7 @@ def test_pictures_again_from_the_file_alone(in_process, case, tmp_path):
     (bare / "design.h5").write_bytes(b"nothing")
     broken = in_process("plot", bare)
     assert broken.returncode == 2
-    assert "is not a search" in broken.stderr
+    assert "cannot be opened as a search" in broken.stderr
 
 
 def test_a_grid_without_a_good_cell_says_so(in_process, case, tmp_path):

@@ -40,12 +40,21 @@ def test_a_request_while_modules_load_is_one(tmp_path, number):
     path = os.pathsep.join([str(tmp_path), *sys.path])
     environment = clean_environment() | {"PYTHONPATH": path}
     command = [sys.executable, "-m", "vipetsc", "doctor"]
+
+    def listen() -> None:
+        # A shell may have started the tests with signals ignored, as it does in the background.
+        signal.signal(number, signal.SIG_DFL)
+
     with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=listen
     ) as process:
-        assert process.stdout.readline() == "loading\n"
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=60)
+        try:
+            assert process.stdout.readline() == "loading\n"
+            process.send_signal(number)
+            _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+
     assert process.returncode == 75
     assert errors == "vipetsc: stopped on request\n"
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vipetsc.case import Case, CaseError, Sweep
-from vipetsc.case.sweep import coordinate
+from vipetsc.case.sweep import MOST_TRIED_SITES, coordinate
 
 BASE = """
 name = "small"
@@ -211,3 +211,16 @@ def test_a_member_is_made_once():
     assert plan.member(1) is members[1]
     assert plan.members()[1] is members[1]
     assert plan.model_copy(update={"name": "other"}).member(1) is not members[1]
+
+
+def test_fewer_members_of_many_sites_are_tried_before_a_sweep_begins():
+    """The members by which a sweep is checked have a bounded number of sites together, and one is always tried."""
+    few = sweep_of("[sweep.drive]\namplitude = { linear = [1, 2], count = 60 }\n[contacts]\nsites = 2")
+    assert len(few.tried()) == 60
+
+    many = "[sweep.drive]\namplitude = {{ linear = [1, 2], count = 60 }}\n[contacts]\nsites = {sites}"
+    table = tomllib.loads(BASE.replace("cells = 40", "cells = 300000") + many.format(sites=10_000))
+    assert len(Sweep.from_table(table).tried()) == MOST_TRIED_SITES // 10_000
+
+    table["contacts"]["sites"] = MOST_TRIED_SITES + 1
+    assert len(Sweep.from_table(table).tried()) == 1

@@ -39,7 +39,7 @@ def test_a_tape_marks_the_substep_in_which_a_contact_begins():
     """An onset equals a substep's beginning where they differ by roundings, since they were summed in other orders."""
     cluster = mass_on_stop()
     timed = timed_onsets(cluster.interval)
-    tape = create_tape(1, len(timed), NODES)
+    tape = create_tape(1, len(timed))
     cluster = cluster._replace(tape=tape)
 
     for each in timed:
@@ -53,7 +53,7 @@ def test_a_tape_marks_the_substep_in_which_a_contact_begins():
 
 def test_a_tape_holds_the_closed_sites_of_a_substep_and_counts_rows_beyond_its_end():
     """A row holds the substep and the motion of its closed site; rows beyond the last are counted alone."""
-    tape = create_tape(1, 2, NODES)
+    tape = create_tape(1, 2)
     cluster = mass_on_stop()
     # Two sites, of which the second one is closed.
     cluster = cluster._replace(

@@ -73,17 +73,40 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
     """Rows (sample, 2) of time in s and value; raises OSError, ValueError or KeyError."""
     if dataset is not None:
         with h5py.File(path, "r") as file:
-            rows = np.asarray(file[str(dataset)], float)
+            values = file[str(dataset)]
+            if not isinstance(values, h5py.Dataset):
+                raise ValueError(f"{dataset} is no data set")
+            # Before it is read: a file may hold more than the memory.
+            _check_shape(values.shape)
+            rows = np.asarray(values, float)
     else:
-        # utf-8-sig: editors on Windows begin files with a byte order mark, which is no number.
-        lines = [re.split(r"[,;\s]+", line.strip()) for line in path.read_text(encoding="utf-8-sig").splitlines()]
-        lines = [line for line in lines if line[0] and not line[0].startswith("#")]
+        lines = _table_lines(path)
         # A table may begin with a line of names.
         has_header = bool(lines) and not re.match(r"[-+.\d]", lines[0][0])
         try:
             rows = np.array(lines[1:] if has_header else lines, float)
         except ValueError:
             raise ValueError("is no table of numbers: time and value in two columns are needed") from None
-    if rows.ndim != 2 or rows.shape[1] != 2 or len(rows) > MOST_SAMPLES:
-        raise ValueError(f"holds {rows.shape} numbers; time and value in two columns, {MOST_SAMPLES} rows at most")
+    _check_shape(rows.shape)
     return rows
+
+
+def _table_lines(path: Path) -> list[list[str]]:
+    """The words of a table's lines without comments, of a table that is too long its beginning."""
+    lines = []
+    # utf-8-sig: editors on Windows begin files with a byte order mark, which is no number.
+    with path.open(encoding="utf-8-sig") as file:
+        for text in file:
+            words = re.split(r"[,;\s]+", text.strip())
+            if words[0] and not words[0].startswith("#"):
+                lines.append(words)
+            # Two more than the samples: a line of names, and one by which the table is too long.
+            if len(lines) == MOST_SAMPLES + 2:
+                break
+    return lines
+
+
+def _check_shape(shape: tuple[int, ...]) -> None:
+    """Raise ValueError for numbers of another ``shape`` than two columns of samples, no more than are allowed."""
+    if len(shape) != 2 or shape[1] != 2 or shape[0] > MOST_SAMPLES:
+        raise ValueError(f"holds {shape} numbers; time and value in two columns, {MOST_SAMPLES} rows at most")

@@ -20,7 +20,9 @@ from vipetsc.case.disorder import SEED
 from vipetsc.case.schema import number
 
 MOST_MEMBERS = 1_000_000
-MOST_TRIED = 1_000  # members whose cases are resolved to check a sweep before it begins
+# Members whose cases are resolved to check a sweep before it begins, and sites that they have together.
+MOST_TRIED = 1_000
+MOST_TRIED_SITES = 200_000
 Values = dict[str, tuple[Any, ...]]  # what each key takes in turn; an axis has those of keys that vary together
 
 
@@ -190,9 +192,23 @@ class Sweep(CaseFile):
             raise CaseError(members[0].problems, self.name)
         return members
 
+    def tried(self) -> list[SweepMember]:
+        """The members by which a sweep is checked before it begins; raises CaseError as ``members`` does.
+
+        Each member resolves all of its sites: where these are many, fewer members are tried, and the others are checked
+        when they begin.
+        """
+        most = MOST_TRIED
+        first = self.member(0).case
+        if first is not None:
+            assert isinstance(first.contacts.sites, list)  # as those of a resolved case are
+            most = min(most, MOST_TRIED_SITES // max(1, len(first.contacts.sites)))
+        most = max(1, most)
+        return self.members(most)
+
     def runs(self) -> list[CaseFile]:
         """The valid cases among the members that are tried."""
-        return [member.case for member in self.members(MOST_TRIED) if member.case]
+        return [member.case for member in self.tried() if member.case]
 
     @property
     def wants_pictures(self) -> bool:

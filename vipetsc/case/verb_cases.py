@@ -12,7 +12,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
-from vipetsc.case.sweep import MOST_TRIED, Sweep
+from vipetsc.case.sweep import Sweep
 
 VERB_CASES: tuple[type[CaseFile], ...]
 VERB_CASES = (Case, Sweep, NnmCase, DesignCase, LawCase, OptimiseCase, PredictCase, NfrcCase)
@@ -41,7 +41,7 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
             case = kind.from_table(table, overrides, source)
             if isinstance(case, Sweep):
                 # The sweep may give what a run lacks: a member replaces the run, whose problems do not count.
-                possible = [member.case for member in case.members(MOST_TRIED) if member.case]
+                possible = [member.case for member in case.tried() if member.case]
                 cases = cases or [*possible[:1]]
                 problems = {}
             cases.append(case)
@@ -71,7 +71,7 @@ def disorder_of(
     table, _ = with_overrides(_table(path)[0], overrides)
     if "sweep" in table:
         plan = next((case for case in cases if isinstance(case, Sweep)), None) or Sweep.from_table(table)
-        first = next(member for member in plan.members(MOST_TRIED) if member.case)
+        first = next(member for member in plan.tried() if member.case)
         table, _ = plan.member_table(first.index)
     if "disorder" not in table:
         return None

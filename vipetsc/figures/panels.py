@@ -64,7 +64,7 @@ def log_norm(*fields: ArrayLike, decades: float = DECADES) -> LogNorm:
 
 
 def percentile_norm(fields: Iterable[xr.DataArray]) -> Normalize:
-    """Return colours from the lowest to the highest percentile of what is finite in the ``fields``."""
+    """Return colours from the 2nd to the 99.8th percentile of what is finite in the ``fields``."""
     values = np.concatenate([np.ravel(field) for field in fields])
     finite = values[np.isfinite(values)]
     low, high = np.percentile(finite if finite.size else 0, (2, 99.8))
@@ -115,7 +115,10 @@ def recorded_sites(run: xr.Dataset, cells: np.ndarray | None = None) -> np.ndarr
 def mark_sites(
     axes: Axes, run: xr.Dataset, colour: str = "white", along: str = "y", cells: np.ndarray | None = None
 ) -> None:
-    """Draw dotted lines at the ``recorded_sites`` if these are few, and triangles on the edge ``along`` the cells."""
+    """Draw dotted lines at the ``recorded_sites`` if these are few, and triangles at the edge.
+
+    ``along`` is the axis of the cells, "x" or "y".
+    """
     sites = recorded_sites(run, cells)
     edge = np.full(len(sites), 0.02)
     look = {"color": style.SKY, "mec": "white", "mew": 0.3, "ms": 3.5, "ls": "", "label": "contact sites"}
@@ -136,6 +139,7 @@ def indentations(run: xr.Dataset, model: Model) -> np.ndarray:
     stops = model.gaps or [(gap, gap) for gap in chain.clearances]
     depth = []
     for cell, pair, (plus, minus) in zip(chain.sites, chain.contact_pairs, stops, strict=True):
+        # The resonator may be in the next cell, that of a ring's last cell in its first.
         w = u[:, (cell + pair.next_cell) % chain.cells, pair.resonator]
         if pair.host >= 0:  # a contact with the ground has no host
             w = w - u[:, cell, pair.host]
@@ -191,9 +195,10 @@ def note(axes: Axes, text: str, at: Sequence[float], shift: tuple[float, float],
 
 
 def shade_regions(axes: Axes, energy: np.ndarray, region: np.ndarray, left: float, at_top: bool) -> None:
-    """Shade the regions I-IV (1-4) of energy (J) of a branch's points, named at the top or the bottom of the panel.
+    """Shade the regions I-IV of a branch on the axis of energy, with their names at the top or the bottom of the panel.
 
-    Each begins where the one below it ends, the first at ``left``.
+    ``energy`` (J) and ``region`` (1-4) are those of the branch's points. Each region is shaded from where the one below
+    it ends, the first from ``left``, to the largest energy of its points.
     """
     height = 0.985 if at_top else 0.015
     look = {"ha": "center", "va": "top" if at_top else "bottom", "color": style.GREY}

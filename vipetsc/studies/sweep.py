@@ -16,7 +16,6 @@ import numpy as np
 
 import vipetsc
 from vipetsc.case import Case, Sweep
-from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import SWEEP, FolderError, claimed
 from vipetsc.io.read import outdated
@@ -78,7 +77,7 @@ def run_sweep(
     Raises CaseError if no member is a valid case (of those drawn, where they are many), FolderError if the folder holds
     anything but this sweep.
     """
-    on_root(comm, lambda: plan.members(MOST_TRIED)[:0])  # raises; the cases are not sent
+    on_root(comm, lambda: plan.tried()[:0])  # raises; the cases are not sent
     with claimed(comm, folder, SWEEP, plan.to_toml(), force=force, resume=resume) as claim:
         reason = on_root(comm, lambda: outdated(claim.folder))
         if reason:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vipetsc.case import Sweep
-from vipetsc.case.sweep import MOST_TRIED
 from vipetsc.cli.arguments import OF_STUDIES, case_with
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import table
@@ -32,8 +31,7 @@ def simulate_members(plan: Sweep, work: Work) -> Outcome:
 
 def sweep_rows(plan: Sweep, ranks: int) -> Rows:
     """Number of members of a sweep, and of those tried that are no valid cases."""
-    # A sweep may have a million members, of which each takes milliseconds to resolve.
-    tried = plan.members(MOST_TRIED)
+    tried = plan.tried()
     impossible = sum(member.case is None for member in tried)
     counts = " x ".join(map(str, plan.shape))
     of = "them" if len(tried) == plan.count else len(tried)

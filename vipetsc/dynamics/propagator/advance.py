@@ -7,9 +7,9 @@ a shorter one. ``advance_cluster`` returns at each change, at which ``forces`` s
 step. While no site is closed and no drive is on, the motion is a polynomial and the cluster goes to its first onset at
 once (sec. 2).
 
-Contacts that touch or are pressed at rest have no modes to switch: their force is that of max(x, 0), x the indentation,
-and not smooth where they open or close. Substeps end on such a *kink* as well, but without a landing: near an end of
-the substep the nodes see little of it.
+Contacts that touch or are pressed at rest stay in the mode ``PERMANENT``: their force is that of max(x, 0), x the
+indentation, and not smooth where they open or close. Substeps end on such a *kink* as well, but without a landing: a
+kink that lies a little inside the substep's end hardly changes the integral of the force.
 """
 
 import numpy as np
@@ -45,21 +45,24 @@ from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, write_
 DONE, CHANGED, RESTS, FAILED = range(4)
 
 MOST_SUBSTEPS = 20_000
-# Longest substep in radians of the fastest oscillation, where sites are searched for changes: the quintic that the
-# search sees misses (omega h)^6/46080 of an oscillation's amplitude, 9e-8 at this length.
+# Longest substep where sites are searched for changes, in radians of the sum of the highest frequencies of lattice and
+# drives, a bound of all rates: the quintic that the search sees misses (omega h)^6/46080 of an oscillation's amplitude,
+# 9e-8 at this length.
 SEARCHED = 0.4
-# ... and where a drive alone acts: nothing is searched, and eight nodes integrate longer waves to rounding.
+# ... and where a drive alone acts: nothing is searched, and eight nodes integrate a sine over 1.25 rad to rounding.
 DRIVEN = 1.25
 # Longest substep of a contact in ages of the contact. Hertz's force goes as the power 3/2 of the age: plain nodes
 # integrate that over 1.5 ages to 3e-14 of it, over 3 ages to 1e-11.
 MOST_AGES = 1.5
 # A contact is new below this fraction of its duration.
 NEW = 1e-7
-# Fraction of a step that is too short for anything to happen.
+# Longest substep, as a fraction of the step, that is taken without a search for changes.
 BLIND = 1e-7
-# Shortest substep, as a fraction of the step, that is rejected for its error or cut for an onset.
+# Shortest substep, as a fraction of the step, that is rejected for its error, cut at a kink, or halved because a
+# contact both begins and ends in it.
 SHORTEST = 1e-9
-# Order by which the substep follows its error: the last coefficients fall as h^6 and h^7, times the substep's length.
+# Order by which the substep follows its error: the last coefficients fall as h^6 and h^7, and the error is their sum
+# times the substep's length. Of the orders 7 and 8 the higher one changes the length less.
 ORDER = 8.0
 # What of the length that would just be allowed is tried, and bounds of its growth.
 SAFETY = 0.9
@@ -122,7 +125,8 @@ def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
         return False
     update_taylor(cluster, trial, substep)
     state = cluster.state[0]
-    # Drives are evaluated at the cluster's position: for a moment that is the substep's end.
+    # Drives are evaluated at the cluster's position, which is the substep's end for this call. Taking the length off
+    # again may leave a rounding error in it, for which comparisons of times allow (SAME_TIME).
     state.position += substep.length
     evaluate_site_motion(cluster, trial.taylor, trial.site_motion)
     state.position -= substep.length
@@ -131,12 +135,13 @@ def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
 
 @kernel
 def first_kink(cluster: Cluster, trial: Trial, length: float) -> float:
-    """Position, as a fraction of a substep tried, at which the first contact without modes opens or closes.
+    """Position, as a fraction of a substep tried, at which the first permanent contact opens or closes.
 
     2 if none does inside.
     """
     first = 2.0
     c = trial.sums.bernstein[0]
+    # `closed` are all sites that are not free: a permanent one may be open.
     for i in trial.closed:
         site = cluster.contacts[i]
         if abs(site.mode) < PERMANENT:
@@ -162,9 +167,9 @@ def first_kink(cluster: Cluster, trial: Trial, length: float) -> float:
 
 @inlined
 def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
-    """Repeat a substep just tried to end where a contact without modes first opens or closes; the one that is tried.
+    """Repeat a substep just tried so that it ends where a permanent contact first opens or closes inside it.
 
-    One of negative length could not be collocated.
+    Returns the substep that is now in ``trial``; its length is negative if it could not be collocated.
     """
     state = cluster.state[0]
     for _ in range(MOST_ATTEMPTS):
@@ -181,7 +186,10 @@ def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
 
 @kernel
 def _land(cluster: Cluster, trial: Trial, substep: Substep, change: ModeChange) -> tuple[float, bool]:
-    """Repeat a substep to end on a ``change``; the length taken, negative if it could not be, whether it was met."""
+    """Repeat a substep so that it ends on a ``change``.
+
+    Returns its length, with a minus sign if it could not be collocated, and whether it ends on the change.
+    """
     contacts = cluster.contacts
     site = change.site
     h = cluster.interval
@@ -197,6 +205,7 @@ def _land(cluster: Cluster, trial: Trial, substep: Substep, change: ModeChange) 
         end = switching(contacts, site, change.function, trial.site_motion[site])
         landing, outcome = correct(landing, end.value, end.rate * h, end.tolerance, LANDING_GOAL * end.tolerance)
         if outcome == SEARCH:
+            # A change of whichever site lies before: this site's change is then sought in what is left before it.
             seconds = h * landing.length
             earlier = first_change(contacts, cluster.site_motion, trial.site_motion, seconds, trial.sums.bernstein)
             if earlier.position > 1.0:
@@ -208,9 +217,10 @@ def _land(cluster: Cluster, trial: Trial, substep: Substep, change: ModeChange) 
 
 @inlined
 def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[Substep, bool, int]:
-    """Search a substep just tried and land on its first change: the substep taken, whether it was met, the site.
+    """Search a substep just tried, and land on its first change if there is one.
 
-    A substep of negative length was rejected; ``state.length`` has the next one to try.
+    Returns the substep to be taken, whether it ends on the change, and the site of the change, else -1. A substep of
+    negative length is to be tried again with ``state.length``.
     """
     state = cluster.state[0]
     seconds = cluster.interval * substep.length
@@ -221,7 +231,8 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
     site = cluster.contacts[change.site]
     separates = not begins_linearly(site.elastic) and abs(site.mode) == CLOSED and change.function == 0
     if separates and substep.kind == ONSET and substep.length > SHORTEST:
-        # The force begins and ends as a power 3/2, and nodes suit one end: a substep for each.
+        # The force begins and ends as a power 3/2. ONSET nodes suit its beginning, EXIT nodes its end: with half the
+        # length each gets a substep of its own.
         state.length = 0.5 * change.position * substep.length
         return Substep(ONSET, -1.0), False, -1
     kind = EXIT if separates else substep.kind
@@ -332,12 +343,16 @@ def _take(cluster: Cluster, trial: Trial, substep: Substep) -> None:
 def advance_cluster(cluster: Cluster, may_rest: bool) -> tuple[int, int]:
     """Advance a cluster to the first change of modes or to the step's end.
 
-    Returns ``DONE``, ``CHANGED`` (``cluster`` stands behind it), ``RESTS``, if it ``may_rest``, or ``FAILED``, and the
-    site of a change that was met before the site had moved from where it had landed, else -1.
+    Returns how it ended, and a site or -1. ``DONE``: at the step's end. ``CHANGED``: the cluster stands on a change of
+    modes, and the caller switches the sites whose switching functions say so; the site is one that changes again before
+    it has moved from where it last landed. ``RESTS``: that site is to rest instead. Without ``may_rest`` this is
+    returned only after such a change was met twice, the first time at the substep's very beginning. ``FAILED``: no
+    progress.
     """
     state = cluster.state[0]
     room = cluster.trial
-    # The workspace has served other clusters, on each rank others: the iteration must begin alike on all.
+    # The workspace has served other clusters before, and which ones depends on the rank. The iteration begins from
+    # zero, so that the bits do not depend on the number of ranks.
     room.force[:] = 0.0
     room.w[:] = 0.0
     room.v[:] = 0.0
@@ -375,7 +390,8 @@ def advance_cluster(cluster: Cluster, may_rest: bool) -> tuple[int, int]:
         if site >= 0 and not _has_stayed(cluster, trial, site, substep.length):
             site = -1
 
-        # A change at the very start that is none: past it.
+        # A change at the very start at which the switching function does not rise is none: the next substep is taken
+        # without a search, and so short that no change is missed.
         blind = substep.length == 0.0 and not landed
         if blind and site >= 0:
             if may_rest:

@@ -23,8 +23,9 @@ SUBSTEP_STATE = np.dtype(
     [(name, float) for name in ("begin", "position", "length")] + [(name, np.int64) for name in COUNTS]
 )
 """Where a cluster stands, a record in an array, so that compiled code can change it: the time in s at which the step
-begins; the position in the step and the length of the next substep, both in units of H; counts of substeps tried, of
-those rejected, of landings and of switches of a mode."""
+begins; the position in the step and the length of the next substep, both in units of H; counts of substeps tried,
+without their repetitions that end on a kink or a change, of those rejected, of landings begun and of switches of a
+mode."""
 
 HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
 """A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
@@ -37,7 +38,7 @@ TAPE_ROW = np.dtype(
 substep in units of H; w'_minus of the contact and, at the substep's beginning, w' in m/s and w'' in m/s^2; the kind of
 nodes; the site's number in its cluster; its mode; whether the contact begins with this substep."""
 
-# Two times that were summed in another order differ by a few roundings.
+# Two equal times that were summed in another order differ by this many roundings of their size at the most.
 SAME_TIME = 4.0
 
 
@@ -53,9 +54,9 @@ class Sums(NamedTuple):
 
     At the nodes: ``free_w`` and ``free_v`` (dof, node) of the free motion; ``to_w`` and ``to_v`` (dof, source, node of
     the source, node) of a unit force, for pairs that ``reaches`` (dof, source) marks; ``w`` and ``v`` (node,) of one
-    DoF. Besides, ``forces`` (dof,) at one time, ``moments`` (2 term,) of one DoF's force about the substep's end, what
-    each term of a response makes of them in powers of s, ``series`` (2 term, 2 term), and Bernstein coefficients
-    ``bernstein`` (2, 6) of w.
+    DoF. Besides, ``forces`` (dof,) at one time; ``moments`` (2 term,) of one DoF's force about the substep's end;
+    ``series`` (2 term, 2 term), whose row k is the polynomial in s that term k of a response makes of these moments;
+    and ``bernstein`` (2, 6), the coefficients of two quintics for w.
     """
 
     free_w: np.ndarray
@@ -74,8 +75,8 @@ class Sums(NamedTuple):
 class Trial(NamedTuple):
     """A substep that has been computed but not yet taken.
 
-    Forces act on the DoFs ``active``: first the sites in contact, ``closed``, then masses whose drive is on. ``force``
-    in N, ``w`` in m and ``v`` in m/s (dof, node) are those at its nodes; ``taylor`` and ``site_motion`` are
+    Forces act on the DoFs ``active``: first the sites that are not free, ``closed``, then masses whose drive is on.
+    ``force`` in N, ``w`` in m and ``v`` in m/s (dof, node) are those at its nodes; ``taylor`` and ``site_motion`` are
     as in ``Cluster``, at its end.
     """
 
@@ -105,10 +106,11 @@ class Cluster(NamedTuple):
     """A cluster, or all clusters of a rank one after another: constants, and what changes as it is advanced.
 
     The DoFs of a cluster are its sites, which ``contacts`` (site,) describe, and then the driven masses in reach.
-    ``drives`` has a row for every DoF; those of sites drive nothing. ``response`` (dof, dof of the same cluster, term)
-    is the motion of one after an impulse on another, times H, in powers 2 m + 1 of s, with dashpots m + 1 (2 term - 1
-    of them). ``interval`` is H in s; ``rtol`` and ``atol`` (m/s) bound the error of a substep; a contact begins with
-    the fraction ``first_substep`` of its duration.
+    ``drives`` has a row for every DoF; those of sites drive nothing. ``response`` (dof, dof of the same cluster, term):
+    term m is the coefficient of s^(2 m + 1), s the time over H, in the displacement of the first DoF after a unit
+    impulse on the second one, times H; with dashpots that of s^(m + 1), m < 2 term - 1. ``interval`` is H in s;
+    ``rtol`` and ``atol`` (m/s) bound the error of a substep; a contact begins with the fraction ``first_substep`` of
+    its duration.
 
     ``taylor`` (dof, 2 term) is the series of the free motion about the present position, ``site_motion`` (dof, 3) has
     w, w', w'' of the sites there. ``moments`` (dof, 2 term) in N s are those of the step's forces about its end,
@@ -162,11 +164,11 @@ def create_trial(dofs: int, terms: int) -> Trial:
     )
 
 
-def create_tape(clusters: int, rows: int, nodes: int = 0) -> Tape:
+def create_tape(clusters: int, rows: int) -> Tape:
     """Create an empty tape; nothing is written on one without ``rows``."""
     return Tape(
         rows=np.zeros((clusters, rows), TAPE_ROW),
-        motion=np.zeros((clusters, rows, 2, nodes)),
+        motion=np.zeros((clusters, rows, 2, NODES)),
         used=np.zeros(clusters, np.int64),
     )
 
@@ -174,7 +176,7 @@ def create_tape(clusters: int, rows: int, nodes: int = 0) -> Tape:
 @njit(error_model="numpy")
 def _select_tape(tape: Tape, c: int) -> Tape:
     """The tape of cluster ``c``."""
-    # A tape without rows has no clusters either: it serves all as it is.
+    # Nothing is written on a tape without rows, so that no view of it is needed.
     if tape.rows.shape[1] == 0:
         return tape
     return Tape(rows=tape.rows[c : c + 1], motion=tape.motion[c : c + 1], used=tape.used[c : c + 1])

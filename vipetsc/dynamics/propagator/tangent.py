@@ -19,7 +19,6 @@ from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.clusters import expand_free_motion
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Halo, exchange
 from vipetsc.dynamics.propagator.substeps import create_tape
 from vipetsc.dynamics.propagator.tangent_kernels import Variations, linearise, move_variations
@@ -77,7 +76,7 @@ class TangentPropagator(Propagator):
         clusters = self._forces.clusters
         # Drives that are over: a cluster is looked at only where a site may touch.
         clusters.drives.rows["duration"] = 0.0
-        self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), MOST_ROWS, NODES))
+        self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), MOST_ROWS))
         self._linear: _Linearisation | None = None
         self._moving: _Moving | None = None
 

@@ -1,8 +1,8 @@
 r"""Compiled motion of variations along an orbit, by the same exact steps: sec. 9 of the derivation.
 
 **9. Variations.** A variation dy is the difference to a neighbouring orbit, to first order. A step takes the lattice's
-state y to P y plus what the forces leave, their moments mu (sec. 5), and mu depends on y through the few coefficients a
-of the free motion of a cluster alone. A variation therefore moves by
+state y to P y plus what the forces leave, their moments mu (sec. 5). These depend on y only through the few
+coefficients a that describe the free motion of a cluster. A variation therefore moves by
 
     dy+ = P dy + (impulses of dmu),    (dmu, dq+) = J (da, dq),    da linear in dy (sec. 2),
 
@@ -10,7 +10,7 @@ with one small matrix J for each step and cluster in contact, made once for an o
 w'_minus of the cluster's sites. J comes from the substeps on the orbit's ``tape``: in each the collocation of sec. 3 is
 linearised at its nodes, dF = F_w dw + F_v dv + F_q dq with dw, dv affine in dF, a linear system for the dF. Forces are
 continuous and a substep ends exactly on each change of a mode, so that the saltation matrix of the state is the
-identity (Leine and Nijmeijer 2004, ch. 7); at an onset the instant moves by -dw/w', and dq = dv - w'' dw/w'.
+identity (Leine and Nijmeijer 2004, ch. 7); at an onset the instant moves by -dw/w', and dq = dw' - w'' dw/w'.
 """
 
 from typing import Any, NamedTuple
@@ -30,8 +30,8 @@ from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, select
 class Variations(NamedTuple):
     """Variations that are moved together.
 
-    ``components`` (variation, 2, component) are states as ``Layout`` orders them, read and written in turn;
-    ``approach`` (variation, dof) are those of w'_minus. ``places`` (step, cluster) numbers the
+    ``components`` (variation, 2, component) are states as ``Layout`` orders them: step k reads slot k % 2 and writes
+    the other one. ``approach`` (variation, dof) are those of w'_minus. ``places`` (step, cluster) numbers the
     ``matrices`` (number, row, column), -1 without contact; ``taylor`` (dof, 2 term) is workspace.
     """
 
@@ -44,9 +44,10 @@ class Variations(NamedTuple):
 
 @kernel
 def _slopes(site: Any, row: Any, w: float, v: float) -> tuple[float, float, float]:
-    """Derivatives to w, w' and w'_minus of the force on a closed site's relative displacement."""
+    """Derivatives with respect to w, w' and w'_minus of the force on a closed site's relative displacement."""
     # The site's own mode may have changed since: the tape has that of the substep.
     if abs(row.mode) == CLIPPED:
+        # The force is clipped to zero.
         return 0.0, 0.0, 0.0
     side = 1.0 if row.mode > 0 else -1.0
     elastic, slope = elastic_force_and_slope(site.elastic, side * w - gap_of(site, side))
@@ -57,11 +58,12 @@ def _slopes(site: Any, row: Any, w: float, v: float) -> tuple[float, float, floa
 
 @kernel
 def _begin_contact(cluster: Cluster, row: Any, x: np.ndarray, first: int) -> None:
-    """Set the variations of w'_minus of a site whose contact begins, in the columns ``x`` (column, number).
+    """Set the variations of w'_minus of a site whose contact begins, in the images ``x`` of unit vectors.
 
-    The onset comes earlier by dw/w', and w'_minus changes by dw' - w'' dw/w'; at the floor of |w'_minus| it does not.
+    ``x[j]`` holds the coefficients of all DoFs' series, then w'_minus of every site. The onset comes earlier by dw/w',
+    and w'_minus changes by dw' - w'' dw/w'. Below its floor |w'_minus| is held there and does not vary.
     """
-    w = row.site * cluster.taylor.shape[1]
+    w = row.site * cluster.taylor.shape[1]  # the place of dw in x[j]; that of dw' times the interval is the next one
     floored = abs(row.rate) < cluster.contacts[row.site].floor
     for j in range(x.shape[0]):
         change = x[j, w + 1] / cluster.interval - row.acceleration * x[j, w] / row.rate
@@ -74,8 +76,8 @@ def _force_variations(
 ) -> np.ndarray:
     """Variations (site and node, column) of the forces of the closed sites ``rows`` in a substep.
 
-    dF = F_w dw + F_v dv + F_q dq at the nodes, where dw and dv are those of the free motion, the columns ``x``, and
-    what dF adds through the responses.
+    dF = F_w dw + F_v dv + F_q dq at the nodes, where dw and dv are those of the free motion, by ``x``, and what dF adds
+    through the responses. Drives do not depend on the state: their variations are zero.
     """
     sites = rows.size
     columns = x.shape[0]
@@ -105,6 +107,7 @@ def _force_variations(
             if node_responses(cluster, substep, i, rows[b].site, to_w, to_v):
                 for node in range(NODES):
                     for k in range(NODES):
+                        # The responses are displacement (m/N) and velocity (m/s/N); only series are in units of H.
                         by_force = slopes[node, 0] * to_w[k, node] + slopes[node, 1] * to_v[k, node]
                         system[a * NODES + node, b * NODES + k] -= by_force
     return np.linalg.solve(system, right)
@@ -116,8 +119,9 @@ def linearise(
 ) -> None:
     """Put the matrix J of cluster ``c`` in a step whose part of the tape is ``rows`` and ``motion`` into ``out``.
 
-    It takes the series of the free motion (dof, 2 term), then the variations of w'_minus (site,), to the moments of the
-    forces and the latter at the step's end. Taylor coefficients, moments and energies of the cluster are overwritten.
+    J maps the series of the free motion (dof, 2 term) and the variations of w'_minus (site,) at the step's beginning to
+    the moments of the forces and the variations of w'_minus at its end. The cluster's Taylor coefficients, moments,
+    energies and position, and the workspace of a trial, are overwritten.
     """
     cluster = select_cluster(clusters, dofs, c)
     room = cluster.trial
@@ -158,7 +162,8 @@ def linearise(
             if rows[a].onset:
                 _begin_contact(cluster, rows[a], x, size)
 
-        # Variations of the forces leave motion and moments as the forces themselves do: both are linear in them.
+        # Motion and moments are linear in the forces: the kernels for forces serve for their variations. Moments are
+        # about the step's end, so that these need the position.
         forces = _force_variations(cluster, rows[begin:stop], motion[begin:stop], substep, x)
         cluster.state[0].position = row.position
         for j in range(columns):
@@ -195,6 +200,7 @@ def _contact_step(dofs: DofTables, c: int, variations: Variations, j: int, numbe
 
     matrix = variations.matrices[number]
     after = np.zeros(before.size)
+    # A loop in place of BLAS, whose order of summation depends on the machine.
     for row in range(before.size):
         for k in range(before.size):
             after[row] += matrix[row, k] * before[k]

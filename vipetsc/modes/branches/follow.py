@@ -38,7 +38,10 @@ Listener = Callable[[Branch[Any], Any], None]
 def claim_branches(
     case: BranchCase, folder: Path, comm: MPI.Comm, force: bool = False, resume: bool = False
 ) -> AbstractContextManager[Claim]:
-    """Claim ``folder`` for the branches of ``case``, as ``claimed``; a case to ``resume`` may end them elsewhere."""
+    """Claim ``folder`` for the branches of ``case``, as ``claimed``.
+
+    With ``resume`` the case may differ from the earlier one in where branches end, and in nothing of their physics.
+    """
 
     def difference(earlier: str) -> str | None:
         # The whole case need not be the same: a branch that has used up its points is resumed with more of them.
@@ -68,8 +71,8 @@ def follow_all(
 ) -> list[Branch[Any]]:
     """All branches of ``case``, written into ``folder``; rank r follows every size-th one, from r on.
 
-    Each branch is computed on one rank, so that its bits do not depend on their number, or on all ranks together where
-    a lattice is shot without dense matrices. A branch that fails is written as far as it came, says why in its
+    Each branch is computed on one rank, so that its bits do not depend on the number of ranks, or on all ranks together
+    where a lattice is shot without dense matrices. A branch that fails is written as far as it came, says why in its
     ``ending``, and the others go on. A ``stop`` ends each branch at its next point, with an ending that begins with
     "stopped"; ``resume`` goes on from there, to the same bits. Returns all branches on rank 0, in the order of the
     case; an empty list on the others.
@@ -117,16 +120,17 @@ class Follower:
         self.method: Method[Any] = method_of(case)(case, comm)
 
     def follow(self, job: int) -> list[Branch[Any]]:
-        """The branch of a job (of a linear mode: its number from 0), then branches that cross it if asked for."""
+        """The branch of a ``job`` (of a linear mode its number from 0), then those that cross it, if asked for."""
         sys.audit("vipetsc.member", job + 1)
         branch = self._begun(self.method.name(job))
         if not branch.complete:
             self._save(branch, lambda: self._follow(branch, job))
-        # The part below the start is in the branch's file, which is written first: a kill leaves at least one of them.
+        # The branch's file now holds the part below the start. That part's own files are removed only after it is
+        # written: a kill leaves at least one of them.
         if branch.points:
             for suffix in ("h5", "csv"):
-                half = self.folder / f"branch-{branch.name}-down.{suffix}"
-                on_root(self.comm, partial(half.unlink, missing_ok=True))
+                part = self.folder / f"branch-{branch.name}-down.{suffix}"
+                on_root(self.comm, partial(part.unlink, missing_ok=True))
         return [branch, *self._crossing(branch)]
 
     def _save(self, branch: Branch[Any], follow: Callable[[], None]) -> None:
@@ -146,7 +150,7 @@ class Follower:
         on_root(self.comm, lambda: write_branch(branch, self.folder, self.about))
 
     def _follow(self, branch: Branch[Any], job: int) -> None:
-        """Compute the points of a branch, and the variables of its file beyond them."""
+        """Compute the points of a branch, then the quantities of the whole branch that its file holds as well."""
         method = self.method
         problem = method.problem(job)
         interruptions: tuple[type[Exception], ...] = (StoppedError, *method.failures)
@@ -187,31 +191,32 @@ class Follower:
         on request; the branch holds the points so far.
         """
         method = self.method
-        # A branch that is resumed has used some of its points; its start is not one of them.
+        # The branch may have points already, from an earlier run or from its part below the start. They count against
+        # the number that it may have; its start does not.
         regular = branch.regular()
         rule = rule_of(problem, start, max(len(regular) - 1, 0))
-        points = Continuation(problem, start, rule, direction, branch.next_step or None)
+        continuation = Continuation(problem, start, rule, direction, branch.next_step or None)
         check = method.monitor(problem)
         # The monitor compares with all earlier points; a resumed branch has to be judged as one that never stopped.
         for point in regular:
             check(point)
         before = regular[-2] if len(regular) > 1 else None
-        last = points.point
+        last = continuation.point
         finding = None
         saved = time.monotonic()
         if not branch.points:
             branch.points = [method.assess(problem, last)]
 
         try:
-            for point in points:
+            for point in continuation:
                 sys.audit("vipetsc.step")
                 if method.locates:
                     grazing = method.grazing
-                    special = locate(problem, last, points.passed, rule.chart, grazing, before, branch.findings)
+                    special = locate(problem, last, continuation.passed, rule.chart, grazing, before, branch.findings)
                     branch.points += [method.assess(problem, replace(p, next_step=point.next_step)) for p in special]
                 assessed = method.assess(problem, point)
                 branch.points.append(assessed)
-                branch.next_step = points.step
+                branch.next_step = continuation.step
                 if self.listener is not None and self.comm.rank == 0:
                     self.listener(branch, assessed)
                 finding = check(assessed)
@@ -220,7 +225,7 @@ class Follower:
                     break
 
                 # Agreed on by all: a signal reaches ranks at different points, and they stop at the same one.
-                stopped = self.stop.agreed(self.comm) and not points.finished
+                stopped = self.stop.agreed(self.comm) and not continuation.finished
                 # One rank's clock decides for all: writing is collective.
                 if stopped or self.comm.bcast(time.monotonic() - saved > SAVE_EVERY):
                     self.write(branch)
@@ -233,8 +238,8 @@ class Follower:
         finally:
             jumps = method.jumps(problem, branch.regular())
             branch.findings += [jump for jump in jumps if jump not in branch.findings]
-        branch.ending = finding or points.ending
-        branch.complete = finding is not None or points.finished
+        branch.ending = finding or continuation.ending
+        branch.complete = finding is not None or continuation.finished
 
     def _begun(self, name: str) -> Branch[Any]:
         """The branch as it is in its file when results are resumed, else one without points."""

@@ -22,7 +22,8 @@ from vipetsc.modes.shooting.orbit import resonance
 from vipetsc.modes.shooting.stability import half_traces, multipliers
 from vipetsc.modes.system import System
 
-# Half-traces of one system cross +-1 tangentially along narrow tongues, to rounding: crossings below are not reported.
+# A half-trace is (lambda + 1/lambda)/2 of a pair of multipliers. Along narrow tongues it only touches +-1: a change of
+# sign smaller than this is rounding, and no special point.
 LEAST_CROSSING = 1e-6
 # Singular values of the Jacobian below this fraction of the largest leave the tangent open.
 DEGENERATE = 1e-12
@@ -50,7 +51,8 @@ A = TypeVar("A", bound=AnyArc)
 class ShootingFrame(Generic[A]):
     """The shooting equations in the unknowns of a ``chart`` at one orbit.
 
-    ``tangent`` (n + 1,) is d(x, period) along the branch, empty where there is none yet.
+    The argument ``tangent`` (n + 1,) is d(x, period) along the branch, or empty where there is none yet. The attribute
+    is its unit image in the chart's unknowns, and is there only with a tangent.
     """
 
     tangent: np.ndarray
@@ -95,7 +97,7 @@ class ShootingFrame(Generic[A]):
         """The unit tangent at a solution, on the side of the frame's own."""
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
-        """The orbit that an attempt has converged to, where ``direction`` is the branch's unit tangent or empty."""
+        """The orbit that an attempt has converged to, where ``direction`` is the branch's unit tangent or None."""
         problem = self.problem
         chart = self.chart
         x, period = chart.decode(attempt.xi)
@@ -127,10 +129,12 @@ class ShootingFrame(Generic[A]):
 
 
 class ShootingEquations(ABC, Generic[A]):
-    """Periodic orbits of a ``system``: initial values x (n,) and period whose arc, a ``shooting_map``, closes.
+    """Periodic orbits of a ``system``: initial values x (n,) and a period.
 
-    x are displacements in m for a map that starts at rest, velocities in m/s for one that starts at the centre.
-    Raises ValueError if the map needs an odd system and the system is not.
+    The ``shooting_map`` says over which part of the period an arc goes, and whether it starts and ends at rest or at
+    the centre; for an orbit half of the state vanishes at its end. x are displacements in m for a map that starts at
+    rest, velocities in m/s for one that starts at the centre. Raises ValueError if the map needs an odd system and the
+    system is not.
     """
 
     has_half_traces: bool
@@ -219,7 +223,7 @@ class ShootingEquations(ABC, Generic[A]):
         Raises ContinuationError at a branch point, where the tangent is not unique.
         """
         tangent = self.null_vector(start)
-        # The null vector has either sign; where the energy is stationary, the direction itself decides.
+        # The null vector has either sign; where the energy is stationary, the sign is arbitrary.
         energy_tangent = self.energy_gradient(start.x) @ tangent[:-1]
         return tangent * (np.sign(energy_tangent) * direction or direction)
 
@@ -230,7 +234,8 @@ class ShootingEquations(ABC, Generic[A]):
         chart = self.relative_chart(before.x, before.period)
         tangents = np.column_stack([before.tangent, after.tangent])
         first, second = chart.to_unknowns(chart.encode(before.x, before.period), tangents).T
-        return float(np.arccos(min(unit(first) @ unit(second), 1.0)))
+        # The product of two unit vectors may be beyond 1 by rounding.
+        return float(np.arccos(np.clip(unit(first) @ unit(second), -1.0, 1.0)))
 
     @abstractmethod
     def relative_chart(self, x: np.ndarray, period: float) -> Chart:
@@ -238,7 +243,8 @@ class ShootingEquations(ABC, Generic[A]):
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
         """Folds of the energy and of the frequency."""
-        # A linear branch has folds of rounding only, as where one of the orbits has no contact.
+        # Without nonlinear springs an orbit without contact lies on a linear branch, whose energy and frequency turn by
+        # rounding alone: folds are sought between two orbits that both have contacts.
         if self.system.springs or (left.episodes and right.episodes):
             yield SpecialKind("fold-energy", lambda p: p.energy_tangent, finish=self.with_resonance)
             yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
@@ -344,7 +350,8 @@ class Shooting(ShootingEquations[Arc]):
         yield from super().special_kinds(left, right)
         if not (self.system.springs or left.episodes or right.episodes):
             return
-        # Seen by a quarter the basic map is half a period: what returns after twice of it is one period.
+        # The half-traces of a quarter map belong to half a period. There a multiplier of -1 returns after the whole
+        # period, which breaks the symmetry; multipliers +-i, half-trace 0, are -1 over the period and double it.
         levels = {1.0: "branch-point", -1.0: "period-doubling"}
         if self.map.quarter:
             levels = {1.0: "branch-point", -1.0: "symmetry-breaking", 0.0: "period-doubling"}

@@ -1,0 +1,56 @@
+"""Samples of a waveform from files: what is too large or no table is refused before it is read whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from vipetsc.case.samples import MOST_SAMPLES, with_samples
+
+
+def refusal(**samples: object) -> str:
+    """The text of the one problem with the file of a drive's ``samples``."""
+    _, problems = with_samples({"drive": {"waveform": "samples", "samples": samples}})
+    (problem,) = problems
+    assert problem.key == "drive.samples.file"
+    return str(problem)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """An HDF5 file with 16 TB of samples, of which none was ever written, a group, and a table of three columns."""
+    path = tmp_path / "samples.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("endless", shape=(10**12, 2), chunks=(1000, 2), dtype=float)
+        file.create_group("group")
+        file["three"] = np.zeros((4, 3))
+    return path
+
+
+def test_a_data_set_is_not_read_before_its_size_is_known(file):
+    """Sixteen terabytes of samples are refused by their number, which no memory could hold."""
+    assert f"holds (1000000000000, 2) numbers; time and value in two columns, {MOST_SAMPLES} rows" in refusal(
+        file=str(file), dataset="endless"
+    )
+
+
+def test_what_is_no_table_of_two_columns_is_refused(file):
+    """A group and a table of three columns are named as such."""
+    assert "group is no data set" in refusal(file=str(file), dataset="group")
+    assert "holds (4, 3) numbers" in refusal(file=str(file), dataset="three")
+
+
+@pytest.mark.parametrize("header", ["", "time,force\n"])
+def test_a_table_of_text_is_read_up_to_the_line_that_is_too_much(tmp_path, header):
+    """A table of text with one sample more than allowed is refused, with a line of names or without."""
+    path = tmp_path / "samples.csv"
+    path.write_text(header + "0.5,1.0\n" * (MOST_SAMPLES + 1), encoding="utf-8")
+    assert f"{MOST_SAMPLES} rows at most" in refusal(file=str(path))
+
+    path.write_text(header + "# a comment\n\n" + "0.5,1.0\n" * MOST_SAMPLES, encoding="utf-8")
+    table, problems = with_samples({"drive": {"waveform": "samples", "samples": {"file": str(path)}}})
+    assert not problems
+    assert len(table["drive"]["samples"]["value"]) == MOST_SAMPLES
