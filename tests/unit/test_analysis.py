@@ -54,6 +54,7 @@ def test_entropy_is_that_of_the_host_from_the_arrival_on(run):
     assert estimate < start < estimate + 2 * INTERVAL
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pixels", "limit"), [(600, 20_000), (7, 60_000)])
 def test_little_memory_gives_the_same(run, tmp_path, monkeypatch, pixels, limit):
     """Of the field, 307 KB, no more than the limit in bytes is read at once; a row of a map of 7 takes 45 KB."""
@@ -81,6 +82,7 @@ def test_little_memory_gives_the_same(run, tmp_path, monkeypatch, pixels, limit)
     assert max(sizes) <= limit
 
 
+@pytest.mark.slow
 def test_maps_are_means_and_spectra_sums_of_what_a_page_cannot_show(run):
     fine = analyse(run, options=AnalysisTable(pixels=600))
     coarse = analyse(run, options=AnalysisTable(pixels=8))

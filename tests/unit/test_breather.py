@@ -103,6 +103,7 @@ def test_the_slope_of_the_energy_is_that_between_points():
         assert min(left.slope, right.slope) * 0.99 <= chord <= max(left.slope, right.slope) * 1.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("omega", [1450.0, 1600.0, 1800.0, 2000.0, 3700.0, 4000.0, 5000.0])
 def test_the_built_in_lattice_has_breathers_in_its_gaps(omega):
     _, point = condensed_breather(300, 100, omega, 1e-6)
@@ -158,6 +159,7 @@ def breather_of_two_sites(signs: list[int]) -> Point:
     return problem.from_gap(4000.0, np.array(signs))
 
 
+@pytest.mark.slow
 def test_two_sites_move_in_and_out_of_phase():
     alone = breather_of_two_sites([1, 0])
     together = breather_of_two_sites([1, 1])

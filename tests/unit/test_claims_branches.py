@@ -205,6 +205,7 @@ def put_portraits(root: Path, linearity: float) -> None:
             file.attrs["case"] = member.case.to_toml()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("linearity", "expected"), [(1.0, HOLDS), (0.0, IN_PART)])
 def test_portraits_pass_the_regimes(tmp_path, linearity, expected):
     put_portraits(tmp_path, linearity)

@@ -100,6 +100,7 @@ def decaying(finished_sweeps, tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_entropies_that_decay_as_powers_hold_everywhere(decaying):
     for claim in ("C7", "C8", "C9"):
         found = measure(claim, decaying)
@@ -114,6 +115,7 @@ def test_entropies_that_decay_as_powers_hold_everywhere(decaying):
     assert found.files == ["scattering/ensemble.h5", "scattering-neighbours/ensemble.h5"]
 
 
+@pytest.mark.slow
 def test_entropies_without_a_power_law_hold_in_part_or_not(tmp_path):
     def ragged(case: Case) -> float:
         amplitude = case.drive.amplitude
@@ -132,6 +134,7 @@ def test_entropies_without_a_power_law_hold_in_part_or_not(tmp_path):
     assert measure("C9", tmp_path).verdict == FAILS
 
 
+@pytest.mark.slow
 def test_entropies_that_only_rise_do_not_decay(tmp_path):
     put_entropies(
         tmp_path,
@@ -153,6 +156,7 @@ def test_entropies_that_only_rise_do_not_decay(tmp_path):
     assert "6 of 6 configurations have their peak at 10 N or above: nothing is behind it" in bars.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("of_configurations", "of_curves", "expected"), [(0.951, 0.901, HOLDS), (0.949, 0.899, IN_PART)]
 )
@@ -164,6 +168,7 @@ def test_fits_on_either_side_of_their_thresholds_decide(decaying, of_configurati
         assert measure(claim, decaying).verdict == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "nonlinear"), [(0.95, 0.5), (0.5, 0.95), (np.nan, 0.95)])
 def test_the_better_fit_counts_at_every_wavenumber(decaying, line, nonlinear):
     set_fits(decaying, SPREAD, r2_log_log=line, r2_nonlinear=nonlinear)
@@ -175,6 +180,7 @@ def test_the_better_fit_counts_at_every_wavenumber(decaying, line, nonlinear):
     assert found.value[f"{CURVES_FIT}, log-log line alone"] == (line > 0.9)
 
 
+@pytest.mark.slow
 def test_fits_of_three_points_do_not_count(decaying):
     for points, expected in ((4, HOLDS), (3, IN_PART)):
         set_fits(decaying, SPREAD, points=points)

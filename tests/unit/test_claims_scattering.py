@@ -119,6 +119,7 @@ def test_partitions_that_miss_more_than_one_per_cent_do_not_reconstruct(tmp_path
     assert measure("C6", tmp_path).verdict == expected
 
 
+@pytest.mark.slow
 def test_a_linear_medium_run_scatters_nothing(tmp_path):
     put_scattering(tmp_path, new=(0.0, 0.0, 0.1), reflected=(0.0, 0.0, 0.2))
     scattered = measure("C3", tmp_path)
@@ -127,6 +128,7 @@ def test_a_linear_medium_run_scatters_nothing(tmp_path):
     assert measure("C4", tmp_path).verdict == FAILS
 
 
+@pytest.mark.slow
 def test_scattering_off_the_branches_holds_in_part(tmp_path):
     put_scattering(tmp_path, new=(0.0, 0.5, 0.6), off_branches=0.3)
     found = measure("C3", tmp_path)
@@ -136,6 +138,7 @@ def test_scattering_off_the_branches_holds_in_part(tmp_path):
     assert measure("C4", tmp_path).verdict == IN_PART
 
 
+@pytest.mark.slow
 def test_a_low_run_with_contacts_is_not_linear(tmp_path):
     put_scattering(tmp_path, new=(0.2, 0.5, 0.1))
     assert measure("C2", tmp_path).verdict == FAILS

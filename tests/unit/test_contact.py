@@ -335,6 +335,7 @@ def test_the_contact_time_is_that_of_an_integrated_impact(law):
     assert 2 * impact.t[-1] == pytest.approx(impact_time(contacts[0], speed), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_log_takes_any_number_of_episodes():
     tracker = ImpactTracker(create_contacts(Contact("hertz", STIFFNESS), [CLEARANCE] * 2, MASS), (7, 3))
     for k in range(9):

@@ -106,6 +106,7 @@ def test_sites_move_by_whole_cells():
     assert np.abs(np.subtract(case.contacts.sites, [10, 30])).max() <= 6
 
 
+@pytest.mark.slow
 def test_samples_of_contacts_alone_have_one_linear_run():
     contacts = {"clearance": {"relative": 0.1}, "restitution": {"absolute": 0.02}}
     by_contacts = {linear_name(draw(seed=seed, **contacts)) for seed in range(3)}
@@ -262,6 +263,7 @@ def ensemble(tmp_path_factory):
     return open_ensemble(folder)
 
 
+@pytest.mark.slow
 def test_statistics_are_those_of_the_samples_that_came_out(ensemble):
     mean = ensemble["statistics/ibtet/mean"]
     deviation = ensemble["statistics/ibtet/deviation"]

@@ -70,6 +70,7 @@ def test_warnings_that_differ_in_numbers_alone_are_one():
     ]
 
 
+@pytest.mark.slow
 def test_a_sample_is_compared_member_by_member(folder, tmp_path):
     sample = sampled(Sweep.from_table(SWEEP), 6, 1)
     members = sample.members()
@@ -91,6 +92,7 @@ def test_a_sample_is_compared_member_by_member(folder, tmp_path):
             assert row["largest"] == pytest.approx(5e-4 if row["agrees"] else 2e-3)
 
 
+@pytest.mark.slow
 def test_every_member_stands_at_the_values_of_its_keys(folder):
     ensemble = open_ensemble(folder)
     assert ensemble["ibtet"].dims == ("law", "sites", "amplitude")

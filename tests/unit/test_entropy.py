@@ -52,6 +52,7 @@ def test_a_tone_has_the_entropy_of_its_gaussian_over_the_nodes(kappa):
     assert weight[0, 3000] == pytest.approx(power.sum() / 4, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_white_noise_approaches_its_limit():
     """S is exponential about its mean E: H over cells and nodes is log2 cells + H(E / sum E) - (1 - gamma)/ln 2."""
     cells = 20_000

@@ -43,6 +43,7 @@ LATTICES = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("interval", "tolerance"), [(1.5e-4, 1e-15), (3e-4, 1e-7)])
 @LATTICES
 def test_a_step_is_the_exponential_within_its_bound(ends, differing, damped, interval, tolerance):
@@ -107,6 +108,7 @@ def displacement_forms(model: Model, numbers: np.ndarray) -> np.ndarray:
     return forms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pairs", ["the cell's pair", "any pairs"])
 @LATTICES
 def test_free_motion_and_impulses_are_the_exponential(ends, differing, damped, pairs):

@@ -172,6 +172,7 @@ def test_the_analysis_names_what_it_left_out(measured):
     assert not list(folder.glob(".*"))
 
 
+@pytest.mark.slow
 def test_the_analysis_opens_in_plain_xarray_and_agrees_with_the_run(tmp_path):
     xarray = pytest.importorskip("xarray")
     write_run(tmp_path / "run.h5")

@@ -117,6 +117,7 @@ def room(module: str) -> str:
     return module
 
 
+@pytest.mark.slow
 def test_folders_import_in_no_circle():
     """A folder is imported as a whole: two modules of it may not lie above and below a third one outside."""
     rooms: dict[str, set[str]] = {}

@@ -14,6 +14,7 @@ def folded(masses: int) -> UnitCell:
     return UnitCell(masses=(0.01,) * masses, springs=springs, host=0, resonator=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masses", [8, 40])
 def test_bands_of_a_folded_chain(masses):
     """Band edges lie at j pi over the masses of the chain's own zone, the long waves are the fastest."""
@@ -25,6 +26,7 @@ def test_bands_of_a_folded_chain(masses):
     assert fastest_speed(folded(masses)) == pytest.approx(top / 2 / masses, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_fastest_speed_does_not_cost_a_grid_a_band(monkeypatch):
     solved = []
     original = bands.bloch

@@ -147,6 +147,7 @@ def test_an_impulse_gives_the_modes_the_amplitudes_of_its_velocity(ends):
     assert modes_.amplitudes(u, v)[0] == pytest.approx(modes_.force(7, 1), abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", ["fixed", "free"])
 def test_a_long_lattice_is_taken_for_a_part_of_a_ring(ends, monkeypatch):
     """Away from the ends, where they meet no wave, bands have the energies of the lattice's own modes."""

@@ -173,6 +173,7 @@ PAIRS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pairs", PAIRS)
 @ENDS
 def test_the_rates_are_those_of_all_forces(ends, pairs):

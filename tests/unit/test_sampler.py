@@ -116,6 +116,7 @@ def test_a_first_generation_changes_neighbours_together():
     assert np.std(points[:, 0] - points[:, 1]) < step < np.std(points[:, 0] - points[:, -1])
 
 
+@pytest.mark.slow
 def test_nsga_ii_finds_the_front_of_two_bowls():
     """The best of both lie on the straight line between their lowest points."""
     ends = np.array([[0.2, 0.2, 0.2], [0.8, 0.8, 0.2]])

@@ -124,6 +124,7 @@ def test_what_comes_back_in_a_run_is_what_is_stated(strength):
     assert measured > 0.35 * every
 
 
+@pytest.mark.slow
 def test_the_end_that_is_chosen_keeps_its_bound():
     """Where an end was chosen by the spectrum's main lobe alone, .8 % came back from it."""
     of = case({"cells": 1200, "absorbing": {}}, BURST | {"cell": 400})
@@ -134,6 +135,7 @@ def test_the_end_that_is_chosen_keeps_its_bound():
     assert f"{reflected([source], sections):.1e} of all that the drive sends" in describe_ends(of)
 
 
+@pytest.mark.slow
 def test_both_ends_absorb_what_each_of_them_gets():
     one, both = (
         case({"cells": 300, "absorbing": {"end": end, "cells": 20, "strength": 200.0}}, BURST | {"cell": 150})
@@ -146,6 +148,7 @@ def test_both_ends_absorb_what_each_of_them_gets():
     assert stated(at_wall) < 0.2 * fractions[0]
 
 
+@pytest.mark.slow
 def test_where_no_end_keeps_the_bound_the_message_names_the_remedy():
     with pytest.raises(CaseError, match=r"lattice\.absorbing\.reflection.*slow waves at band edges; allow more"):
         case({"cells": 300, "absorbing": {}}, BURST | {"cell": 100})

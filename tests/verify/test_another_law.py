@@ -67,6 +67,7 @@ def found(tmp_path_factory) -> dict:
     return json.loads((folder / "found.json").read_text())
 
 
+@pytest.mark.slow
 def test_the_law_on_arrays_and_its_compiled_twin_are_the_formula(found):
     assert found["twins"] == pytest.approx(0, abs=1e-12)
     assert found["duration"] == pytest.approx(0, abs=1e-7)

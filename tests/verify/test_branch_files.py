@@ -59,6 +59,7 @@ def follow(folder: Path, listener=None, stop=None, resume=False, **nnm) -> Branc
     return follow_all(case, folder, MPI.COMM_SELF, resume=resume, listener=listener, stop=stop)[0]
 
 
+@pytest.mark.slow
 def test_a_branch_file_is_read_back(branch, tmp_path):
     """Every quantity of every point, the table and how the branch ended survive a file."""
     write_branch(branch, tmp_path, {"ranks": 1})

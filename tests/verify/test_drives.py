@@ -166,6 +166,7 @@ def test_every_waveform_has_its_ledger(engine, drive):
     assert ledger_error(run) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("end", ["left", "right"])
 def test_a_moved_end_against_another_integrator(engine, end):

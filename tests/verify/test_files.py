@@ -29,6 +29,7 @@ def run_folder(tmp_path_factory):
     return run
 
 
+@pytest.mark.slow
 def test_every_file_opens_in_xarray_with_units(run_folder):
     groups = {"run.h5": [None, "energy", "sites", "impacts"], "analysis.h5": [None, "bands"]}
     for name, members in groups.items():
@@ -145,6 +146,7 @@ def test_another_analysis_of_the_same_run(run_folder, folder):
         simulate(small_case(drive={"amplitude": 2.0}), folder / "run")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lattice", "amplitude"),
     [({"preset": "four-band", "cells": 100}, 24.33), ({"preset": "diatomic", "cells": 200}, 1.0)],

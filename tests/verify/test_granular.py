@@ -103,6 +103,7 @@ def peak_time(time: np.ndarray, values: np.ndarray) -> float:
     return time[largest] + shift * (time[1] - time[0])
 
 
+@pytest.mark.slow
 def test_a_struck_chain_sends_a_solitary_wave(tmp_path):
     """The wave is 1.2 % faster than Nesterenko's long wave, at any force, and five beads move in it.
 

@@ -79,6 +79,7 @@ def test_a_mode_stays_a_mode(engine, ends):
     assert np.abs(u).max() == pytest.approx(case.initial.amplitude, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_packet_travels_with_the_group_velocity_on_its_band(engine, direction):
@@ -115,6 +116,7 @@ def test_a_packet_travels_with_the_group_velocity_on_its_band(engine, direction)
     assert measured == pytest.approx(direction * speed, rel=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_run_goes_on_from_a_sample_of_another_in_the_middle_of_a_contact(engine, tmp_path):
     """Without loss a contact remembers nothing: from the state alone the run takes the same trajectory."""

@@ -44,6 +44,7 @@ def runs():
     return {engine: simulated(laboratory(engine=engine)) for engine in ("ts", "propagator")}
 
 
+@pytest.mark.slow
 def test_engines_agree(runs):
     by_ts, result = runs["ts"]
     by_propagator, _ = runs["propagator"]
@@ -113,6 +114,7 @@ def test_a_site_is_of_the_masses_of_its_cell():
     assert joined.reduced_masses() == [joined.cell.masses[2]] * 2
 
 
+@pytest.mark.slow
 def test_an_absorbing_end_is_that_of_all_drives():
     ends = {"cells": 90, "absorbing": {"cells": 10, "strength": 400.0}}
     with pytest.raises(CaseError, match=r"lattice\.absorbing\.end.*driven cell 85"):

@@ -46,6 +46,7 @@ def sweep(tmp_path_factory):
     return margins, open_ensemble(folder / "sweep"), folder / "sweep"
 
 
+@pytest.mark.slow
 def test_a_member_is_simulated_unless_its_wave_stays_well_inside_the_clearance(sweep):
     margins, ensemble, _ = sweep
     assert ensemble["status"].values.tolist() == np.where(margins < 0.9, SCALED, COMPLETE).tolist()
@@ -68,6 +69,7 @@ def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
     assert not ensemble["dissipated_fraction"].values[:2].any()
 
 
+@pytest.mark.slow
 def test_what_is_kept_does_not_change_what_is_measured(sweep, tmp_path):
     _, ensemble, _ = sweep
     # Amplitudes that a coarse linear wave might take for quiet.
@@ -80,6 +82,7 @@ def test_what_is_kept_does_not_change_what_is_measured(sweep, tmp_path):
         np.testing.assert_array_equal(thin[name].values, ensemble[name].values[2:5], name)
 
 
+@pytest.mark.slow
 def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
     _, _, folder = sweep
     out = shutil.copytree(folder, tmp_path / "out")
@@ -149,6 +152,7 @@ def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
     assert_same_bits(found, datasets(kept / "run.h5"))
 
 
+@pytest.mark.slow
 def test_a_linear_run_that_was_not_foreseen_is_made_where_it_is_needed(sweep, tmp_path, monkeypatch):
     _, ensemble, _ = sweep
     # Only the first member is looked at before the sweep: the second site list comes as a surprise.

@@ -107,6 +107,7 @@ def test_a_search_finds_a_better_case_whose_run_has_its_value(tmp_path):
     assert found["upper_share_at_end"].tolist() == value.tolist()
 
 
+@pytest.mark.slow
 def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, monkeypatch):
     """D_k = A env(s_k) sqrt(T^k)/z* (SPEC section 13), in the order in which the wave meets the sites."""
     requests = []

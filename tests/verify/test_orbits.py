@@ -28,6 +28,7 @@ def superposed(stiffness, masses, centre, displacement, velocity, duration):
     return later / root + centre, later_rate / root
 
 
+@pytest.mark.slow
 def test_bilinear_orbit_is_the_exact_piecewise_solution(bilinear):
     """A quarter period is modal superposition with the contact closed, then open, with one separation between."""
     problem = bilinear.problem
@@ -49,6 +50,7 @@ def test_bilinear_orbit_is_the_exact_piecewise_solution(bilinear):
     assert np.abs(u).max() <= 1e-12 * np.abs(point.x).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["bilinear", "hertz"])
 @pytest.mark.parametrize(("flow", "accuracy"), [(Tsrk, 1e-11), (Newmark, 1e-4)])
 def test_other_flows_agree(flow, accuracy, law, request):

@@ -168,6 +168,7 @@ PRESSED = JOINED | {"side": "minus", "clearance": 0.0, "precompression": 1e-4, "
 DASHPOTS = {"mass": 10.0, "stiffness": 5e-6}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lattice", "contacts"),
     [
@@ -185,6 +186,7 @@ def test_agrees_on_contacts_of_any_pair(lattice, contacts):
     assert assert_engines_agree(case, velocity=1e-8)["episodes"] >= 3
 
 
+@pytest.mark.slow
 def test_agrees_on_other_cells():
     diatomic = {
         "lattice": {"preset": "diatomic", "cells": 31},

@@ -161,6 +161,7 @@ def test_both_directions_give_the_same_curve():
     assert energies[-1] == pytest.approx(GRAZING_ENERGY[OUT_OF_PHASE], rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["bilinear", "hertz"])
 @pytest.mark.parametrize("mode", [0, 1])
 def test_three_cells_through_grazing(law, mode):

@@ -56,6 +56,7 @@ def spring_ends(chain: Chain, ends: str):
                 yield spring, start if start >= 0 else None, end if end < n else None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 def test_against_another_integrator(ends):
     """Displacements are those of SciPy's DOP853 with forces a z^2 + b z^3 in the springs; the engine is the stepper."""

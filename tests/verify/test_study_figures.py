@@ -373,6 +373,7 @@ def test_entropy_maps_leave_quiet_cells_blank(whole):
         assert over.get_ylim() == pytest.approx(image.get_clim())
 
 
+@pytest.mark.slow
 def test_entropy_history_is_an_image_over_amplitude(curves):
     figure = offered_figures("entropy_history", [curves])["calibrated-5pi-9"]
     for axes, sites in zip(figure.axes, (2, 3), strict=False):

@@ -166,6 +166,7 @@ def test_diatomic_agrees_with_an_independent_integration():
     assert relative(run["velocity"].values - velocity, velocity) < 1e-6
 
 
+@pytest.mark.slow
 def test_work_of_the_linear_diatomic_case():
     table = {
         "lattice": {"preset": "diatomic", "reading": "printed"},
@@ -216,6 +217,7 @@ def test_ledger_closes(preset, amplitude, law, restitution):
     np.testing.assert_allclose(by_site.sum(axis=1), dissipated, rtol=1e-12, atol=1e-300)
 
 
+@pytest.mark.slow
 def test_tolerance_keeps_its_promise():
     """A hundredth of the tolerance lowers the error by ten or more; 1e-10 leaves less than 1e-6."""
     velocity = {rtol: run_of(small_case(time={"rtol": rtol}))["velocity"].values for rtol in (1e-8, 1e-10, 1e-12)}
@@ -234,6 +236,7 @@ def exact():
 
 
 # The third-order pair would need very many steps at 1e-9.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "rtol"), [("5dp", 1e-9), ("3bs", 1e-6), ("5bs", 1e-9), ("6vr", 1e-9), ("7vr", 1e-9)]
 )
@@ -302,6 +305,7 @@ def mirrored_table() -> dict[str, Any]:
     return table
 
 
+@pytest.mark.slow
 def test_a_mirrored_lattice_gives_the_mirrored_answer():
     straight = run_of(Case.from_table(mirror_table()))
     mirrored = run_of(Case.from_table(mirrored_table()))

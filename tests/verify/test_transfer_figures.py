@@ -157,6 +157,7 @@ def test_shares_are_the_ensembles_and_sum_to_one(reduced):
     np.testing.assert_allclose(shown["sum"][1], 1.0, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_backbone_is_aligned_exactly(reduced):
     """Energies are those of the branch at grazing, the slope is divided by the fitted divisor, its power law drawn."""
     figures = offered_figures("ibtet_backbone", reduced)

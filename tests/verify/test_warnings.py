@@ -35,6 +35,7 @@ def test_sites_that_nothing_reaches(folder, engine):
     assert warnings_of(simulate(case, folder / "run")) == ["no contact: nothing reached one of the 3 sites"]
 
 
+@pytest.mark.slow
 def test_indentations_beyond_the_radius(folder):
     """Hertz's law asks for small indentations: soft spheres are warned of, larger or linear ones are not."""
 
@@ -55,6 +56,7 @@ def test_the_radius_stays_with_the_case():
     assert "radius" not in small_case().to_toml()
 
 
+@pytest.mark.slow
 def test_an_energy_balance_that_does_not_close(folder, petsc_options, capsys):
     """Fixed steps that are too long for the tolerance are warned of, by the front door too."""
     petsc_options(ts_rk_type="3bs", ts_adapt_type="none", ts_dt=1e-4)
