@@ -16,7 +16,7 @@ import numpy as np
 
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.changes import LANDED_W, ModeChange, extremes, first_change, stays_landed, switching
-from vipetsc.contact.law import CLOSED, FREE, PERMANENT, begins_linearly, contact_force, gap_of
+from vipetsc.contact.law import CLOSED, PERMANENT, begins_linearly, contact_force, gap_of
 from vipetsc.contact.search import (
     LANDED,
     MOST_ATTEMPTS,
@@ -38,7 +38,7 @@ from vipetsc.dynamics.propagator.collocation import (
 )
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN
 from vipetsc.dynamics.propagator.series import ROUNDING, copy, first_onset, shift
-from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, write_on_tape
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, select_active, write_on_tape
 
 # How an advance ended: at the end of the step, on a change of modes, on one of a site that is to rest instead, or
 # without progress.
@@ -296,36 +296,6 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> 
     history.smallest_force = min(history.smallest_force, smallest)
 
 
-@kernel
-def _select_active(cluster: Cluster) -> Trial:
-    """The workspace for a substep of a cluster, of those DoFs on which forces act."""
-    state = cluster.state[0]
-    sites = cluster.contacts
-    room = cluster.trial
-    closed = 0
-    for i in range(sites.size):
-        if sites[i].mode != FREE:
-            room.active[closed] = i
-            room.closed[closed] = i
-            closed += 1
-
-    count = closed
-    for i in range(sites.size, cluster.taylor.shape[0]):
-        if state.position < drive_end(cluster.drives, i, state.begin, cluster.interval, state.position):
-            room.active[count] = i
-            count += 1
-    return Trial(
-        active=room.active[:count],
-        closed=room.closed[:closed],
-        force=room.force,
-        w=room.w,
-        v=room.v,
-        taylor=room.taylor,
-        site_motion=room.site_motion,
-        sums=room.sums,
-    )
-
-
 @inlined
 def _take(cluster: Cluster, trial: Trial, substep: Substep) -> None:
     """Take the substep of ``trial``: add its moments, energies and extremes; the cluster then stands at its end."""
@@ -361,7 +331,7 @@ def advance_cluster(cluster: Cluster, may_rest: bool) -> tuple[int, int]:
         if 1.0 - state.position <= ROUNDING:
             state.position = 1.0
             return DONE, -1
-        trial = _select_active(cluster)
+        trial = select_active(cluster)
         if trial.active.size == 0:
             return _advance_freely(cluster), -1
 

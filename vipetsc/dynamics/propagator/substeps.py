@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel, njit
-from vipetsc.dynamics.drives import Drives
+from vipetsc.contact.law import FREE
+from vipetsc.dynamics.drives import Drives, drive_end
 from vipetsc.dynamics.propagator.clusters import DofTables
 from vipetsc.dynamics.propagator.nodes import NODES, Collocation
 from vipetsc.dynamics.propagator.series import ROUNDING
@@ -206,6 +207,36 @@ def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
         state=clusters.state[c : c + 1],
         trial=clusters.trial,
         tape=_select_tape(clusters.tape, c),
+    )
+
+
+@kernel
+def select_active(cluster: Cluster) -> Trial:
+    """The workspace for a substep of a cluster, of those DoFs on which forces act."""
+    state = cluster.state[0]
+    sites = cluster.contacts
+    room = cluster.trial
+    closed = 0
+    for i in range(sites.size):
+        if sites[i].mode != FREE:
+            room.active[closed] = i
+            room.closed[closed] = i
+            closed += 1
+
+    count = closed
+    for i in range(sites.size, cluster.taylor.shape[0]):
+        if state.position < drive_end(cluster.drives, i, state.begin, cluster.interval, state.position):
+            room.active[count] = i
+            count += 1
+    return Trial(
+        active=room.active[:count],
+        closed=room.closed[:closed],
+        force=room.force,
+        w=room.w,
+        v=room.v,
+        taylor=room.taylor,
+        site_motion=room.site_motion,
+        sums=room.sums,
     )
 
 
