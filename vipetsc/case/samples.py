@@ -92,14 +92,14 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
 
 
 def _table_lines(path: Path) -> list[list[str]]:
-    """The words of a table's lines without comments, of a table that is too long its beginning."""
+    """The fields of a table's lines without comments, of a table that is too long its beginning."""
     lines = []
     # utf-8-sig: editors on Windows begin files with a byte order mark, which is no number.
     with path.open(encoding="utf-8-sig") as file:
         for text in file:
-            words = re.split(r"[,;\s]+", text.strip())
-            if words[0] and not words[0].startswith("#"):
-                lines.append(words)
+            fields = re.split(r"[,;\s]+", text.strip())
+            if fields[0] and not fields[0].startswith("#"):
+                lines.append(fields)
             # Two more than the samples: a line of names, and one by which the table is too long.
             if len(lines) == MOST_SAMPLES + 2:
                 break
