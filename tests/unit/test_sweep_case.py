@@ -213,14 +213,23 @@ def test_a_member_is_made_once():
     assert plan.model_copy(update={"name": "other"}).member(1) is not members[1]
 
 
+@pytest.mark.slow
 def test_fewer_members_of_many_sites_are_tried_before_a_sweep_begins():
     """The members by which a sweep is checked have a bounded number of sites together, and one is always tried."""
-    few = sweep_of("[sweep.drive]\namplitude = { linear = [1, 2], count = 60 }\n[contacts]\nsites = 2")
-    assert len(few.tried()) == 60
+    sweep = "[sweep.drive]\namplitude = { linear = [1, 2], count = 60 }\n[contacts]\nclearance = 1e-3\nsites = "
+    assert len(sweep_of(sweep + "2").tried()) == 60
 
-    many = "[sweep.drive]\namplitude = {{ linear = [1, 2], count = 60 }}\n[contacts]\nsites = {sites}"
-    table = tomllib.loads(BASE.replace("cells = 40", "cells = 300000") + many.format(sites=10_000))
-    assert len(Sweep.from_table(table).tried()) == MOST_TRIED_SITES // 10_000
+    long = BASE.replace("cells = 40", "cells = 300000")
+    some = Sweep.from_table(tomllib.loads(f"{long}{sweep}{MOST_TRIED_SITES // 4}"))
+    assert len(some.tried()) == 4
+    many = Sweep.from_table(
+        tomllib.loads(f"{long}{sweep}{{ first = 1, last = 290000, count = {MOST_TRIED_SITES + 1} }}")
+    )
+    assert len(many.tried()) == 1
 
-    table["contacts"]["sites"] = MOST_TRIED_SITES + 1
-    assert len(Sweep.from_table(table).tried()) == 1
+
+def test_a_sweep_of_many_sites_that_is_no_case_is_refused_by_one_member():
+    """A sweep whose members are all wrong is refused as soon as one of many sites has been tried."""
+    sweep = "[sweep.drive]\namplitude = { linear = [1, 2], count = 60 }\n[contacts]\nsites = 250000"
+    with pytest.raises(CaseError, match=r"contacts\.sites"):
+        Sweep.from_table(tomllib.loads(BASE + sweep)).tried()

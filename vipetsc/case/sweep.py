@@ -198,13 +198,8 @@ class Sweep(CaseFile):
         Each member resolves all of its sites: where these are many, fewer members are tried, and the others are checked
         when they begin.
         """
-        most = MOST_TRIED
-        first = self.member(0).case
-        if first is not None:
-            assert isinstance(first.contacts.sites, list)  # as those of a resolved case are
-            most = min(most, MOST_TRIED_SITES // max(1, len(first.contacts.sites)))
-        most = max(1, most)
-        return self.members(most)
+        table, _ = self.member_table([0] * len(self.axes))
+        return self.members(max(1, min(MOST_TRIED, MOST_TRIED_SITES // max(1, _site_count(table)))))
 
     def runs(self) -> list[CaseFile]:
         """The valid cases among the members that are tried."""
@@ -221,6 +216,16 @@ class Sweep(CaseFile):
         short = {key: key.removesuffix(".count").rpartition(".")[2] for key in keys}
         common = {name for name in short.values() if list(short.values()).count(name) > 1}
         return {key: key.replace(".", "_") if name in common else name for key, name in short.items()}
+
+
+def _site_count(table: Table) -> int:
+    """The number of sites that a table asks for, which need not be a valid case; 0 where it does not say."""
+    sites = table.get("contacts", {}).get("sites", 0)
+    if isinstance(sites, dict):
+        sites = sites.get("count", 0)
+    if isinstance(sites, list):
+        return len(sites)
+    return sites if isinstance(sites, int) else 0
 
 
 def _leaves(tree: Table, path: str = "") -> Iterator[tuple[str, Any]]:
