@@ -5,62 +5,75 @@ import shutil
 import sys
 
 import pytest
+from PIL import Image
 
 import vipetsc
 from tests.cli.test_guide import ROOT
+from tests.conftest import set_words
 from vipetsc.case.verb_cases import load_every
 from vipetsc.cli.main import main
 
 sys.path.insert(0, str(ROOT / "scripts"))
 import gallery
 
-MOST_PNG = 1_000_000  # bytes of all
+# All pictures come with every clone: so many bytes together.
+MOST_PNG = 1_000_000
 PAGES = gallery.pages()
 SMALL = {
     "run": ["time.end=0.01", "time.sample_interval=0.0005", "time.engine=propagator", "output.figures=false"],
     "nnm": ["nnm.points=2", "nnm.start_frequency=[1420.0]", "nnm.orbits_at=[]"],
 }
-SETS = {verb: [word for text in texts for word in ("--set", text)] for verb, texts in SMALL.items()}
+SETS = {verb: set_words(*changes) for verb, changes in SMALL.items()}
 
 
 def test_every_study_has_a_page_a_command_and_small_pictures():
+    """Each page has commands and pictures within their sizes, and no case or picture lacks a page."""
     assert 6 <= len(PAGES) <= 10
     assert set(PAGES.values()) == set(gallery.INDEX.with_suffix("").glob("*.md"))
+
     shown = {name: gallery.pictures(page) for name, page in PAGES.items()}
-    assert all(map(gallery.commands, PAGES.values())) and all(shown.values())
+    assert all(map(gallery.commands, PAGES.values()))
+    assert all(shown.values())
     every = {path for paths in shown.values() for path in paths}
     assert all(path.stat().st_size <= gallery.MOST[path.suffix] for path in every)
     assert sum(path.stat().st_size for path in every if path.suffix == ".png") <= MOST_PNG
     assert {path for path in (ROOT / "runs/gallery").iterdir() if path.suffix != ".toml"} == every
-    named = {name for page in PAGES.values() for name in re.findall(r"runs/gallery/[\w-]+\.toml", page.read_text())}
+
+    named = set()
+    for page in PAGES.values():
+        named.update(re.findall(r"runs/gallery/[\w-]+\.toml", page.read_text()))
     assert {f"runs/gallery/{path.name}" for path in (ROOT / "runs/gallery").glob("*.toml")} == named
 
 
 def test_every_case_is_valid_and_some_run_in_small(tmp_path, monkeypatch):
-    """In the order of the pages: one begins with a file that another leaves."""
+    """Every case that a page's commands name is valid; runs and branches are made in small, as the pages go on."""
     shutil.copytree(ROOT / "runs", tmp_path / "runs", ignore=shutil.ignore_patterns("*.h5", "*.png"))
     monkeypatch.chdir(tmp_path)
-    for words in (words for page in PAGES.values() for words in gallery.commands(page)):
-        ranks, words = words[: words.index("python")], words[words.index("python") :]
-        assert ranks in ([], ["mpirun", "-n", "2"])
-        assert words[:3] == ["python", "-m", vipetsc.__name__]
-        verb, *words = words[3:]
-        begun = words[0] == "runs/breather.toml" or "breather-run" in words[0]
-        if verb in SMALL and (begun or "gate.toml" in words[0]):
-            first = ["--set", "initial.orbit=1"] if "breather-run" in words[0] else []
-            assert main([verb, *words, *SETS[verb], *first, "--quiet"]) == 0, words
+    # In the order of the pages: the run of a breather begins with an orbit of the branch before it.
+    commands = [words for page in PAGES.values() for words in gallery.commands(page)]
+    for command in commands:
+        begin = command.index("python")
+        assert command[:begin] in ([], ["mpirun", "-n", "2"])
+        assert command[begin : begin + 3] == ["python", "-m", vipetsc.__name__]
+
+        verb, case, *options = command[begin + 3 :]
+        if verb in SMALL and any(name in case for name in ("runs/breather.toml", "breather-run", "gate.toml")):
+            # The short branch lacks the orbit that the case names: its first one is taken.
+            first = set_words("initial.orbit=1") if "breather-run" in case else []
+            assert main([verb, case, *options, *SETS[verb], *first, "--quiet"]) == 0, command
         elif verb != "plot":
-            sets = [words[i + 1] for i, word in enumerate(words) if word == "--set"]
-            assert load_every(words[0], sets), words
+            changes = [options[i + 1] for i, word in enumerate(options) if word == "--set"]
+            assert load_every(case, changes), command
 
 
-@pytest.mark.parametrize("width", [300, 1800])
-def test_a_picture_is_made_small(width, tmp_path):
-    from PIL import Image
-
+@pytest.mark.parametrize(("width", "size"), [(300, (300, 200)), (1800, (900, 100))])
+def test_a_picture_is_made_small(width, size, tmp_path):
+    """A picture is scaled to 900 pixels at most, and one that is still too large is refused."""
     Image.effect_noise((width, 200), 5).convert("RGB").save(tmp_path / "a.png")
     gallery.make_small(tmp_path / "a.png", tmp_path / "b.png")
-    assert Image.open(tmp_path / "b.png").size == (min(width, 900), 200 if width < 900 else 100)
+    assert Image.open(tmp_path / "b.png").size == size
+
+    # Noise of this strength cannot be compressed.
     Image.effect_noise((900, 900), 90).convert("RGB").save(tmp_path / "a.png")
     with pytest.raises(ValueError, match="bytes"):
         gallery.make_small(tmp_path / "a.png", tmp_path / "b.png")

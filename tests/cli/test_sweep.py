@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import assert_same_bits, datasets
+from tests.conftest import assert_same_bits, datasets, set_words
 from vipetsc.io.netcdf import open_netcdf
 
 SWEEP = """
@@ -43,33 +43,39 @@ def case(tmp_path) -> Path:
 
 @pytest.mark.mpirun
 def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, case, tmp_path):
+    """Twelve members leave an index and an ensemble over both axes; those without contact are one linear run."""
     out = tmp_path / "out"
     ended = vipetsc(2, "sweep", case, "--out", out)
     assert ended.returncode == 0, ended.stderr
 
     index = json.loads((out / "index.json").read_text())
-    assert sum(index["members"].values()) == 12 and not index["members"]["failed"] and index["failed"] == []
+    assert sum(index["members"].values()) == 12
+    assert not index["members"]["failed"]
+    assert index["failed"] == []
+
     with h5py.File(out / "ensemble.h5") as file:
         amplitude = file["amplitude"][...]
-        status, episodes, work = (file[n][...] for n in ("status", "contact_episodes", "work"))
+        status = file["status"][...]
+        episodes = file["contact_episodes"][...]
+        work = file["work"][...]
         entropy = file["entropy/energy_weighted"][...]
         assert [d.label or d[0].name for d in file["work"].dims] == ["/sites", "/amplitude"]
+    # 1 is a member that was scaled from another one.
     assert status.shape == (2, 6)
     assert np.array_equal(status == 1, episodes == 0)
     assert (status[:, 0] == 1).all()
     assert (status[:, -1] == 0).all()
+
     # Contact-free runs are one linear run: work goes with the square of the amplitude, entropy does not change.
     quiet = status[0] == 1
     assert work[0, quiet] / amplitude[quiet] ** 2 == pytest.approx(work[0, 0] / amplitude[0] ** 2, rel=1e-14)
     assert np.ptp(entropy[0, quiet]) == 0
-    assert {p.name for p in out.iterdir() if p.name[0] != "."} == {
-        "case.toml",
-        "members.jsonl",
-        "ensemble.h5",
-        "index.json",
-    }
-    again = in_process("sweep", case, "--out", out)
-    assert re.search(r"made now +0 in", again.stdout)
+
+    visible = {path.name for path in out.iterdir() if path.name[0] != "."}
+    assert visible == {"case.toml", "members.jsonl", "ensemble.h5", "index.json"}
+
+    second = in_process("sweep", case, "--out", out)
+    assert re.search(r"made now +0 in", second.stdout)
     changed = in_process("sweep", case, "--out", out, "--set", "drive.cycles=6")
     assert changed.returncode == 2
     assert "holds another sweep: drive.cycles = 5 there, 6 here; --force replaces it" in changed.stderr
@@ -78,49 +84,72 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
 def test_a_member_is_made_again_whole_by_its_name_or_number(in_process, case, tmp_path):
     """Its run has what its record says, be it simulated or scaled, and measures are the same bits."""
     out = tmp_path / "out"
-    changes = ("--set", "sweep.drive.amplitude=[0.3, 20.0]", "--set", "sweep.contacts.sites=[1]")
+    changes = set_words("sweep.drive.amplitude=[0.3, 20.0]", "sweep.contacts.sites=[1]")
     assert in_process("sweep", case, "--out", out, *changes).returncode == 0
     with open_netcdf(out / "ensemble.h5", "ensemble") as ensemble:
-        names, status = ensemble["member"].values.ravel(), ensemble["status"].values.ravel()
-        work, entropy = ensemble["work"].values.ravel(), ensemble["entropy/masked"].values.ravel()
+        names = ensemble["member"].values.ravel()
+        status = ensemble["status"].values.ravel()
+        work = ensemble["work"].values.ravel()
+        entropy = ensemble["entropy/masked"].values.ravel()
+    # One scaled, one simulated.
     assert status.tolist() == [1, 0]
 
     for number, name in enumerate((names[0], "1")):
         run = tmp_path / f"run-{number}"
         ended = in_process("run", out, "--member", name, "--out", run, "--set", "output.figures=false")
         assert ended.returncode == 0, ended.stderr
-        found, measured = datasets(run / "run.h5"), datasets(run / "analysis.h5")
-        assert found["energy/work"][-1] == pytest.approx(work[number], rel=1e-6 if status[number] else 0)
-        assert measured["entropy/masked"] == pytest.approx(entropy[number], rel=1e-6 if status[number] else 0)
+        found = datasets(run / "run.h5")
+        measured = datasets(run / "analysis.h5")
+        # A simulated member has the same bits. A scaled one is simulated here with its own steps, whose errors of
+        # rtol = 1e-8 each add up.
+        rel = 1e-6 if status[number] else 0
+        assert found["energy/work"][-1] == pytest.approx(work[number], rel=rel)
+        assert measured["entropy/masked"] == pytest.approx(entropy[number], rel=rel)
         assert found["velocity"].shape == (301, 40, 2)
 
-    for path, name, says in (
+
+def test_a_member_that_is_not_there_is_refused(in_process, case, tmp_path):
+    """A number beyond the last member, an unknown name and a folder without a sweep end with 2 and write nothing."""
+    out = tmp_path / "out"
+    changes = set_words("sweep.drive.amplitude=[0.1, 0.2]", "sweep.contacts.sites=[1]")
+    assert in_process("sweep", case, "--out", out, *changes).returncode == 0
+
+    for path, name, message in (
         (out, "2", "--member = '2': is no member"),
         (case, "x", "is no member"),
         (tmp_path, "0", "case"),
     ):
         bad = in_process("run", path, "--member", name, "--out", tmp_path / "bad")
-        assert bad.returncode == 2 and says in bad.stderr and not (tmp_path / "bad").exists()
+        assert bad.returncode == 2
+        assert message in bad.stderr
+        assert not (tmp_path / "bad").exists()
 
 
 def test_a_sweep_of_an_earlier_version_is_named(in_process, case, tmp_path):
+    """Results of an earlier version are neither gone on with nor analysed; --force replaces them."""
     out = tmp_path / "out"
-    changes = ("--set", "sweep.drive.amplitude=[0.3]", "--set", "sweep.contacts.sites=[1]")
+    changes = set_words("sweep.drive.amplitude=[0.3]", "sweep.contacts.sites=[1]")
     assert in_process("sweep", case, "--out", out, *changes).returncode == 0
+    # Contact-free runs once had this folder.
     (out / "linear").mkdir()
     for words in (("sweep", case, "--out", out, *changes), ("analyse", out)):
         ended = in_process(*words)
-        assert ended.returncode == 2 and "holds a sweep of an earlier version" in ended.stderr
+        assert ended.returncode == 2
+        assert "holds a sweep of an earlier version" in ended.stderr
+
     assert in_process("sweep", case, "--out", out, *changes, "--force").returncode == 0
     assert not (out / "linear").exists()
 
 
 @pytest.mark.mpirun
 def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
+    """A value outside the lattice costs its own members: they are named, are NaN in the ensemble, and the code is 1."""
     out = tmp_path / "out"
     ended = vipetsc(2, "sweep", case, "--out", out, "--set", "sweep.contacts.sites=[[20], [41], [30]]")
     assert ended.returncode == 1
     assert "contacts.sites = [41]: outside the lattice; cells count from 1 to 40" in ended.stdout
+
+    # One for each of the six amplitudes.
     rows = json.loads((out / "index.json").read_text())["failed"]
     assert [row["place"][0] for row in rows] == [1] * 6
     with h5py.File(out / "ensemble.h5") as file:
@@ -131,30 +160,25 @@ def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
 
 
 def test_a_member_that_does_not_come_out_is_recorded(in_process, case, tmp_path):
-    # A contact this stiff needs steps below the rounding of the time: the run stalls, the quiet one does not.
+    """A member that stalls has its place and reason in the index; the other one is there."""
     out = tmp_path / "out"
-    ended = in_process(
-        "sweep",
-        case,
-        "--out",
-        out,
-        "--set",
-        "contacts.stiffness=1e30",
-        "--set",
-        "time.engine=ts",
-        "--set",
-        "sweep.drive.amplitude=[0.1, 20.0]",
-        "--set",
-        "sweep.contacts.sites=[1]",
-    )
+    # A contact this stiff needs steps below the rounding of the time: the run stalls, the quiet one does not.
+    stiff = set_words("contacts.stiffness=1e30", "time.engine=ts")
+    two = set_words("sweep.drive.amplitude=[0.1, 20.0]", "sweep.contacts.sites=[1]")
+
+    ended = in_process("sweep", case, "--out", out, *stiff, *two)
+
     assert ended.returncode == 1
     index = json.loads((out / "index.json").read_text())
-    (loud,) = index["failed"]
-    assert index["members"]["scaled"] == 1 and loud["place"] == [0, 1] and "t = " in loud["reason"]
+    assert index["members"]["scaled"] == 1
+    (stalled,) = index["failed"]
+    assert stalled["place"] == [0, 1]
+    assert "t = " in stalled["reason"]
 
 
 @pytest.mark.parametrize("value", ["sweep.drive.amplitud=[1.0]", "sweep.feilds=true", "sweep.drive.amplitude=[0.0]"])
 def test_bad_sweeps_write_nothing(in_process, case, tmp_path, value):
+    """An unknown key and an amplitude that is impossible end with exit code 2, and no folder is made."""
     ended = in_process("sweep", case, "--out", tmp_path / "out", "--set", value)
     assert ended.returncode == 2, ended.stdout
     assert not (tmp_path / "out").exists()
@@ -162,28 +186,20 @@ def test_bad_sweeps_write_nothing(in_process, case, tmp_path, value):
 
 @pytest.mark.mpirun
 def test_full_fields_on_request(vipetsc, in_process, case, tmp_path):
+    """With sweep.fields a member keeps its run and analysis; one that a kill cut off is made again."""
     out = tmp_path / "out"
-    ended = vipetsc(
-        2,
-        "sweep",
-        case,
-        "--out",
-        out,
-        "--set",
-        "sweep.fields=true",
-        "--set",
-        "sweep.drive.amplitude=[1.0]",
-        "--set",
-        "sweep.contacts.sites=[2]",
-    )
+    one = set_words("sweep.fields=true", "sweep.drive.amplitude=[1.0]", "sweep.contacts.sites=[2]")
+    ended = vipetsc(2, "sweep", case, "--out", out, *one)
     assert ended.returncode == 0, ended.stderr
     (member,) = (path.parent for path in out.glob("*/run.h5"))
     assert {path.name for path in member.iterdir()} == {"run.h5", "analysis.h5"}
+
     # As a kill leaves it that comes before the run has begun.
     shutil.rmtree(member)
     (member / "parts").mkdir(parents=True)
-    again = in_process("sweep", out / "case.toml", "--out", out)
-    assert again.returncode == 0, again.stderr
+    repaired = in_process("sweep", out / "case.toml", "--out", out)
+    assert repaired.returncode == 0, repaired.stderr
+
     found = datasets(member / "run.h5")
     assert found["velocity"].shape == (301, 40, 2)
     measured = datasets(member / "analysis.h5")
@@ -194,18 +210,12 @@ def test_full_fields_on_request(vipetsc, in_process, case, tmp_path):
 
 @pytest.mark.mpirun
 def test_measures_again_from_files(vipetsc, in_process, case, tmp_path):
+    """Analyses and ensemble that were removed are computed from the kept runs to the same bits."""
     out = tmp_path / "out"
-    keys = (
-        "--set",
-        "sweep.fields=true",
-        "--set",
-        "sweep.drive.amplitude=[0.1, 5.0]",
-        "--set",
-        "sweep.contacts.sites=[2]",
-    )
-    assert in_process("sweep", case, "--out", out, *keys).returncode == 0
+    two = set_words("sweep.fields=true", "sweep.drive.amplitude=[0.1, 5.0]", "sweep.contacts.sites=[2]")
+    assert in_process("sweep", case, "--out", out, *two).returncode == 0
 
-    before = {p: datasets(p) for p in [*out.glob("*/analysis.h5"), out / "ensemble.h5"]}
+    before = {path: datasets(path) for path in [*out.glob("*/analysis.h5"), out / "ensemble.h5"]}
     for path in before:
         path.unlink()
 
@@ -221,6 +231,7 @@ def test_measures_again_from_files(vipetsc, in_process, case, tmp_path):
 
 
 def test_validate_counts_the_members(in_process, case):
+    """The table of a sweep has the number of its members, by axes, and of those that cannot be."""
     ended = in_process("validate", case, "--set", "sweep.contacts.sites=[[20], [41]]")
     assert ended.returncode == 0, ended.stderr
     assert "12 members (2 x 6), 6 of them impossible" in ended.stdout
