@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import clean_environment
+from tests.conftest import clean_environment, set_words
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
+# Few cells and a short burst, with a clearance so small that there are contacts.
 TINY = (
     "lattice.cells=24",
     "contacts.sites=[6, 12]",
@@ -22,6 +23,7 @@ TINY = (
 
 
 def bench(*arguments: object) -> subprocess.CompletedProcess:
+    """Call ``scripts/bench.py`` in a process of its own."""
     command = [sys.executable, SCRIPTS / "bench.py", *arguments]
     return subprocess.run(
         list(map(str, command)), capture_output=True, text=True, timeout=120, check=False, env=clean_environment()
@@ -29,14 +31,17 @@ def bench(*arguments: object) -> subprocess.CompletedProcess:
 
 
 def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path):
-    changes = [word for key in TINY for word in ("--set", key)]
-    ended = bench("--quick", "--only", "precision", "--out", tmp_path, *changes)
+    """The errors of every solver that is installed fall with its tolerance; the results leave a picture and a table."""
+    ended = bench("--quick", "--only", "precision", "--out", tmp_path, *set_words(*TINY))
     assert ended.returncode == 0, ended.stderr
+
     found = json.loads((tmp_path / "latest.json").read_text())
     errors: dict[str, list[float]] = {}
     for row in found["rows"]:
         assert row["seconds"] > 0, row
         errors.setdefault(row["solver"], []).append(row["error"])
+
+    # Peers that a machine may lack are held to the same where they are installed.
     wanted = {"vipetsc ts", "TSRK 5dp", "TSRK 8vr", "DOP853 numba", "DOP853 numpy"}
     if Path("/usr/include/boost/numeric/odeint.hpp").exists():
         wanted |= {"odeint dopri5", "odeint fehlberg78"}
@@ -45,13 +50,16 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path):
     if (SCRIPTS.parent / ".venv-diffrax" / "bin" / "python").exists():
         wanted.add("diffrax Dopri8")
     assert wanted <= errors.keys()
+
     for solver, falling in errors.items():
         # Kinks that Fehlberg's estimate overlooks leave its error uneven.
-        share = 0.3 if solver == "odeint fehlberg78" else 1e-3
+        fraction = 0.3 if solver == "odeint fehlberg78" else 1e-3
         # Exact steps leave little that could fall: the propagator begins where the reference's own error lies.
-        assert falling[-1] < max(share * falling[0], 1e-11), (solver, falling)
+        assert falling[-1] < max(fraction * falling[0], 1e-11), (solver, falling)
     assert max(found["reference"]["separation"].values()) < 1e-9
     assert min(found["ratios"].values()) > 0
+
+    # A picture without curves takes less.
     assert (tmp_path / "work-precision.png").stat().st_size > 5000
     table = bench("--table", "--out", tmp_path)
     assert table.returncode == 0, table.stderr
@@ -60,10 +68,12 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path):
 
 @pytest.mark.mpirun
 def test_what_two_ranks_do_is_timed_beside_memory_messages_and_files(monkeypatch):
+    """A flight on two ranks reports times, memory, messages and reductions; a build reports its files and times."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     from bench_scaling import builds, on_ranks
 
     row = on_ranks(2, "flight", engine="ts", cells=30, intervals=3)
+
     assert row["ranks"] == 2
     assert row["wall_ms"] > 0
     assert 0 < row["share_of_bandwidth_limit"] < 1
@@ -71,9 +81,12 @@ def test_what_two_ranks_do_is_timed_beside_memory_messages_and_files(monkeypatch
     # Each stage of a step sends the ghosts of a cell, 4 displacements and 4 velocities or half of them.
     assert row["messages"] >= 13
     assert row["message_bytes"] / row["messages"] in (32, 64)
-    assert row["reductions"] > row["messages"] / 14  # one of PETSc's own a step, and ours
-    assert row["TSStep_ms"] > row["ContactSearch_ms"] > 0  # events of PETSc's log
-    (alone, together) = builds([(200, 3)])
+    # One of PETSc's own a step, and ours.
+    assert row["reductions"] > row["messages"] / 14
+    # Events of PETSc's log.
+    assert row["TSStep_ms"] > row["ContactSearch_ms"] > 0
+
+    alone, together = builds([(200, 3)])
     assert together["ranks"] == 2
     assert together["file_gb"] == pytest.approx(alone["file_gb"], rel=0.2)
     assert min(together["set_up_s"], together["write_s"], together["seconds"]["step"]) > 0
@@ -83,6 +96,7 @@ def test_what_two_ranks_do_is_timed_beside_memory_messages_and_files(monkeypatch
     "arguments", [("--table",), ("--set", "lattice.cels=3"), ("--set", "contacts.restitution=0.7")]
 )
 def test_what_cannot_be_measured_is_refused(tmp_path, monkeypatch, arguments):
+    """A table without results, an unknown key and a case that the peers cannot solve end with 2 and write nothing."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     from bench import main
 
@@ -91,43 +105,60 @@ def test_what_cannot_be_measured_is_refused(tmp_path, monkeypatch, arguments):
 
 
 def test_a_model_of_many_ranks_and_the_targets_read_the_same_rows(monkeypatch):
+    """The model and the targets have the values that are computed by hand from four measured rows and a failed one."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     from bench_model import LATENCY, ScalingModel, model_tables
     from bench_targets import table, targets
 
     common = {"engine": "propagator", "messages": 1.0, "message_bytes": 0.0, "reductions": 1.0}
-    rows = [common | {"cells": n, "ranks": r, "wall_ms": 1e-5 * n / r} for n in (300, 10**5) for r in (1, 2)]
-    rows[1] |= {"speedup": 2.0, "memory_speedup": 2.0}
-    rows[3] |= {"speedup": 1.4, "memory_speedup": 2.0}
-    rows[2] |= {"share_of_bandwidth_limit": 0.4}
+    rows = []
+    for cells in (300, 10**5):
+        for ranks in (1, 2):
+            rows.append(common | {"cells": cells, "ranks": ranks, "wall_ms": 1e-5 * cells / ranks})
+    short_alone, short_paired, long_alone, long_paired = rows
+    short_paired.update(speedup=2.0, memory_speedup=2.0)
+    long_paired.update(speedup=1.4, memory_speedup=2.0)
+    long_alone.update(share_of_bandwidth_limit=0.4)
     rows.append({"engine": "ts", "cells": 300, "ranks": 0, "failure": "no memory"})
+
     model = ScalingModel(rows, "propagator")
     # 1e-8 s a cell and a message to each neighbour and ten in turn for the reduction.
     assert model.total(1024 * 2000, 1024) == pytest.approx(2e-5 + 12 * LATENCY)
     assert model.total(10**6, 1) == pytest.approx(1e-2)
     assert model_tables(rows).count("| propagator |") == 3
+    # The engine whose rows all failed has no model.
     assert "| ts |" not in model_tables(rows)
-    rows[0] |= {"share_of_bandwidth_limit": 0.1}
+
+    # No target concerns the bandwidth of so few cells.
+    short_alone.update(share_of_bandwidth_limit=0.1)
     found = {
         "scaling": rows,
         "ratios": {"odeint dopri5 / vipetsc propagator at 1e-08": 21.0},
         "members": {"diatomic": 1.0},
     }
     met = {target.name: target.met for target in targets(found)}
+    # 21 times where 20 are wanted, 0.4 of the limit where 0.3 are, a gain of 1.4 / 2 where 0.9 is, 2 where 1 is, and
+    # 1 s where a member may take 0.25 s.
     assert list(met.values()) == [True, True, False, True, False]
     assert table(found).count("| yes |") == 3
 
 
 def test_equal_error_is_interpolated_in_logarithms_and_never_beyond_the_points(monkeypatch):
+    """The cost at an error follows a power law between the points; beyond them it is a bound, if that is asked for."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     from bench_precision import at_equal_error
 
+    # Twice the time for a tenth of the error.
     power_law = [(10.0**-k, 2.0**k) for k in range(4, 9)]
+
     assert at_equal_error(power_law, 10**-5.5) == pytest.approx(2**5.5)
     assert at_equal_error(power_law, 1e-3) is None
     assert at_equal_error(power_law, 1e-9) is None
+
+    # A larger error costs no more than the largest one; what a smaller one costs cannot be bounded.
     assert at_equal_error(power_law, 1e-3, bound=True) == pytest.approx(2**4)
     assert at_equal_error(power_law, 1e-9, bound=True) is None
     assert at_equal_error([], 1e-5, bound=True) is None
+
     # A point that is slower and less accurate than another one says nothing about what an error costs.
     assert at_equal_error([*power_law, (3e-6, 1e4)], 3e-6) == pytest.approx(at_equal_error(power_law, 3e-6))

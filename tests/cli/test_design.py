@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray
 
-from tests.conftest import alone_and_on_two_ranks, assert_same_bits, datasets, modified
+from tests.conftest import alone_and_on_two_ranks, assert_same_bits, datasets, modified, set_words
 from vipetsc.case import Case, CaseError
 from vipetsc.case.design import DesignCase
 from vipetsc.case.nnm import NnmCase
@@ -32,16 +32,22 @@ def case(tmp_path):
 
 
 def numbers(path):
-    """The datasets that hold numbers."""
+    """Return the datasets that hold numbers; those of texts have Python objects."""
     return {name: values for name, values in datasets(path).items() if values.dtype != object}
 
 
 @pytest.mark.mpirun
 def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, in_process, case, tmp_path):
+    """The search leaves its files; the cell that it names has the bands that the cell's model has.
+
+    A second call makes nothing, and two ranks make the same bits.
+    """
     out = tmp_path / "out"
     done = in_process("design", case, "--out", out)
     assert done.returncode == 0, done.stderr
+
     rows = {tuple(line.split()[:2]): line.split()[2:] for line in done.stdout.splitlines()}
+    # Both readings have the best cell at the same lambda and eta.
     assert rows["printed", "weighted"][:2] == rows["calibrated", "weighted"][:2] == ["0.1", "0.5"]
     names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
     assert names == {"case.toml", "design.h5", *(f"figures/{name}.png" for name in FIGURES)}
@@ -49,34 +55,43 @@ def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, in_process, ca
     with xarray.open_dataset(out / "design.h5", engine="h5netcdf") as file:
         assert list(file.reading.values) == ["printed", "calibrated"]
         assert file["weighted"].dims == ("reading", "lambda", "eta")
-        assert file.eta.values[-1] == 0.9  # eta = 1 would leave the host without mass
+        # eta = 1 would leave the host without mass.
+        assert file.eta.values[-1] == 0.9
         assert "eta = 1" in file.attrs["left_out"]
         assert file.attrs["vipetsc_version"]
+
         best = file.sel(reading="calibrated", cost="weighted")
         place = {"lambda": best.optimum_lambda.item(), "eta": best.optimum_eta.item()}
         assert best.out_of_phase.sel(place).item() == 1
         assert best["weighted"].sel(place).item() == best.optimum_value.item() == best.paper_value.item()
         assert best.frequency.attrs["units"] == "rad/s"
+
         cell = four_band("calibrated", place["lambda"], place["eta"])
         expected = bloch(cell, file.wavenumber.values).frequency
+        # The first band begins at zero, where a relative tolerance alone may not be met.
         np.testing.assert_allclose(best.frequency.sel(place).values, expected, atol=1e-9)
+
         second = best.optimum_deflection.sel(band=2)
         np.testing.assert_allclose(second, best.signed_deflection.sel(place), atol=1e-12)
         np.testing.assert_allclose((best.optimum_amplitude**2).sum("dof"), 1)
     assert DesignCase.load(out / "case.toml").to_toml() == (out / "case.toml").read_text()
 
     written = modified(out)
-    again = in_process("design", case, "--out", out)
-    assert again.returncode == 0
-    assert again.stdout.splitlines()[:8] == done.stdout.splitlines()[:8]
-    assert modified(out) == written  # complete: nothing is made again
+    second_call = in_process("design", case, "--out", out)
+    assert second_call.returncode == 0
+    assert second_call.stdout.splitlines()[:8] == done.stdout.splitlines()[:8]
+    # Complete: nothing is made again.
+    assert modified(out) == written
+
     before = numbers(out / "design.h5")
     assert vipetsc(2, "design", case, "--out", out, "--force").returncode == 0
     assert_same_bits(before, numbers(out / "design.h5"))
 
 
 def test_pictures_again_from_the_file_alone(in_process, case, tmp_path):
-    out, bare = tmp_path / "out", tmp_path / "bare"
+    """The file alone gives the pictures of the search; unknown figures and a broken file are refused."""
+    out = tmp_path / "out"
+    bare = tmp_path / "bare"
     assert in_process("design", case, "--out", out, "--set", "design.readings=['printed']").returncode == 0
     bare.mkdir()
     (out / "design.h5").rename(bare / "design.h5")
@@ -85,6 +100,7 @@ def test_pictures_again_from_the_file_alone(in_process, case, tmp_path):
     assert done.returncode == 0, done.stderr
     drawn = {p.name: p.stat().st_size for p in (bare / "figures").iterdir()}
     assert drawn.keys() == {f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf")}
+    # A picture without curves takes less.
     assert min(drawn.values()) > 5000
     assert (bare / "figures" / "cost_maps.png").read_bytes() == (out / "figures" / "cost_maps.png").read_bytes()
 
@@ -102,9 +118,13 @@ def test_pictures_again_from_the_file_alone(in_process, case, tmp_path):
 
 
 def test_a_grid_without_a_good_cell_says_so(in_process, case, tmp_path):
-    stiff = ("--set", "design.lambda.first=5.0", "--set", "design.lambda.last=6.0")
+    """A search of which no cell is out of phase ends well, says so and has no optimum."""
+    # Springs of the resonators that are fifty times as stiff as the paper's, and more.
+    stiff = set_words("design.lambda.first=5.0", "design.lambda.last=6.0")
+
     done = in_process("design", case, "--out", tmp_path / "out", *stiff)
     assert done.returncode == 0, done.stderr
+    # Three costs in each of two readings.
     assert done.stdout.count("none is out of phase") == 6
     assert np.isnan(datasets(tmp_path / "out" / "design.h5")["optimum_lambda"]).all()
 
@@ -127,6 +147,7 @@ def test_a_grid_without_a_good_cell_says_so(in_process, case, tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_search_is_named(change, message):
+    """A wrong key or value is named, with the remedy where there is one."""
     with pytest.raises(CaseError) as error:
         DesignCase.load(None, [change])
     assert message in str(error.value)
@@ -134,8 +155,9 @@ def test_what_is_wrong_with_a_search_is_named(change, message):
 
 @alone_and_on_two_ranks
 def test_bad_cases_write_nothing(on_ranks, case, tmp_path, ranks):
-    """Everything wrong is said at once, once."""
-    wrong = ("--set", "design.eta.last=1.5", "--set", "design.lambda.coutn=3", "--set", "design.wavenumbers=2")
+    """Everything wrong is said at once, once, whatever the number of ranks."""
+    wrong = set_words("design.eta.last=1.5", "design.lambda.coutn=3", "design.wavenumbers=2")
+
     done = on_ranks(ranks, "design", case, "--out", tmp_path / "out", *wrong)
     assert done.returncode == 2, done.stdout
     for message in (
@@ -149,6 +171,7 @@ def test_bad_cases_write_nothing(on_ranks, case, tmp_path, ranks):
 
 
 def test_results_of_other_kinds_are_never_replaced(in_process, case, tmp_path):
+    """Even --force replaces no results of another verb, be it by a search or of one."""
     for evidence in ("run.h5", "branch-mode-1.h5", "index.json"):
         folder = tmp_path / evidence.split(".")[0]
         folder.mkdir()
@@ -173,6 +196,7 @@ def test_results_of_other_kinds_are_never_replaced(in_process, case, tmp_path):
 
 
 def test_the_section_may_stand_beside_those_of_other_verbs():
+    """Each verb reads its own section of a table with sections of several verbs."""
     table = {"design": {"wavenumbers": 5}, "lattice": {"preset": "four-band"}, "nnm": {"modes": [1]}}
     assert DesignCase.from_table(table).design.wavenumbers == 5
     assert Case.from_table(table).lattice.cells == 300

@@ -13,7 +13,7 @@ from mpi4py import MPI
 import h5py
 import pytest
 
-from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets, modified
+from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets, modified, set_words
 from vipetsc.cli.verbs.doctor_verb import doctor_table
 from vipetsc.figures.registry import FIGURES
 
@@ -43,6 +43,7 @@ def case(tmp_path) -> Path:
 @pytest.mark.usefixtures("plain_pictures")
 @alone_and_on_two_ranks
 def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, monkeypatch, case, tmp_path, ranks):
+    """A run leaves its files, a summary that says what was computed by what, and pictures."""
     ended = on_ranks(ranks, "run", case, "--out", tmp_path / "out")
     assert ended.returncode == 0, ended.stderr
     assert "complete: 301 samples" in ended.stdout
@@ -60,7 +61,10 @@ def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, monke
     pictures = {p.name: p.stat().st_size for p in (tmp_path / "out" / "figures").glob("*.png")}
     wanted = {"modal_energies", "spacetime", "dispersion", "ledger", "impacts", "phase", "unit_cell"}
     assert {f"{name}.png" for name in wanted} <= pictures.keys()
+    # A picture without curves takes less.
     assert min(pictures.values()) > 5000
+
+    # What one rank does from here on concerns files alone; two pictures are enough for it.
     if not ranks:
         for name in FIGURES.keys() - {"ledger", "modal_energies"}:
             monkeypatch.delitem(FIGURES, name)
@@ -68,13 +72,16 @@ def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, monke
 
 
 def assert_the_same_command_finishes_what_is_missing(in_process, case, out):
-    """What is there stays as it is."""
+    """Remove or spoil files: the same command makes those again and no others, and refuses a run that is cut off."""
     before = modified(out)
+    # Nothing first: the same command then writes nothing at all.
     for missing in ((), ("analysis.h5",), ("figures/ledger.png", "summary.json", "run.xdmf")):
         for name in missing:
             (out / name).unlink()
             if name == "analysis.h5":
+                # As a kill may leave it.
                 (out / name).write_text("cut")
+
         ended = in_process("run", case, "--out", out)
         assert ended.returncode == 0, ended.stderr
         assert "complete: 301 samples" in ended.stdout
@@ -92,6 +99,7 @@ def assert_the_same_command_finishes_what_is_missing(in_process, case, out):
 
 
 def test_no_verb_is_the_builtin_case(vipetsc, in_process, tmp_path):
+    """Without a verb the built-in case is run; another case is refused until --force replaces the run."""
     ended = vipetsc(0, "--set", "time.end=0.01", *QUICK, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "runs" / "four-band" / "run.h5").exists()
@@ -114,6 +122,7 @@ def test_no_verb_is_the_builtin_case(vipetsc, in_process, tmp_path):
 
 @alone_and_on_two_ranks
 def test_everything_wrong_with_a_case_is_said_at_once(on_ranks, tmp_path, ranks):
+    """Every wrong key and value is named once, whatever the number of ranks, and nothing is written."""
     path = tmp_path / "bad.toml"
     path.write_text(
         """
@@ -131,6 +140,7 @@ def test_everything_wrong_with_a_case_is_said_at_once(on_ranks, tmp_path, ranks)
         [drvie]
         """
     )
+
     ended = on_ranks(ranks, "run", path, "--out", tmp_path / "out")
     assert ended.returncode == 2
     for text in (
@@ -156,6 +166,7 @@ def test_everything_wrong_with_a_case_is_said_at_once(on_ranks, tmp_path, ranks)
     ],
 )
 def test_bad_input_is_exit_code_2_and_writes_nothing(in_process, tmp_path, arguments, text):
+    """Bad input is named, ends with exit code 2 and leaves the folder empty."""
     ended = in_process(*arguments, cwd=tmp_path)
     assert ended.returncode == 2
     assert text in ended.stderr
@@ -163,7 +174,9 @@ def test_bad_input_is_exit_code_2_and_writes_nothing(in_process, tmp_path, argum
 
 
 def test_a_case_that_is_not_toml(in_process, tmp_path):
+    """A case file that is not TOML is refused by name."""
     path = tmp_path / "case.toml"
+    # How an HDF5 file begins, with bytes that are no UTF-8.
     path.write_bytes(b"\x89HDF\r\n\x1a\n\xff\xfe")
     ended = in_process("validate", path)
     assert ended.returncode == 2
@@ -171,6 +184,7 @@ def test_a_case_that_is_not_toml(in_process, tmp_path):
 
 
 def test_a_folder_that_is_not_a_run_is_never_replaced(in_process, case, tmp_path):
+    """A folder with foreign files is refused and stays as it is, even with --force."""
     out = tmp_path / "out"
     out.mkdir()
     (out / "thesis.tex").write_text("years of work")
@@ -178,10 +192,12 @@ def test_a_folder_that_is_not_a_run_is_never_replaced(in_process, case, tmp_path
         ended = in_process("run", case, "--out", out, *force)
         assert ended.returncode == 2
         assert "not a run's" in ended.stderr
+
     assert [p.name for p in out.iterdir()] == ["thesis.tex"]
 
 
 def test_a_run_file_that_is_not_ours(in_process, tmp_path):
+    """A run.h5 that is not HDF5 is named, without a traceback."""
     (tmp_path / "run.h5").write_text("not HDF5 at all")
     ended = in_process("plot", tmp_path)
     assert ended.returncode == 2
@@ -190,12 +206,14 @@ def test_a_run_file_that_is_not_ours(in_process, tmp_path):
 
 
 def test_a_frequency_in_a_gap_is_a_warning(in_process, tmp_path):
+    """A drive whose frequency lies in no pass band is valid, with a warning."""
     ended = in_process("validate", "--set", "drive.frequency=650.0")
     assert ended.returncode == 0
     assert "no pass band" in ended.stdout
 
 
 def test_validate_prints_what_follows_from_the_case(in_process):
+    """The table of the built-in case has its memory, bands, drive frequency, group velocity, samples and sites."""
     ended = in_process("validate")
     assert ended.returncode == 0
     for text in ("GB on a rank", "3214.90-3644.75", "Om = 1023.27", "v_g = 428.68", "4421", "75, 106, 138, 169, 200"):
@@ -203,6 +221,7 @@ def test_validate_prints_what_follows_from_the_case(in_process):
 
 
 def test_validate_reads_every_section_as_its_verb_does(in_process, tmp_path):
+    """A file with sections of several verbs has a table of each, and the problems of all are named, once."""
     path = tmp_path / "case.toml"
     path.write_text("[nnm]\nmodes = [2]\n[design]\nwavenumbers = 11\n[sweep.drive]\namplitude = [1.0, 2.0]\n")
     ended = in_process("validate", path)
@@ -210,59 +229,78 @@ def test_validate_reads_every_section_as_its_verb_does(in_process, tmp_path):
     for text in ("restitution 0.7, effective 0.768", "2 members (2), 0 of them impossible", "reduced system, modes 2,",
                  "37 lambda x 36 eta, 11 wavenumbers"):  # fmt: skip
         assert text in ended.stdout
+
     unknown = in_process("validate", path, "--set", "petsc.ts_rk_type=magic")
     assert unknown.returncode == 2
     assert "petsc.ts_rk_type = 'magic'" in unknown.stderr
-    spoilt = in_process("validate", path, "--set", "nnm.modes=foo", "--set", "design.wavenumbers=1")
+
+    spoilt = in_process("validate", path, *set_words("nnm.modes=foo", "design.wavenumbers=1"))
     assert spoilt.returncode == 2
-    assert spoilt.stderr.count("nnm.modes = 'foo'") == spoilt.stderr.count("design.wavenumbers = 1") == 1
+    assert spoilt.stderr.count("nnm.modes = 'foo'") == 1
+    assert spoilt.stderr.count("design.wavenumbers = 1") == 1
 
 
 def test_bands_as_json_and_picture(in_process, tmp_path):
+    """The bands of the printed reading come as JSON with the gaps between them, and as a picture."""
     ended = in_process("bands", "--json", "--set", "lattice.reading=printed", "--out", tmp_path / "bands")
     assert ended.returncode == 0, ended.stderr
+
     table = json.loads(ended.stdout)
     edges = [(round(b["low"], 2), round(b["high"], 2)) for b in table["bands"]]
     assert edges == [(0.0, 836.47), (947.07, 1414.21), (2331.09, 3162.28), (3271.55, 3669.65)]
     assert len(table["gaps"]) == 3
+    # A picture without curves takes less.
     assert (tmp_path / "bands" / "bands.png").stat().st_size > 5000
 
 
 def test_bands_with_modes_of_the_finite_lattice(in_process, tmp_path):
-    asked = "bands", "--set", "lattice.cells=40", "--out", tmp_path / "bands"
-    printed = in_process(*asked, "--modes", "2", "--near", "2034")
+    """So many modes as are asked for next to a frequency are printed and written; impossible requests are refused."""
+    bands = ("bands", "--set", "lattice.cells=40")
+    out = tmp_path / "bands"
+
+    printed = in_process(*bands, "--out", out, "--modes", "2", "--near", "2034")
     assert printed.returncode == 0, printed.stderr
     rows = [line.split() for line in printed.stdout.splitlines() if line.endswith("edge")]
+    # Two modes of one frequency in a gap, which live at the edges of the lattice.
     assert [row[:3] for row in rows] == [["1", "2034.825055", "gap"], ["2", "2034.825055", "gap"]]
-    with h5py.File(tmp_path / "bands" / "modes.h5") as file:
+    with h5py.File(out / "modes.h5") as file:
         assert file["shape"].shape == (2, 40, 4)
-    as_json = in_process(*asked, "--modes", "3", "--near", "2034", "--json")
-    assert len(json.loads(as_json.stdout)["bands"]) == 4  # nothing else is printed
-    with h5py.File(tmp_path / "bands" / "modes.h5") as file:
+
+    as_json = in_process(*bands, "--out", out, "--modes", "3", "--near", "2034", "--json")
+    # Nothing but JSON is printed.
+    assert len(json.loads(as_json.stdout)["bands"]) == 4
+    with h5py.File(out / "modes.h5") as file:
         assert file["shape"].shape == (3, 40, 4)
+
+    # 40 cells of four masses have 160 modes.
     for wrong in (("--near", "2034"), ("--modes", "161"), ("--modes", "2", "--near", "-1")):
-        refused = in_process(*asked[:-1], tmp_path / "none", *wrong)
-        assert refused.returncode == 2 and wrong[-2] in refused.stderr
+        refused = in_process(*bands, "--out", tmp_path / "none", *wrong)
+        assert refused.returncode == 2
+        assert wrong[-2] in refused.stderr
         assert not (tmp_path / "none" / "modes.h5").exists()
 
 
 @pytest.mark.mpirun
 def test_doctor(vipetsc):
+    """On two ranks the doctor finds an installation that is well."""
     ended = vipetsc(2, "doctor")
     assert ended.returncode == 0, ended.stdout
     assert "all is well" in ended.stdout
 
 
 def test_doctor_without_slepc_names_the_package(monkeypatch):
+    """Without SLEPc the installation is healthy and the package that brings it is named; with it, its version is."""
     monkeypatch.setitem(sys.modules, "slepc4py", None)
     text, healthy = doctor_table(MPI.COMM_SELF)
     assert healthy
     assert "python3-slepc4py" in text
+
     monkeypatch.undo()
     assert re.search(r"slepc +3\.", doctor_table(MPI.COMM_SELF)[0])
 
 
 def test_petsc_options_reach_the_integrator(vipetsc, case, tmp_path):
+    """Options after -- choose the integrator's method and PETSc's log."""
     ended = vipetsc(0, "run", case, "--out", tmp_path / "out", *QUICK, "--", "-ts_rk_type", "5dp", "-log_view")
     assert ended.returncode == 0, ended.stderr
     assert "TSFunctionEval" in ended.stdout
@@ -271,20 +309,26 @@ def test_petsc_options_reach_the_integrator(vipetsc, case, tmp_path):
 
 @alone_and_on_two_ranks
 def test_an_unstable_run_ends_with_time_place_and_last_good_sample(vipetsc, tmp_path, ranks):
-    """Explicit Euler without step control feeds energy in: the guard ends the run and keeps what is good."""
+    """A run that grows without bound ends with 1; its status says when, where and up to which sample it is good."""
     out = tmp_path / "out"
+    # Explicit Euler without step control feeds energy in.
     euler = ("--", "-ts_rk_type", "1fe", "-ts_adapt_type", "none", "-ts_dt", "1e-5")
-    sets = ("--set", "lattice.cells=40", "--set", "contacts.sites=[10]", "--set", "time.end=0.5")
-    ended = vipetsc(ranks, "run", "--out", out, *sets, *QUICK, *euler)
+    changes = set_words("lattice.cells=40", "contacts.sites=[10]", "time.end=0.5")
+
+    ended = vipetsc(ranks, "run", "--out", out, *changes, *QUICK, *euler)
+
     assert ended.returncode == 1, ended.stdout + ended.stderr
     status = json.loads((out / "summary.json").read_text())["status"]
     for text in ("runs away", "at t = ", "nearest site 1 in cell 10", "last good sample: t = "):
         assert text in status
+
+    # Samples up to the last good one are kept, and none of those that ran away.
     run = datasets(out / "run.h5")
     assert 1 < len(run["time"]) < 2500
     assert all(abs(run["velocity"][k]).max() < 1e3 for k in range(len(run["time"])))
 
 
+# A limit on the size of files stands for a full disk: a write beyond it fails.
 FULL_DISK = """
 import resource, sys
 from mpi4py import MPI
@@ -297,66 +341,30 @@ sys.exit(main(sys.argv[2:]))
 @pytest.mark.mpirun
 @pytest.mark.parametrize(("ranks", "limit"), [(1, 300_000), (2, 440_000)])
 def test_a_disk_that_fills_ends_all_and_loses_nothing(in_process, case, tmp_path, ranks, limit):
-    """No file may grow beyond the limit: the first part does not fit, or the parts do and run.h5 does not."""
+    """A run that cannot be written ends all ranks with a sentence, keeps the earlier run, and can be resumed.
+
+    No file may grow beyond the limit: the first part does not fit, or the parts do and run.h5 does not.
+    """
     out = tmp_path / "out"
     first = in_process("run", case, "--out", out, *QUICK)
     assert first.returncode == 0, first.stderr
-    before, whole = (out / "run.h5").read_bytes(), datasets(out / "run.h5")
+    before = (out / "run.h5").read_bytes()
+    whole = datasets(out / "run.h5")
+
     script = tmp_path / "full.py"
     script.write_text(FULL_DISK)
     command = ["mpirun", "--oversubscribe", "-n", str(ranks), sys.executable, str(script), str(limit)]
     command += ["run", str(case), "--out", str(out), "--force", *QUICK]
     full = subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
+
     assert full.returncode == 1, full.stdout + full.stderr
     assert "Traceback" not in full.stderr
     assert "File too large" in full.stderr
     assert (out / "run.h5").read_bytes() == before
-    resumed = in_process("run", case, "--out", out, "--resume", *QUICK)  # on one rank, whatever it was begun on
+
+    # On one rank, whatever it was begun on.
+    resumed = in_process("run", case, "--out", out, "--resume", *QUICK)
     assert resumed.returncode == 0, resumed.stderr
     assert_same_bits(whole, datasets(out / "run.h5"))
     assert (out / "run.h5").read_bytes() != before
     assert not (out / ".new").exists()
-
-
-FAILS_ON_RANK_0_FOR_ALL = """
-from mpi4py import MPI
-from vipetsc.parallel import install_abort_hook, on_root
-install_abort_hook()
-
-def write():
-    raise PermissionError(13, "no right to write")
-
-on_root(MPI.COMM_WORLD, write)
-"""
-
-FAILS_ON_ONE_RANK = """
-import sys
-from mpi4py import MPI
-from vipetsc import Case, install_abort_hook, simulate
-assert sys.excepthook is sys.__excepthook__, "an import has installed a hook"
-install_abort_hook()
-if MPI.COMM_WORLD.rank == 1:
-    raise RuntimeError("rank 1 cannot go on")
-simulate(Case.from_table({"time": {"end": 0.01}}), "out")
-"""
-
-
-@pytest.mark.mpirun
-def test_what_rank_0_raises_for_all_is_said_once(tmp_path):
-    script = tmp_path / "fails.py"
-    script.write_text(FAILS_ON_RANK_0_FOR_ALL)
-    command = ["mpirun", "--oversubscribe", "-n", "3", sys.executable, str(script)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
-    assert ended.returncode == 1
-    assert ended.stderr.count("no right to write") == 1
-
-
-@pytest.mark.mpirun
-def test_a_rank_of_a_script_that_raises_ends_all(tmp_path):
-    script = tmp_path / "fails.py"
-    script.write_text(FAILS_ON_ONE_RANK)
-    command = ["mpirun", "--oversubscribe", "-n", "2", sys.executable, str(script)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
-    assert ended.returncode == 1
-    assert "rank 1: " in ended.stderr
-    assert "cannot go on" in ended.stderr

@@ -1,0 +1,57 @@
+"""Scripts whose ranks raise, one alone or all together: all end, and the message is printed once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.conftest import clean_environment
+
+FAILS_ON_RANK_0_FOR_ALL = """
+from mpi4py import MPI
+from vipetsc.parallel import install_abort_hook, on_root
+install_abort_hook()
+
+def write():
+    raise PermissionError(13, "no right to write")
+
+on_root(MPI.COMM_WORLD, write)
+"""
+
+FAILS_ON_ONE_RANK = """
+import sys
+from mpi4py import MPI
+from vipetsc import Case, install_abort_hook, simulate
+assert sys.excepthook is sys.__excepthook__, "an import has installed a hook"
+install_abort_hook()
+if MPI.COMM_WORLD.rank == 1:
+    raise RuntimeError("rank 1 cannot go on")
+simulate(Case.from_table({"time": {"end": 0.01}}), "out")
+"""
+
+
+@pytest.mark.mpirun
+def test_what_rank_0_raises_for_all_is_said_once(tmp_path):
+    """An error of rank 0 that all ranks raise is printed once, and all end with 1."""
+    script = tmp_path / "fails.py"
+    script.write_text(FAILS_ON_RANK_0_FOR_ALL)
+    command = ["mpirun", "--oversubscribe", "-n", "3", sys.executable, str(script)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
+
+    assert ended.returncode == 1
+    assert ended.stderr.count("no right to write") == 1
+
+
+@pytest.mark.mpirun
+def test_a_rank_of_a_script_that_raises_ends_all(tmp_path):
+    """An error of one rank ends the others, which wait for it, and is printed with its rank."""
+    script = tmp_path / "fails.py"
+    script.write_text(FAILS_ON_ONE_RANK)
+    command = ["mpirun", "--oversubscribe", "-n", "2", sys.executable, str(script)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
+
+    assert ended.returncode == 1
+    assert "rank 1: " in ended.stderr
+    assert "cannot go on" in ended.stderr
