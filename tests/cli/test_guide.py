@@ -32,8 +32,9 @@ from vipetsc.parallel import StopRequest, on_root
 
 ROOT = Path(package.__file__).parents[1]
 MANUAL = ROOT / "vipetsc/manual"
-CHAPTERS = "own-lattice", "files", "measures", "modal", "engines", "python"
-GUIDE = [ROOT / "README.md", *(MANUAL / f"{name}.md" for name in CHAPTERS)]  # one session, in this order
+CHAPTERS = ("own-lattice", "files", "measures", "modal", "engines", "python")
+# One session in this order: later pages go on with files of earlier ones.
+GUIDE = [ROOT / "README.md", *(MANUAL / f"{name}.md" for name in CHAPTERS)]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", flags=re.M | re.S)
 # Chapters with commands or code that the session does not type, and why.
 NOT_TYPED = {
@@ -49,11 +50,12 @@ NOT_TYPED = {
 
 
 def session() -> str:
-    """All blocks in order as one script for bash; `scripts/test` alone, which would come back here, is left out."""
+    """Return all blocks in order as one script for bash, which ends at the first command that fails."""
     script = ["set -ex"]
     for page in GUIDE:
         for language, text in filter(all, BLOCK.findall(page.read_text(encoding="utf-8"))):
             script.append(f": {page.name}")
+
             if language == "toml":
                 name, added = re.match(r"# (\S+\.toml)(, added)?\n", text).groups()
                 script.append(f"cat {'>>' if added else '>'} {name} <<'END'\n{text}END")
@@ -61,27 +63,33 @@ def session() -> str:
                 script.append(f"python - <<'END'\n{text}END")
             else:
                 assert language == "sh", language
+                # The tests would come back here.
                 script.append(re.sub(r"^scripts/test .*\n", "", text, flags=re.M))
     return "\n".join(script)
 
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory) -> Path:
-    """A fresh clone in which all of it was typed, without a variable of MPI set, and ended well."""
+    """Type the whole session in a fresh clone, without a variable of MPI set, where it ends well."""
     folder = tmp_path_factory.mktemp("guide")
     shutil.copytree(ROOT / "scripts", folder / "scripts")
+    # Files alone: names without a dot are folders, most of them of results.
     shutil.copytree(ROOT / "runs", folder / "runs", ignore=lambda _, names: {n for n in names if "." not in n})
+
+    # A test under mpirun has variables that a terminal does not have.
     outside = {name: value for name, value in clean_environment().items() if not name.startswith(("OMPI_", "PRTE_"))}
     environment = outside | {"PYTHONPATH": str(ROOT), "VIPETSC_PYTHON": sys.executable}
     ended = subprocess.run(
         ["bash", "-c", session()], cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False
     )
+
     assert ended.returncode == 0, ended.stdout[-2000:] + ended.stderr[-4000:]
     return folder
 
 
 @pytest.mark.mpirun
 def test_the_guide_leaves_runs_a_sweep_a_branch_and_pictures(desk):
+    """The session leaves the results that the guide speaks of, none of them empty."""
     for name in (
         "four-band/figures/dispersion.png",
         "loud/figures/dispersion.pdf",
@@ -96,6 +104,7 @@ def test_the_guide_leaves_runs_a_sweep_a_branch_and_pictures(desk):
 
 @pytest.mark.mpirun
 def test_what_the_guide_says_of_its_lattice_is_so(desk):
+    """The numbers that the guide gives of its lattice, its run and its sweep are those of the files."""
     case = Case.load(desk / "my-lattice.toml")
     assert case.drive.frequency == pytest.approx(936, abs=0.5)
     assert case.lattice.unit_cell().dofs == 3
@@ -107,20 +116,23 @@ def test_what_the_guide_says_of_its_lattice_is_so(desk):
         assert file["energy/dissipated"][-1] / file["energy/work"][-1] == pytest.approx(1 / 3, abs=0.03)
 
     with h5py.File(desk / "runs/my-sweep/ensemble.h5") as file:
-        ibtet, episodes = file["ibtet"][...], file["contact_episodes"][...]
-        quiet = episodes == 0
+        ibtet = file["ibtet"][...]
+        quiet = file["contact_episodes"][...] == 0
         assert 1 < quiet.sum() < 7
+        # Members without contact are scaled from one linear run, whose transfer is the same at any amplitude.
         assert ibtet[quiet] == pytest.approx(ibtet[0], rel=1e-12)
         assert ibtet.max() > 10 * ibtet[0]
     assert (desk / "runs/my-sweep/figures/ibtet-calibrated.png").exists()
 
 
 def commands() -> dict[str, list[str]]:
-    """Every call of the program in README and manual by where it stands, in blocks and in the text."""
+    """Return the words of every call of the program in README and manual, by page and number."""
     found = {}
     for page in [ROOT / "README.md", *sorted(MANUAL.rglob("*.md"))]:
+        # A command may go on in the next line.
         text = page.read_text(encoding="utf-8").replace("\\\n", " ")
         for number, line in enumerate(re.findall(r"python -m vipetsc *([^`\n]*)", text)):
+            # Options of PETSc and redirections are not the parser's.
             words = line.partition(" -- ")[0].partition(">")[0]
             found[f"{page.relative_to(ROOT)}-{number}"] = shlex.split(words, comments=True)
     return found
@@ -128,29 +140,43 @@ def commands() -> dict[str, list[str]]:
 
 @pytest.mark.parametrize("words", commands().values(), ids=commands())
 def test_every_command_of_the_manual_is_understood(words, monkeypatch):
-    """By the program's own parser, with every case file there; what they do is tested elsewhere."""
-    asked = []
-    monkeypatch.setattr("vipetsc.cli.main._call", lambda options, petsc: asked.append(options) or 0)
+    """The program's own parser takes every command, and the case file that it names exists."""
+    calls = []
+
+    def note(options, petsc) -> int:
+        calls.append(options)
+        return 0
+
+    # What the commands do is tested elsewhere.
+    monkeypatch.setattr("vipetsc.cli.main._call", note)
     assert main(words) == 0
-    case = getattr(asked[0], "case", None)
+
+    # The others are placeholders, or files that the session writes.
+    case = getattr(calls[0], "case", None)
     if case and case.endswith(".toml") and case not in ("CASE", "my-lattice.toml", "case.toml"):
         assert (ROOT / case).exists()
 
 
 def test_every_block_of_commands_is_typed_or_listed_with_a_reason():
+    """The pages with commands or code are those of the session and those with a reason, and no page is both."""
     found = set()
     for page in [ROOT / "README.md", *MANUAL.glob("*.md")]:
         for language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
             if language in ("sh", "python") or re.match(r"(mpirun|python|vipetsc|scripts/)", text):
                 found.add(page)
+
     assert found == {*GUIDE, *(MANUAL / f"{name}.md" for name in NOT_TYPED)}
     assert not {page.stem for page in GUIDE} & NOT_TYPED.keys()
 
 
 def test_what_extend_shows_of_figures_and_verbs_works(monkeypatch):
+    """The figure and the verb that the chapter shows draw and print what it says."""
     text = (MANUAL / "extend.md").read_text(encoding="utf-8")
     blocks = [block for language, block in BLOCK.findall(text) if language == "python"]
-    figure, verb = (next(block for block in blocks if block.startswith(f"def {name}(")) for name in ("centre", "weigh"))
+    (figure,) = (block for block in blocks if block.startswith("def centre("))
+    (verb,) = (block for block in blocks if block.startswith("def weigh("))
+
+    # Names that the chapter imports, or that stand in the file to which its code is added.
     printed: list[str] = []
     names = {"Case": Case, "Figure": Figure, "MPI": MPI, "StopRequest": StopRequest, "argparse": argparse,
              "echo": lambda comm, text: printed.append(text), "on_root": on_root, "style": style, "xr": xr,
@@ -162,13 +188,16 @@ def test_what_extend_shows_of_figures_and_verbs_works(monkeypatch):
 
     monkeypatch.setitem(VERBS, "weigh", names["VERB"])
     assert main(["weigh", "--set", "lattice.cells=100", "--quiet"]) == DONE
+    # 100 cells of the four-band lattice have 15 g each.
     assert printed == ["1.5 kg"]
 
 
 def test_the_chapter_on_verbs_lists_those_that_are_there():
+    """The chapter has a command of every verb, and lists those that take PETSc's options and those with results."""
     text = (MANUAL / "verbs.md").read_text(encoding="utf-8")
 
     def listed(pattern: str) -> set[str]:
+        """Return the names in the part of the text that the pattern's group matches."""
         return set(re.findall(r"`(\w+)`", re.search(pattern, text, flags=re.S)[1]))
 
     assert set(re.findall(r"^(?:mpirun -n 2 )?python -m vipetsc (\w+)", text, flags=re.M)) == VERBS.keys()
@@ -179,6 +208,7 @@ def test_the_chapter_on_verbs_lists_those_that_are_there():
 
 
 def test_the_names_that_extend_gives_are_where_it_says():
+    """Every name in the chapter's table stands in one of the files of its row."""
     text = (MANUAL / "extend.md").read_text(encoding="utf-8")
     for files, what in re.findall(r"^\| (`\w+/.*?) \| (.*?) \|$", text, flags=re.M):
         sources = "".join((ROOT / "vipetsc" / name).read_text() for name in re.findall(r"`([\w/.]+)`", files))
@@ -187,21 +217,26 @@ def test_the_names_that_extend_gives_are_where_it_says():
 
 
 def sections() -> dict[str, str]:
-    """Every excerpt of a case file in the manual, but those that the session writes."""
-    pages = [page for page in sorted(MANUAL.glob("*.md")) if page not in GUIDE]
-    blocks = {page.stem: BLOCK.findall(page.read_text(encoding="utf-8")) for page in pages}
-    return {
-        f"{name}-{i}": text for name, found in blocks.items() for i, (kind, text) in enumerate(found) if kind == "toml"
-    }
+    """Return every excerpt of a case file in the manual, but those that the session writes, by page and number."""
+    excerpts = {}
+    for page in sorted(MANUAL.glob("*.md")):
+        if page in GUIDE:
+            continue
+        for number, (language, text) in enumerate(BLOCK.findall(page.read_text(encoding="utf-8"))):
+            if language == "toml":
+                excerpts[f"{page.stem}-{number}"] = text
+    return excerpts
 
 
 @pytest.mark.parametrize("text", sections().values(), ids=sections())
 def test_every_excerpt_of_a_case_file_is_valid(text, tmp_path):
+    """The verbs of its sections read every excerpt without a problem."""
     (tmp_path / "case.toml").write_text(text, encoding="utf-8")
     assert load_every(tmp_path / "case.toml")
 
 
 def test_every_file_that_the_manual_names_is_there():
+    """Every path of the source tree that README or manual name exists."""
     for page in [ROOT / "README.md", *MANUAL.rglob("*.md")]:
         text = page.read_text(encoding="utf-8")
         for path in re.findall(r"`((?:vipetsc|scripts|tests|runs/gallery)/[\w/.-]*[\w/])`", text):

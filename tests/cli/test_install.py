@@ -15,30 +15,40 @@ from pathlib import Path
 import pytest
 
 import vipetsc as package
-from tests.conftest import clean_environment
+from tests.conftest import clean_environment, set_words
 from vipetsc.__main__ import BUILT_FOR_MPI
 
 ROOT = Path(package.__file__).parents[1]
 BUILD = "import sys; from setuptools.build_meta import build_sdist; print(build_sdist(sys.argv[1]))"
-PIP = sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "--no-cache-dir"
+PIP = (sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "--no-cache-dir")
 TOP = {
     "pyproject.toml", "vipetsc", "tests", "runs", "scripts", "README.md",
     "LICENSE", "CITATION.cff", "CHANGELOG.md", "MANIFEST.in", ".gitignore", ".ci",
 }  # fmt: skip
 # As scripts/setup runs it, so that its kernels are compiled.
-TINY = ("--set", "lattice.cells=40", "--set", "contacts.sites=[6,12]", "--set", "contacts.clearance=1e-4",
-        "--set", "time.end=0.08", "--set", "time.engine=propagator", "--set", "output.figures=false")  # fmt: skip
+TINY = set_words(
+    "lattice.cells=40",
+    "contacts.sites=[6,12]",
+    "contacts.clearance=1e-4",
+    "time.end=0.08",
+    "time.engine=propagator",
+    "output.figures=false",
+)
 
 
 def tracked() -> list[str]:
-    """What belongs to the source tree, by git."""
+    """Return the files that git tracks and that are there."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
+    # A file that was removed is tracked until that is committed.
     return [name for name in listed.stdout.splitlines() if (ROOT / name).exists()]
 
 
 def call(*command: object, cwd: Path, site: Path | None = None) -> subprocess.CompletedProcess:
-    """A command that ends well; with the installed package, if that is in ``site``, and never with the source."""
-    environment = clean_environment() | ({"PYTHONPATH": str(site)} if site else {})
+    """Call a command, which ends well, with the installed package if that is in ``site``, never with the source."""
+    environment = clean_environment()
+    if site:
+        environment["PYTHONPATH"] = str(site)
+
     words = list(map(str, command))
     ended = subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert ended.returncode == 0, f"{words}\n{ended.stdout}\n{ended.stderr}"
@@ -47,11 +57,13 @@ def call(*command: object, cwd: Path, site: Path | None = None) -> subprocess.Co
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> tuple[Path, Path]:
-    """An sdist of what git tracks, and a wheel made from that sdist."""
+    """Build an sdist of what git tracks, and a wheel from that sdist."""
     folder = tmp_path_factory.mktemp("built")
     for name in tracked():
         (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(ROOT / name, folder / "source" / name)
+
+    # The wheel comes from the sdist, so that what the sdist lacks is missed.
     call(sys.executable, "-c", BUILD, folder, cwd=folder / "source")
     (sdist,) = folder.glob("*.tar.gz")
     call(*PIP, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, sdist, cwd=folder)
@@ -61,7 +73,7 @@ def built(tmp_path_factory) -> tuple[Path, Path]:
 
 @pytest.fixture(scope="module")
 def site(built, tmp_path_factory) -> Path:
-    """The wheel installed into a folder of its own, beside the libraries of this environment."""
+    """Install the wheel into a folder of its own, next to the libraries of this environment."""
     folder = tmp_path_factory.mktemp("site")
     call(*PIP, "install", "--no-deps", "--no-compile", "--target", folder, built[1], cwd=folder)
     bring_kernels(folder)
@@ -75,39 +87,48 @@ def bring_kernels(site: Path) -> None:
     """
     for ours in (ROOT / "vipetsc" / "__pycache__").glob("kernels-*"):
         for folder in {Path(name).parent for name in tracked() if name.startswith("vipetsc/")}:
-            here, there = (cache_name(root / folder) for root in (ROOT, site))
-            if (ours / here).is_dir():
-                shutil.copytree(ours / here, site / "vipetsc" / "__pycache__" / ours.name / there)
+            # Numba's name of a folder depends on where it is.
+            compiled = ours / cache_name(ROOT / folder)
+            if compiled.is_dir():
+                shutil.copytree(compiled, site / "vipetsc" / "__pycache__" / ours.name / cache_name(site / folder))
 
 
 def cache_name(folder: Path) -> str:
-    """What numba calls the cache of the modules in a folder."""
+    """Return the name that numba gives to the cache of the modules in a folder."""
     return f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
 
 
 def test_the_sdist_is_the_source_and_the_wheel_is_the_package(built):
+    """The sdist has all tracked files that are not hidden, and the wheel all of the package, with its version."""
     sdist, wheel = built
     with tarfile.open(sdist) as file:
+        # Without the folder that all of them are in.
         packed = {name.partition("/")[2] for name in file.getnames()}
     assert {name for name in tracked() if not name.startswith(".")} <= packed
+
     with zipfile.ZipFile(wheel) as file:
         assert {name for name in tracked() if name.startswith("vipetsc/")} <= set(file.namelist())
     assert wheel.name == f"vipetsc-{package.__version__}-py3-none-any.whl"
 
 
 def test_the_top_level_holds_what_it_may():
+    """Every tracked file lies in one of the folders of the source tree, or is one of the files at its top."""
     assert {name.partition("/")[0] for name in tracked()} <= TOP
 
 
 @pytest.mark.mpirun
 def test_the_wheel_runs_away_from_the_source(site, tmp_path):
-    """The console script alone and under mpirun, and a part of the tiny paper."""
-    program, rank = site / "bin" / "vipetsc", ["mpirun", "--oversubscribe", "-n", "2"]
+    """The console script of the wheel prints its version, runs on two ranks, draws, and lists the paper's steps."""
+    program = site / "bin" / "vipetsc"
+    mpirun = ["mpirun", "--oversubscribe", "-n", "2"]
     printed = call(sys.executable, "-c", "import vipetsc; print(vipetsc.__file__)", cwd=tmp_path, site=site)
     assert Path(printed.stdout.strip()).is_relative_to(site)
     assert call(program, "--version", cwd=tmp_path, site=site).stdout == f"vipetsc {package.__version__}\n"
-    ended = call(*rank, program, "run", *TINY, cwd=tmp_path, site=site)
+
+    ended = call(*mpirun, program, "run", *TINY, cwd=tmp_path, site=site)
     assert ended.stdout.count("complete: ") == 1
+
+    # A picture without curves takes less.
     call(program, "plot", "runs/four-band", "--fig", "ledger", cwd=tmp_path, site=site)
     assert (tmp_path / "runs/four-band/figures/ledger.png").stat().st_size > 5000
     assert "scattering" in call(program, "paper", "--list", cwd=tmp_path, site=site).stdout
@@ -118,26 +139,32 @@ def test_the_wheel_runs_away_from_the_source(site, tmp_path):
 
 
 def test_what_pip_cannot_bring_is_named(site, tmp_path):
-    """Without the libraries that are built for MPI: a sentence, no traceback."""
+    """Without the libraries that are built for MPI the doctor ends with a sentence about them, without a traceback."""
+    # An import of a module that is None in sys.modules fails.
     code = (
         f"import sys; sys.path.insert(0, {str(site)!r}); sys.modules.update(dict.fromkeys({BUILT_FOR_MPI}));"
         " from vipetsc.__main__ import main; sys.exit(main(['doctor']))"
     )
     ended = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
-    assert "petsc4py" in ended.stderr and "apt install" in ended.stderr
+    assert "petsc4py" in ended.stderr
+    assert "apt install" in ended.stderr
     assert "Traceback" not in ended.stderr
 
 
 def test_recipes_and_citation_say_what_the_package_says():
+    """Citation, recipe and changes have the package's version, and the recipe its dependencies."""
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     recipe = (ROOT / "scripts/recipes/recipe.yaml").read_text(encoding="utf-8")
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     for text in (citation, recipe):
         assert re.findall(r"^ *version: (\d\S*)$", text, flags=re.M) == [package.__version__]
     assert re.search(r"^## (\S+)", changes, flags=re.M)[1] == package.__version__
+
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     needed = {re.match(r"[\w-]+", line)[0] for line in [*project["dependencies"], "h5py"]}
+
+    # Conda calls some packages by the name of their smaller variant; what it brings besides is not pip's.
     run = recipe.split("\n  run:\n")[1].split("\n\n")[0]
     names = {name.removesuffix("-base") for name in re.findall(r"^ +- ([\w-]+)", run, flags=re.M)}
     assert names - {"python", "petsc", "slepc4py"} == needed
