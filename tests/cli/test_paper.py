@@ -16,7 +16,7 @@ import pytest
 
 from tests.cli.browser import NEEDED, SCREENS, browsing
 from tests.cli.tiny_paper import DRAWN, drawing, tiny_plan
-from tests.conftest import clean_environment
+from tests.conftest import clean_environment, modified
 from vipetsc.figures.sweep_members import Files
 from vipetsc.paper.claims.criteria import CLAIMS
 from vipetsc.paper.make import make_paper
@@ -27,11 +27,12 @@ ROOT = Path(__file__).parents[2]
 
 
 def command(folder: Path) -> list[str]:
+    """Return the words that make the tiny paper in a folder on two ranks."""
     return ["mpirun", "--oversubscribe", "-n", "2", sys.executable, "-m", "tests.cli.tiny_paper", str(folder)]
 
 
 def make(folder: Path) -> dict:
-    """What the tiny paper says it did on two ranks."""
+    """Make the tiny paper on two ranks; return what it says it did."""
     ended = subprocess.run(
         command(folder), cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=300, check=False
     )
@@ -40,12 +41,13 @@ def make(folder: Path) -> dict:
 
 
 def environment() -> dict[str, str]:
+    """Return the environment in which the tests' own modules are found."""
     return clean_environment() | {"PYTHONPATH": str(ROOT)}
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    """The tiny paper made on two ranks."""
+    """Make the tiny paper on two ranks, once for all tests that read it."""
     folder = tmp_path_factory.mktemp("paper") / "out"
     done = make(folder)
     assert done["complete"]
@@ -55,8 +57,10 @@ def made(tmp_path_factory) -> Path:
 
 @pytest.mark.mpirun
 def test_one_rank_makes_the_same_claims_as_two(made, tmp_path):
+    """One rank computes the steps that two claims need, and their table is the same to the byte."""
     done = make_paper(drawing(tiny_plan()), tmp_path / "out", only=["C8", "C11"])
     assert set(done.new_steps) == {"scattering", "interband", "interband-scatter"}
+
     claims = (made / "claims.json").read_bytes()
     assert (tmp_path / "out" / "claims.json").read_bytes() == claims
     assert {row["verdict"] for row in json.loads(claims)} == {"holds"}
@@ -64,23 +68,31 @@ def test_one_rank_makes_the_same_claims_as_two(made, tmp_path):
 
 @pytest.mark.mpirun
 def test_a_second_call_does_nothing_and_a_lost_picture_is_drawn_again(made):
-    before = {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.is_file()}
-    again = make_paper(drawing(tiny_plan()), made)
-    assert (again.new_steps, again.drawn, again.complete) == ((), (), True)
-    assert {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.is_file()} == before
+    """A second call computes, draws and writes nothing; without one of its files a picture is drawn again."""
+    before = modified(made)
+    second_call = make_paper(drawing(tiny_plan()), made)
+    assert second_call.new_steps == ()
+    assert second_call.drawn == ()
+    assert second_call.complete is True
+    assert modified(made) == before
+
+    # A picture is three files, which are drawn together.
     (made / "figures" / "fig10-reduced-model-printed.pdf").unlink()
     assert len(make_paper(drawing(tiny_plan()), made).drawn) == 3
 
 
 @pytest.mark.mpirun
 def test_every_figure_of_the_paper_is_offered(made):
+    """The results of the tiny paper allow pictures of all figures; those that it draws are there in every format."""
     plan = tiny_plan()
     folders = plan.folders(made)
     assert set(folders) == {step.name for step in plan.steps}
+
     with Files() as files:
         stems = [picture.stem for figure in PAPER_FIGURES for picture in figure.offers(folders, files)]
     assert len(stems) == len(set(stems))
     assert {stem.partition("-")[0] for stem in stems} == {figure.id for figure in PAPER_FIGURES}
+
     drawn = {path.name for path in (made / "figures").iterdir()}
     ours = [stem for stem in stems if stem.partition("-")[0] in DRAWN]
     assert drawn == {f"{stem}.{kind}" for stem in ours for kind in ("png", "pdf", "json")}
@@ -88,28 +100,13 @@ def test_every_figure_of_the_paper_is_offered(made):
 
 @pytest.mark.mpirun
 def test_a_changed_case_is_stale(made):
-    plan = tiny_plan()
-    step = next(step for step in plan.steps if step.name == "design")
+    """A finished step is stale once its case has a change more."""
+    (step,) = (step for step in tiny_plan().steps if step.name == "design")
     assert step.state(made) == DONE
     assert replace(step, changes=(*step.changes, "design.lambda.count=4")).state(made) == "stale"
 
 
-def test_every_claim_and_figure_leads_to_steps():
-    for grid in ("full", "quick"):
-        plan = paper_plan(grid)
-        assert {claim for step in plan.steps for claim in plan.claims_of(step)} == set(CLAIMS)
-        for figure in plan.figures:
-            part = plan.only([figure.id])
-            assert {step.name for step in part.steps} >= set(figure.steps)
-        assert [step.name for step in plan.only(["C10"]).steps] == ["design"]
-        assert {step.name for step in plan.only(["figs8"]).steps} > {"interband", "nnm-hertz-calibrated"}
-        assert plan.only([]) == plan
-    full, quick = paper_plan("full"), paper_plan("quick")
-    assert all(
-        a.text != b.text for a, b in zip(full.steps, quick.steps, strict=True) if (a.checks or a.name) not in SAME
-    )
-
-
+# Steps whose cases are the same on both grids.
 SAME = (
     "scattering-amplitudes",
     "interband-amplitudes",
@@ -119,7 +116,29 @@ SAME = (
 )
 
 
+def test_every_claim_and_figure_leads_to_steps():
+    """On both grids every claim and figure leads to its steps; but for some the grids have other cases."""
+    for grid in ("full", "quick"):
+        plan = paper_plan(grid)
+        assert {claim for step in plan.steps for claim in plan.claims_of(step)} == set(CLAIMS)
+
+        for figure in plan.figures:
+            part = plan.only([figure.id])
+            assert {step.name for step in part.steps} >= set(figure.steps)
+
+        assert [step.name for step in plan.only(["C10"]).steps] == ["design"]
+        assert {step.name for step in plan.only(["figs8"]).steps} > {"interband", "nnm-hertz-calibrated"}
+        assert plan.only([]) == plan
+
+    full = paper_plan("full")
+    quick = paper_plan("quick")
+    for full_step, quick_step in zip(full.steps, quick.steps, strict=True):
+        if (full_step.checks or full_step.name) not in SAME:
+            assert full_step.text != quick_step.text, full_step.name
+
+
 def test_list_says_what_is_left(in_process, tmp_path):
+    """--list names missing steps with their minutes and claims, and missing figures, and writes nothing."""
     listed = in_process("paper", "--list", "--out", tmp_path / "none")
     assert listed.returncode == 0, listed.stderr
     assert re.search(r"^scattering +missing +\d+ min +.*C7 C8", listed.stdout, re.M)
@@ -128,11 +147,13 @@ def test_list_says_what_is_left(in_process, tmp_path):
 
 
 def test_bad_ids_and_foreign_folders_are_refused(in_process, tmp_path):
+    """An unknown id is refused with those that there are, once, and a folder with other files is refused."""
     wrong = in_process("paper", "--only", "fig99", "C7", "--out", tmp_path / "out")
     assert wrong.returncode == 2
     assert wrong.stderr.count("--only fig99: figures are fig01, fig02") == 1
     assert "claims are C1 to C18" in wrong.stderr
     assert not (tmp_path / "out").exists()
+
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "letter.txt").write_text("mine")
     foreign = in_process("paper", "--only", "fig10", "--out", tmp_path / "foreign")
@@ -141,6 +162,7 @@ def test_bad_ids_and_foreign_folders_are_refused(in_process, tmp_path):
 
 
 def test_quick_and_full_do_not_mix(in_process, tmp_path):
+    """A folder of the full grid is refused for the quick one, with the remedy."""
     (tmp_path / "plan.json").write_text('{"grid": "full"}')
     mixed = in_process("paper", "--quick", "--only", "fig10", "--out", tmp_path)
     assert mixed.returncode == 2
@@ -149,6 +171,7 @@ def test_quick_and_full_do_not_mix(in_process, tmp_path):
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
+    """Open one browser for all sizes of its window."""
     with browsing(tmp_path_factory.mktemp("browser")) as opened:
         yield opened
 
@@ -157,6 +180,7 @@ def browser(tmp_path_factory):
 @NEEDED
 @SCREENS
 def test_the_report_fits_a_phone_and_a_desk(made, browser, width, height):
+    """The report is no wider than the window, holds every picture itself, and has no dead link and no error."""
     found = browser.measure(browser.open(made / "report.html", width, height))
     assert found["window"] == width
     assert found["page"] <= width
@@ -168,6 +192,7 @@ def test_the_report_fits_a_phone_and_a_desk(made, browser, width, height):
     assert found["errors"] == []
 
 
+# Before each script below: the figure whose picture has a text, its choice of panels and its picture.
 LOOK = """
 const figure = [...document.querySelectorAll('figure')].find(f => f.querySelector('img').alt.includes('%s'));
 const box = e => { const b = e.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; };
@@ -178,21 +203,29 @@ const choice = figure.querySelector('select'), image = figure.querySelector('img
 @pytest.mark.mpirun
 @NEEDED
 def test_values_of_the_report_are_read_off_zoomed_and_switched_off(made, browser):
+    """Of a picture in the report the values are those of the results; its plot zooms, comes back and hides curves."""
     session = browser.open(made / "report.html", 1280, 900)
     look = LOOK % "Transferred energy against amplitude"
     left, top, width, height = browser.ask(
         session, look + "image.scrollIntoView({block: 'center'}); return box(image);"
     )
+
+    # The numbers are those of the results, to four digits.
     packed = browser.ask(session, look + "return figure.querySelector('script').textContent;")
     axes = json.loads(zlib.decompress(base64.b64decode(packed)))
-    (first,) = [a for a in axes if a["curves"]][:1]
-    curve, (west, north, east, south) = first["curves"][0], first["box"]
-    with h5py.File(made / "interband/ensemble.h5") as file:  # the numbers are those of the results
-        assert curve["x"] == pytest.approx(list(file["amplitude"][...][: len(curve["x"])]), rel=5e-4)  # four digits
-    browser.drag(session, (left + (west + east) / 2 * width, top + (north + south) / 2 * height))
-    told = browser.ask(session, look + "return figure.querySelector('output').textContent;")
-    assert first["x"]["label"] in told and first["y"]["label"] in told
+    first = next(panel for panel in axes if panel["curves"])
+    curve = first["curves"][0]
+    with h5py.File(made / "interband/ensemble.h5") as file:
+        assert curve["x"] == pytest.approx(list(file["amplitude"][...][: len(curve["x"])]), rel=5e-4)
 
+    # The pointer in the middle of the panel.
+    west, north, east, south = first["box"]
+    browser.drag(session, (left + (west + east) / 2 * width, top + (north + south) / 2 * height))
+    text = browser.ask(session, look + "return figure.querySelector('output').textContent;")
+    assert first["x"]["label"] in text
+    assert first["y"]["label"] in text
+
+    # The first choice draws the panel's curves in the page itself.
     draw = (
         "choice.value = 0; choice.dispatchEvent(new Event('change')); const plot = figure.querySelector('.plot svg');"
     )
@@ -204,10 +237,14 @@ def test_values_of_the_report_are_read_off_zoomed_and_switched_off(made, browser
     )
     paths, ticks = browser.ask(session, count)
     assert paths == sum(curve["joined"] for curve in first["curves"])
+
+    # A part that is pulled open has other ticks, and the button brings back the whole.
     browser.drag(session, (left + 0.3 * width, top + 0.3 * height), (left + 0.5 * width, top + 0.6 * height))
     assert browser.ask(session, count)[1] != ticks
     browser.ask(session, look + "figure.querySelector('.legend .reset').click();")
     assert browser.ask(session, count) == [paths, ticks]
+
+    # A curve's button takes it away.
     browser.ask(session, look + "figure.querySelector('.legend button').click();")
     assert browser.ask(session, count)[0] < paths
     assert browser.measure(session)["errors"] == []
@@ -215,8 +252,10 @@ def test_values_of_the_report_are_read_off_zoomed_and_switched_off(made, browser
 
 @pytest.mark.mpirun
 def test_the_report_says_what_it_must(made):
+    """The report names readings, verdicts, reservations and versions, and takes less than 5 MB."""
     page = (made / "report.html").read_text(encoding="utf-8")
     assert "quick: coarse grid" in page
     for words in ("calibrated", "printed", "holds", "minus sign", "Hermitian", "ledger", "petsc", "Two engines"):
         assert words in page
+
     assert len(page) < 5e6

@@ -19,6 +19,7 @@ FOUR_BAND = (*SHORT, "lattice.cells=30")
 AMPLITUDES = "sweep.drive.amplitude={ log = [0.2, 50.0], count = 6 }"
 BRANCH = ("nnm.energy=[0.0, 30.0]",)
 PREDICTED = (*FOUR_BAND[:3], "lattice.cells=30", "contacts.sites=2", "predict.amplitudes=[2.0]")
+# By the name of a step, which a step that checks it by the other engine takes too.
 CHANGES = {
     "scattering-amplitudes": (*DIATOMIC, "contacts.sites=2"),
     "interband-amplitudes": (*FOUR_BAND, "output.window=[5, 15]", "output.every=10"),
@@ -40,27 +41,28 @@ CHANGES = {
     ),
     "scattering": (*DIATOMIC, "time.samples=201", "sweep.contacts.sites=[1, 2]", AMPLITUDES),
 }  # fmt: skip
-DRAWN = ("fig01", "fig09", "fig10", "fig11", "figS3")  # the cheap ones; all others are offered as well
+# The cheap ones; all others are offered as well.
+DRAWN = ("fig01", "fig09", "fig10", "fig11", "figS3")
 
 
 def tiny_plan() -> Plan:
-    """All steps of the quick plan in small, a few figures, and claims that are sums over the results."""
+    """Return the steps of the quick plan in small, with claims that are sums over the results."""
     plan = paper_plan(QUICK)
-    kept = (step for step in plan.steps if step.checks in ("", "interband"))  # one sample by the other engine will do
-    steps = (replace(step, changes=(*step.changes, *CHANGES[step.checks or step.name])) for step in kept)
+    steps = []
+    for step in plan.steps:
+        # One sample by the other engine will do.
+        if step.checks in ("", "interband"):
+            steps.append(replace(step, changes=(*step.changes, *CHANGES[step.checks or step.name])))
     return replace(plan, steps=tuple(steps), measure=measure_claims)
 
 
 def drawing(plan: Plan) -> Plan:
-    """The plan with the figures ``DRAWN`` alone."""
+    """Return the plan with the figures ``DRAWN`` alone."""
     return replace(plan, figures=tuple(figure for figure in plan.figures if figure.id in DRAWN))
 
 
-ROW = "id", "reading", "claim", "value", "uncertainty", "threshold", "verdict", "reason", "figure", "files"
-
-
 def measure_claims(root: Path) -> list[dict]:
-    """Sums over the results of two steps, as rows like the project's own: any bit that differs shows."""
+    """Return sums over the results of two steps as rows like the project's own; any bit that differs shows in them."""
     found = []
     for name, key, step, data in (
         ("C7", "entropy", "scattering", "entropy/energy_weighted"),
@@ -68,20 +70,32 @@ def measure_claims(root: Path) -> list[dict]:
     ):
         path = root / step / "ensemble.h5"
         value = {}
+        # With a part of the paper one of the steps may be missing.
         if path.exists():
             with h5py.File(path) as file:
                 value = {"total": float(np.nansum(file[data][...]))}
 
         verdict = "holds" if value else "not measured"
         for reading in ("calibrated", "printed"):
-            text = f"the {key} of the small lattice adds up"
-            row = name, reading, text, value, {}, "total > 0", verdict, "", "", [f"{step}/ensemble.h5"]
-            found.append(dict(zip(ROW, row, strict=True)))
+            row = {
+                "id": name,
+                "reading": reading,
+                "claim": f"the {key} of the small lattice adds up",
+                "value": value,
+                "uncertainty": {},
+                "threshold": "total > 0",
+                "verdict": verdict,
+                "reason": "",
+                "figure": "",
+                "files": [f"{step}/ensemble.h5"],
+            }
+            found.append(row)
     return found
 
 
 def main() -> int:
     """Make the tiny paper and print what was done."""
+    # Here and not above, since tests import this module into processes that have PETSc.
     import petsc4py
 
     petsc4py.init(["tiny", "-no_signal_handler"])
