@@ -20,13 +20,14 @@ from tests.faults.scenarios import SCENARIOS
 from tests.faults.trials import Crew, judge, last_words, matrix, references
 from vipetsc.case import Case
 
-Row = dict[str, Any]  # of the report: a task, and how it went
+# Of the report: a task, and how it went.
+Row = dict[str, Any]
 # Of verbs that leave results of their own, which the same command goes on with.
 KILLED = [scenario.name for scenario in SCENARIOS.values() if scenario.verb.results]
 
 
 def faults(options: argparse.Namespace) -> dict[str, Any]:
-    """Every kind of fault at every phase of every verb, on 2 and on 3 ranks."""
+    """Do every kind of fault at every phase of every verb, on 2 and on 3 ranks."""
     rows: list[Row] = []
     reached: set[str] = set()
     with tempfile.TemporaryDirectory(prefix="faults-") as work:
@@ -36,6 +37,7 @@ def faults(options: argparse.Namespace) -> dict[str, Any]:
             tasks = list(matrix(unbroken, options.kinds))
             if options.phases:
                 tasks = [task for task in tasks if task["phase"] in options.phases]
+            # A phase counts as reached even if --every leaves out its trials.
             reached |= {task["phase"] for task in tasks}
             for task, stages in crew.do(tasks[:: options.every]):
                 rows.append(judged(task | {"ranks": ranks}, stages, options))
@@ -51,30 +53,31 @@ def faults(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def kills(options: argparse.Namespace) -> dict[str, Any]:
-    """Signals at random times to whole calls and to single ranks; then the same command, and its bits."""
+    """Send signals at random times to whole calls and to single ranks; call the same command, and compare its bits."""
     rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="kills-") as work:
         crews = {ranks: Crew(Path(work) / str(ranks), ranks, options.patience) for ranks in options.ranks}
-        for _ in range(2):  # kernels are compiled in the first
+        # Kernels may be compiled in the first: the times of the second are those of a call.
+        for _ in range(2):
             unbroken = {ranks: references(crew, options.only) for ranks, crew in crews.items()}
         seconds = {(name, ranks): unbroken[ranks][name]["seconds"] for ranks in crews for name in options.only}
         tasks = list(trials.kills(seconds, options.seed, options.count))
         for ranks, crew in crews.items():
-            of_crew = [task for task in tasks if task["ranks"] == ranks]
-            rows += [judged(task, stages, options) for task, stages in crew.do(of_crew)]
+            crew_tasks = [task for task in tasks if task["ranks"] == ranks]
+            rows += [judged(task, stages, options) for task, stages in crew.do(crew_tasks)]
 
     bad = sum(bool(row["wrong"]) for row in rows)
     for name in options.only:
-        of_name = [row for row in rows if row["scenario"] == name]
-        in_time = sum(bool(row["came"]) for row in of_name)
-        lost = sum(bool(row["wrong"]) for row in of_name)
-        print(f"{name:<13}{len(of_name):>5} kills, {in_time:>4} before the end, {lost} not as they should be")
+        named = [row for row in rows if row["scenario"] == name]
+        in_time = sum(bool(row["came"]) for row in named)
+        lost = sum(bool(row["wrong"]) for row in named)
+        print(f"{name:<13}{len(named):>5} kills, {in_time:>4} before the end, {lost} not as they should be")
     print(f"seed {options.seed}: {len(rows)} kills, {bad} of them not as they should be")
     return {"seed": options.seed, "rows": rows, "bad": bad}
 
 
 def judged(task: Row, stages: dict[str, Row], options: argparse.Namespace) -> Row:
-    """A row of the report; what is wrong is printed at once."""
+    """Return a row of the report; print what is wrong at once, as a campaign takes hours."""
     wrong = judge(task, stages, options.allowed)
     ended = stages.get("ended", {})
     if wrong:
@@ -83,7 +86,7 @@ def judged(task: Row, stages: dict[str, Row], options: argparse.Namespace) -> Ro
 
 
 def cases(options: argparse.Namespace) -> dict[str, Any]:
-    """Random changes of case files, read as every verb reads them: a sentence, never a traceback or a long wait."""
+    """Read random changes of case files as every verb does: to a sentence, never to a traceback or a long wait."""
     from tests.faults import mutations
 
     rows: list[Row] = []
@@ -92,9 +95,12 @@ def cases(options: argparse.Namespace) -> dict[str, Any]:
         for mutation in itertools.islice(mutations.mutations(options.seed), options.count):
             verdict = mutations.judge(mutation, Path(work) / "case.toml", options.seconds)
             defect = verdict.defect
+
+            # A run takes much longer than its reading: every N-th one that is valid is simulated.
             runs = [case for case in verdict.cases if isinstance(case, Case)]
             if runs and endings["valid"] % options.every == 0:
                 defect = mutations.run_shortly(runs[0], options.seconds)
+
             endings["valid" if verdict.cases else "refused"] += 1
             if defect:
                 rows.append({"parent": mutation.parent, "changes": mutation.changes, "defect": defect})
@@ -106,7 +112,7 @@ def cases(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def fault_table(rows: Sequence[dict[str, Any]], kinds: Sequence[str], ranks: Sequence[int]) -> str:
-    """Phases of every verb against kinds of faults and ranks: "." as it should be, "x" not, "-" it did not come."""
+    """Return the table of phases against kinds of faults and ranks: "." well, "x" not well, "-" it did not come."""
     marks = {}
     for row in rows:
         mark = "." if row["came"] else "-"

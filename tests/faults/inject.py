@@ -47,27 +47,32 @@ class Injector:
         return counts
 
     def _hook(self, event: str, arguments: tuple) -> None:
+        # Python itself raises audit events too.
         if not event.startswith(PREFIX):
             return
+
         phase = event.removeprefix(PREFIX)
         self.counts[phase] += 1
         if self.armed and self.armed[:2] == (phase, self.counts[phase]):
             kind = self.armed[2]
-            self.armed = None  # before it strikes, as what cleans up comes to phases too
+            # Before it strikes, as what cleans up comes to phases too.
+            self.armed = None
             if self.mark:
                 self.mark.write_text(str(time.time()))
             strike(kind, phase)
 
 
 def strike(kind: str, where: str) -> None:
-    """Meet the fault."""
+    """Raise the exception of a ``kind`` of fault, or send this process the signal."""
     if kind == "exception":
         raise InjectedError(f"a fault at {where}")
     if kind == "memory":
         raise MemoryError(f"Unable to allocate 1.00 TiB at {where}")
     if kind == "full-disk":
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), where)
-    os.kill(os.getpid(), {"sigterm": signal.SIGTERM, "sigkill": signal.SIGKILL}[kind])
+
+    signals = {"sigterm": signal.SIGTERM, "sigkill": signal.SIGKILL}
+    os.kill(os.getpid(), signals[kind])
 
 
 def main() -> int:
@@ -79,9 +84,12 @@ def main() -> int:
     parser.add_argument("kind", choices=KINDS)
     parser.add_argument("arguments", nargs="*", help="after --: what vipetsc is called with")
     options = parser.parse_args()
+
+    # mpirun names the rank; the program that it starts has not begun MPI.
     injector = Injector()
     if int(os.environ.get("OMPI_COMM_WORLD_RANK", "0")) == options.rank:
         injector.arm(options.phase, options.number, options.kind)
+
     from vipetsc.__main__ import main as vipetsc
 
     return vipetsc(options.arguments)

@@ -59,7 +59,8 @@ OWN: dict[str, Any] = {
     "drive": {"frequency": 300.0},
     "time": {"end": 0.2},
 }
-Path_ = tuple[Any, ...]  # keys and list positions that lead to a value
+# Keys and list positions that lead to a value.
+KeyPath = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
@@ -82,24 +83,26 @@ class Verdict:
 
 
 def parents() -> dict[str, dict[str, Any]]:
-    """The tables that are spoilt, by name."""
+    """Return the tables that are spoilt, by name."""
     files = {path.stem: tomllib.loads(path.read_text(encoding="utf-8")) for path in sorted(RUNS.glob("*.toml"))}
     return {"builtin": copy.deepcopy(Case.builtin_table), "own": OWN} | files
 
 
-def known_keys() -> dict[Path_, list[Any]]:
-    """Every key of every section with values of its kind: the choices of a literal, or none."""
-    found: dict[Path_, list[Any]] = {}
+def known_keys() -> dict[KeyPath, list[Any]]:
+    """Return every key of every section with values of its kind: the choices of a literal, or none."""
+    found: dict[KeyPath, list[Any]] = {}
     for section, table in SECTIONS.items():
         _collect(table, (section,), found)
     return found | {("petsc", name): list(values) for name, values in PETSC.items()}
 
 
-def _collect(annotation: Any, path: Path_, found: dict[Path_, list[Any]]) -> None:
+def _collect(annotation: Any, path: KeyPath, found: dict[KeyPath, list[Any]]) -> None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for name, field in annotation.model_fields.items():
+            # A key of the file may be a word that Python reserves, as lambda.
             _collect(field.annotation, (*path, field.alias or name), found)
         return
+
     choices = found.setdefault(path, [])
     if get_origin(annotation) is Literal:
         choices += get_args(annotation)
@@ -109,7 +112,7 @@ def _collect(annotation: Any, path: Path_, found: dict[Path_, list[Any]]) -> Non
 
 
 def mutations(seed: int, without: tuple[str, ...] = (), mild: bool = False) -> Iterator[Mutation]:
-    """Spoilt case files for ever, the same ones from the same seed; of all parents but those ``without``.
+    """Yield spoilt case files for ever, the same ones from the same seed, from all parents but those ``without``.
 
     ``mild``: few changes, of the kinds that often leave a valid case.
     """
@@ -128,18 +131,21 @@ def mutations(seed: int, without: tuple[str, ...] = (), mild: bool = False) -> I
         for _ in range(rng.choice(counts)):
             change = rng.choice(kinds)
             changes.append(change(rng, table, keys))
+
         try:
             text = tomli_w.dumps(table).encode("utf-8", "surrogatepass")
-        except (ValueError, TypeError):  # tomli_w refuses some numbers and keys
+        except (ValueError, TypeError):
+            # tomli_w refuses some numbers and keys.
             continue
+
         if rng.random() < 0.1 and not mild:
             text, change_of_text = _spoil_text(rng, text)
             changes.append(change_of_text)
         yield Mutation(parent, tuple(changes), text)
 
 
-def _places(node: Any, path: Path_ = ()) -> Iterator[Path_]:
-    """The path of every value, sections and elements of lists included."""
+def _places(node: Any, path: KeyPath = ()) -> Iterator[KeyPath]:
+    """Yield the path of every value, sections and elements of lists included."""
     items: Iterable[tuple[Any, Any]] = ()
     if isinstance(node, dict):
         items = node.items()
@@ -150,13 +156,13 @@ def _places(node: Any, path: Path_ = ()) -> Iterator[Path_]:
         yield from _places(value, (*path, key))
 
 
-def _at(table: Any, path: Path_) -> Any:
+def _at(table: Any, path: KeyPath) -> Any:
     for key in path:
         table = table[key]
     return table
 
 
-def _choose(rng: random.Random, table: Any, wanted: Callable[[Any], bool] = lambda value: True) -> Path_ | None:
+def _choose(rng: random.Random, table: Any, wanted: Callable[[Any], bool] = lambda value: True) -> KeyPath | None:
     places = [path for path in _places(table) if wanted(_at(table, path))]
     return rng.choice(places) if places else None
 
@@ -171,11 +177,13 @@ def _replace(rng: random.Random, table: Any, keys: Any) -> str:
 
 
 def _scale(rng: random.Random, table: Any, keys: Any) -> str:
+    # A bool is an int to isinstance.
     path = _choose(rng, table, lambda value: type(value) in (int, float))
     if path is None:
         return "nothing to scale"
     factor = rng.choice((-1, 0.5, 2, 10, 100, 1e3, 1e6, 1e12, 0.1, 1e-3, 1e-6, 1e-12, 1e40, 1e-40))
     old = _at(table, path)
+    # An integer beyond the largest float cannot be multiplied by one.
     new = type(old)(old * factor) if abs(old) < 1e300 else old
     _at(table, path[:-1])[path[-1]] = new
     return f"{path} = {new!r:.60}"
@@ -193,7 +201,9 @@ def _misspell(rng: random.Random, table: Any, keys: Any) -> str:
     path = _choose(rng, table)
     if path is None or not isinstance(path[-1], str):
         return "nothing to misspell"
+
     section = _at(table, path[:-1])
+    # The last two are names of Python and of pydantic.
     name = rng.choice(
         (path[-1][:-1], path[-1] + "s", path[-1].upper(), path[-1] + ".x", "", "ключ", "self", "model_config")
     )
@@ -221,15 +231,18 @@ def _lists(rng: random.Random, table: Any, keys: Any) -> str:
     return f"{what} {path}"
 
 
-def _put(rng: random.Random, table: Any, keys: dict[Path_, list[Any]]) -> str:
-    """A key that some section has, with one of its choices, a plausible number or nonsense; sometimes elsewhere."""
+def _put(rng: random.Random, table: Any, keys: dict[KeyPath, list[Any]]) -> str:
+    """Put a key of any section, with one of its choices, a plausible number or nonsense; sometimes into a sweep."""
     path = rng.choice(sorted(keys))
     numbers = (1, 2, 3, 5, 40, 0.3, 0.9, 1e-3, 1e4, [1], [1, 2], [2, 1], [1.0, 2.0], True)
     plausible = rng.random() < 0.6
     value = rng.choice(keys[path] or numbers if plausible else HOSTILE)
     if rng.random() < 0.15:
         path = ("sweep", *path)
-        value = value if isinstance(value, list) else [value, value]
+        if not isinstance(value, list):
+            value = [value, value]
+
+    # Where another change has left no section, the key is left out.
     section = table
     for key in path[:-1]:
         section = section.setdefault(key, {}) if isinstance(section, dict) else section
@@ -263,6 +276,7 @@ def _spoil_text(rng: random.Random, text: bytes) -> tuple[bytes, str]:
 def limit(seconds: int) -> Iterator[None]:
     """Raise TimeoutError in the block after ``seconds`` of this process's time, or ten times as many by the clock."""
 
+    # A process that waits uses no time of its own: the clock ends it.
     def expire(number: int, frame: Any) -> None:
         raise TimeoutError(f"longer than {seconds} s")
 
@@ -279,7 +293,7 @@ def limit(seconds: int) -> Iterator[None]:
 
 
 def judge(mutation: Mutation, path: Path, seconds: int = 20) -> Verdict:
-    """Read ``mutation`` from ``path``, as ``validate`` does; anything but cases or a CaseError is a defect."""
+    """Read ``mutation`` from ``path`` as ``validate`` does; anything but cases or a CaseError is a defect."""
     path.write_bytes(mutation.text)
     begin = time.process_time()
     try:
@@ -289,7 +303,8 @@ def judge(mutation: Mutation, path: Path, seconds: int = 20) -> Verdict:
             for case in cases:
                 verb_of(case).table(case, 1)
                 case.warnings()
-                assert type(case).from_toml(case.to_toml()).to_toml() == case.to_toml()  # a NaN differs from itself
+                # Texts are compared, since a NaN differs from itself.
+                assert type(case).from_toml(case.to_toml()).to_toml() == case.to_toml()
     except CaseError as error:
         return Verdict(refusal=str(error), seconds=time.process_time() - begin)
     except Exception as error:
@@ -305,12 +320,12 @@ class Deadline(StopRequest):
 
     @property
     def requested(self) -> bool:  # type: ignore[override]
-        """Whether the time is over."""
+        """Return whether the time is over."""
         return time.monotonic() > self.end
 
 
 def run_shortly(case: Case, seconds: float = 20, samples: int = 100) -> str:
-    """Simulate the first ``samples`` samples of ``case`` in memory; "" if it ended with a sentence, else the defect.
+    """Simulate the first ``samples`` samples of ``case`` in memory; return the defect, "" if it ends with a sentence.
 
     Cases of more than 2000 cells are left out, and those that take longer than ``seconds`` are stopped.
     """

@@ -11,11 +11,15 @@ PREFIX = "vipetsc."
 
 
 def phases() -> set[str]:
-    """The names of all phases in the source; raises ValueError for one whose name is no plain string."""
+    """Return the names of all phases in the source.
+
+    Raises ValueError for a phase whose name is no plain string.
+    """
     found = set()
     for path in Path(vipetsc.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "sys.audit":
+                # A name that is put together at run time could not be found here, and would meet no fault.
                 if not (node.args and isinstance(node.args[0], ast.Constant)):
                     raise ValueError(f"{path}:{node.lineno}: the name of a phase has to be a plain string")
                 found.add(str(node.args[0].value).removeprefix(PREFIX))

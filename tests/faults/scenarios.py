@@ -142,6 +142,7 @@ PREDICT = LAW + "[predict]\namplitudes = [4.0, 8.0]\npoints = 16\n"
 OPTIMISE = LAW.partition("[law]")[0] + "[optimise]\nbudget = 8\ncurve = [10.0]\nvariables.clearance = [1e-5, 1e-3]\n"
 # A picture for each kind of folder is enough, and costs the least.
 DRAWN = ("ledger", "branch", "deflections", "amplitudes")
+# So few that a run of 101 samples has several chunks.
 SAMPLES_A_CHUNK = 20
 
 # The paper's steps that are left in it, and what makes them tiny.
@@ -215,6 +216,7 @@ SCENARIOS = {
 
 def shrink() -> None:
     """Make the program's own pieces as small as the cases: pictures, chunks, the paper."""
+    # Workers alone call this: what is replaced stays so in the process.
     import vipetsc.paper.plan as plan
     from tests.cli.tiny_paper import tiny_plan
     from vipetsc.dynamics import recorder
@@ -223,30 +225,34 @@ def shrink() -> None:
     for name in registry.FIGURES.keys() - {*DRAWN}:
         del registry.FIGURES[name]
     recorder.CHUNK_SAMPLES = SAMPLES_A_CHUNK
+
     small = tiny_plan()
-    steps = [s for s in small.steps if s.name in PAPER]
-    steps = [replace(step, changes=(*step.changes, *PAPER[step.name])) for step in steps]
+    steps = []
+    for step in small.steps:
+        if step.name in PAPER:
+            steps.append(replace(step, changes=(*step.changes, *PAPER[step.name])))
     figures = [figure for figure in small.figures if figure.id == "fig10"]
     small = replace(small, steps=tuple(steps), figures=tuple(figures))
     plan.paper_plan = lambda grid: small
 
 
 def words_of(text: str, case: Path, out: Path) -> list[str]:
-    """The words of a call of ``Scenario``."""
+    """Return the words of a call of ``Scenario``, with the paths in them."""
     return [word.format(case=case, out=out) for word in text.split()]
 
 
 def prepare(scenario: Scenario, work: Path) -> Path:
-    """Write the scenario's case into ``work``; returns its path."""
+    """Write the scenario's case into ``work``; return its path."""
     case = work / f"{scenario.name}.toml"
     case.write_text(scenario.case)
     return case
 
 
 def unreadable(folder: Path) -> list[str]:
-    """The files of results in ``folder`` that are not whole, the hidden ones and those of parts left out."""
+    """Return the files of results in ``folder`` that are not whole, each with the error."""
     broken = []
     for path in sorted(folder.rglob("*")):
+        # Hidden files and parts are on their way to become results.
         if any(part.startswith(".") for part in path.relative_to(folder).parts):
             continue
         try:
@@ -260,9 +266,10 @@ def unreadable(folder: Path) -> list[str]:
 
 
 def difference(wanted: Path, found: Path) -> str:
-    """What differs between two outcomes of the same case, in words; empty if nothing does.
+    """Return what differs between two outcomes of the same case, in words; empty if nothing does.
 
-    The files that are there; every bit of the datasets, tables and claims; the numbers of the summaries but for times.
+    Compared are the files that are there, every bit of the datasets, tables and claims, and the numbers of the
+    summaries but for times.
     """
     names_wanted = {str(path.relative_to(wanted)) for path in wanted.rglob("*")}
     names_found = {str(path.relative_to(found)) for path in found.rglob("*")}
@@ -278,7 +285,7 @@ def difference(wanted: Path, found: Path) -> str:
 
 
 def _content(path: Path) -> dict:
-    """What has to be the same in a file."""
+    """Return what has to be the same in a file; of pictures nothing has to."""
     found: dict = {}
     if path.suffix == ".h5":
         with h5py.File(path) as file:
@@ -289,9 +296,10 @@ def _content(path: Path) -> dict:
         rows = map(json.loads, path.read_text().splitlines())
         for row in rows:
             if "key" in row:
-                found[str(row["key"])] = repr(row | {"cpu_seconds": None, "crc32": None})  # NaN equals NaN
+                # As text, in which NaN equals NaN.
+                found[str(row["key"])] = repr(row | {"cpu_seconds": None, "crc32": None})
             else:
-                found[row.get("id") or row["linear"]] = row.get("status"), row.get("measures")
+                found[row.get("id") or row["linear"]] = (row.get("status"), row.get("measures"))
     elif path.name == "summary.json":
         numbers = json.loads(path.read_text())["statistics"]
         found = {key: value for key, value in numbers.items() if not key.endswith("_seconds")}
@@ -301,12 +309,15 @@ def _content(path: Path) -> dict:
 def _bits(item: h5py.Dataset | h5py.Group) -> object:
     if not isinstance(item, h5py.Dataset):
         return None
+
     values = item[...]
-    return values.shape, values.tolist() if values.dtype == object else values.tobytes()
+    # The bytes of texts are addresses.
+    content = values.tolist() if values.dtype == object else values.tobytes()
+    return values.shape, content
 
 
 def copy(source: Path, target: Path) -> None:
-    """``target`` as ``source`` is, which may be missing."""
+    """Make ``target`` as ``source`` is, which may be missing."""
     shutil.rmtree(target, ignore_errors=True)
     if source.exists():
         shutil.copytree(source, target)

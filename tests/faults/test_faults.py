@@ -26,11 +26,14 @@ ON_RANKS: dict[int, list[str]] = {}
 for scenario in SCENARIOS.values():
     if scenario.ranks:
         ON_RANKS.setdefault(scenario.ranks, []).append(scenario.name)
-ONE_CELL = {"reduced"}  # a system of one's own, as far as faults are concerned
-KILLS = 2  # every one ends a worker and costs seconds
+# As far as faults are concerned, a system of one's own.
+ONE_CELL = {"reduced"}
+# Every one ends a worker and costs seconds.
+KILLS = 2
 
 
 def test_every_verb_that_leaves_results_meets_faults_and_kills():
+    """The verbs with results are those of the faults below and those of the campaign's kills."""
     leaving = {verb.name for verb in VERBS.values() if verb.results}
     assert {verb.name for verb in study_verbs()} < leaving
     assert {scenario.verb.name for scenario in SCENARIOS.values() if scenario.ranks} == leaving
@@ -38,7 +41,7 @@ def test_every_verb_that_leaves_results_meets_faults_and_kills():
 
 
 def test_every_verb_that_reads_or_writes_files_meets_faults():
-    """A new verb cannot be left out: what takes a case, a folder or a file needs a scenario."""
+    """The verbs that take a case, a folder or a file are those of the scenarios."""
     flags = {"case", "path", "--out"}
     with_files = {verb.name for verb in VERBS.values() if flags & {argument.flag for argument in verb.arguments}}
     assert with_files > {verb.name for verb in study_verbs()}
@@ -46,13 +49,18 @@ def test_every_verb_that_reads_or_writes_files_meets_faults():
 
 
 def test_every_system_of_normal_modes_meets_faults():
-    systems = {tomllib.loads(scenario.case)["nnm"].get("system", "reduced")
-               for scenario in SCENARIOS.values() if scenario.verb.name == "nnm"}  # fmt: skip
+    """The systems of the scenarios of nnm are all that its case has, but for one that is like another."""
+    systems = set()
+    for scenario in SCENARIOS.values():
+        if scenario.verb.name == "nnm":
+            systems.add(tomllib.loads(scenario.case)["nnm"].get("system", "reduced"))
+
     assert systems == {*get_args(NnmTable.model_fields["system"].annotation)} - ONE_CELL
 
 
 @pytest.mark.mpirun
 def test_a_fault_at_any_phase_ends_all_and_loses_nothing(tmp_path):
+    """A fault at each phase ends as it should, and the same command then leaves what an unbroken one leaves."""
     crews = {ranks: Crew(tmp_path / str(ranks), ranks) for ranks in ON_RANKS}
     tasks = []
     for ranks, crew in crews.items():
@@ -60,41 +68,57 @@ def test_a_fault_at_any_phase_ends_all_and_loses_nothing(tmp_path):
     assert phases() - {task["phase"] for task in tasks} == set(), "phases that no verb here comes to"
 
     chosen = one_of_each(tasks)
-    found, rows = {}, []
+    found = {}
+    rows = []
     for ranks, crew in crews.items():
         for task, stages in crew.do([task for task in chosen if task["ranks"] == ranks]):
             wrong = judge(task, stages, allowed=crew.patience)
             rows.append(task | {"wrong": wrong, "came": stages["ended"]["fired"]})
             if wrong:
-                found[task["id"]] = *wrong, last_words(stages)
+                found[task["id"]] = (*wrong, last_words(stages))
+
+    # Pytest shows it when the test fails.
     print(fault_table(rows, KINDS, list(ON_RANKS)))
     assert found == {}
     assert processes_of(tmp_path) == []
 
 
 def one_of_each(tasks):
-    """Of the trials one for every phase: ranks, verbs and kinds in turn, few of them kills."""
-    chosen, kills = [], KILLS
+    """Choose one trial for every phase: ranks, verbs and kinds in turn, at most KILLS of them kills."""
+    chosen = []
+    kills = 0
     for turn, phase in enumerate(sorted({task["phase"] for task in tasks})):
-        here = [task for task in tasks if task["phase"] == phase and (kills > 0 or task["kind"] != "sigkill")]
+        here = [task for task in tasks if task["phase"] == phase]
+        if kills == KILLS:
+            here = [task for task in here if task["kind"] != "sigkill"]
         numbers = sorted({task["ranks"] for task in here})
         here = [task for task in here if task["ranks"] == numbers[turn % len(numbers)]]
+
+        # From here on there may be none of the kind whose turn it is, as of kills.
+        begin = turn % len(here)
         kind = KINDS[turn % len(KINDS)]
-        chosen.append(next((t for t in here[turn % len(here) :] if t["kind"] == kind), here[turn % len(here)]))
-        kills -= chosen[-1]["kind"] == "sigkill"
+        task = next((task for task in here[begin:] if task["kind"] == kind), here[begin])
+        chosen.append(task)
+        if task["kind"] == "sigkill":
+            kills += 1
     return chosen
 
 
 @pytest.mark.mpirun
 @pytest.mark.parametrize(("kind", "code"), [("sigterm", 75), ("sigkill", 137)])
 def test_a_fault_by_the_front_door(vipetsc, in_process, tmp_path, kind, code):
-    """Real processes from their beginning to their end, as a user has them: exit codes; and the plain command again."""
-    case, whole, out = prepare(SCENARIOS["run-ts"], tmp_path), tmp_path / "whole", tmp_path / "out"
+    """A signal to one rank of a user's command ends it with its code; the plain command goes on to the same bits."""
+    case = prepare(SCENARIOS["run-ts"], tmp_path)
+    whole = tmp_path / "whole"
+    out = tmp_path / "out"
     simulate(Case.load(case), whole)
+
+    # Real processes from their beginning to their end, which the workers above are not.
     fault = vipetsc(2, "step", "60", "1", kind, "--", "run", case, "--out", out, module="tests.faults.inject", cwd=ROOT)
     assert fault.returncode == code, fault.stderr
     assert "Traceback" not in fault.stderr
     assert not (out / "run.h5").exists()
-    again = in_process("run", case, "--out", out)
-    assert again.returncode == 0, again.stderr
+
+    resumed = in_process("run", case, "--out", out)
+    assert resumed.returncode == 0, resumed.stderr
     assert_same_bits(datasets(whole / "run.h5"), datasets(out / "run.h5"))

@@ -21,8 +21,10 @@ from tests.faults.inject import KINDS
 from tests.faults.scenarios import unreadable
 
 ROOT = Path(__file__).parents[2]
-AT_ONCE = 60  # tasks of one worker
-ALLOWED = 10.0  # time in s from the fault to the end of all ranks
+# Tasks of one worker.
+AT_ONCE = 60
+# Time in s from the fault to the end of all ranks.
+ALLOWED = 10.0
 STOPPED = 75
 # What a call may end with; mpirun, which a kill or the signal itself may end, has codes of its own.
 CODES = {"sigterm": {0, STOPPED}, "sigkill": {128 + signal.SIGKILL}}
@@ -53,6 +55,7 @@ class Crew:
             for line in (self.folder / "results.jsonl").read_text().splitlines():
                 record = json.loads(line)
                 stages_of.setdefault(record["id"], {})[record["stage"]] = record
+
             while left and "finished" in stages_of.get(left[0]["id"], {}):
                 task = left.pop(0)
                 yield task, stages_of.pop(task["id"])
@@ -64,8 +67,10 @@ class Crew:
             stages = stages_of.setdefault(task["id"], {})
             if code == 0 and "ended" not in stages:
                 continue
+
             end = self._end(code, messages)
             if "begun" in stages and task["do"] == "trial":
+                # The new worker first does what the old one did not come to: the same command again.
                 stages.setdefault("ended", end | {"broken": unreadable(self.folder / task["scenario"])})
                 left[0] = task | {"do": "finish"}
             else:
@@ -73,14 +78,14 @@ class Crew:
                 yield task, stages | {"finished": end | {"differs": "it did not end by itself"}}
 
     def _end(self, code: int, messages: str) -> Record:
-        """What a call that ended its worker has left: exit code, messages, the time since its fault."""
+        """Return what a call that ended its worker has left: exit code, messages, the time since its fault."""
         errors = "".join(path.read_text(errors="replace") for path in sorted(self.folder.glob("errors-*")))
         fired = self.folder / "fired"
         since = time.time() - float(fired.read_text()) if fired.exists() else 0.0
         return {"code": code, "errors": errors, "since": since, "fired": fired.exists(), "mpirun": messages}
 
     def _launch(self, tasks: Sequence[Task]) -> tuple[int, str]:
-        """One mpirun with a worker; code and messages of mpirun. No process of it is left."""
+        """Call mpirun with a worker; return its code and its messages. No process of it is left."""
         worker = [sys.executable, "-m", "tests.faults.worker", str(self.folder), json.dumps(tasks), str(self.patience)]
         command = ["mpirun", "--oversubscribe", "-n", str(self.ranks), *worker]
         environment = clean_environment() | {"PYTHONPATH": str(ROOT), "OMPI_MCA_mpi_yield_when_idle": "1"}
@@ -90,13 +95,15 @@ class Crew:
                 command, cwd=ROOT, env=environment, stdout=file, stderr=file, start_new_session=True
             )
             code = self._await(process, {task["id"]: task for task in tasks if "delay" in task})
+
+        # After a kill, ranks may outlive their mpirun.
         for number in processes_of(self.folder):
             with suppress(ProcessLookupError):
                 os.kill(number, signal.SIGKILL)
         return code, log.read_text(errors="replace")
 
     def _await(self, process: subprocess.Popen, kills: dict[str, Task]) -> int:
-        """The exit code of a worker; it is killed when it reports nothing for longer than any call may take.
+        """Return the exit code of a worker, which is killed if it reports nothing for longer than any call may take.
 
         ``kills`` are tasks by their ids that are to meet a signal from outside, a ``delay`` in s after they began.
         """
@@ -110,17 +117,22 @@ class Crew:
                 last = time.monotonic()
                 lines = results.read_text().splitlines()
                 record = json.loads(lines[-1]) if lines else {}
-                kill = kills.get(record.get("id", "")) if record.get("stage") == "begun" else None
+
+                kill = None
+                if record.get("stage") == "begun":
+                    kill = kills.get(record["id"])
+                # A call that has ended in the meantime is past being killed.
                 if kill and not self._changes(results, size, record["time"] + kill["delay"]):
                     (self.folder / "fired").write_text(str(time.time()))
                     self._kill(process.pid, record["processes"], kill)
+            # A reference may take ten times the patience, since kernels may have to be compiled in it.
             elif time.monotonic() - last > 15 * self.patience:
                 os.killpg(process.pid, signal.SIGKILL)
             time.sleep(0.01)
         return process.returncode
 
     def _changes(self, results: Path, size: int, until: float) -> bool:
-        """Whether the worker reports something before the time ``until``."""
+        """Return whether the worker reports something before the time ``until``."""
         while (left := until - time.time()) > 0 and results.stat().st_size == size:
             time.sleep(min(left, 0.01))
         return results.stat().st_size != size
@@ -128,18 +140,24 @@ class Crew:
     def _kill(self, mpirun: int, processes: list[int], task: Task) -> None:
         """Send the signal of ``task`` to one rank, or to all: as a terminal or a scheduler does it, to mpirun."""
         number = {"sigterm": signal.SIGTERM, "sigkill": signal.SIGKILL}[task["kind"]]
-        victims = [processes[task["rank"]]] if task["rank"] >= 0 else [mpirun]
-        if task["rank"] < 0 and number == signal.SIGKILL:
-            victims += processes
+        if task["rank"] >= 0:
+            victims = [processes[task["rank"]]]
+        elif number == signal.SIGKILL:
+            # mpirun cannot pass this one on.
+            victims = [mpirun, *processes]
+        else:
+            victims = [mpirun]
+
         for victim in victims:
             with suppress(ProcessLookupError):
                 os.kill(victim, number)
 
 
 def processes_of(folder: Path) -> list[int]:
-    """The processes that were started for ``folder`` and have not ended."""
+    """Return the processes that were started for ``folder`` and have not ended."""
     found = []
     for path in Path("/proc").glob("[0-9]*"):
+        # A process may end while it is looked at.
         with suppress(OSError):
             ended = (path / "stat").read_text().rpartition(")")[2].split()[0] in "ZX"
             if not ended and os.fsencode(folder) in (path / "cmdline").read_bytes().split(b"\0"):
@@ -148,20 +166,22 @@ def processes_of(folder: Path) -> list[int]:
 
 
 def references(crew: Crew, names: Sequence[str]) -> dict[str, Record]:
-    """Unbroken calls of the scenarios: ``counts``, how often every phase came (by rank), and their time in ``seconds``.
+    """Call the scenarios unbroken; return what was found, by scenario.
 
-    Raises RuntimeError if one fails.
+    ``counts`` is how often every phase came, by rank, and ``seconds`` the time of the call. Raises RuntimeError if one
+    fails.
     """
     found = {}
     for task, stages in crew.do([{"id": name, "do": "reference", "scenario": name} for name in names]):
-        found[task["scenario"]] = result = stages["finished"]
+        result = stages["finished"]
+        found[task["scenario"]] = result
         if result["code"] != 0:
             raise RuntimeError(f"{task['id']} on {crew.ranks} ranks: {result['code']}, {result['errors']}")
     return found
 
 
 def matrix(unbroken: dict[str, Record], kinds: Sequence[str] = KINDS) -> Iterator[Task]:
-    """A trial with every kind of fault at every phase of the scenarios, rank and occurrence in turn."""
+    """Yield a trial with every kind of fault at every phase of the scenarios, rank and occurrence in turn."""
     turn = 0
     for name, reference in unbroken.items():
         ranks = reference["counts"]
@@ -170,6 +190,7 @@ def matrix(unbroken: dict[str, Record], kinds: Sequence[str] = KINDS) -> Iterato
             for kind in kinds:
                 rank = taking_part[turn % len(taking_part)]
                 most = ranks[rank][phase]
+                # The first time, the last or one in the middle: the next when all ranks have had a turn.
                 number = (1, most, (most + 1) // 2)[turn // len(ranks) % 3]
                 yield {
                     "id": f"{name} {phase} {kind} rank {rank} of {len(ranks)}, time {number}", "do": "trial",
@@ -179,12 +200,16 @@ def matrix(unbroken: dict[str, Record], kinds: Sequence[str] = KINDS) -> Iterato
 
 
 def kills(seconds: dict[tuple[str, int], float], seed: int, count: int) -> Iterator[Task]:
-    """Signals at random times of calls that take so many ``seconds`` (by scenario and ranks), to one rank or to all."""
+    """Yield trials with signals to one rank or to all at random times.
+
+    ``seconds`` is the time that a call takes, by scenario and ranks.
+    """
     random = Random(seed)
     for number in range(count):
         (name, ranks), duration = random.choice(sorted(seconds.items()))
         kind = random.choice(("sigkill", "sigterm"))
         rank = random.randrange(-1, ranks)
+        # A signal towards the end would often come after it.
         delay = round(0.8 * random.random() * duration, 3)
         whom = "all" if rank < 0 else f"rank {rank}"
         yield {
@@ -194,10 +219,11 @@ def kills(seconds: dict[tuple[str, int], float], seed: int, count: int) -> Itera
 
 
 def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> list[str]:
-    """What is wrong with how a trial ended, in words."""
+    """Return what is wrong with how a trial ended, in words."""
     ended = stages.get("ended", {})
     finished = stages.get("finished", {})
-    if not ended.get("fired"):  # what ranks draw from a count may have gone to another
+    # What ranks draw from a count may have gone to another: then the fault has not come, and nothing may be wrong.
+    if not ended.get("fired"):
         return [] if ended.get("code") == finished.get("code") == 0 else ["it ends before the fault"]
 
     kind = task["kind"]
@@ -215,6 +241,7 @@ def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> li
     if ended["code"] not in codes:
         wrong.append(f"exit code {ended['code']}")
 
+    # One for all ranks; a rank that is killed says nothing.
     messages = re.findall(r"^vipetsc: (?!warning:)", errors, re.MULTILINE)
     if len(messages) > (kind != "sigkill"):
         wrong.append(f"{len(messages)} messages")
@@ -230,7 +257,7 @@ def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> li
 
 
 def last_words(stages: dict[str, Record]) -> str:
-    """The last line on stderr of the call after the fault, else of the one with it."""
+    """Return the last line on stderr of the call after the fault, else of the one with it."""
     lines: list[str] = []
     for stage in ("ended", "finished"):
         lines += stages.get(stage, {}).get("errors", "").splitlines()

@@ -39,9 +39,11 @@ class _Quiet:
     """A communicator for the abort hook whose processes go on after it."""
 
     def __init__(self, comm: MPI.Comm) -> None:
-        self.rank, self.size = comm.rank, comm.size
+        self.rank = comm.rank
+        self.size = comm.size
 
     def Abort(self, code: int) -> None:
+        """Raise SystemExit where MPI would end all processes."""
         raise SystemExit(code)
 
 
@@ -68,8 +70,9 @@ class Worker:
         words = words_of(scenario.words, self._case(scenario), out)
         if task["do"] == "trial":
             self._meet_the_fault(task, words, out, self._before(scenario))
+            # Another worker calls again: this one may have a signal on its way.
             if "delay" in task:
-                raise SystemExit(0)  # another worker calls again: this one may have a signal on its way
+                raise SystemExit(0)
 
         ended = self._call(words)
         differs = difference(self._wanted(scenario), out) if self.comm.rank == 0 else ""
@@ -117,22 +120,28 @@ class Worker:
         self.comm.Barrier()
 
         self.injector.disarm()
-        ended = self._call(words_of(scenario.words, case, wanted), 10.0)  # kernels may have to be compiled
+        # Kernels may have to be compiled.
+        ended = self._call(words_of(scenario.words, case, wanted), 10.0)
         counts = self.comm.gather(self.injector.disarm())
         self._report(task, "finished", **ended, counts=counts)
 
     def _left_behind(self, out: Path) -> dict[str, Any]:
+        """Return whether the fault came, the time in s since then, and files of results that are not whole."""
         fired = self.folder / "fired"
         since = time.time() - float(fired.read_text()) if fired.exists() else 0.0
-        return {"fired": fired.exists(), "since": since, "broken": unreadable(out) if self.comm.rank == 0 else []}
+        # Rank 0 alone reports.
+        broken = unreadable(out) if self.comm.rank == 0 else []
+        return {"fired": fired.exists(), "since": since, "broken": broken}
 
     def _call(self, words: list[str], leave: float = 1.0) -> dict[str, Any]:
-        """Call the program as its front door does: code, lines on stderr and time of all ranks, on all ranks.
+        """Call the program as its front door does; return code, lines on stderr and time of all ranks, on all ranks.
 
-        It has so many times the usual time to end.
+        It has ``leave`` times the usual time to end.
         """
+        # As in a process that begins.
         for number in SIGNALS:
             signal.signal(number, signal.SIG_DFL)
+
         begin = time.monotonic()
         code: Any = 1
         error: BaseException | None = None
@@ -144,8 +153,11 @@ class Worker:
                 code = end.code
             except BaseException as raised:
                 error = raised
+
+            # An error that not all ranks raise leaves the others waiting for this one.
             if not self._all_are_here(1.0 if error else 2 * leave * self.patience):
-                sys.excepthook(type(error), error, error.__traceback__)  # as at the end of a process: it ends all
+                # As at the end of a process: it ends all.
+                sys.excepthook(type(error), error, error.__traceback__)
             self._report_error(error)
             faulthandler.cancel_dump_traceback_later()
 
@@ -159,6 +171,8 @@ class Worker:
         everywhere = all(self.comm.allgather(agreed))
         if error is None or (agreed and everywhere and self.comm.rank):
             return
+
+        # The program's own hook would end this process.
         hook = sys.excepthook
         install_abort_hook(_Quiet(self.comm))
         try:
@@ -169,6 +183,7 @@ class Worker:
             sys.excepthook = hook
 
     def _all_are_here(self, patience: float) -> bool:
+        """Return whether all ranks come to this call within ``patience`` s."""
         request = self.comm.Ibarrier()
         deadline = time.monotonic() + patience
         while not request.Test():
@@ -200,6 +215,7 @@ class Worker:
             os.close(target)
 
     def _report(self, task: Task, stage: str, **more: Any) -> None:
+        """Write a line that says how far a task is."""
         if self.comm.rank == 0:
             with (self.folder / "results.jsonl").open("a") as file:
                 file.write(json.dumps({"id": task["id"], "stage": stage, "time": time.time(), **more}) + "\n")
