@@ -18,7 +18,8 @@ import pytest
 import vipetsc
 from tests.conftest import clean_environment
 
-pytestmark = pytest.mark.parallel(1)
+# All of them wait for a copy of the package, whose kernels are compiled with the changed law.
+pytestmark = [pytest.mark.parallel(1), pytest.mark.slow]
 PACKAGE = Path(vipetsc.__file__).parent
 SCRIPT = Path(__file__).with_name("another_law.py")
 
@@ -67,7 +68,6 @@ def found(tmp_path_factory) -> dict:
     return json.loads((folder / "found.json").read_text())
 
 
-@pytest.mark.slow
 def test_the_law_on_arrays_and_its_compiled_twin_are_the_formula(found):
     assert found["twins"] == pytest.approx(0, abs=1e-12)
     assert found["duration"] == pytest.approx(0, abs=1e-7)
