@@ -20,7 +20,10 @@ TOLERANCE = 1e-11
 # Restarts of the first search, and of one for further copies of a mode, which mostly finds none.
 RESTARTS = 60
 COPY_RESTARTS = 4
-SHIFT = 1e-9  # of the largest Om^2, by which s differs from the frequency asked, which may be that of a mode
+# By how much of the largest Om^2 the number s differs from the square of the frequency asked, at most; and in a long
+# lattice as a part of the mean distance of its modes, so that those nearest to s are those nearest to the frequency.
+LARGEST_SHIFT = 1e-6
+SHIFT_OF_SPACING = 1e-2
 
 
 class NearModes(NamedTuple):
@@ -61,8 +64,10 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     # The modes nearest in Om are not those nearest in Om^2, which are lower ones.
     eps.setWhichEigenpairs(eps.Which.USER)
     eps.setEigenvalueComparison(lambda one, other, *_: int(np.sign(distance(one) - distance(other))))
-    # The shifted matrix would be singular if the frequency were exactly that of a mode.
-    eps.setTarget(near**2 - SHIFT * matrices.largest)
+    # The shifted matrix would be singular if the frequency were exactly that of a mode. The iteration sees 1/(Om^2 - s):
+    # that mode's is larger than all others by 1 / shift, and rounding of the others grows by as much.
+    shift = min(LARGEST_SHIFT, SHIFT_OF_SPACING / matrices.rows)
+    eps.setTarget(near**2 - shift * matrices.largest)
     _solve_directly(eps.getST())
 
     pairs: list[tuple[float, PETSc.Vec]] = []
