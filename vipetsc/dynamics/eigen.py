@@ -17,9 +17,9 @@ from vipetsc.dynamics.matrices import LatticeMatrices
 # Direct solvers for one rank, for several; the first that PETSc has. MUMPS takes ten times as long for a band.
 DIRECT = ("superlu", "petsc"), ("superlu_dist", "mumps")
 TOLERANCE = 1e-11
-# Restarts of the first search, and of one for further copies of a mode, which mostly finds none.
+# Of each search, that for further copies of a mode too: it ends as soon as one mode has converged, mostly one farther
+# away. With 4 restarts it gave up near the edge of a band, where modes crowd, and copies of ring modes were missing.
 RESTARTS = 60
-COPY_RESTARTS = 4
 # By how much of the largest Om^2 the number s differs from the square of the frequency asked, at most; and in a long
 # lattice as a part of the mean distance of its modes, so that those nearest to s are those nearest to the frequency.
 LARGEST_SHIFT = 1e-6
@@ -51,8 +51,7 @@ def load_slepc() -> Any:
 def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     """The ``count`` modes nearest to ``near`` in rad/s, lowest first; all ranks must call it.
 
-    After them further ones are sought, a few restarts long, until none is nearer: a Krylov space may miss copies of a
-    mode. Raises CaseError where modes lie so close, as at the edge of a band, that not all can be separated.
+    After them further ones are sought, until none is nearer: a Krylov space may miss copies of a mode. Raises CaseError where modes lie so close, as at the edge of a band, that not all can be separated.
     """
 
     def distance(value: complex) -> float:
@@ -76,7 +75,7 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
         # SLEPc wants one vector more than modes, if there is one, also where the last mode alone is left.
         left = max(matrices.rows - len(pairs), min(wanted + 1, matrices.rows))
         eps.setDimensions(wanted, min(max(3 * wanted, 20), left))
-        eps.setTolerances(TOLERANCE, COPY_RESTARTS if pairs else RESTARTS)
+        eps.setTolerances(TOLERANCE, RESTARTS)
         eps.setDeflationSpace([vector for _, vector in pairs])
         eps.solve()
 
