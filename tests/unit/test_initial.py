@@ -255,3 +255,24 @@ def test_an_orbit_at_rest_is_refused(branch):
 def test_an_orbit_beyond_the_lattice_is_refused(branch):
     with pytest.raises(CaseError, match="cells up to 4"):
         case_with(initial={"kind": "file", "path": str(branch)}, lattice=FOUR_BAND | {"cells": 3})
+
+
+@pytest.mark.parametrize(
+    ("sites", "join", "is_at_rest"),
+    [
+        ([3], {}, False),
+        ([5], {}, True),
+        # The resonator of a contact with the next cell moves where the host is at rest.
+        ([2], {"pair": [2, 1], "next_cell": True}, False),
+        ([1], {"pair": [2, 1], "next_cell": True}, True),
+    ],
+)
+def test_a_lossy_stop_without_clearance_is_refused_where_the_state_is_at_rest(branch, sites, join, is_at_rest):
+    """The dissipation divides by the approach velocity, which is zero there."""
+    contacts = {"sites": sites, "clearance": 0.0, "side": "plus", "restitution": 0.7, "stiffness": 1e6} | join
+    changes = {"contacts": contacts, "initial": {"kind": "file", "path": str(branch)}}
+    if is_at_rest:
+        with pytest.raises(CaseError, match="touches its stop at rest"):
+            case_with(**changes)
+    else:
+        assert Case.from_toml(case_with(**changes).to_toml())

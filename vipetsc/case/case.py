@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, read_section
-from vipetsc.case.contacts import check_pairs, contact_of, gaps_of_sites, laws_of_sites
+from vipetsc.case.contacts import check_pairs, check_touching, contact_of, gaps_of_sites, laws_of_sites, values_of_sites
 from vipetsc.case.disorder import SEED, DisorderTable, scatter
 from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_speed
 from vipetsc.case.features import FEATURES, refusals
@@ -24,6 +24,7 @@ from vipetsc.case.resolve import (
     check_cell,
     check_contacts,
     check_unsprung,
+    clearances,
     resolve,
     site_cells,
     with_preset,
@@ -86,7 +87,7 @@ class Case(CaseFile):
             reflection = sections["lattice"].absorbing and sections["lattice"].absorbing.reflection
             return sections, [Problem("lattice.absorbing.reflection", reflection, str(error))]
 
-        problems = _resolved_problems(sections, resolved)
+        problems = [*_resolved_problems(sections, resolved), *_touching_problems(sections, beginning)]
         if problems or "disorder" not in table:
             return resolved, problems
         return cls._scattered(resolved, disorder, sections["contacts"])
@@ -272,6 +273,20 @@ def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[
     if samples is None:
         return []
     return _too_coarse(given["lattice"].unit_cell(), time.sample_interval, "time.samples", samples)
+
+
+def _touching_problems(sections: dict[str, Any], beginning: Beginning | None) -> Iterator[Problem]:
+    """Lossy sites that touch their stops and that the state of a file leaves at rest."""
+    if beginning is None or beginning.moving is None:
+        return
+    contacts = sections["contacts"]
+    cells = site_cells(sections["lattice"], contacts)
+    is_to_next = values_of_sites(contacts, "next_cell", len(cells))
+    at_rest = []
+    for cell, reaches_on in zip(cells, is_to_next, strict=True):
+        touched = {cell, cell + 1} if reaches_on else {cell}
+        at_rest.append(not touched & beginning.moving)
+    yield from check_touching(contacts, clearances(sections["lattice"], contacts, len(cells)), at_rest)
 
 
 def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:

@@ -53,7 +53,8 @@ def check_per_site(
         yield Problem(f"contacts.{lacking[0]}", None, "missing; the stiffness of each site needs it")
     yield from _check_laws(contacts, count)
     yield from _check_sides(contacts, count)
-    yield from _check_stops(contacts, gaps, at_rest)
+    yield from _check_stops(contacts, gaps)
+    yield from check_touching(contacts, gaps, at_rest)
 
 
 def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
@@ -87,7 +88,22 @@ def _check_sides(contacts: ContactsTable, count: int) -> Iterator[Problem]:
         yield Problem(_path_of(contacts, "clearance_minus"), contacts.clearance_minus, remedy)
 
 
-def _check_stops(contacts: ContactsTable, gaps: list[float], at_rest: Sequence[bool]) -> Iterator[Problem]:
+def check_touching(contacts: ContactsTable, gaps: list[float], at_rest: Sequence[bool]) -> Iterator[Problem]:
+    """The first lossy site that touches its stop and is ``at_rest`` (site,) at t = 0; ``gaps`` are clearances in m."""
+    restitutions = values_of_sites(contacts, "restitution", len(gaps))
+    stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
+    for number, (plus, minus) in enumerate(stops, 1):
+        is_singular = restitutions[number - 1] < 1 and contacts.approach_floor == 0
+        if min(plus, minus) == 0 and at_rest[number - 1] and is_singular:
+            remedy = (
+                f"site {number} touches its stop at rest: its first contact has no approach velocity, by which the"
+                " damping divides; give restitution = 1, a clearance, or an approach_floor in m/s"
+            )
+            yield Problem(_path_of(contacts, "restitution"), restitutions[number - 1], remedy)
+            return
+
+
+def _check_stops(contacts: ContactsTable, gaps: list[float]) -> Iterator[Problem]:
     """Problems with contacts that are closed at rest: a second stop, or a dissipation that has no limit."""
     restitutions = values_of_sites(contacts, "restitution", len(gaps))
     precompressions = values_of_sites(contacts, "precompression", len(gaps))
@@ -104,15 +120,6 @@ def _check_stops(contacts: ContactsTable, gaps: list[float], at_rest: Sequence[b
         if min(plus, minus) < 0 and restitutions[number - 1] < 1:
             remedy = "a contact that is pressed together has no approach velocity: its restitution must be 1"
             yield Problem(_path_of(contacts, "precompression"), -min(plus, minus), f"site {number}: {remedy}")
-            return
-
-        is_singular = restitutions[number - 1] < 1 and contacts.approach_floor == 0
-        if min(plus, minus) == 0 and at_rest[number - 1] and is_singular:
-            remedy = (
-                f"site {number} touches its stop at rest: its first contact has no approach velocity, by which the"
-                " damping divides; give restitution = 1, a clearance, or an approach_floor in m/s"
-            )
-            yield Problem(_path_of(contacts, "restitution"), restitutions[number - 1], remedy)
             return
 
 

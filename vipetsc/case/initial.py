@@ -89,11 +89,16 @@ class InitialTable(Section):
 
 
 class Beginning(NamedTuple):
-    """The resolved ``section``, the frequency in rad/s of the motion, the cell (1-based) in its middle."""
+    """The resolved ``section``, the frequency in rad/s of the motion, the cell (1-based) in its middle.
+
+    ``moving`` are the cells (1-based) of a state that was read from a file in which some mass moves or is displaced;
+    None where the section alone says what is at rest.
+    """
 
     section: InitialTable
     frequency: float
     cell: int
+    moving: frozenset[int] | None = None
 
 
 def check_initial(
@@ -196,7 +201,7 @@ def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
         "time": state.time,
         "orbit": state.orbit,
     }
-    return Beginning(initial.model_copy(update=update), frequency, cell)
+    return Beginning(initial.model_copy(update=update), frequency, cell, state.moving())
 
 
 def _read_state(path: Path, initial: InitialTable) -> tuple[State, str]:

@@ -51,7 +51,8 @@ def load_slepc() -> Any:
 def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     """The ``count`` modes nearest to ``near`` in rad/s, lowest first; all ranks must call it.
 
-    After them further ones are sought, until none is nearer: a Krylov space may miss copies of a mode. Raises CaseError where modes lie so close, as at the edge of a band, that not all can be separated.
+    After them further ones are sought, until none is nearer: a Krylov space may miss copies of a mode. Raises CaseError
+    where modes lie so close, as at the edge of a band, that not all can be separated.
     """
 
     def distance(value: complex) -> float:
@@ -63,8 +64,8 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     # The modes nearest in Om are not those nearest in Om^2, which are lower ones.
     eps.setWhichEigenpairs(eps.Which.USER)
     eps.setEigenvalueComparison(lambda one, other, *_: int(np.sign(distance(one) - distance(other))))
-    # The shifted matrix would be singular if the frequency were exactly that of a mode. The iteration sees 1/(Om^2 - s):
-    # that mode's is larger than all others by 1 / shift, and rounding of the others grows by as much.
+    # The shifted matrix would be singular if the frequency were exactly that of a mode. The iterated matrix has the
+    # eigenvalues 1/(Om^2 - s): that mode's exceeds all others 1 / shift times, and so do rounding errors of the others.
     shift = min(LARGEST_SHIFT, SHIFT_OF_SPACING / matrices.rows)
     eps.setTarget(near**2 - shift * matrices.largest)
     _solve_directly(eps.getST())

@@ -70,6 +70,11 @@ class State(NamedTuple):
         v[rows] = self.velocity[inside]
         return u, v
 
+    def moving(self) -> frozenset[int]:
+        """The cells (1-based) of which some mass moves or is displaced."""
+        is_moving = np.any((self.displacement != 0) | (self.velocity != 0), axis=1)
+        return frozenset(self.cell[is_moving].tolist())
+
     def frequency(self) -> float | None:
         """Frequency in rad/s of an orbit, or of a run's drive; None for a state alone."""
         if self.period:
