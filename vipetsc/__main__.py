@@ -6,7 +6,7 @@ import sys
 from importlib.util import find_spec
 
 from vipetsc.cli.streams import check_standard_streams
-from vipetsc.process import end_on_request
+from vipetsc.process import end_on_request, quick_start_alone
 
 BUILT_FOR_MPI = "mpi4py", "petsc4py", "h5py"  # which no wheel brings
 
@@ -40,8 +40,9 @@ def main(arguments: list[str] | None = None) -> int:
     import petsc4py
 
     # Signals are ours: SIGTERM ends a run at its next step, with a checkpoint.
-    petsc4py.init([sys.argv[0], "-no_signal_handler", *arguments[end + 1 :]])
-    from petsc4py import PETSc
+    with quick_start_alone():
+        petsc4py.init([sys.argv[0], "-no_signal_handler", *arguments[end + 1 :]])
+        from petsc4py import PETSc
 
     try:
         from vipetsc.parallel import install_abort_hook

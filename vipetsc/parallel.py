@@ -14,7 +14,6 @@ from typing import Any, NamedTuple, Self, TypeVar, cast
 from mpi4py import MPI
 
 import numpy as np
-from tqdm import tqdm
 
 from vipetsc.process import STOP_SIGNALS
 
@@ -233,6 +232,8 @@ class Progress:
 
         self._bar = None
         if self._show and sys.stderr.isatty() and logging.getLogger(BAR).level < logging.CRITICAL:
+            from tqdm import tqdm
+
             layout = "{percentage:3.0f}%|{bar}| {n:.4g}/{total:.4g} {unit} [{elapsed}<{remaining}]"
             self._bar = tqdm(total=total, unit=unit, bar_format=layout, file=sys.stderr)
 

@@ -2,17 +2,37 @@
 
 import os
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 STOP_SIGNALS = signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1
 # What launchers tell a process of its rank: Open MPI's, those with PMI (MPICH, Intel MPI, Slurm's), Slurm's own.
 RANKS = "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"
+# For Open MPI, where one process runs alone: no daemon is started for it, and no network is looked for.
+ALONE = {"OMPI_MCA_ess_singleton_isolated": "1", "OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self"}
 
 
 def launched_rank() -> int | None:
     """The rank of this process in its job; None if it was not launched as one of several."""
     ranks = [os.environ[name] for name in RANKS if os.environ.get(name, "").isdigit()]
     return int(ranks[0]) if ranks else None
+
+
+@contextmanager
+def quick_start_alone() -> Iterator[None]:
+    """Let MPI be started within the block in a tenth of a second instead of half a one, if this process is alone.
+
+    What the environment already says stays as it is.
+    """
+    added = {} if launched_rank() is not None else {name: ALONE[name] for name in ALONE if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        # A process that this one starts may be an mpirun.
+        for name in added:
+            del os.environ[name]
 
 
 def end_on_request() -> None:

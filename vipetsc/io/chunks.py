@@ -5,18 +5,22 @@ dof, cell) belong to the ranges ``columns`` of the recorded cells, losses (sampl
 ``impacts`` are episodes. The part of rank 0 also has ``SAMPLED``.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from mpi4py import MPI
 
 import h5py
 import numpy as np
-import xarray as xr
 
 from vipetsc.io.atomic import Arrays
 from vipetsc.io.netcdf import tabulated
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # Variables of the file by name: dimensions, units, text.
 # Rank 0 has ``SAMPLED`` and ``DAMPING`` of every sample; ``GIVEN`` exists before the first one. ``LARGE`` are the
@@ -107,6 +111,8 @@ def joined(output: Chunks, names: Collection[str]) -> dict[str, np.ndarray]:
 
 def small_dataset(output: Chunks, attributes: Mapping[str, Any]) -> xr.Dataset:
     """The dataset of ``GIVEN`` and of all that rank 0 has of every sample, with the root ``attributes`` of the run."""
+    import xarray as xr
+
     arrays = {**joined(output, output.recording.sampled), **output.recording.given}
     if len(arrays["field_time"]) == len(arrays["time"]):
         del arrays["field_time"]  # fields are of every sample

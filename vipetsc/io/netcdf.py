@@ -8,26 +8,33 @@ The dataset is flat rather than a ``DataTree`` because there a group inherits th
 ``tree["sites/cell"]`` would be the coordinate ``/cell``, not the variable of the group ``sites``.
 """
 
+from __future__ import annotations
+
 import json
 import sys
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import h5py
 import numpy as np
-import xarray as xr
 
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.errors import ResultFileError, UnreadableFileError
 
-Variables = dict[str, xr.Variable]
+# xarray loads pandas, which takes as long as all else that a command needs before it begins: functions import it.
+if TYPE_CHECKING:
+    import xarray as xr
+
+Variables: TypeAlias = "dict[str, xr.Variable]"
 """Variables of a dataset by name."""
 
 
 def variable(dims: str | Sequence[str], values: Any, units: str, long_name: str, **attributes: Any) -> xr.Variable:
     """``values`` over the named dimensions, with ``units``, ``long_name`` and further attributes."""
+    import xarray as xr
+
     return xr.Variable(dims, np.asarray(values), {"units": units, "long_name": long_name, **attributes})
 
 
@@ -105,6 +112,8 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     attributes that a file of this kind must have. Raises UnreadableFileError, an OSError, if the file cannot be opened
     as HDF5, ResultFileError, a ValueError, if it is not of this kind.
     """
+    import xarray as xr
+
     sys.audit("vipetsc.read", str(path))
     try:
         groups = xr.open_groups(path, engine="h5netcdf", phony_dims="access", decode_cf=False)
@@ -153,6 +162,8 @@ def _flat(groups: dict[str, xr.Dataset], links: Collection[PurePosixPath]) -> xr
 
     The coordinate of a dimension stands in the same group, or in the nearest one that holds it.
     """
+    import xarray as xr
+
     nodes: dict[PurePosixPath, xr.Dataset] = {}
     scales: set[PurePosixPath] = set()
     for group, data in groups.items():

@@ -5,20 +5,24 @@ measures over one dimension a swept axis; ``select`` picks members by the values
 from 1, units stand in the attributes.
 """
 
+from __future__ import annotations
+
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import xarray as xr
 
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice.chain import cells_between
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 # Files that are opened where a folder is named: the first of them that it holds.
 FIRST = "run.h5", "optimum.h5", "prediction.h5", "law.h5", "design.h5", "analysis.h5"
-Selectable = TypeVar("Selectable", xr.Dataset, xr.DataArray)
+Selectable = TypeVar("Selectable", "xr.Dataset", "xr.DataArray")
 
 
 def open_run(path: str | Path) -> xr.Dataset:

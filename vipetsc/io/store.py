@@ -7,6 +7,8 @@ a run. Every part names its cells and sites, so that another number of ranks can
 are copied chunk by chunk, to a file of one rank or to a common file of all ranks; each writer holds a part of the log.
 """
 
+from __future__ import annotations
+
 import json
 import os
 import sys
@@ -15,13 +17,12 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mpi4py import MPI
 
 import h5py
 import numpy as np
-import xarray as xr
 
 from vipetsc.io import chunks
 from vipetsc.io.atomic import Arrays, discard, load_arrays, save_arrays, unwritten, write_text
@@ -30,6 +31,9 @@ from vipetsc.io.lock import FolderError
 from vipetsc.io.netcdf import add_variable, put_dataset
 from vipetsc.io.read import open_run
 from vipetsc.parallel import SortedRows, on_every_rank, on_root, sort_over_ranks
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has every rank write its own
 

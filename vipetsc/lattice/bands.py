@@ -7,8 +7,8 @@ from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq, minimize_scalar
 
 from vipetsc.lattice.cell import UnitCell
 
@@ -108,7 +108,9 @@ def _maximum(function: Callable[[float], float], values: np.ndarray, kappa: np.n
         # Bands of long cells have their extremes at 0 and pi.
         return float(kappa[best]), float(values[best])
     bracket = kappa[max(best - 1, 0)], kappa[min(best + 1, last)]
-    refined = minimize_scalar(lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10})
+    refined = scipy.optimize.minimize_scalar(
+        lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10}
+    )
     if -refined.fun > values[best]:
         return refined.x, -refined.fun
     # A bounded search does not reach the ends of its bracket, where an extreme at 0 or pi lies.
@@ -160,7 +162,11 @@ def waves_at(cell: UnitCell, frequency: float) -> tuple[tuple[int, float, float]
         for i in np.nonzero(offset[:-1] * offset[1:] <= 0)[0]:
             if offset[i] == 0 and i > 0:
                 continue  # a root on the grid, which the interval before has given
-            root = brentq(lambda x, n=number: _frequency(cell, n, x) - frequency, *grid.kappa[i : i + 2], xtol=1e-13)
+
+            def difference(kappa: float, band: int = number) -> float:
+                return _frequency(cell, band, kappa) - frequency
+
+            root = scipy.optimize.brentq(difference, *grid.kappa[i : i + 2], xtol=1e-13)
             speed = float(abs(bloch(cell, root).group_velocity[number - 1]))
             waves.append((number, root, speed))
     return tuple(waves)

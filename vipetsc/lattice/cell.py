@@ -5,9 +5,9 @@ from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 Reading = Literal["printed", "calibrated"]
 
@@ -193,7 +193,7 @@ def _dashpot_problems(grounding: tuple[float, ...], n: int) -> list[tuple[str, s
 def connected_groups(n: int, pairs: tuple[tuple[int, int], ...]) -> list[int]:
     """Numbers of the groups into which ``pairs`` tie ``n`` nodes (0-based): that of each node, in their order."""
     graph = coo_matrix((np.ones(len(pairs)), np.transpose(pairs)), (n, n))
-    return connected_components(graph, directed=False)[1].tolist()
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1].tolist()
 
 
 def diatomic(reading: Reading = "printed") -> UnitCell:

@@ -5,9 +5,9 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
-from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.cell import UnitCell
 from vipetsc.lattice.drive import Waveform
@@ -198,7 +198,7 @@ class Chain:
         dynamic = cut.stiffness_matrix() - diags(cut.masses() * omega**2)
         force = np.zeros(cut.cells * self.cell.dofs, complex)
         force[driven * self.cell.dofs + mass] = 1.0
-        response = float(np.abs(spsolve(dynamic.tocsc(), force)).max())
+        response = float(np.abs(scipy.sparse.linalg.spsolve(dynamic.tocsc(), force)).max())
         return response * drive.peak
 
 

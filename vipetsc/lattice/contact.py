@@ -12,9 +12,8 @@ from dataclasses import dataclass, field, fields
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
-from scipy.special import gamma
 
 Law = Literal["hertz", "bilinear", "power"]
 Adhesion = Literal["allow", "clip"]
@@ -124,6 +123,7 @@ class Contact:
             return 0.0
         n = self.onset_exponent
         # Integral of dx / sqrt(1 - x^(n+1)) over [0, 1]: pi/2 for n = 1, 1.4716 for n = 3/2.
+        gamma = scipy.special.gamma
         integral = np.sqrt(np.pi) * gamma(1 / (n + 1)) / ((n + 1) * gamma(0.5 + 1 / (n + 1)))
         return float(2 * integral)
 
@@ -175,14 +175,17 @@ class Contact:
         # Close to 1 the equation has lost its digits, and both dampings are the same to 1e-12.
         if self.factor != "exact" or e > 1 - 1e-6:
             return 1.5 * (1 - e)
-        return float(brentq(rebound, 0.75 * (1 - e**2) / (1 + e**3), (1 - 1e-12) / e, (e,)))
+        return float(scipy.optimize.brentq(rebound, 0.75 * (1 - e**2) / (1 + e**3), (1 - 1e-12) / e, (e,)))
 
     @property
     def effective_restitution(self) -> float:
         """-w'_plus/w'_minus of two masses that nothing but the contact acts on, above the ``approach_floor``."""
         c = self.damping
         # Near c = 0 the equation's terms cancel: its expansion takes their place.
-        return 1 - 2 * c / 3 if c < 1e-6 else float(brentq(lambda e: rebound(c, e), 0.0, min(1.0, (1 - 1e-12) / c)))
+        if c < 1e-6:
+            return 1 - 2 * c / 3
+        most = min(1.0, (1 - 1e-12) / c)
+        return float(scipy.optimize.brentq(lambda e: rebound(c, e), 0.0, most))
 
     def dissipation_factor(self, rate: ArrayLike, approach: ArrayLike) -> np.ndarray:
         """g = 1 + 3 (1 - r)/2 w'/w'_minus for relative velocity and approach velocity in m/s.

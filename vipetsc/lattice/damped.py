@@ -10,9 +10,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from scipy.linalg import eig
-from scipy.optimize import nnls
 
 from vipetsc.lattice.bands import bloch
 from vipetsc.lattice.cell import UnitCell
@@ -85,7 +85,7 @@ def fitted_dashpots(cell: UnitCell, loss: tuple[tuple[int, float], ...]) -> tupl
     scale = np.where(asked > 0, asked, asked.mean() or 1.0)
     rows = np.moveaxis(rows[..., bands] / (point.frequency[:, bands] * scale)[:, None], 1, -1)
     given = [*(cell.grounding or [0.0] * cell.dofs), *(s.damping for s in cell.springs)]
-    fitted = nnls(rows.reshape(-1, len(given)), (asked / scale - rows @ given).ravel())[0]
+    fitted = scipy.optimize.nnls(rows.reshape(-1, len(given)), (asked / scale - rows @ given).ravel())[0]
     return fitted[: cell.dofs], fitted[cell.dofs :]
 
 

@@ -16,9 +16,9 @@ from itertools import pairwise
 from typing import Literal, Self
 
 import numpy as np
+import scipy
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
 Envelope = Literal["paper", "hann"]
 COEFFICIENTS = ("c0", "c1", "c2", "c3", "c4", "c5")
@@ -307,7 +307,7 @@ def spline(amplitude: float, times: ArrayLike, values: ArrayLike, frequency: flo
     values = np.asarray(values, float)
     hold &= bool(values[-1] != 0)
     table = _table(times if hold else times[:-1])
-    for k, column in enumerate(CubicSpline(times, values).c[::-1]):
+    for k, column in enumerate(scipy.interpolate.CubicSpline(times, values).c[::-1]):
         table[COEFFICIENTS[k]][: len(times) - 1] = column
     if hold:
         table["c0"][-1] = values[-1]
@@ -322,5 +322,5 @@ def main_frequency(times: ArrayLike, values: ArrayLike) -> float:
     count = int(min(max(steps, 16), 2**20)) + 1
     even = np.linspace(times[0], times[-1], count)
     # Padded with zeros, the transform has four times as many frequencies as the record's length resolves.
-    content = np.abs(np.fft.rfft(CubicSpline(times, values)(even), 4 * count))
+    content = np.abs(np.fft.rfft(scipy.interpolate.CubicSpline(times, values)(even), 4 * count))
     return float(2 * np.pi * (1 + np.argmax(content[1:])) / (4 * count * (even[1] - even[0])))

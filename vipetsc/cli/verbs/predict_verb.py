@@ -1,6 +1,8 @@
 """The verb ``predict``: several sites composed from the response of one, compared with simulations."""
 
-import xarray as xr
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from vipetsc.case.predict import PredictCase
 from vipetsc.cli.arguments import CASE, OF_STUDIES
@@ -8,6 +10,9 @@ from vipetsc.cli.case_rows import lattice_rows
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import PREDICTION
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 SUMMARY = {
     "onset_amplitude": "first contact (N)",

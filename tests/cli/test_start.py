@@ -1,0 +1,49 @@
+"""What a command loads before it answers: libraries that take long are loaded by the verbs that need them alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.parallel(1)
+
+# Each takes a tenth of a second or more.
+HEAVY = {"matplotlib", "numba", "pandas", "scipy.interpolate", "scipy.optimize", "xarray"}
+CASE = Path("runs", "three-mass.toml")
+
+REPORT = f"""
+import sys
+from vipetsc.__main__ import main
+
+try:
+    main(sys.argv[1:])
+finally:
+    print("loaded:", *sorted({HEAVY!r} & sys.modules.keys()))
+"""
+
+
+def loaded_by(*arguments: object) -> set[str]:
+    """The heavy libraries that a command has loaded at its end."""
+    words = [sys.executable, "-c", REPORT, *map(str, arguments)]
+    ended = subprocess.run(words, capture_output=True, text=True, check=True)
+    return set(ended.stdout.splitlines()[-1].split()[1:])
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--help",), ("sweep", "--help"), ("schema",), ("manual", "contacts"), ("bands",)]
+)
+def test_a_verb_that_computes_little_loads_none_of_them(arguments):
+    assert loaded_by(*arguments) <= {"scipy.optimize"}
+
+
+def test_a_check_loads_no_tables_and_no_pictures():
+    """The cost of a run follows from its kernels' tables, which numba fills."""
+    assert loaded_by("validate", CASE) <= {"numba", "scipy.optimize"}
+
+
+def test_a_run_without_pictures_loads_no_pictures(tmp_path):
+    small = ("--set", "time.end=0.01", "--set", "output.figures=false")
+    assert "matplotlib" not in loaded_by("run", CASE, "--out", tmp_path / "run", *small)
