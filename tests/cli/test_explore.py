@@ -65,6 +65,7 @@ def shown(tmp_path_factory):
         assert browser.measure(session)["errors"] == []
 
 
+@pytest.mark.browser
 @NEEDED
 def test_a_map_tells_the_value_of_its_colour(shown):
     """The page shows the value that the colour under the pointer stands for, or the bound that it lies beyond."""
@@ -81,6 +82,7 @@ def test_a_map_tells_the_value_of_its_colour(shown):
     assert "Energy" not in read_off(area, 0.6, 0.51)[0]
 
 
+@pytest.mark.browser
 @NEEDED
 def test_logarithmic_axes_are_read_by_decades(shown):
     """Away from the points the place itself is read off; near one of them its values, and a mark is on it."""

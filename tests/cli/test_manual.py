@@ -14,7 +14,10 @@ from tests.cli.browser import NEEDED, SCREENS, browsing
 
 ROOT = Path(vipetsc.__file__).parents[1]
 CHAPTERS = {path.stem for path in (ROOT / "vipetsc/manual").glob("*.md")}
-pytestmark = pytest.mark.skipif(not find_spec("furo"), reason="no Sphinx with furo; scripts/test installs it")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(not find_spec("furo"), reason="no Sphinx with furo; scripts/test installs it"),
+]
 
 
 def build(folder: Path, *options: str) -> subprocess.CompletedProcess:
