@@ -178,6 +178,7 @@ class StopRequest:
     """
 
     requested = False
+    _ends_at_once = False
 
     def agreed(self, comm: MPI.Comm) -> bool:
         """Whether any rank of ``comm`` got a request; all must call it."""
@@ -189,11 +190,27 @@ class StopRequest:
             raise StoppedError("stopped on request; the same command goes on")
 
     @contextmanager
-    def listening(self, at_once: bool = False) -> Iterator[Self]:
-        """Take SIGTERM, SIGINT, SIGHUP and SIGUSR1 for requests within the block; a second ends the process.
+    def at_once(self) -> Iterator[None]:
+        """Let a request end the work where it is: within the block nothing is computed that has to be saved.
 
-        ``at_once``: the first one ends the work where it is, for what has nothing to save: StoppedError is raised.
+        A process alone raises StoppedError; of several ranks, which may wait for one another, all end.
         """
+        self._ends_at_once = True
+        try:
+            if self.requested:
+                self._end()
+            yield
+        finally:
+            self._ends_at_once = False
+
+    def _end(self) -> None:
+        if MPI.COMM_WORLD.size > 1:
+            MPI.COMM_WORLD.Abort(os.EX_TEMPFAIL)
+        raise StoppedError("stopped on request")
+
+    @contextmanager
+    def listening(self) -> Iterator[Self]:
+        """Take SIGTERM, SIGINT, SIGHUP and SIGUSR1 for requests within the block; a second ends the process."""
 
         def receive(number: int, frame: FrameType | None) -> None:
             self.requested = True
@@ -204,10 +221,8 @@ class StopRequest:
                 signal.signal(number, signal.SIG_DFL)
             signal.pthread_sigmask(signal.SIG_UNBLOCK, earlier)
 
-            if at_once and MPI.COMM_WORLD.size > 1:
-                MPI.COMM_WORLD.Abort(os.EX_TEMPFAIL)  # the others may wait for this rank
-            if at_once:
-                raise StoppedError("stopped on request")
+            if self._ends_at_once:
+                self._end()
 
         # What nohup has set stays.
         taken = [number for number in STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]

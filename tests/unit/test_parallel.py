@@ -56,8 +56,24 @@ def test_a_signal_that_is_sent_twice_is_one_request():
 
 def test_what_has_nothing_to_save_ends_at_once():
     """Where nothing is to be saved, the signal raises StoppedError."""
-    with pytest.raises(StoppedError), StopRequest().listening(at_once=True):
+    with StopRequest().listening() as stop, pytest.raises(StoppedError), stop.at_once():
         signal.raise_signal(signal.SIGUSR1)
+        pytest.fail("the work went on")
+
+
+def test_what_has_nothing_to_save_does_not_begin_after_a_request():
+    with StopRequest().listening() as stop:
+        signal.raise_signal(signal.SIGUSR1)
+        with pytest.raises(StoppedError), stop.at_once():
+            pytest.fail("the work began")
+
+
+def test_after_such_work_a_request_is_kept_again():
+    with StopRequest().listening() as stop:
+        with stop.at_once():
+            pass
+        signal.raise_signal(signal.SIGUSR1)
+        assert stop.requested
 
 
 def test_a_signal_that_nohup_ignores_stays_ignored():

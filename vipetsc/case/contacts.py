@@ -53,8 +53,8 @@ def check_per_site(
         yield Problem(f"contacts.{lacking[0]}", None, "missing; the stiffness of each site needs it")
     yield from _check_laws(contacts, count)
     yield from _check_sides(contacts, count)
-    yield from _check_stops(contacts, gaps)
-    yield from check_touching(contacts, gaps, at_rest)
+    wrong = list(_check_stops(contacts, gaps))
+    yield from wrong or check_touching(contacts, gaps, at_rest)
 
 
 def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:

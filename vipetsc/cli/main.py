@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Mapping
+from contextlib import nullcontext
 from typing import Any, NoReturn
 
 from mpi4py import MPI
@@ -69,7 +70,7 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
             raise FolderError("--force and --resume exclude each other: begin anew, or go on")
 
         # A verb that never looks at the request has nothing to save and ends at once.
-        with StopRequest().listening(at_once=not verb.is_stoppable) as stop:
+        with StopRequest().listening() as stop, nullcontext() if verb.is_stoppable else stop.at_once():
             return int(verb.call(options, MPI.COMM_WORLD, stop))
 
     except ResultFileError as error:

@@ -142,7 +142,9 @@ class StudyVerb(Verb):
             # What was computed is saved; pictures are drawn by the command that goes on.
             stop.check(comm)
             if self.pictures and outcome.drawable and case.wants_pictures:
-                echo_paths(comm, draw_pictures(self.pictures, [folder], comm, afresh=False))
+                with stop.at_once():
+                    drawn = draw_pictures(self.pictures, [folder], comm, afresh=False)
+                echo_paths(comm, drawn)
 
         # Last, where a user sees them; with --quiet they are all that is printed.
         for failure in outcome.failures:

@@ -68,11 +68,13 @@ def make_law(
         path = claim.folder / "law.h5"
         # Rank 0 looks for all ranks: one that saw no file would begin the runs alone.
         if not on_root(comm, path.exists):
-            runs = ScatteringRuns(case, claim.folder, comm, stop or StopRequest())
+            stop = stop or StopRequest()
+            runs = ScatteringRuns(case, claim.folder, comm, stop)
             errors = refine(runs, progress)
             # Before law.h5 is written: a folder with its result is complete, a kill before that leaves the records.
             runs.recorded.finish()
-            on_root(comm, lambda: write_netcdf(path, runs.dataset(errors)))
+            with stop.at_once():
+                on_root(comm, lambda: write_netcdf(path, runs.dataset(errors)))
 
         claim.publish()
         return on_root(comm, lambda: ScatteringLaw.read(claim.path / "law.h5"))

@@ -92,11 +92,14 @@ def predict(
         path = claim.folder / "prediction.h5"
         # Rank 0 looks for all ranks: one that saw no file would begin the runs alone.
         if not on_root(comm, path.exists):
-            runs = PredictionRuns(case, claim.folder, comm, stop or StopRequest(), progress)
+            stop = stop or StopRequest()
+            runs = PredictionRuns(case, claim.folder, comm, stop, progress)
             records = runs.make_all()
             about = provenance(comm)
             runs.recorded.finish()
-            on_root(comm, lambda: write_netcdf(path, composed(case, records).assign_attrs(about)))
+            # Composing takes seconds, and nobody looks at requests to stop; the runs are recorded.
+            with stop.at_once():
+                on_root(comm, lambda: write_netcdf(path, composed(case, records).assign_attrs(about)))
 
         claim.publish()
         return on_root(comm, lambda: read_prediction(claim.path))
