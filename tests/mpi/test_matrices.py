@@ -112,6 +112,19 @@ def test_modes_near_a_frequency_are_those_of_the_lattice_with_all_their_copies(e
     matrices.destroy()
 
 
+@pytest.mark.parallel(2)
+def test_modes_need_no_direct_solver_for_several_ranks(monkeypatch):
+    monkeypatch.setattr(eigen, "DIRECT", (("petsc",), ()))
+    chain = Chain(four_band("calibrated"), 60, "fixed")
+    matrices = LatticeMatrices(chain, COMM)
+    modes = modes_near(matrices, 4, 2034.0)
+    every = np.array([mode_frequency(chain, number) for number in range(1, matrices.rows + 1)])
+    nearest = np.sort(every[np.argsort(np.abs(every - 2034.0), kind="stable")[:4]])
+    assert modes.frequency == pytest.approx(nearest, rel=1e-9)
+    assert modes.residual.max() < 1e-9
+    matrices.destroy()
+
+
 @pytest.mark.parallel([1, 2])
 def test_the_edge_modes_of_the_lattice_and_their_file(folder):
     case = small_case(lattice={"cells": 100}, contacts={"sites": [30]})

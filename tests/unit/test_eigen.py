@@ -67,10 +67,12 @@ def test_the_first_direct_solver_that_petsc_has_is_taken(monkeypatch, ranks, pac
     assert transformation.solver == solver
 
 
-def test_several_ranks_without_a_direct_solver_are_refused(monkeypatch):
+def test_several_ranks_without_a_direct_solver_for_them_factor_the_whole_matrix_each(monkeypatch):
     pretend_packages(monkeypatch, {"superlu"})
-    with pytest.raises(CaseError, match="no direct solver for several ranks, superlu_dist or mumps; call it on one"):
-        eigen._solve_directly(RecordingTransformation(ranks=2))
+    transformation = RecordingTransformation(ranks=2)
+    eigen._solve_directly(transformation)
+    assert transformation.type == "redundant"
+    assert transformation.solver == ""
 
 
 def test_a_machine_without_slepc_is_refused_with_what_to_install(monkeypatch):
