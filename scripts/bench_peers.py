@@ -16,6 +16,8 @@ from functools import cache
 from pathlib import Path
 from shutil import which
 
+from petsc4py import PETSc
+
 import numba
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -74,6 +76,21 @@ def parameters(model: Model) -> str:
     return "".join(" ".join(map(str, line)) + "\n" for line in lines)
 
 
+def petsc_flags() -> list[str]:
+    """Flags of a compiler for the PETSc of petsc4py; none where pkg-config knows none, or only another one."""
+    if not which("pkg-config"):
+        return []
+
+    def ask(*options: str) -> str:
+        command = ["pkg-config", *options, "PETSc"]
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+    version = ".".join(map(str, PETSc.Sys.getVersion()))
+    if ask("--modversion") != version:
+        return []
+    return ask("--cflags", "--libs").split()
+
+
 def compile_peers(folder: Path) -> dict[str, Path]:
     """Build the C++ peers into ``folder``; those that cannot be built here are left out."""
     commands = {}
@@ -81,10 +98,8 @@ def compile_peers(folder: Path) -> dict[str, Path]:
         commands["odeint"] = ["g++", *FLAGS, str(SOURCES / "odeint.cpp")]
     if ARKODE.exists():
         commands["arkode"] = ["g++", *FLAGS, str(SOURCES / "arkode.cpp"), "-lsundials_arkode", "-lsundials_nvecserial"]
-    if which("mpicxx") and which("pkg-config"):
-        petsc = subprocess.run(["pkg-config", "--cflags", "--libs", "PETSc"], capture_output=True, text=True)
-        if petsc.returncode == 0:
-            commands["tsrk"] = ["mpicxx", *FLAGS, str(SOURCES / "tsrk.cpp"), *petsc.stdout.split()]
+    if which("mpicxx") and (petsc := petsc_flags()):
+        commands["tsrk"] = ["mpicxx", *FLAGS, str(SOURCES / "tsrk.cpp"), *petsc]
 
     # All at once: each takes some seconds.
     programs = {name: (folder / name).resolve() for name in commands}

@@ -31,7 +31,7 @@ def bench(*arguments: object) -> subprocess.CompletedProcess:
     )
 
 
-def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path):
+def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path, monkeypatch):
     """The errors of every solver that is installed fall with its tolerance; the results leave a picture and a table."""
     ended = bench("--quick", "--only", "precision", "--out", tmp_path, *set_words(*TINY))
     assert ended.returncode == 0, ended.stderr
@@ -45,8 +45,10 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path):
     # Peers that a machine may lack are held to the same where they are installed.
     wanted = {"vipetsc ts", "DOP853 numba", "DOP853 numpy"}
     has_compiler = bool(which("c++"))
-    # Where PETSc came by pip, pkg-config does not know it.
-    if has_compiler and subprocess.run(["pkg-config", "--exists", "PETSc"], check=False).returncode == 0:
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    from bench_peers import petsc_flags
+
+    if has_compiler and petsc_flags():
         wanted |= {"TSRK 5dp", "TSRK 8vr"}
     if has_compiler and Path("/usr/include/boost/numeric/odeint.hpp").exists():
         wanted |= {"odeint dopri5", "odeint fehlberg78"}
