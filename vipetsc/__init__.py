@@ -1,20 +1,49 @@
-"""Waves in phononic lattices whose cells carry vibro-impacts, on PETSc and MPI."""
+"""Waves in phononic lattices whose cells carry vibro-impacts, on PETSc and MPI.
+
+    Case      what to simulate: ``Case(lattice=..., contacts=..., drive=..., time=...)``, ``Case.load("file.toml")``
+    Sweep     many cases in one: the same tables, and ``sweep=...`` with the values that keys take
+    simulate  one run of a case, in memory or in a folder
+    sweep     every member of a sweep, in memory or in a folder
+    analyse   the measures of a run: spectra, energies of the pass bands, entropy
+    open      files of results as xarray datasets
+    CaseError what is wrong with a case: key, value and remedy of every problem
+
+A run of the built-in lattice with a weaker burst, and its largest speed by cell and mass:
+
+    from vipetsc import Case, simulate
+
+    case = Case(lattice={"cells": 100}, contacts={"sites": [20, 30]}, drive={"amplitude": 40.0, "cycles": 10})
+    result = simulate(case, progress=True)
+    print(result.sentence, abs(result.dataset["velocity"]).max("time"))
+
+All keys, their units and their defaults are in the manual (``vipetsc manual case-file``, ``vipetsc manual case-keys``).
+"""
 
 from importlib import import_module
 
 __version__ = "0.1.0"
-__all__ = ["Case", "install_abort_hook", "open", "simulate"]
+__all__ = ["Case", "CaseError", "Sweep", "analyse", "install_abort_hook", "open", "simulate", "sweep"]
+
+MODULES = {
+    "Case": ("vipetsc.case", "Case"),
+    "CaseError": ("vipetsc.case", "CaseError"),
+    "Sweep": ("vipetsc.case", "Sweep"),
+    "analyse": ("vipetsc.studies.analysis", "analyse"),
+    "install_abort_hook": ("vipetsc.parallel", "install_abort_hook"),
+    "open": ("vipetsc.io.read", "open_results"),
+    "simulate": ("vipetsc.dynamics.run", "simulate"),
+    "sweep": ("vipetsc.studies.sweep", "run_sweep"),
+}
 
 
 def __getattr__(name: str) -> object:
     """Load a name when it is first used: importing the package must not start PETSc, whose options come first."""
-    modules = {
-        "Case": ("vipetsc.case", "Case"),
-        "install_abort_hook": ("vipetsc.parallel", "install_abort_hook"),
-        "open": ("vipetsc.io.read", "open_results"),
-        "simulate": ("vipetsc.dynamics.run", "simulate"),
-    }
-    if name in modules:
-        module, attribute = modules[name]
+    if name in MODULES:
+        module, attribute = MODULES[name]
         return getattr(import_module(module), attribute)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """The names that are loaded late among the others: completion and ``help`` ask for them."""
+    return sorted({*globals(), *__all__})

@@ -1,4 +1,4 @@
-"""Ranks that work, fail and end together; progress and messages from rank 0."""
+"""Ranks that work, fail and end together."""
 
 import logging
 import os
@@ -19,8 +19,6 @@ from vipetsc.process import STOP_SIGNALS
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
-BAR = "vipetsc.bar"  # the logger whose level switches bars off
-LINE_EVERY = 5.0  # s between lines of the log where there is no terminal
 
 
 def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
@@ -232,45 +230,3 @@ class StopRequest:
         finally:
             for number, handler in earlier.items():
                 signal.signal(number, handler)
-
-
-class Progress:
-    """Progress of a run, on rank 0: a bar on a terminal, otherwise a line of the log every five seconds."""
-
-    def __init__(self, comm: MPI.Comm, total: float, unit: str, show: bool = True) -> None:
-        self._total = total
-        self._unit = unit
-        self._begin = time.monotonic()
-        self._last = self._begin
-        self._first = 0.0
-        self._show = show and comm.rank == 0
-
-        self._bar = None
-        if self._show and sys.stderr.isatty() and logging.getLogger(BAR).level < logging.CRITICAL:
-            from tqdm import tqdm
-
-            layout = "{percentage:3.0f}%|{bar}| {n:.4g}/{total:.4g} {unit} [{elapsed}<{remaining}]"
-            self._bar = tqdm(total=total, unit=unit, bar_format=layout, file=sys.stderr)
-
-    def start_at(self, done: float) -> None:
-        """Count from ``done``, where a resumed run begins."""
-        self._first = done
-        if self._bar is not None:
-            self._bar.update(done)
-
-    def update(self, done: float) -> None:
-        """Report that ``done`` of the total is reached."""
-        now = time.monotonic()
-        if self._bar is not None:
-            self._bar.update(done - self._bar.n)
-        elif self._show and now - self._last >= LINE_EVERY:
-            rate = (done - self._first) / (now - self._begin)
-            left = (self._total - done) / rate if rate > 0 else float("inf")
-            position = f"{100 * done / self._total:3.0f} %  {done:.4g} of {self._total:.4g} {self._unit}"
-            logger.info("%s, %.0f s left", position, left)
-            self._last = now
-
-    def close(self) -> None:
-        """End the bar, if there is one."""
-        if self._bar is not None:
-            self._bar.close()

@@ -17,10 +17,10 @@ from mpi4py import MPI
 import pytest
 
 import vipetsc as package
-from vipetsc import parallel
+from vipetsc import progress as reports
 from vipetsc.cli.main import _parser
 from vipetsc.cli.verbs.verb_list import VERBS
-from vipetsc.parallel import BAR, Progress
+from vipetsc.progress import BAR, Progress
 
 ROOT = Path(package.__file__).parents[1]
 TINY = ("--set", "lattice.cells=12", "--set", "contacts.sites=[4]", "--set", "drive.cycles=3",
@@ -132,7 +132,7 @@ def test_a_bar_on_a_terminal_unless_quiet(monkeypatch, quiet, bar):
 def test_lines_elsewhere_come_every_five_seconds(monkeypatch, caplog):
     """Where stderr is no terminal, progress of 20 s is a line every five seconds of the clock."""
     now = [0.0]
-    monkeypatch.setattr(parallel.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(reports.time, "monotonic", lambda: now[0])
     with caplog.at_level(logging.INFO, logger="vipetsc"):
         progress = Progress(MPI.COMM_SELF, 20.0, "s")
         for second in range(20):

@@ -28,6 +28,7 @@ FLOORS = (
     "lattice",
     "parallel",
     "compiled",
+    "progress",
     "process",
     "__init__",
 )

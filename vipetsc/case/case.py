@@ -16,6 +16,7 @@ from vipetsc.case.contacts import check_pairs, check_touching, contact_of, gaps_
 from vipetsc.case.disorder import SEED, DisorderTable, scatter
 from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_speed
 from vipetsc.case.features import FEATURES, refusals
+from vipetsc.case.html import case_html
 from vipetsc.case.inhomogeneity import check_inhomogeneity
 from vipetsc.case.initial import Beginning, InitialTable, beginning_of, check_initial
 from vipetsc.case.model import Model
@@ -237,6 +238,10 @@ class Case(CaseFile):
     def wants_pictures(self) -> bool:
         """Whether the results are drawn, ``output.figures``."""
         return self.output.figures
+
+    def _repr_html_(self) -> str:
+        """The case as a notebook shows it: its numbers, and its cell drawn."""
+        return case_html(self.name, self.model(), self.lattice.ends, [one.describe() for _, one in self.drive.every])
 
     def warnings(self) -> list[str]:
         """Sentences about what is allowed but likely not meant."""

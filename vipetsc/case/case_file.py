@@ -11,9 +11,10 @@ import math
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from inspect import Parameter, Signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args
 
@@ -21,20 +22,18 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vipetsc.case.changes import has_more_keys, value_of
+from vipetsc.case.nearest_type import BRANCH, of_nearest_type
 from vipetsc.case.nesting import DEEPEST, TOO_DEEP, is_deeper
+from vipetsc.case.plain import plain_table
 from vipetsc.io.names import readable
 
 if TYPE_CHECKING:
     import xarray as xr
 
 FOLDER = re.compile(r"[^\s./\\-][^/\\]*")
-# The types that pydantic tried a value as, in the path of an error: "float", "list[int]", "Span".
-BRANCH = re.compile(r"int|float|str|bool|Span|ClearanceSpan|Profile|Defects|\w*\[(?!\d+\]).*|constrained.*")
 LARGEST = 1e50
-MISTYPED = 100  # errors within a value that weigh as much as another type: no value has so many
 LONGEST_VALUE = 200  # characters of a value that a message shows
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
-Location = tuple[int | str, ...]  # the path of an error in a section, as pydantic gives it
 Table = dict[str, Any]  # a parsed TOML table
 Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid
 
@@ -97,6 +96,26 @@ class CaseFile(Section):
     premise: ClassVar[str] = ""
     builtin_table: ClassVar[Table] = {}
 
+    def __init__(self, **sections: Any) -> None:
+        """Read and resolve the case of these ``sections``: tables by keyword, with a ``name`` or without.
+
+        ``Case(lattice={"cells": 60}, drive={"amplitude": 8.0})`` is the case of a file with these sections. Values are
+        as in a file; arrays, tuples and sections of another case are taken too, and None is a key that is not given.
+        Raises CaseError with everything that is wrong.
+        """
+        super().__init__(**self.fields_of(plain_table(sections)))
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **options: Any) -> None:
+        """Name the sections in the signature, which completion and ``help`` show."""
+        names = "name", *cls.keywords()
+        cls.__signature__ = Signature([Parameter(name, Parameter.KEYWORD_ONLY, default=None) for name in names])
+
+    @classmethod
+    def keywords(cls) -> Iterable[str]:
+        """The names of the sections that a case of this verb is built of."""
+        return cls.sections()
+
     @classmethod
     @cache  # reading a case asks for the sections of all verbs
     def sections(cls) -> dict[str, type[Section]]:
@@ -128,6 +147,18 @@ class CaseFile(Section):
     @classmethod
     def from_table(cls, table: Table, overrides: Iterable[str] = (), source: str = "case") -> Self:
         """The resolved case of a parsed table; raises CaseError with everything that is wrong."""
+        return cls.resolved(cls.fields_of(table, overrides, source))
+
+    @classmethod
+    def resolved(cls, fields: Mapping[str, Any]) -> Self:
+        """The case with these ``fields``, which are resolved already."""
+        case = cls.__new__(cls)
+        Section.__init__(case, **fields)
+        return case
+
+    @classmethod
+    def fields_of(cls, table: Table, overrides: Iterable[str] = (), source: str = "case") -> dict[str, Any]:
+        """The resolved fields of a parsed table, its name among them; raises CaseError."""
         problems: list[Problem] = []
         if overrides:
             table, problems = with_overrides(table, overrides)
@@ -139,7 +170,7 @@ class CaseFile(Section):
         fields, wrong = cls.read(table)
         if problems + wrong:
             raise CaseError(problems + wrong, source)
-        return cls(name=name, **fields)
+        return {"name": name, **fields}
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -290,7 +321,7 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
     try:
         section = kind(**table)
     except ValidationError as error:
-        for item in _of_nearest_type(error.errors(include_url=False)):
+        for item in of_nearest_type(error.errors(include_url=False)):
             problem = _problem_of(kind, name, item)
             problems.setdefault(problem.key, problem)
             invalid.add(item["loc"][0])
@@ -314,39 +345,6 @@ def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
     # ``type`` rather than ``isinstance``: a boolean is an ``int`` for the latter.
     elif type(value) in (int, float) and (0 < abs(value) < 1 / LARGEST or LARGEST < abs(value) < math.inf):
         yield Problem(path, value, f"must be of a magnitude between {1 / LARGEST:g} and {LARGEST:g}, in SI units")
-
-
-def _of_nearest_type(errors: Sequence[Any]) -> list[Any]:
-    """Pydantic's ``errors`` without those of types that a value is not nearest to.
-
-    A value that may be of several types (a number, a list, a table) is tried as each, and has the errors of all. The
-    nearest type is the one with the lowest cost: an error within the value, such as an item of a list, costs 1, a value
-    that is not of the type at all ``MISTYPED``.
-    """
-    costs: dict[Location, dict[str, int]] = {}
-    for error in errors:
-        value, tried_type = _tried_type(error["loc"])
-        if tried_type:
-            is_whole_value = len(error["loc"]) == len(value) + 1
-            is_mistyped = is_whole_value and error["type"].endswith("_type")
-            types = costs.setdefault(value, {})
-            types[tried_type] = types.get(tried_type, 0) + (MISTYPED if is_mistyped else 1)
-
-    nearest = {value: min(types, key=lambda name: types[name]) for value, types in costs.items()}
-    kept_errors = []
-    for error in errors:
-        value, tried_type = _tried_type(error["loc"])
-        if not tried_type or tried_type == nearest[value]:
-            kept_errors.append(error)
-    return kept_errors
-
-
-def _tried_type(location: Location) -> tuple[Location, str]:
-    """The path of the value in an error's ``location`` that may be of several types, and the one tried; "" if one."""
-    for i, part in enumerate(location):
-        if BRANCH.fullmatch(str(part)):
-            return location[:i], str(part)
-    return location, ""
 
 
 def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:

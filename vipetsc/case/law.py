@@ -110,7 +110,7 @@ class LawCase(Case):
     def _of_sections(cls, sections: Mapping[str, Any], **update: Any) -> Self:
         """The case of resolved ``sections`` in which the section ``[law]`` is changed."""
         changed = {**sections, "law": sections["law"].model_copy(update=update)}
-        return cls(name="law", **changed)
+        return cls.resolved({"name": "law", **changed})
 
     def warnings(self) -> list[str]:
         """Sentences about what is likely not meant in the wave; lattice, times and sites of the runs are others."""

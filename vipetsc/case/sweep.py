@@ -60,6 +60,11 @@ class Sweep(CaseFile):
     takes = Case.takes
 
     @classmethod
+    def keywords(cls) -> Iterable[str]:
+        """The sections of a run, and that of the keys that vary."""
+        return (*Case.sections(), cls.section)
+
+    @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The fields, and everything that is wrong with ``[sweep]``; the members' cases are built by ``member``."""
         table = dict(table)

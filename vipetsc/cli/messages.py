@@ -13,7 +13,8 @@ from mpi4py import MPI
 
 from vipetsc.cli.streams import CheckedStream
 from vipetsc.io.lock import FolderError
-from vipetsc.parallel import BAR, on_root
+from vipetsc.parallel import on_root
+from vipetsc.progress import BAR
 
 logger = logging.getLogger("vipetsc")
 answers = logging.getLogger("vipetsc.answers")

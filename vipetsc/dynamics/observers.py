@@ -18,7 +18,7 @@ from vipetsc.dynamics.engine import Engine
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.samples import Block
 from vipetsc.io.store import RunOutput
-from vipetsc.parallel import Progress
+from vipetsc.progress import Progress
 
 # A ledger that misses by this fraction of the largest work is no longer a solution but an instability.
 RUNAWAY = 0.1

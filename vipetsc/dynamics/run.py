@@ -4,15 +4,17 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mpi4py import MPI
 
 import numpy as np
 
 from vipetsc.case import Case, Model
+from vipetsc.case.html import html_table
 from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine, FillResult
@@ -26,14 +28,28 @@ from vipetsc.dynamics.recorder import Recorder
 from vipetsc.dynamics.samples import Block, Samples
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import RUN, claimed, provenance
+from vipetsc.io.read import open_results
 from vipetsc.io.store import RunFolder, RunMemory, RunOutput
 from vipetsc.parallel import StopRequest, install_abort_hook
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # In the order in which engine = "auto" tries them.
 ENGINES = (Propagator, Integrator)
 # Cells times samples between two looks at requests to stop: a fraction of a second.
 BLOCK_CELLS = 1_000_000
 COMPLETE, STOPPED, FAILED = "complete", "stopped", "failed"
+# Statistics that a notebook shows, with their words.
+SHOWN = {
+    "engine": "engine",
+    "samples": "samples",
+    "episodes": "impacts",
+    "work": "work in J",
+    "dissipated": "dissipated in J",
+    "ledger_error": "error of the energy balance",
+    "wall_seconds": "wall time in s",
+}
 
 
 class Failure(NamedTuple):
@@ -50,7 +66,7 @@ class Result:
     ``complete``: the whole case was simulated; ``resumable``: it was stopped and can go on from its last
     checkpoint; neither: it failed, and ``run.h5`` holds the samples up to the last good one. ``sentence`` says
     it in words, ``statistics`` in numbers; ``warnings`` are sentences about results that are not what they seem. All
-    are the same on all ranks.
+    are the same on all ranks, but for ``held``, the run of a simulation without a folder, which rank 0 has.
     """
 
     complete: bool
@@ -59,11 +75,29 @@ class Result:
     statistics: dict[str, Any]
     warnings: list[str]
     folder: Path | None
+    held: "xr.Dataset | None" = field(default=None, repr=False, compare=False)
+
+    @cached_property
+    def dataset(self) -> "xr.Dataset | None":
+        """The run: opened in its folder, or the one in memory, which only rank 0 has; None for one that was stopped.
+
+        Raises OSError if the file is gone.
+        """
+        if self.folder is None or self.resumable:
+            return self.held
+        return open_results(self.folder / "run.h5")
+
+    def _repr_html_(self) -> str:
+        """The ending, warnings and some numbers, as a notebook shows them."""
+        rows = [(text, self.statistics.get(key)) for key, text in SHOWN.items()]
+        rows += [("run", self.folder or "in memory, as dataset")]
+        rows += [("warning", warning) for warning in self.warnings]
+        return html_table(self.sentence, rows)
 
 
 def simulate(
     case: Case,
-    folder: str | Path | RunOutput,
+    folder: str | Path | RunOutput | None = None,
     comm: MPI.Comm = MPI.COMM_WORLD,
     *,
     force: bool = False,
@@ -72,22 +106,23 @@ def simulate(
     progress: bool = False,
     observers: Sequence[type[Observer]] = (),
 ) -> Result:
-    """Simulate ``case`` on all ranks of ``comm`` and leave ``run.h5`` and ``summary.json`` in ``folder``.
+    """Simulate ``case`` on all ranks of ``comm``, in memory or into ``folder`` (``run.h5`` and ``summary.json``).
 
     Parameters
     ----------
     case
         A resolved case.
     folder
-        Output folder. An unfinished run of the same case in it is resumed, to the same bits; one that has ended is not
-        simulated again. ``force`` begins anew and replaces the run in the folder when the new one has ended;
-        ``resume`` requires an unfinished run. A ``RunMemory`` holds the run in memory.
+        Output folder; without one the run is held in memory, and is lost where it is stopped. An unfinished run of the
+        same case in the folder is resumed, to the same bits; one that has ended is not simulated again. ``force``
+        begins anew and replaces the run in the folder when the new one has ended; ``resume`` requires an unfinished
+        run. ``result.dataset`` is the run as an xarray dataset.
     comm
         The ranks over which the lattice is distributed; a ``RunMemory`` has its own.
     stop
         A request that ends the run at one of the next samples.
     progress
-        Report progress on stderr of rank 0.
+        Report progress on rank 0: a bar on a terminal or in a notebook, elsewhere lines on stderr.
     observers
         Further observers, which see all good samples.
 
@@ -103,23 +138,26 @@ def simulate(
     # In a script under mpirun a rank that raises would leave the others waiting; a hook of the script's own stays.
     if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
         install_abort_hook()
-    if isinstance(folder, RunMemory) and resume:
+    memory = RunMemory(comm)
+    target = memory if folder is None else folder
+    if isinstance(target, RunMemory) and resume:
         raise ValueError("a run in memory cannot be resumed")
     case = with_database(case)
     check_options(case)
     model = case.model()
     kind, refusal = select_engine(case, model)
-    check_memory(model, case.output, kind.name, folder.comm if isinstance(folder, RunOutput) else comm)
+    check_memory(model, case.output, kind.name, target.comm if isinstance(target, RunOutput) else comm)
 
     # The guard first: the others see only samples that it accepts.
     watching: list[type[Observer]] = [Guard, *observers, Ledger]
     if progress:
         watching.append(ProgressReport)
     simulation = Simulation(case, model, kind, refusal, stop, watching)
-    if isinstance(folder, RunOutput):
-        return simulation.make(folder)
+    if isinstance(target, RunOutput):
+        result = simulation.make(target)
+        return replace(result, held=memory.dataset) if folder is None else result
 
-    with claimed(comm, folder, RUN, case.to_toml(), force=force, resume=resume) as claim:
+    with claimed(comm, target, RUN, case.to_toml(), force=force, resume=resume) as claim:
         output = RunFolder(claim.folder, comm)
         # A run that a kill has ended between its file and its publication is published now.
         ended = output.ending()

@@ -21,7 +21,8 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import OPTIMUM, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.lattice.chain import cells_between
-from vipetsc.parallel import Progress, StopRequest, on_root
+from vipetsc.parallel import StopRequest, on_root
+from vipetsc.progress import Progress
 from vipetsc.studies.linear_run import LinearRun, linear_case
 from vipetsc.studies.objective import ObjectiveRuns
 from vipetsc.studies.one_site import make_law

@@ -9,7 +9,8 @@ from typing import NamedTuple, TypeVar
 
 from mpi4py import MPI
 
-from vipetsc.parallel import Progress, SharedCounter, StoppedError, StopRequest, on_root, wait_for_all
+from vipetsc.parallel import SharedCounter, StoppedError, StopRequest, on_root, wait_for_all
+from vipetsc.progress import Progress
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # no other job's result could be written either
 BLOCKS = 100  # that each team draws, at least, so that none waits long for the last

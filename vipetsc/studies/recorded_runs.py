@@ -18,7 +18,8 @@ from vipetsc.dynamics import simulate
 from vipetsc.dynamics.run import Result
 from vipetsc.io.records import Line, Record, RecordFile, merge_records, read_records
 from vipetsc.io.store import RunMemory, RunOutput
-from vipetsc.parallel import Progress, StoppedError, StopRequest, on_root
+from vipetsc.parallel import StoppedError, StopRequest, on_root
+from vipetsc.progress import Progress
 from vipetsc.studies.pool import TaskPool
 
 Key = str | float | tuple[str, float]

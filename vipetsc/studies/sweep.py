@@ -3,11 +3,13 @@
 import json
 import re
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -15,14 +17,19 @@ import h5py
 import numpy as np
 
 import vipetsc
-from vipetsc.case import Case, Sweep
-from vipetsc.io.atomic import write_text
+from vipetsc.case import Case, CaseError, Problem, Sweep
+from vipetsc.case.html import html_table
+from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.folder import SWEEP, FolderError, claimed
-from vipetsc.io.read import outdated
-from vipetsc.parallel import Progress, StopRequest, on_root
+from vipetsc.io.read import open_ensemble, outdated
+from vipetsc.parallel import StopRequest, on_every_rank, on_root
+from vipetsc.progress import Progress, say
 from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
 from vipetsc.studies.linear_run import LinearRun, leading_cell, linear_name
 from vipetsc.studies.sweep_runs import SweepRuns
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 MOST_SURVEYED = 10_000  # members whose cases are resolved beforehand, for their linear runs and what they will cost
 
@@ -32,15 +39,31 @@ class SweepResult:
     """Outcome of a sweep: ``status`` (member), an index of ``studies.ensemble.STATUS``.
 
     ``newly_made`` counts the members simulated or scaled now; ``busy`` (rank) is the fraction of the time in which each
-    rank worked on members. ``warnings`` are sentences about lost results and about the members.
+    rank worked on members. ``warnings`` are sentences about lost results and about the members. Rank 0 has what is
+    ``held`` of a sweep without a folder.
     """
 
     status: np.ndarray
     newly_made: int
     seconds: float
     busy: tuple[float, ...]
-    folder: Path
+    folder: Path | None
     warnings: list[str]
+    held: "xr.Dataset | None" = field(default=None, repr=False, compare=False)
+
+    @cached_property
+    def dataset(self) -> "xr.Dataset | None":
+        """The ensemble: read from its folder, or the one in memory, which only rank 0 has; None while members miss."""
+        if self.folder is None or self.resumable:
+            return self.held
+        return open_ensemble(self.folder)
+
+    def _repr_html_(self) -> str:
+        """The numbers of members by their ending, and warnings, as a notebook shows them."""
+        rows: list[tuple[str, object]] = [(name, self.count(code) or None) for code, name in enumerate(STATUS)]
+        rows += [("time in s", round(self.seconds, 1)), ("ensemble", self.folder or "in memory, as dataset")]
+        rows += [("warning", warning) for warning in self.warnings]
+        return html_table(f"sweep of {self.status.size} members", rows)
 
     @property
     def complete(self) -> bool:
@@ -59,7 +82,7 @@ class SweepResult:
 
 def run_sweep(
     plan: Sweep,
-    folder: str | Path,
+    folder: str | Path | None = None,
     comm: MPI.Comm = MPI.COMM_WORLD,
     *,
     force: bool = False,
@@ -69,15 +92,20 @@ def run_sweep(
 ) -> SweepResult:
     """Simulate every member of ``plan`` in ``folder``, then write ``ensemble.h5`` and ``index.json``.
 
+    ``result.dataset`` is the ensemble, an xarray dataset. Without a folder it is held in memory; a sweep that is
+    stopped then stays in a temporary folder, which ``result.folder`` names.
+
     Complete members of this version are not simulated again, so a sweep that was killed goes on where
     it was; ``force`` begins anew and replaces the sweep in the folder when the new one has ended, ``resume`` needs one
     to go on with. A member that fails is recorded with its reason and the others go on. All ranks of
     ``comm`` work, ``[sweep] ranks`` of them together on each member.
 
-    Raises CaseError if no member is a valid case (of those drawn, where they are many), FolderError if the folder holds
-    anything but this sweep.
+    Raises CaseError if no member is a valid case (of those drawn, where they are many), or if fields of members are to
+    be kept without a folder, FolderError if the folder holds anything but this sweep.
     """
     on_root(comm, lambda: plan.tried()[:0])  # raises; the cases are not sent
+    if folder is None:
+        return _in_memory(plan, comm, stop, progress)
     with claimed(comm, folder, SWEEP, plan.to_toml(), force=force, resume=resume) as claim:
         reason = on_root(comm, lambda: outdated(claim.folder))
         if reason:
@@ -87,6 +115,33 @@ def run_sweep(
         if not result.resumable:
             claim.publish()
     return replace(result, folder=claim.path)
+
+
+def _in_memory(plan: Sweep, comm: MPI.Comm, stop: StopRequest | None, progress: bool) -> SweepResult:
+    """The sweep in a temporary folder, which goes once rank 0 has read the ensemble."""
+    if plan.options.fields:
+        remedy = "keeps files of every member: name a folder for them, as in sweep(plan, 'my-sweep')"
+        raise CaseError([Problem("sweep.fields", True, remedy)], plan.name)
+    folder = Path(on_root(comm, lambda: tempfile.mkdtemp(prefix="vipetsc-sweep-")))
+    try:
+        result = run_sweep(plan, folder, comm, stop=stop, progress=progress)
+    except BaseException:
+        if comm.rank == 0:
+            say(f"vipetsc: members that are complete stay in {folder}; sweep(plan, {str(folder)!r}) goes on")
+        raise
+    if result.resumable:
+        return result
+
+    def read() -> "xr.Dataset":
+        index = json.loads((folder / "index.json").read_text(encoding="utf-8"))
+        ensemble = open_ensemble(folder).assign_attrs(failed=json.dumps(index["failed"]))
+        # No folder has the members.
+        del ensemble.attrs["folder"]
+        discard(folder)
+        return ensemble
+
+    held = on_every_rank(comm, lambda: read() if comm.rank == 0 else None)
+    return replace(result, folder=None, held=held)
 
 
 def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool) -> SweepResult:

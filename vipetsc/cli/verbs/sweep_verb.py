@@ -40,6 +40,8 @@ def sweep_rows(plan: Sweep, ranks: int) -> Rows:
 
 def sweep_table(result: "SweepResult") -> str:
     """Ending of a sweep: counts, time, failed members."""
+    # The verb names one.
+    assert result.folder
     complete, scaled, failed, missing = (result.count(status) for status in range(4))
     counts = f"{complete} simulated, {scaled} scaled from a linear run, {failed} failed"
     rows = [

@@ -1,0 +1,119 @@
+"""Cases that are built in code: the same as those of tables, refused in the same words, and shown in a notebook."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import small_case
+from vipetsc.case import Case, CaseError, LawCase, Sweep
+from vipetsc.case.html import cell_svg, html_table
+from vipetsc.lattice import Spring, UnitCell, four_band
+from vipetsc.lattice.chain import Pair
+
+TABLE = {
+    "lattice": {"cells": 24},
+    "contacts": {"sites": [6, 12, 13], "clearance": 2e-4},
+    "drive": {"amplitude": 24.33, "cycles": 6},
+    "time": {"end": 0.05},
+}
+SPRINGS = [{"start": 1, "end": 1, "stiffness": 2.0e4, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 6.0e3}]
+
+
+def test_keywords_give_the_case_of_the_table():
+    """A case and a sweep of keywords are those of the same table, with the same text."""
+    assert Case(**TABLE) == Case.from_table(TABLE)
+    assert Case(name="a", **TABLE).to_toml() == Case.from_table({"name": "a"} | TABLE).to_toml()
+
+    varied = {"sweep": {"drive": {"amplitude": [1.0, 2.0]}}}
+    assert Sweep(**TABLE, **varied) == Sweep.from_table(TABLE | varied)
+
+
+def test_what_a_program_holds_is_taken():
+    """Arrays, tuples, numbers of numpy, paths, sections of another case are what a file has; None is a key left out."""
+    written = {"cell": {"masses": [0.01, 0.004], "springs": SPRINGS}, "cells": 60}
+    held = {"cell": {"masses": np.array([0.01, 0.004]), "springs": tuple(SPRINGS)}, "cells": np.int64(60), "ends": None}
+    drive = {"amplitude": np.float64(8.0), "band": 2, "at": "max-group-velocity"}
+    case = Case(lattice=held, drive=drive, contacts=None)
+    assert case == Case.from_table({"lattice": written, "drive": {**drive, "amplitude": 8.0}})
+
+    assert Case(lattice=case.lattice, drive=case.drive, time=case.time) == case
+    with pytest.raises(CaseError, match=r"no-such\.csv"):
+        Case(drive={"waveform": "samples", "samples": {"file": Path("no-such.csv")}})
+
+
+def test_bad_input_is_refused_as_in_a_file():
+    """Problems of keywords are those of the table: key, value and remedy."""
+    wrong = {"lattice": {"cels": 3}, "drive": {"amplitude": "x"}, "contacts": 5, "latice": {}}
+    with pytest.raises(CaseError) as of_table:
+        Case.from_table(wrong)
+    with pytest.raises(CaseError) as of_keywords:
+        Case(**wrong)
+    assert str(of_keywords.value) == str(of_table.value)
+    assert "lattice.cels = 3: unknown key; did you mean lattice.cells?" in str(of_keywords.value)
+
+    with pytest.raises(CaseError, match="sweep: missing; list what varies"):
+        Sweep(**TABLE)
+
+
+def test_signatures_name_the_sections():
+    """Completion and help have the sections of each verb's case."""
+    assert list(inspect.signature(Case).parameters) == ["name", *Case.sections()]
+    assert {"disorder", "drive", "sweep"} <= inspect.signature(Sweep).parameters.keys()
+    assert "law" in inspect.signature(LawCase).parameters
+
+
+def test_a_case_in_code_can_be_sent():
+    """Pickling keeps a case, which other ranks get."""
+    case = Case(**TABLE)
+    assert pickle.loads(pickle.dumps(case)) == case
+
+
+def drawing(cell: UnitCell, pair: Pair | None) -> list[str]:
+    """Return the kinds of the elements of a cell's drawing, which is sound XML."""
+    root = ElementTree.fromstring(cell_svg(cell, pair))
+    return [element.tag.rpartition("}")[2] for element in root.iter()]
+
+
+def test_a_notebook_shows_a_case_with_its_cell():
+    """The table has name, lattice, bands, contacts and drive, and the drawing each mass, spring and stop."""
+    html = small_case()._repr_html_()
+    for text in (
+        "<b>small</b>",
+        "24 cells of 4 masses",
+        "681.48 to 1414.2",
+        "cell 6, cell 12, cell 13",
+        "0.2 mm",
+        "24.33 N",
+    ):
+        assert text in html, text
+
+    # Four masses, and the first of the next cell; four springs and the two halves of the clearance.
+    shapes = drawing(four_band("calibrated"), Pair(1, 2))
+    assert shapes.count("circle") == 5
+    assert shapes.count("polyline") == len(four_band("calibrated").springs) + 2
+    assert drawing(four_band("calibrated"), None).count("polyline") == len(four_band("calibrated").springs)
+
+
+def test_every_cell_can_be_drawn():
+    """Beads without springs, a stop at the ground and masses that nothing ties together are drawn too."""
+    bead = UnitCell((0.03,), (), 0, 0)
+    assert drawing(bead, Pair(0, 0, next_cell=True)).count("circle") == 2
+    lone = UnitCell((0.1,), (Spring(0, 0, 1e3, next_cell=True),), 0, 0)
+    assert drawing(lone, Pair(-1, 0)).count("polyline") == 3
+    apart = UnitCell((0.1, 0.2, 0.3), (Spring(0, 0, 1e3, next_cell=True), Spring(1, 2, 1e3)), 0, 1)
+    assert drawing(apart, Pair(0, 1)).count("circle") == 4
+
+
+def test_text_in_a_table_is_text():
+    """What a name holds is no markup; rows without a value are left out."""
+    html = html_table("<b>", [("a", "x < y"), ("gone", None), ("none", "")])
+    assert "&lt;b&gt;" in html
+    assert "x &lt; y" in html
+    assert "gone" not in html
+    assert "none" not in html

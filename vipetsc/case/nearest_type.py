@@ -1,0 +1,43 @@
+"""Errors of pydantic in a value that may be of several types: those of the type that it is nearest to."""
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+# The types that pydantic tried a value as, in the path of an error: "float", "list[int]", "Span".
+BRANCH = re.compile(r"int|float|str|bool|Span|ClearanceSpan|Profile|Defects|\w*\[(?!\d+\]).*|constrained.*")
+MISTYPED = 100  # errors within a value that weigh as much as another type: no value has so many
+Location = tuple[int | str, ...]  # the path of an error in a section, as pydantic gives it
+
+
+def of_nearest_type(errors: Sequence[Any]) -> list[Any]:
+    """Pydantic's ``errors`` without those of types that a value is not nearest to.
+
+    A value that may be of several types (a number, a list, a table) is tried as each, and has the errors of all. The
+    nearest type is the one with the lowest cost: an error within the value, such as an item of a list, costs 1, a value
+    that is not of the type at all ``MISTYPED``.
+    """
+    costs: dict[Location, dict[str, int]] = {}
+    for error in errors:
+        value, tried_type = _tried_type(error["loc"])
+        if tried_type:
+            is_whole_value = len(error["loc"]) == len(value) + 1
+            is_mistyped = is_whole_value and error["type"].endswith("_type")
+            types = costs.setdefault(value, {})
+            types[tried_type] = types.get(tried_type, 0) + (MISTYPED if is_mistyped else 1)
+
+    nearest = {value: min(types, key=lambda name: types[name]) for value, types in costs.items()}
+    kept_errors = []
+    for error in errors:
+        value, tried_type = _tried_type(error["loc"])
+        if not tried_type or tried_type == nearest[value]:
+            kept_errors.append(error)
+    return kept_errors
+
+
+def _tried_type(location: Location) -> tuple[Location, str]:
+    """The path of the value in an error's ``location`` that may be of several types, and the one tried; "" if one."""
+    for i, part in enumerate(location):
+        if BRANCH.fullmatch(str(part)):
+            return location[:i], str(part)
+    return location, ""

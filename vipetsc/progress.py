@@ -1,0 +1,93 @@
+"""Progress of long work, reported on rank 0: a bar on a terminal or in a notebook, elsewhere lines."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+logger = logging.getLogger(__name__)
+BAR = "vipetsc.bar"  # the logger whose level switches bars off
+LINE_EVERY = 5.0  # s between lines where there is no bar
+LAYOUT = "{percentage:3.0f}%|{bar}| {n:.4g}/{total:.4g} {unit} [{elapsed}<{remaining}]"
+
+
+def say(text: str) -> None:
+    """Report ``text`` in the log where one takes it, as that of the command line does; else on stderr.
+
+    Scripts and notebooks seldom set up a log. A level above WARNING of the logger ``vipetsc`` silences both.
+    """
+    if has_log():
+        logger.info("%s", text)
+    elif logger.isEnabledFor(logging.WARNING):
+        sys.stderr.write(f"{text}\n")
+        sys.stderr.flush()
+
+
+def has_log() -> bool:
+    """Whether a log takes lines of progress."""
+    return logger.isEnabledFor(logging.INFO) and logger.hasHandlers()
+
+
+class Progress:
+    """Progress of a run, on rank 0: a bar on a terminal or in a notebook, otherwise a line every five seconds.
+
+    In a script without a log the end is a line, too, so that work of a few seconds says something.
+    """
+
+    def __init__(self, comm: MPI.Comm, total: float, unit: str, show: bool = True) -> None:
+        self._total = total
+        self._unit = unit
+        self._begin = time.monotonic()
+        self._last = self._begin
+        self._first = 0.0
+        self._done = 0.0
+        self._show = show and comm.rank == 0
+
+        self._bar: Any = None
+        has_bars = logging.getLogger(BAR).level < logging.CRITICAL
+        if self._show and has_bars and (in_notebook() or sys.stderr.isatty()):
+            # A notebook has bars of its own, if ipywidgets is there.
+            from tqdm.auto import tqdm
+
+            self._bar = tqdm(total=total, unit=unit, bar_format=LAYOUT, file=sys.stderr)
+
+    def start_at(self, done: float) -> None:
+        """Count from ``done``, where a resumed run begins."""
+        self._first = done
+        self._done = done
+        if self._bar is not None:
+            self._bar.update(done)
+
+    def update(self, done: float) -> None:
+        """Report that ``done`` of the total is reached."""
+        now = time.monotonic()
+        self._done = done
+        if self._bar is not None:
+            self._bar.update(done - self._bar.n)
+        elif self._show and now - self._last >= LINE_EVERY:
+            rate = (done - self._first) / (now - self._begin)
+            left = (self._total - done) / rate if rate > 0 else float("inf")
+            say(f"{self._position()}, {left:.0f} s left")
+            self._last = now
+
+    def close(self) -> None:
+        """End the bar, or the lines of a script."""
+        if self._bar is not None:
+            self._bar.close()
+        elif self._show and not has_log():
+            say(f"{self._position()} in {time.monotonic() - self._begin:.1f} s")
+
+    def _position(self) -> str:
+        """How much of the total is done."""
+        percent = 100 * self._done / self._total if self._total else 100.0
+        return f"{percent:3.0f} %  {self._done:.4g} of {self._total:.4g} {self._unit}"
+
+
+def in_notebook() -> bool:
+    """Whether this process is the kernel of a notebook, whose stderr is no terminal."""
+    return "ipykernel" in sys.modules
