@@ -33,3 +33,40 @@ def test_the_fastest_speed_does_not_cost_a_grid_a_band(monkeypatch):
     monkeypatch.setattr(bands, "bloch", lambda cell, kappa: solved.append(np.size(kappa)) or original(cell, kappa))
     fastest_speed(folded(41))
     assert sum(solved) < 3 * len(bands.GRID)
+
+
+def graded(masses: int) -> UnitCell:
+    """A chain whose masses grow along the cell, so that no two bands touch."""
+    springs = tuple(Spring(i, (i + 1) % masses, 1e4, next_cell=i == masses - 1) for i in range(masses))
+    return UnitCell(masses=tuple(np.linspace(0.01, 0.02, masses)), springs=springs, host=0, resonator=1)
+
+
+@pytest.mark.parametrize("kappa", [0.0, 1e-4, 0.7, np.pi])
+def test_one_band_of_a_long_cell_is_that_of_all_bands(kappa):
+    cell = graded(bands.MANY_MASSES + 3)
+    every = bands.bloch(cell, kappa)
+    for band in (1, 2, 17, cell.dofs):
+        assert bands._frequency(cell, band, kappa) == pytest.approx(every.frequency[band - 1], rel=1e-9, abs=1e-2)
+        speed = abs(every.group_velocity[band - 1])
+        assert bands._speed(cell, band, kappa) == pytest.approx(speed, rel=1e-6, abs=1e-6)
+
+
+def test_extremes_of_bands_that_are_flat_to_rounding_are_not_refined(monkeypatch):
+    """Cells that a spring of 1e-12 of the others ties together have bands of no width."""
+    masses = bands.MANY_MASSES + 3
+    within = tuple(Spring(i, i + 1, 1e4) for i in range(masses - 1))
+    between = Spring(masses - 1, 0, 1e-8, next_cell=True)
+    cell = UnitCell(masses=(0.01,) * masses, springs=(*within, between), host=0, resonator=1)
+
+    refined = set()
+    original = bands._frequency
+
+    def record(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
+        refined.add(band)
+        return original(cell, band, kappa, sign)
+
+    monkeypatch.setattr(bands, "_frequency", record)
+    found = pass_bands(cell)
+    assert len(found) == masses
+    # The lowest band, at nearly zero, is the root of rounding errors.
+    assert refined <= {1}

@@ -18,6 +18,7 @@ MANY_MASSES = 32
 FEWEST = 61
 BLOCK = 16  # wavenumbers whose matrices are held at once
 NEARLY_FASTEST = 0.9  # of the largest group velocity on the grid, below which no refined one is larger
+FLAT = 1e-12  # part of a frequency by which rounding moves it
 OFF_ZERO = 3e-4  # smallest wavenumber at which group velocities are computed
 
 
@@ -61,15 +62,21 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     u = vectors.copy()
     if near_zero.any():
         eigenvalue[near_zero], u[near_zero] = np.linalg.eigh(cell.stiffness_matrix(OFF_ZERO) * scale)
-    stiffness_slope = np.zeros((*kappa.shape, cell.dofs, cell.dofs), complex)
-    for mass, offset, other, stiffness, *_ in cell.couplings():
-        stiffness_slope[..., mass, other] -= 1j * offset * stiffness * np.exp(1j * off_zero * offset)
+    stiffness_slope = _stiffness_slope(cell, off_zero)
     eigenvalue_slope = np.einsum("...ij,...ij->...j", u.conj(), stiffness_slope * scale @ u).real
     return BlochPoint(
         frequency=np.sqrt(np.maximum(squared, 0)),
         vectors=vectors * root[:, None],
         group_velocity=eigenvalue_slope / (2 * np.sqrt(np.maximum(eigenvalue, np.finfo(float).tiny))),
     )
+
+
+def _stiffness_slope(cell: UnitCell, kappa: np.ndarray) -> np.ndarray:
+    """Derivative of the stiffness matrix (..., dof, dof) in N/m with respect to the wavenumbers ``kappa`` (...)."""
+    slope = np.zeros((*kappa.shape, cell.dofs, cell.dofs), complex)
+    for mass, offset, other, stiffness, *_ in cell.couplings():
+        slope[..., mass, other] -= 1j * offset * stiffness * np.exp(1j * kappa * offset)
+    return slope
 
 
 class BandGrid(NamedTuple):
@@ -97,16 +104,41 @@ def _grid(cell: UnitCell) -> BandGrid:
 
 def _frequency(cell: UnitCell, band: int, kappa: float, sign: int = 1) -> float:
     """Frequency in rad/s of ``band`` (from 1) at ``kappa``; ``sign`` -1 makes the lower edge a maximum."""
-    return sign * float(bloch(cell, kappa).frequency[band - 1])
+    if cell.dofs <= MANY_MASSES:
+        return sign * float(bloch(cell, kappa).frequency[band - 1])
+    squared, _ = _eigenpair(cell, band, kappa)
+    return sign * float(np.sqrt(max(squared, 0.0)))
+
+
+def _speed(cell: UnitCell, band: int, kappa: float) -> float:
+    """Magnitude of the group velocity in cells/s of ``band`` (from 1) at ``kappa``."""
+    if cell.dofs <= MANY_MASSES or kappa < OFF_ZERO:
+        return float(abs(bloch(cell, kappa).group_velocity[band - 1]))
+    squared, vector = _eigenpair(cell, band, kappa)
+    slope = float((vector.conj() @ _stiffness_slope(cell, np.asarray(kappa)) @ vector).real)
+    return abs(slope) / (2 * np.sqrt(max(squared, np.finfo(float).tiny)))
+
+
+def _eigenpair(cell: UnitCell, band: int, kappa: float) -> tuple[float, np.ndarray]:
+    """Squared frequency of ``band`` (from 1) at ``kappa``, and its mass-normalised vector.
+
+    One pair of a large matrix costs a quarter of all of them.
+    """
+    root = 1 / np.sqrt(cell.masses)
+    matrix = cell.stiffness_matrix(np.asarray(kappa)) * (root[:, None] * root)
+    (squared,), vectors = scipy.linalg.eigh(matrix, subset_by_index=[band - 1, band - 1])
+    return float(squared), vectors[:, 0] * root
 
 
 def _maximum(function: Callable[[float], float], values: np.ndarray, kappa: np.ndarray) -> tuple[float, float]:
     """Argument in [0, pi] and value of a function's maximum: the best of its ``values`` at ``kappa``, refined."""
     best = int(np.argmax(values))
     last = len(kappa) - 1
-    if last + 1 < len(GRID) and best in (0, last):
-        # Bands of long cells have their extremes at 0 and pi.
-        return float(kappa[best]), float(values[best])
+    if last + 1 < len(GRID):
+        # Bands of long cells have their extremes at 0 and pi; a band so narrow that it is flat to rounding, anywhere.
+        end = 0 if values[0] >= values[last] else last
+        if values[best] - values[end] <= FLAT * np.abs(values).max():
+            return float(kappa[end]), float(values[end])
     bracket = kappa[max(best - 1, 0)], kappa[min(best + 1, last)]
     refined = scipy.optimize.minimize_scalar(
         lambda x: -function(x), bounds=bracket, method="bounded", options={"xatol": 1e-10}
@@ -139,9 +171,7 @@ def max_group_velocity(cell: UnitCell, band: int) -> tuple[float, float, float]:
     """Wavenumber (rad per cell), frequency (rad/s) and |v_g| (cells/s) at which ``band`` (1-based) is fastest."""
     grid = _grid(cell)
     speeds = np.abs(grid.group_velocity[:, band - 1])
-    fastest, largest = _maximum(
-        lambda kappa: float(abs(bloch(cell, kappa).group_velocity[band - 1])), speeds, grid.kappa
-    )
+    fastest, largest = _maximum(partial(_speed, cell, band), speeds, grid.kappa)
     return fastest, _frequency(cell, band, fastest), largest
 
 
@@ -167,6 +197,6 @@ def waves_at(cell: UnitCell, frequency: float) -> tuple[tuple[int, float, float]
                 return _frequency(cell, band, kappa) - frequency
 
             root = scipy.optimize.brentq(difference, *grid.kappa[i : i + 2], xtol=1e-13)
-            speed = float(abs(bloch(cell, root).group_velocity[number - 1]))
+            speed = _speed(cell, number, root)
             waves.append((number, root, speed))
     return tuple(waves)
