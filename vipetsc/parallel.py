@@ -168,6 +168,13 @@ class StoppedError(Exception):
     """Work was left on request; the message says how to go on with it."""
 
 
+class EndedError(BaseException):
+    """Work in which nothing has to be saved was ended on request, by an exception that no handler of errors takes.
+
+    Other ranks may wait for the one that raises it: who catches it has to end them too.
+    """
+
+
 class StopRequest:
     """A request to stop, by a signal: ``requested`` once this rank has got one.
 
@@ -189,22 +196,14 @@ class StopRequest:
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """Let a request end the work where it is: within the block nothing is computed that has to be saved.
-
-        A process alone raises StoppedError; of several ranks, which may wait for one another, all end.
-        """
+        """Let a request raise EndedError where the work is: within the block nothing has to be saved."""
         self._ends_at_once = True
         try:
             if self.requested:
-                self._end()
+                raise EndedError
             yield
         finally:
             self._ends_at_once = False
-
-    def _end(self) -> None:
-        if MPI.COMM_WORLD.size > 1:
-            MPI.COMM_WORLD.Abort(os.EX_TEMPFAIL)
-        raise StoppedError("stopped on request")
 
     @contextmanager
     def listening(self) -> Iterator[Self]:
@@ -220,7 +219,7 @@ class StopRequest:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, earlier)
 
             if self._ends_at_once:
-                self._end()
+                raise EndedError
 
         # What nohup has set stays.
         taken = [number for number in STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]

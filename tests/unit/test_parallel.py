@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from vipetsc.parallel import STOP_SIGNALS, StoppedError, StopRequest
+from vipetsc.parallel import STOP_SIGNALS, EndedError, StopRequest
 
 
 @pytest.fixture(autouse=True)
@@ -55,8 +55,8 @@ def test_a_signal_that_is_sent_twice_is_one_request():
 
 
 def test_what_has_nothing_to_save_ends_at_once():
-    """Where nothing is to be saved, the signal raises StoppedError."""
-    with StopRequest().listening() as stop, pytest.raises(StoppedError), stop.at_once():
+    """Where nothing is to be saved, the signal raises an exception that handlers of errors leave alone."""
+    with StopRequest().listening() as stop, pytest.raises(EndedError), stop.at_once():
         signal.raise_signal(signal.SIGUSR1)
         pytest.fail("the work went on")
 
@@ -64,7 +64,7 @@ def test_what_has_nothing_to_save_ends_at_once():
 def test_what_has_nothing_to_save_does_not_begin_after_a_request():
     with StopRequest().listening() as stop:
         signal.raise_signal(signal.SIGUSR1)
-        with pytest.raises(StoppedError), stop.at_once():
+        with pytest.raises(EndedError), stop.at_once():
             pytest.fail("the work began")
 
 

@@ -16,7 +16,7 @@ from vipetsc.cli.streams import report_unwritten
 from vipetsc.cli.verb import BAD_INPUT, STOPPED
 from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.io.errors import FolderError, ResultFileError
-from vipetsc.parallel import StoppedError, StopRequest, all_meet, on_root
+from vipetsc.parallel import EndedError, StoppedError, StopRequest, all_meet, on_root
 
 PATIENCE = 5.0  # s in which ranks that stopped have to meet; a launcher kills those that are left sooner
 ABOUT_THE_PROGRAM = "-h", "--help", "--version"
@@ -81,6 +81,12 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
         # Every rank gets here: bad input is found on one rank and raised on all.
         echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return BAD_INPUT
+    except EndedError:
+        # The others may wait for this rank.
+        if MPI.COMM_WORLD.size > 1:
+            MPI.COMM_WORLD.Abort(STOPPED)
+        echo(MPI.COMM_WORLD, "vipetsc: stopped on request", sys.stderr)
+        return STOPPED
     except StoppedError as error:
         # The launcher asks ranks to stop when one of them was killed: then nobody has stopped on request.
         if all_meet(MPI.COMM_WORLD, PATIENCE):

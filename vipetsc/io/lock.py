@@ -50,6 +50,10 @@ def _lock(path: Path) -> Iterator[None]:
     descriptor = None
     try:
         descriptor = _acquire(path, created)
+        # Files of commands that were killed while they wrote; nobody else writes here now.
+        if descriptor is not None:
+            for leftover in path.glob(".*.part"):
+                leftover.unlink(missing_ok=True)
         yield
     finally:
         # Removed while it is still locked: one that opens it from here on finds another file, and tries again.

@@ -54,8 +54,6 @@ def write_bands(case: Case, folder: Path, as_json: bool) -> str:
     numbers = bands_table(cell) | damping_table(cell, case.drive.frequency or 0.0)
     # This rank alone is here, so that the lock must not wait for others.
     with locked(MPI.COMM_SELF, folder):
-        for leftover in folder.glob(".*.part"):  # of a command that was killed
-            leftover.unlink()
         picture = draw_bands(cell, folder / "bands.png", case.drive.frequency)
         text = json.dumps(numbers | {"picture": str(picture)} | origin(), indent=2)
         write_text(folder / "bands.json", text + "\n")
