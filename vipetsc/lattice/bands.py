@@ -1,6 +1,7 @@
 """Bloch bands of a unit cell: frequencies, eigenvectors, group velocities, pass bands and gaps."""
 
 import itertools
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -116,7 +117,7 @@ def _speed(cell: UnitCell, band: int, kappa: float) -> float:
         return float(abs(bloch(cell, kappa).group_velocity[band - 1]))
     squared, vector = _eigenpair(cell, band, kappa)
     slope = float((vector.conj() @ _stiffness_slope(cell, np.asarray(kappa)) @ vector).real)
-    return abs(slope) / (2 * np.sqrt(max(squared, np.finfo(float).tiny)))
+    return abs(slope) / (2 * float(np.sqrt(max(squared, sys.float_info.min))))
 
 
 def _eigenpair(cell: UnitCell, band: int, kappa: float) -> tuple[float, np.ndarray]:
