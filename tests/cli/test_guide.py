@@ -122,7 +122,7 @@ def test_what_the_guide_says_of_its_lattice_is_so(desk):
         # Members without contact are scaled from one linear run, whose transfer is the same at any amplitude.
         assert ibtet[quiet] == pytest.approx(ibtet[0], rel=1e-12)
         assert ibtet.max() > 10 * ibtet[0]
-    assert (desk / "runs/my-sweep/figures/ibtet-calibrated.png").exists()
+    assert (desk / "runs/my-sweep/figures/ibtet-over-drive.amplitude.png").exists()
 
 
 def commands() -> dict[str, list[str]]:

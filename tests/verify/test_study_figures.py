@@ -109,7 +109,7 @@ def members(ensemble):
 @pytest.mark.usefixtures("plain_pictures")
 def test_every_figure_is_drawn_from_files(whole):
     folder = Path(whole.attrs["folder"])
-    written = draw("sweep", [folder])
+    written = draw("sweep", [folder], OF_FIELDS)
     vector = draw("sweep", [folder], ["amplitudes"], ("pdf",))
 
     assert [path.name for path in vector] == ["amplitudes-calibrated.pdf"]

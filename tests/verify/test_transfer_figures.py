@@ -144,8 +144,8 @@ def test_floor_is_that_of_members_without_contact(reduced):
 
 
 def test_shares_are_the_ensembles_and_sum_to_one(reduced):
-    figures = offered_figures("band_energies", reduced)
-    assert list(figures) == ["shares-calibrated-1-site-4-cycles"]
+    figures = offered_figures("band_energies-shares", reduced)
+    assert list(figures) == ["calibrated-1-site-4-cycles"]
 
     (figure,) = figures.values()
     share = select(open_ensemble(reduced), law="bilinear")["bands/share"]
@@ -360,7 +360,7 @@ def test_regimes_without_an_ensemble(whole):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["png", "pdf"])
 def test_files_are_named_by_figure_and_suffix(reduced, kind):
-    written = draw("sweep", [reduced], ["ibtet", "ibtet_backbone"], [kind])
+    written = draw("paper", [reduced], ["ibtet"], [kind]) + draw("sweep", [reduced], ["ibtet_backbone"], [kind])
     stems = ("ibtet-calibrated", "ibtet_backbone-calibrated-1-site-4-cycles")
     assert [p.name for p in written] == [f"{stem}.{kind}" for stem in stems]
     # An empty page is smaller.

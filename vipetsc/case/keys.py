@@ -7,8 +7,9 @@ import tomllib
 from collections.abc import Iterator
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import Any, get_args
 
+from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from vipetsc.case.case import Case
@@ -36,6 +37,30 @@ def unit_and_text(name: str, key: str) -> tuple[str, str]:
     """Unit and text of a key of the class ``name``, empty where nothing is said."""
     unit, text = texts().get(name, {}).get(key, ("", ""))
     return unit, text
+
+
+def unit_of(path: str) -> str:
+    """Unit of the key with that ``path`` in a case (``contacts.clearance``); empty where it has none of its own."""
+    section, *keys = path.split(".")
+    table: type[BaseModel] | None = SECTIONS.get(section)
+    for key in keys[:-1]:
+        table = _table_of(table, key)
+    if table is None or not keys:
+        return ""
+    unit, _ = unit_and_text(table.__name__, keys[-1])
+    # A phrase says on what the unit depends.
+    return "" if " of " in unit or " or " in unit else unit
+
+
+def _table_of(table: type[BaseModel] | None, key: str) -> type[BaseModel] | None:
+    """The class of the table that ``key`` of a ``table`` is; None where it is no table."""
+    fields = table.model_fields if table else {}
+    choices = [fields[key].annotation] if key in fields else []
+    for choice in choices:
+        choices += get_args(choice)
+        if isinstance(choice, type) and issubclass(choice, BaseModel):
+            return choice
+    return None
 
 
 def json_schema() -> Schema:

@@ -1,13 +1,17 @@
 """Pictures of what a folder holds, drawn from its files over all ranks."""
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from mpi4py import MPI
 
+from vipetsc.cli.messages import echo
 from vipetsc.io.folder import FolderError
 from vipetsc.parallel import on_every_rank, on_root
+
+SWEEP_FIGURES = "sweep"  # the source of pictures whose measures are those of the file
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,8 @@ def draw_pictures(
             raise FolderError(f"{path}: is not {article} {pictures.noun} of vipetsc ({error})") from None
 
     on_root(comm, lambda: prepare(pictures, folders, names))
+    for sentence in on_root(comm, lambda: left_out(pictures, folders, names)):
+        echo(comm, f"vipetsc: {sentence}", sys.stderr)
     # Rank 0 looks, so that all ranks judge by one time, whatever their file systems show them.
     newest = None if afresh else on_root(comm, lambda: newest_result(folders))
     drawn = on_every_rank(comm, draw_part)
@@ -77,11 +83,27 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
 
     try:
         # Names first: measuring writes files, and a wrong --fig must leave none.
-        figure_names(pictures.source, names)
+        figure_names(pictures.source, names, folders)
     except KeyError as error:
         raise FolderError(f"--fig: {error.args[0]}") from None
     if pictures.prepare:
         pictures.prepare(folders)
+
+
+def left_out(pictures: Pictures, folders: Sequence[Path], names: list[str] | None) -> list[str]:
+    """Sentences about what is not drawn of sweeps; on one rank. Raises FolderError for a figure asked for by name."""
+    from vipetsc.figures.registry import reasons_without_pages
+
+    if pictures.source != SWEEP_FIGURES:
+        return []
+    reasons = reasons_without_pages(folders, names)
+    if names and reasons:
+        missing = "; ".join(f"--fig {name}: {reason}" for name, reason in reasons.items())
+        raise FolderError(f"{folders[0]}: {missing}")
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        by_reason.setdefault(reason, []).append(name)
+    return [f"no picture of {', '.join(named)}: {reason}" for reason, named in by_reason.items()]
 
 
 def newest_result(folders: Sequence[Path]) -> float:

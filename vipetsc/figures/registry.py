@@ -4,7 +4,7 @@ import difflib
 import itertools
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ from vipetsc.figures import (
     frequency_energy,
     impact_panels,
     law_panels,
+    measure_pages,
     modal,
     nfrc,
     optimum,
@@ -41,6 +42,7 @@ MOST_WARNINGS = 4  # below a picture
 # The sources: what folders hold.
 RUN, SWEEP, BRANCHES, DESIGN = "run", "sweep", "branches", "design"
 OPTIMUM, LAW, PREDICTION = "optimum", "law", "prediction"
+PAPER = "paper"  # sweeps of the paper, in its panels; of any sweep `measure_pages` draws what it measured
 
 
 class ResultFile(NamedTuple):
@@ -63,13 +65,14 @@ class FigureSpec(NamedTuple):
 
     ``function`` is (run, analysis or None) -> Figure of a run, (data) -> Figure of a source in ``FILES``, (paths) ->
     Figure of branches. Of sweeps it is (sweeps) -> iterator of Drawing, called with those sweeps that take ``measure``;
-    the stem of such a drawing follows the figure's name.
+    the stem of such a drawing follows the figure's name, and ``needs`` says what a sweep must hold for it.
     """
 
     name: str
     source: str
     function: Callable[..., Any]
     measure: str = ""
+    needs: str = ""
 
 
 def branch(paths: Sequence[Path]) -> Figure:
@@ -90,6 +93,11 @@ BRANCH_FIGURES: Mapping[str, Callable[[Sequence[Path]], Figure]] = {
     branch_kinds.RESPONSES: nfrc.frequency_response,
 }
 
+# What sweeps must hold for a figure.
+WHOLE_MEMBERS = "members with their fields ([sweep] fields = true), contact sites and a band above the driven one"
+THREE_AMPLITUDES = "members with their fields ([sweep] fields = true) at three values of drive.amplitude"
+BRANCHES_TOO = "branches of the same law, in a further folder, and six values of drive.amplitude"
+
 _SPECS = (
     # The dearest of a run first, so that ranks which divide the work among them finish together.
     FigureSpec("modal_energies", RUN, modal.modal_energies),
@@ -99,21 +107,22 @@ _SPECS = (
     FigureSpec("unit_cell", RUN, schematics.unit_cell),
     FigureSpec("impacts", RUN, impact_panels.impacts),
     FigureSpec("ledger", RUN, runs.ledger),
-    FigureSpec("amplitudes", SWEEP, scattering.amplitudes, measure="entropy"),
-    FigureSpec("wavelets", SWEEP, scattering.wavelets, measure="entropy"),
-    FigureSpec("partition", SWEEP, scattering.partition, measure="entropy"),
-    FigureSpec("partition_explained", SWEEP, scattering.partition_explained, measure="entropy"),
-    FigureSpec("reconstruction", SWEEP, scattering.reconstruction, measure="entropy"),
-    FigureSpec("entropy", SWEEP, entropy.entropy, measure="entropy"),
-    FigureSpec("entropy_all", SWEEP, entropy.entropy_all, measure="entropy"),
-    FigureSpec("entropy_maps", SWEEP, scattering.entropy_maps, measure="entropy"),
-    FigureSpec("entropy_history", SWEEP, entropy.entropy_history, measure="entropy"),
-    FigureSpec("transfer", SWEEP, transfer.transfer, measure="transfer"),
-    FigureSpec("transfer_dispersions", SWEEP, transfer.transfer_dispersions, measure="transfer"),
-    FigureSpec("band_energies", SWEEP, transfer.band_energies, measure="transfer"),
-    FigureSpec("ibtet", SWEEP, transfer_curves.ibtet, measure="transfer"),
-    FigureSpec("ibtet_backbone", SWEEP, transfer_curves.ibtet_backbone, measure="transfer"),
-    FigureSpec("phase_regimes", SWEEP, transfer_curves.phase_regimes, measure="transfer"),
+    FigureSpec("amplitudes", SWEEP, scattering.amplitudes, measure="entropy", needs=THREE_AMPLITUDES),
+    FigureSpec("wavelets", SWEEP, scattering.wavelets, measure="entropy", needs=THREE_AMPLITUDES),
+    FigureSpec("partition", SWEEP, scattering.partition, measure="entropy", needs=THREE_AMPLITUDES),
+    FigureSpec("partition_explained", SWEEP, scattering.partition_explained, "entropy", needs=THREE_AMPLITUDES),
+    FigureSpec("reconstruction", SWEEP, scattering.reconstruction, measure="entropy", needs=THREE_AMPLITUDES),
+    FigureSpec("entropy_maps", SWEEP, scattering.entropy_maps, measure="entropy", needs=THREE_AMPLITUDES),
+    FigureSpec("entropy", PAPER, entropy.entropy, measure="entropy"),
+    FigureSpec("entropy_all", PAPER, entropy.entropy_all, measure="entropy"),
+    FigureSpec("entropy_history", PAPER, entropy.entropy_history, measure="entropy"),
+    FigureSpec("transfer", SWEEP, transfer.transfer, measure="transfer", needs=WHOLE_MEMBERS),
+    FigureSpec("transfer_dispersions", SWEEP, transfer.transfer_dispersions, measure="transfer", needs=WHOLE_MEMBERS),
+    FigureSpec("band_energies", SWEEP, transfer.band_energies, measure="transfer", needs=WHOLE_MEMBERS),
+    FigureSpec("band_energies-shares", PAPER, transfer.band_shares, measure="transfer"),
+    FigureSpec("ibtet", PAPER, transfer_curves.ibtet, measure="transfer"),
+    FigureSpec("ibtet_backbone", SWEEP, transfer_curves.ibtet_backbone, measure="transfer", needs=BRANCHES_TOO),
+    FigureSpec("phase_regimes", SWEEP, transfer_curves.phase_regimes, measure="transfer", needs=WHOLE_MEMBERS),
     FigureSpec("branch", BRANCHES, branch),
     FigureSpec("deflections", DESIGN, cost_maps.deflections),
     FigureSpec("cost_maps", DESIGN, cost_maps.cost_maps),
@@ -128,11 +137,22 @@ _SPECS = (
 FIGURES: Mapping[str, FigureSpec] = {spec.name: spec for spec in _SPECS}
 
 
-def figure_names(source: str, names: Sequence[str] | None = None) -> list[str]:
-    """Return ``names``, by default those of all figures of ``source``; raise KeyError for one that is not of it."""
-    valid = [name for name, spec in FIGURES.items() if spec.source == source]
+def figure_names(source: str, names: Sequence[str] | None = None, folders: Sequence[Path] = ()) -> list[str]:
+    """Return ``names``, by default those of all figures of ``source``; raise KeyError for one that is not of it.
+
+    The measures in the ``folders`` of sweeps are names of figures too; by default those that most readers look at.
+    """
+    specified = [name for name, spec in FIGURES.items() if spec.source == source]
+    measures: dict[str, str] = {}
+    if source == SWEEP:
+        for folder in _with_ensemble(folders):
+            measures |= {
+                measure_pages.figure_name(name): name for name in measure_pages.measures_of(open_ensemble(folder))
+            }
     if names is None:
-        return valid
+        return [*(name for name in measures if measures[name] not in measure_pages.ON_REQUEST), *specified]
+
+    valid = [*measures, *specified]
     for name in names:
         if name not in valid:
             (nearest,) = difflib.get_close_matches(name, valid, n=1, cutoff=0) or valid[:1]
@@ -140,6 +160,39 @@ def figure_names(source: str, names: Sequence[str] | None = None) -> list[str]:
             listed = ", ".join(valid)
             raise KeyError(f"no figure {name!r} of {holder}; did you mean {nearest!r}? There are {listed}")
     return list(names)
+
+
+def _with_ensemble(folders: Iterable[Path]) -> list[Path]:
+    """Return the folders of sweeps; others that share a page with them hold branches."""
+    return [folder for folder in folders if (folder / "ensemble.h5").exists()]
+
+
+def reasons_without_pages(folders: Sequence[Path], names: Sequence[str] | None = None) -> dict[str, str]:
+    """Return why figures of the sweeps in ``folders`` are not drawn, by name; those in ``names``, by default measures.
+
+    Raises KeyError as ``figure_names``.
+    """
+    reasons: dict[str, str] = {}
+    with Files() as files:
+        ensembles = [files.get(folder, open_ensemble) for folder in _with_ensemble(folders)]
+        for name in figure_names(SWEEP, names, folders):
+            spec = FIGURES.get(name)
+            if spec and spec.source == SWEEP:
+                if names and not any(_specified_drawings(spec, ensembles, files)):
+                    reasons[name] = f"needs {spec.needs}"
+                continue
+            by_sweep = [_reason(ensemble, name, by_name=names is not None) for ensemble in ensembles]
+            if all(by_sweep):
+                reasons[name] = by_sweep[0]
+    return reasons
+
+
+def _reason(ensemble: xr.Dataset, name: str, by_name: bool) -> str:
+    """Return why the measure whose pages have that ``name`` has none for an ensemble; empty where it has some."""
+    for measure in measure_pages.measures_of(ensemble):
+        if measure_pages.figure_name(measure) == name:
+            return measure_pages.reason_without_page(ensemble, measure, by_name)
+    return "the sweep does not measure it"
 
 
 def draw(
@@ -202,9 +255,13 @@ def drawings(
     Warnings in the files are the figures' labels. A drawing can be called as long as its ``files`` are open. Raises
     KeyError as ``figure_names``.
     """
-    specs = [FIGURES[name] for name in figure_names(source, names)]
+    chosen = figure_names(source, names, folders)
     if source == SWEEP:
-        return _sweep_drawings(specs, folders, files)
+        return _sweep_drawings(chosen, folders, files, by_name=names is not None)
+    specs = [FIGURES[name] for name in chosen]
+    if source == PAPER:
+        ensembles = [files.get(folder, open_ensemble) for folder in _with_ensemble(folders)]
+        return itertools.chain.from_iterable(_specified_drawings(spec, ensembles, files) for spec in specs)
     if source == BRANCHES:
         return _branch_drawings(specs, folders, files)
     if source == RUN:
@@ -212,15 +269,40 @@ def drawings(
     return _file_drawings(specs, folders[0], files)
 
 
-def _sweep_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files) -> Iterator[Drawing]:
-    """Yield what the functions of ``specs`` offer; folders without an ensemble hold branches, which they find."""
-    ensembles = [files.get(folder, open_ensemble) for folder in folders if (folder / "ensemble.h5").exists()]
-    for spec in specs:
-        measured = [ensemble for ensemble in ensembles if spec.measure in table(ensemble)["sweep"]["measures"]]
-        sweeps = Sweeps(measured, files)
-        for offered in spec.function(sweeps):
-            stem = f"{spec.name}-{offered.stem}" if offered.stem else spec.name
-            yield Drawing(stem, warned(offered.draw, *sweeps))
+def _sweep_drawings(names: Sequence[str], folders: Sequence[Path], files: Files, by_name: bool) -> Iterator[Drawing]:
+    """Yield the pages of measures and what the other figures offer, each with a stem of its own."""
+    ensembles = [files.get(folder, open_ensemble) for folder in _with_ensemble(folders)]
+    used: dict[str, int] = {}
+    for name in names:
+        spec = FIGURES.get(name)
+        if spec and spec.source == SWEEP:
+            offered = _specified_drawings(spec, ensembles, files)
+        else:
+            offered = _measure_drawings(name, ensembles, by_name)
+        for drawing in offered:
+            used[drawing.stem] = used.get(drawing.stem, 0) + 1
+            count = used[drawing.stem]
+            yield drawing if count == 1 else drawing._replace(stem=f"{drawing.stem}-no-{count}")
+
+
+def _measure_drawings(name: str, ensembles: Sequence[xr.Dataset], by_name: bool) -> Iterator[Drawing]:
+    """Yield the pages of the measure of that ``name``, sweep after sweep."""
+    for ensemble in ensembles:
+        sweep = table(ensemble)["name"] if len(ensembles) > 1 else ""
+        for measure in measure_pages.measures_of(ensemble):
+            is_asked = measure_pages.figure_name(measure) == name
+            if is_asked and not measure_pages.reason_without_page(ensemble, measure, by_name):
+                for drawing in measure_pages.measure_pages(ensemble, measure, sweep):
+                    yield drawing._replace(draw=warned(drawing.draw, ensemble))
+
+
+def _specified_drawings(spec: FigureSpec, ensembles: Sequence[xr.Dataset], files: Files) -> Iterator[Drawing]:
+    """Yield what the function of ``spec`` offers of the sweeps that take its measure."""
+    measured = [ensemble for ensemble in ensembles if spec.measure in table(ensemble)["sweep"]["measures"]]
+    sweeps = Sweeps(measured, files)
+    for offered in spec.function(sweeps):
+        stem = f"{spec.name}-{offered.stem}" if offered.stem else spec.name
+        yield Drawing(stem, warned(offered.draw, *sweeps))
 
 
 def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files) -> Iterator[Drawing]:

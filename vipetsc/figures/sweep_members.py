@@ -3,7 +3,6 @@
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from fractions import Fraction
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeVar, cast
@@ -16,14 +15,16 @@ from vipetsc.case import Case, Model, Sweep
 from vipetsc.figures import style
 from vipetsc.figures.panels import ROMAN, recorded_sites
 from vipetsc.figures.style import Drawing
+from vipetsc.figures.swept_axes import SweptAxis, in_pi
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes, curves, field_time, open_run, over_samples, whole_members
 from vipetsc.lattice import waves_at
 from vipetsc.lattice.chain import cells_between
 
 AMPLITUDE = "amplitude"
+SITES = "contacts.sites"
+NAMED = {"contacts.law", "lattice.reading", SITES, "drive.cycles", "drive.amplitude"}  # keys in the names of a case
 LEVELS = ("Low", "Medium", "High")
-FRACTION_LIMIT = 36  # largest denominator of a wavenumber over pi that is written as a fraction
 T = TypeVar("T")
 
 
@@ -53,13 +54,22 @@ class Sweeps(list[xr.Dataset]):
 
 
 class MemberRun(NamedTuple):
-    """A member of a sweep with its fields: its case, in the lattice's own terms (0-based) too, and its files."""
+    """A member of a sweep with its fields: its case, in the lattice's own terms (0-based) too, and its files.
+
+    ``varied`` says what the keys are that the sweep varies, but for those that all names of cases have.
+    """
 
     folder: Path
     case: Case
     model: Model
     run: xr.Dataset
     analysis: xr.Dataset
+    varied: str = ""
+
+    @property
+    def labels(self) -> "Labels":
+        """The names of the member on pages and in their files' names."""
+        return Labels.of(self.case, self.varied)
 
     @classmethod
     @contextmanager
@@ -73,11 +83,23 @@ class MemberRun(NamedTuple):
 def transfer_members(sweeps: Sweeps) -> Iterator[MemberRun]:
     """Yield the whole members with sites and a band above the driven one."""
     for ensemble in sweeps:
-        for _, folder in whole_members(ensemble):
-            member = sweeps.files.get(folder, MemberRun.open)
+        for row, folder in whole_members(ensemble):
+            member = sweeps.files.get(folder, MemberRun.open)._replace(varied=varied_in(row, ensemble))
             # The transfer of a lattice without a higher band is not a number.
             if member.analysis.get("ibtet", -1) >= 0 and member.run.sizes["site"]:
                 yield member
+
+
+def varied_in(member: xr.Dataset, ensemble: xr.Dataset) -> str:
+    """Return the keys of an ``ensemble`` that are not among ``NAMED``, with their values in a ``member`` of it."""
+    texts = []
+    for axis in SweptAxis.all_of(ensemble):
+        # Equal numbers of sites in other cells have one name.
+        keys = [key for key in axis.keys if key.path not in NAMED or (key.values.dtype == object and key.path == SITES)]
+        at = int(np.argmax(ensemble["number"].values == member["number"].item()))
+        index = np.unravel_index(at, ensemble["number"].shape)[ensemble["number"].dims.index(axis.dimension)]
+        texts += [key.texts[int(index)] for key in keys]
+    return ", ".join(texts)
 
 
 class DrivenWave(NamedTuple):
@@ -275,17 +297,6 @@ def _in_file_name(member: xr.Dataset, name: str) -> str:
     if name == "wavenumber":
         return in_pi(member[name].item()).replace("π", "pi").replace("/", "-")
     return "".join(c if c.isalnum() or c in "-." else "-" for c in _in_words(member, name, "-"))
-
-
-def in_pi(wavenumber: float) -> str:
-    """Return a wavenumber in rad/cell as 5π/9, or as a decimal where no such fraction is near."""
-    multiple = float(wavenumber) / np.pi
-    near = Fraction(multiple).limit_denominator(FRACTION_LIMIT)
-    if abs(float(near) - multiple) > 1e-6:
-        return f"{multiple:.3f}π"
-    numerator = "" if near.numerator == 1 else near.numerator
-    denominator = f"/{near.denominator}" if near.denominator > 1 else ""
-    return f"{numerator}π{denominator}"
 
 
 def counted(number: int, noun: str) -> str:

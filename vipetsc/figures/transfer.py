@@ -197,15 +197,18 @@ def _dispersion_table(members: Sequence[CaseFolder], files: Files) -> Figure:
 
 
 def band_energies(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer energies of all parts and their sum over time for every whole member; mean fractions for every sweep."""
+    """Offer energies of all parts and their sum over time for every whole member."""
     for member in transfer_members(sweeps):
         if member.analysis.sizes["bands/part"] and "bands/total" in member.analysis:
             yield Drawing(Labels.of(member.case).member_stem, partial(energies_over_time, member))
 
+
+def band_shares(sweeps: Sweeps) -> Iterator[Drawing]:
+    """Offer mean fractions of all parts over the amplitude, a page a configuration and reading."""
     with_fractions = (curve for curve in transfer_curves(sweeps) if "bands/share" in curve.data)
     for name, curves in grouped(with_fractions, lambda curve: Labels.of(curve.case).page_stem).items():
         page = partial(columns_of_laws, curves, "Mean share of the energy (1)", _draw_fractions)
-        yield Drawing(f"shares-{name}", page)
+        yield Drawing(name, page)
 
 
 def closing_error(parts: np.ndarray, total: np.ndarray, samples: int) -> np.ndarray:

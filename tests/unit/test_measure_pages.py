@@ -1,0 +1,319 @@
+"""Pages of a sweep's measures name the keys that vary, and draw any number of them; nothing is simulated."""
+
+from itertools import product
+from math import prod
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from vipetsc.case.keys import unit_of
+from vipetsc.case.sweep import coordinate
+from vipetsc.figures.measure_pages import MOST_PAGES, Measure, Roles, measure_pages, measures_of, reason_without_page
+from vipetsc.figures.measure_panels import cell_edges, log_ticks
+from vipetsc.figures.style import rc_style, save
+from vipetsc.figures.swept_axes import SweptAxis, even_scale
+
+AMPLITUDES = {"drive.amplitude": [1.0, 2.0, 4.0, 8.0, 16.0, 32.0]}
+RESTITUTIONS = {"contacts.restitution": [0.3, 0.9]}
+CLEARANCES = {"contacts.clearance": [2e-4, 5e-4, 1e-3, 2e-3]}
+THREE = {"contacts.restitution": [0.3, 0.6, 0.9]}
+LAWS = {"contacts.law": ["hertz", "bilinear"]}
+SITES = {"contacts.sites": [[9], [9, 20], [4, 30]]}
+
+
+@pytest.fixture(autouse=True)
+def style():
+    with rc_style():
+        yield
+
+
+def ensemble_of(*axes: dict[str, list], drive: dict[str, Any] | None = None, parts: int = 0) -> xr.Dataset:
+    """An ensemble over ``axes``, each with the values of one or several keys, whose measures rise with the member."""
+    dims = [next(iter(axis)).rpartition(".")[2] for axis in axes]
+    coords = {}
+    for dim, axis in zip(dims, axes, strict=True):
+        for path, values in axis.items():
+            about = {"long_name": path, "units": "1"}
+            coords[path.rpartition(".")[2]] = xr.Variable(dim, coordinate(values), about)
+    shape = [len(next(iter(axis.values()))) for axis in axes]
+    number = np.arange(prod(shape)).reshape(shape)
+    about = {"units": "1", "long_name": "inter-band energy transfer"}
+    data = {
+        "status": (dims, np.zeros(shape, np.int8)),
+        "member": (dims, np.full(shape, "name", object)),
+        "number": (dims, number),
+        "contact_episodes": (dims, number.astype(float), {"units": "1", "long_name": "contact episodes"}),
+        "ibtet": (dims, 0.01 * (number + 1.0), about),
+    }
+    if parts:
+        shares = np.stack([10.0**-part * (number + 1.0) for part in range(parts)], axis=-1)
+        names = ["below", *(f"band {part}" for part in range(1, parts))]
+        data["bands/share"] = ((*dims, "part"), shares, {"units": "1", "long_name": "share", "parts": names})
+    case = tomli_w.dumps({"name": "tried", "drive": drive or {}, "sweep": {}})
+    return xr.Dataset(data, coords, {"case": case})
+
+
+def with_samples(*axes: dict[str, list]) -> xr.Dataset:
+    """An ensemble over eight seeds and ``axes``, with the statistics that a finished sweep has."""
+    ensemble = ensemble_of({"disorder.seed": list(range(8))}, *axes)
+    for name in ("ibtet", "contact_episodes"):
+        values = ensemble[name]
+        quantiles = values.quantile([0.05, 0.5, 0.95], dim="seed")
+        ensemble[f"statistics/{name}/mean"] = values.mean("seed")
+        ensemble[f"statistics/{name}/quantiles"] = quantiles.transpose("quantile", ...).drop_vars("quantile")
+    ensemble["statistics/samples"] = values.notnull().sum("seed")
+    return ensemble
+
+
+def drawn(ensemble: xr.Dataset, name: str = "ibtet") -> dict[str, Figure]:
+    return {drawing.stem: drawing.draw() for drawing in measure_pages(ensemble, name)}
+
+
+def only(ensemble: xr.Dataset, name: str = "ibtet") -> Figure:
+    (figure,) = drawn(ensemble, name).values()
+    return figure
+
+
+def panels(figure: Figure) -> list[Axes]:
+    return [axes for axes in figure.get_axes() if axes.axison and axes.get_label() != "<colorbar>"]
+
+
+def title(figure: Figure) -> str:
+    bodies = [figure, *figure.subfigs]
+    return " ".join(body._suptitle.get_text() for body in bodies if body._suptitle).replace("\n", " ")
+
+
+def legend(figure: Figure) -> list[str]:
+    return [text.get_text() for body in figure.subfigs for box in body.legends for text in box.get_texts()]
+
+
+def curves(axes: Axes) -> list:
+    return [line for line in axes.lines if not line.get_label().startswith("_")]
+
+
+def test_two_values_of_a_key_are_two_curves_of_their_own_colour_and_name():
+    figure = only(ensemble_of(RESTITUTIONS, AMPLITUDES))
+    (axes,) = panels(figure)
+    low, high = curves(axes)
+    np.testing.assert_allclose(low.get_ydata(), 0.01 * np.arange(1, 7))
+    np.testing.assert_allclose(high.get_ydata(), 0.01 * np.arange(7, 13))
+    assert to_hex(low.get_color()) != to_hex(high.get_color())
+    assert legend(figure) == ["contacts.restitution 0.3", "contacts.restitution 0.9"]
+    assert "over drive.amplitude (N), for each contacts.restitution" in title(figure)
+    assert "largest (ring): 0.12 at contacts.restitution 0.9, drive.amplitude 32 N" in title(figure)
+
+
+def test_the_ring_is_at_the_largest_value():
+    ensemble = ensemble_of(RESTITUTIONS, AMPLITUDES)
+    ensemble["ibtet"][0, 3] = 5.0
+    (axes,) = panels(only(ensemble))
+    (ring,) = [line for line in axes.lines if line.get_markerfacecolor() == "none"]
+    assert ring.get_xydata().tolist() == [[8.0, 5.0]]
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_two_numbers_are_a_map_with_contours_and_its_largest_marked(turned):
+    axes_of_sweep = [THREE, CLEARANCES] if turned else [CLEARANCES, THREE]
+    ensemble = ensemble_of(*axes_of_sweep)
+    figure = only(ensemble)
+    (axes,) = panels(figure)
+    (mesh,) = [shape for shape in axes.collections if isinstance(shape, QuadMesh)]
+    expected = ensemble["ibtet"].transpose("restitution", "clearance")
+    np.testing.assert_allclose(np.reshape(mesh.get_array(), (3, 4)), expected)
+    assert len(axes.collections) > 1  # contours
+    assert {tuple(line.get_xydata()[0]) for line in axes.lines} == {(2e-3, 0.9)}
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["0.0002", "0.0005", "0.001", "0.002"]
+    assert "over contacts.clearance (m) and contacts.restitution" in title(figure)
+
+
+def test_a_map_over_falling_values_shows_each_at_its_place():
+    falling = {"contacts.clearance": CLEARANCES["contacts.clearance"][::-1]}
+    (axes,) = panels(only(ensemble_of(falling, THREE)))
+    mesh = axes.collections[0]
+    assert np.reshape(mesh.get_array(), (3, 4))[0, 0] == pytest.approx(0.01 * 10)
+
+
+def test_words_and_lists_are_curves_and_panels_with_their_values():
+    figure = only(ensemble_of(LAWS, SITES, RESTITUTIONS, AMPLITUDES))
+    assert len(panels(figure)) == 2
+    assert legend(figure)[0] == "contacts.sites [9], contacts.restitution 0.3"
+    assert [axes.get_title(loc="left") for axes in panels(figure)] == [
+        "(a) contacts.law hertz",
+        "(b) contacts.law bilinear",
+    ]
+
+
+def test_categories_alone_are_ticks():
+    (axes,) = panels(only(ensemble_of(SITES)))
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["[9]", "[9, 20]", "[4, 30]"]
+    assert all(line.get_linestyle() == "None" for line in axes.lines)
+
+
+def test_keys_that_vary_together_are_named_together():
+    together = {"contacts.sites": [[9], [9, 20], [9]], "drive.cycles": [4, 4, 6]}
+    figure = only(ensemble_of(together, AMPLITUDES))
+    assert legend(figure)[1] == "contacts.sites [9, 20], drive.cycles 4"
+
+
+def test_what_does_not_vary_stands_nowhere():
+    figure = drawn(ensemble_of({"contacts.law": ["hertz"]}, {"lattice.reading": ["printed"]}, AMPLITUDES))
+    (stem,) = figure
+    assert stem == "ibtet-over-drive.amplitude"
+    text = title(figure[stem])
+    assert "hertz" not in text
+    assert "printed" not in text
+    assert "contacts.law" not in text
+
+
+def test_many_keys_are_panels_and_pages_each_with_a_name_of_its_own():
+    layers = {"lattice.cells": [40, 50, 60, 70, 80, 90]}
+    ensemble = ensemble_of(layers, {"drive.cycles": [3, 4, 5, 6]}, CLEARANCES, LAWS, AMPLITUDES)
+    figures = drawn(ensemble)
+    # Maps of cells over amplitude: two laws and four clearances are panels, four numbers of cycles pages.
+    assert len(figures) == 4
+    assert {len(panels(figure)) for figure in figures.values()} == {8}
+    assert "drive.cycles 3" in title(next(iter(figures.values())))
+
+
+def test_a_study_of_too_many_pages_is_cut_through_its_largest_value():
+    wide = [{f"drive.{key}": list(range(1, 5))} for key in ("cycles", "frequency", "ramp", "duration")]
+    figures = drawn(
+        ensemble_of(*wide, {"drive.band": list(range(1, 9))}, {"contacts.radius": [1.0, 2.0, 3.0, 4.0, 5.0]})
+    )
+    assert MOST_PAGES < 4**3
+    (figure,) = figures.values()
+    assert "through the largest value of all: " in title(figure)
+
+
+def test_bands_are_curves_of_their_own_and_other_parts_stay_out():
+    ensemble = ensemble_of(AMPLITUDES, parts=4)
+    figure = only(ensemble, "bands/share")
+    assert legend(figure) == ["band 1", "band 2", "band 3"]
+    assert "largest" not in title(figure)
+    (axes,) = panels(figure)
+    np.testing.assert_allclose(curves(axes)[0].get_ydata(), ensemble["bands/share"][:, 1])
+
+
+def test_samples_are_a_mean_and_a_band():
+    ensemble = with_samples(AMPLITUDES)
+    figure = only(ensemble)
+    (axes,) = panels(figure)
+    (band,) = axes.collections
+    low, high = (ensemble["ibtet"].quantile(end, dim="seed").values for end in (0.05, 0.95))
+    edges = band.get_paths()[0].vertices
+    assert edges[:, 1].min() == pytest.approx(low.min())
+    assert edges[:, 1].max() == pytest.approx(high.max())
+    assert "means over 8 samples; bands: 5 to 95 % of them" in title(figure)
+    assert "disorder.seed" not in title(figure)
+
+
+def test_samples_alone_are_points_over_their_seeds():
+    figures = drawn(with_samples())
+    assert list(figures) == ["ibtet-over-disorder.seed"]
+    (figure,) = figures.values()
+    assert legend(figure) == ["mean 0.045, 5 to 95 % of samples: 0.0135 to 0.0765"]
+
+
+def test_members_that_failed_are_gaps_and_counted():
+    ensemble = ensemble_of(RESTITUTIONS, AMPLITUDES)
+    for name in ("ibtet", "contact_episodes"):
+        ensemble[name][0, 2] = np.nan
+    figure = only(ensemble)
+    (axes,) = panels(figure)
+    assert np.isnan(curves(axes)[0].get_ydata()[2])
+    assert "1 of 12 members failed" in title(figure)
+
+
+def test_what_cannot_be_drawn_has_a_reason():
+    ensemble = ensemble_of(AMPLITUDES)
+    assert reason_without_page(ensemble, "ibtet", by_name=True) == ""
+    zero = ensemble.assign(ibtet=0 * ensemble["ibtet"])
+    assert reason_without_page(zero, "ibtet", by_name=False) == "0 for every member"
+    assert reason_without_page(zero, "ibtet", by_name=True) == ""
+    empty = ensemble.assign(ibtet=np.nan * ensemble["ibtet"])
+    assert reason_without_page(empty, "ibtet", by_name=True) == "no member has a value"
+    single = ensemble_of({"drive.amplitude": [1.0]})
+    assert "one member" in reason_without_page(single, "ibtet", by_name=True)
+
+
+def test_measures_are_what_is_measured_of_every_member():
+    ensemble = ensemble_of(LAWS, AMPLITUDES, parts=3)
+    ensemble["fits/ibtet/exponent"] = ("law", [1.0, 2.0])
+    ensemble["entropy/history"] = (("law", "amplitude", "snapshot"), np.ones((2, 6, 9)))
+    assert measures_of(ensemble) == ["contact_episodes", "ibtet", "bands/share"]
+
+
+@pytest.mark.parametrize("drive", [{}, {"end": "left"}, {"waveform": "impulse"}])
+def test_the_amplitude_has_the_unit_of_its_drive(drive):
+    (axis,) = SweptAxis.all_of(ensemble_of(AMPLITUDES, drive=drive))
+    unit = "m" if "end" in drive else "N s" if drive else "N"
+    assert axis.label == f"drive.amplitude ({unit})"
+
+
+@pytest.mark.parametrize(
+    ("path", "unit"),
+    [("contacts.clearance", "m"), ("contacts.restitution", ""), ("lattice.cell.masses", "kg"), ("disorder.seed", "")],
+)
+def test_units_are_those_of_the_manual(path, unit):
+    assert unit_of(path) == unit
+
+
+def test_values_are_told_apart_in_few_digits():
+    (axis,) = SweptAxis.all_of(ensemble_of({"drive.frequency": [1000.0, 1000.5, 1100.0]}))
+    assert axis.value_texts == ["1000", "1000.5", "1100"]
+    long = [[*range(40)], [*range(41)]]
+    (axis,) = SweptAxis.all_of(ensemble_of({"contacts.sites": long}))
+    assert len(set(axis.texts)) == 2
+
+
+@pytest.mark.parametrize("low", [0.2, 1.0, 3.0, 9.5])
+@pytest.mark.parametrize("ratio", [1.5, 3.0, 12.0, 300.0, 1e9])
+def test_a_logarithmic_axis_has_three_labels_at_least(low, ratio):
+    ticks = log_ticks(low, low * ratio)
+    assert 3 <= len(ticks) <= 10
+    assert low * 0.999 <= min(ticks)
+    assert max(ticks) <= low * ratio * 1.001
+
+
+def test_edges_of_a_map_lie_between_its_positions():
+    np.testing.assert_allclose(cell_edges(np.array([1.0, 2.0, 4.0]), "linear"), [0.5, 1.5, 3.0, 5.0])
+    np.testing.assert_allclose(cell_edges(np.array([1.0, 4.0, 16.0]), "log"), [0.5, 2.0, 8.0, 32.0])
+
+
+def test_scales_follow_the_spacing():
+    assert even_scale(np.geomspace(1, 100, 7)) == "log"
+    assert even_scale(np.linspace(1, 100, 7)) == "linear"
+    assert even_scale(np.array([-1.0, 1.0, 10.0])) == "linear"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("numbers", [0, 1, 2, 3])
+@pytest.mark.parametrize("words", [0, 1, 2])
+def test_every_combination_of_keys_is_drawn_into_a_file(numbers, words, tmp_path):
+    """Files of a page's picture and of its numbers, with every key in the names."""
+    axes = [AMPLITUDES, CLEARANCES, THREE][:numbers] + [LAWS, SITES][:words]
+    if not axes:
+        return
+    ensemble = ensemble_of(*axes, parts=3)
+    stems = [drawing.stem for name in measures_of(ensemble) for drawing in measure_pages(ensemble, name)]
+    assert len(set(stems)) == len(stems) >= 3
+    for stem, axis in product(stems, axes):
+        assert all(path in stem for path in axis)
+    figure = next(measure_pages(ensemble, "bands/share")).draw()
+    for suffix in ("png", "json"):
+        assert save(figure, tmp_path / f"page.{suffix}").stat().st_size > 100
+
+
+def test_roles_do_not_depend_on_equal_sizes():
+    same = [{"drive.frequency": [1.0, 2.0, 3.0]}, {"drive.ramp": [1.0, 2.0, 3.0]}, {"drive.duration": [1.0, 2.0, 3.0]}]
+    roles = Roles.of(Measure.of(ensemble_of(*same), "ibtet").axes)
+    assert roles.y is not None
+    assert [roles.x.label, roles.y.label] == ["drive.frequency (rad/s)", "drive.ramp (s)"]
+    assert [axis.label for axis in roles.panels] == ["drive.duration (s)"]

@@ -1,0 +1,299 @@
+"""Pages of a sweep's measures over whatever keys it sweeps: curves over one number, maps over two, panels for more.
+
+A measure is any variable of ``ensemble.h5`` over all axes of its sweep, perhaps over parts of the frequency axis too.
+Numbers are positions on an axis; words, lists and numbers with two values are curves; samples of disorder are a band.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from itertools import product
+from typing import NamedTuple, Self
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+from vipetsc.figures.measure_panels import Curve, LargestOnMap, MeasurePage, draw_curves, draw_maps, draw_samples
+from vipetsc.figures.style import Drawing
+from vipetsc.figures.sweep_members import table
+from vipetsc.figures.swept_axes import SweptAxis, SweptKey, joined
+from vipetsc.io.read import axes as axes_of
+from vipetsc.io.read import over_samples
+
+MOST_CURVES = 6
+MOST_PANELS = 16
+MOST_PAGES = 12  # of a measure; a longer study is cut through its largest value
+LEAST_ON_A_MAP = 3  # values of a number that is an axis of a map
+PART = "part"
+LONGEST_STEM = 150  # letters: file systems take 255, and figures of a report have prefixes
+
+# Not about the lattice's motion, but about the members and how well they were computed.
+ABOUT_MEMBERS = {"status", "number"}
+ON_REQUEST = {
+    "ledger_error",
+    "work",
+    "ibtet_whole",
+    "entropy/masked",
+    "entropy/joint",
+    "entropy/error",
+    "entropy/start",
+    "bands/modal_energy",
+}
+
+
+class Roles(NamedTuple):
+    """What the axes of a measure are in its pictures: positions ``x`` (and ``y`` of a map), curves, panels, pages."""
+
+    x: SweptAxis
+    y: SweptAxis | None
+    curves: tuple[SweptAxis, ...]
+    panels: tuple[SweptAxis, ...]
+    pages: tuple[SweptAxis, ...]
+
+    @classmethod
+    def of(cls, axes: Sequence[SweptAxis]) -> Self:
+        """Return the roles of ``axes``, of which there is at least one."""
+        longest_first = sorted(axes, key=lambda axis: -axis.size)
+        numbers = [axis for axis in longest_first if axis.is_number]
+        of_a_map = [axis for axis in numbers if axis.size >= LEAST_ON_A_MAP]
+        x = (numbers or longest_first)[0]
+        y = of_a_map[1] if len(of_a_map) > 1 else None
+
+        taken = {x.dimension} | ({y.dimension} if y else set())
+        others = [axis for axis in axes if axis.dimension not in taken]
+        # The last axes of a case vary fastest: what they compare stands closest together.
+        # Bands differ by orders of magnitude: members are compared band by band.
+        keys = [axis for axis in others if axis.dimension != PART]
+        curves = () if y else _last_of(keys or others, MOST_CURVES)
+        taken |= {axis.dimension for axis in curves}
+        others = [axis for axis in others if axis.dimension not in taken]
+        panels = _last_of(others, MOST_PANELS)
+        return cls(x, y, curves, panels, pages=tuple(others[: len(others) - len(panels)]))
+
+
+def _last_of(axes: Sequence[SweptAxis], most: int) -> tuple[SweptAxis, ...]:
+    """Return the last of the ``axes`` that have ``most`` combinations or fewer."""
+    count = 0
+    while count < len(axes) and math.prod(axis.size for axis in axes[-count - 1 :]) <= most:
+        count += 1
+    return tuple(axes[len(axes) - count :])
+
+
+class Measure(NamedTuple):
+    """A measure of a sweep: its ``values`` over the dimensions of ``axes``, and the ends of its band over samples."""
+
+    name: str
+    unit: str
+    text: str
+    values: xr.DataArray
+    band: tuple[xr.DataArray, xr.DataArray] | None
+    samples: int
+    axes: tuple[SweptAxis, ...]
+    failed: xr.DataArray
+
+    @classmethod
+    def of(cls, ensemble: xr.Dataset, name: str) -> Self:
+        """Return the measure ``name`` of an ensemble, means over its samples if it has any."""
+        samples = _seeds(ensemble).size
+        means = over_samples(ensemble)
+        values = means[name]
+        band = None
+        if f"statistics/{name}/quantiles" in means:
+            quantiles = means[f"statistics/{name}/quantiles"]
+            band = (quantiles.isel(quantile=0), quantiles.isel(quantile=-1))
+
+        axes = SweptAxis.all_of(means)
+        if PART in values.dims:
+            parts = [str(part) for part in np.atleast_1d(values.attrs["parts"])]
+            bands = [number for number, part in enumerate(parts) if part.startswith("band")]
+            numbers = np.array([parts[number].removeprefix("band ") for number in bands], dtype=object)
+            values = values.isel(part=bands)
+            band = band and (band[0].isel(part=bands), band[1].isel(part=bands))
+            axes.append(SweptAxis(PART, (SweptKey("band", "", numbers),)))
+
+        # Axes of one value have no part in a picture.
+        shown = {axis.dimension for axis in axes}
+        fixed = {dimension: 0 for dimension in values.dims if dimension not in shown}
+        episodes = means["contact_episodes"]
+        unit = str(values.attrs.get("units", "1"))
+        return cls(
+            name=name,
+            unit="" if unit == "1" else unit,
+            text=str(values.attrs.get("long_name", "")),
+            values=values.isel(fixed),
+            band=band and (band[0].isel(fixed), band[1].isel(fixed)),
+            samples=samples,
+            axes=tuple(axis for axis in axes if axis.size > 1),
+            failed=episodes.isel({d: 0 for d in episodes.dims if d in fixed}).isnull(),
+        )
+
+    @property
+    def label(self) -> str:
+        """The name of the measure with its unit."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+    def at(self, place: Mapping[str, int]) -> Self:
+        """Return the measure at the indices ``place`` of its dimensions, without these."""
+        present = {dimension: index for dimension, index in place.items() if dimension in self.failed.dims}
+        return self._replace(
+            values=self.values.isel(place),
+            band=self.band and (self.band[0].isel(place), self.band[1].isel(place)),
+            axes=tuple(axis for axis in self.axes if axis.dimension not in place),
+            failed=self.failed.isel(present),
+        )
+
+    def largest(self) -> dict[str, int]:
+        """Return the place of the largest value: its index along every dimension."""
+        index = np.unravel_index(int(np.nanargmax(self.values.values)), self.values.shape)
+        return {str(dimension): int(i) for dimension, i in zip(self.values.dims, index, strict=True)}
+
+    def place_text(self, place: Mapping[str, int]) -> str:
+        """Return what the keys are at the indices ``place``."""
+        return ", ".join(axis.texts[place[axis.dimension]] for axis in self.axes if axis.dimension in place)
+
+
+def _seeds(ensemble: xr.Dataset) -> np.ndarray:
+    """Return the seeds of the samples over which an ensemble has statistics; empty where it has none."""
+    if "statistics/samples" not in ensemble:
+        return np.array([])
+    return np.asarray(ensemble[_seed_dimension(ensemble)].values)
+
+
+def _seed_dimension(ensemble: xr.Dataset) -> str:
+    return next(dim for dim in axes_of(ensemble) if ensemble[dim].attrs["long_name"] == "disorder.seed")
+
+
+def figure_name(measure: str) -> str:
+    """Return the name by which the pages of a ``measure`` are asked for, with which their files begin."""
+    return measure.replace("/", "_")
+
+
+def measures_of(ensemble: xr.Dataset) -> list[str]:
+    """Return the names of the measures that an ensemble holds."""
+    over_all = set(axes_of(ensemble))
+    names = []
+    for name, variable in ensemble.data_vars.items():
+        dims = set(map(str, variable.dims))
+        is_measure = not str(name).startswith(("statistics/", "fits/")) and name not in ABOUT_MEMBERS
+        if is_measure and dims - {PART} == over_all and np.issubdtype(variable.dtype, np.number):
+            names.append(str(name))
+    return names
+
+
+def reason_without_page(ensemble: xr.Dataset, name: str, by_name: bool) -> str:
+    """Return why the measure ``name`` of an ensemble has no page; empty where it has one.
+
+    One that vanishes everywhere has a page only where it is asked for ``by_name``.
+    """
+    values = ensemble[name].values
+    if not np.isfinite(values).any():
+        return "no member has a value"
+    if not by_name and not np.nan_to_num(values).any():
+        return "0 for every member"
+    if not SweptAxis.all_of(over_samples(ensemble)) and _seeds(ensemble).size < 2:
+        return "the sweep has one member, so nothing varies; its pictures are those of `run CASE --member 0`"
+    return ""
+
+
+def measure_pages(ensemble: xr.Dataset, name: str, sweep: str = "") -> Iterator[Drawing]:
+    """Offer the pages of the measure ``name``; ``sweep`` names it where pictures of several lie in one folder."""
+    measure = Measure.of(ensemble, name)
+    begin = "-".join(filter(None, [figure_name(name), sweep]))
+    heading = f"{table(ensemble)['name']}: {name}, {measure.text}"
+    if not SweptAxis.all_of(over_samples(ensemble)):
+        samples = np.atleast_2d(ensemble[name].squeeze().transpose(..., "seed").values)
+        yield Drawing(
+            f"{begin}-over-disorder.seed", partial(_samples_page, measure, heading, _seeds(ensemble), samples)
+        )
+        return
+
+    roles = Roles.of(measure.axes)
+    stem = _file_name(f"{begin}-over-{'-'.join(key.path for axis in measure.axes for key in axis.keys)}")
+    places = list(product(*(range(axis.size) for axis in roles.pages)))
+    cut = ""
+    if len(places) > MOST_PAGES:
+        best = measure.largest()
+        places = [tuple(best[axis.dimension] for axis in roles.pages)]
+        cut = "through the largest value of all: "
+    for number, indices in enumerate(places, 1):
+        place = {axis.dimension: index for axis, index in zip(roles.pages, indices, strict=True)}
+        page = measure.at(place)
+        if not np.isfinite(page.values).any():
+            continue
+        title = [heading, cut + measure.place_text(place)]
+        page_stem = f"{stem}-{number}" if roles.pages else stem
+        yield Drawing(page_stem, partial(_page, page, roles, title))
+
+
+def _file_name(text: str) -> str:
+    """Return ``text`` in characters that every file system takes."""
+    allowed = "".join(c if (c.isascii() and c.isalnum()) or c in "-._" else "-" for c in text)
+    return allowed[:LONGEST_STEM]
+
+
+def _samples_page(measure: Measure, heading: str, seeds: np.ndarray, series: Sequence[np.ndarray]) -> Figure:
+    """Draw a measure of every sample over its seed: ``series`` (part, sample)."""
+    labels = []
+    for name, values in zip(measure.axes[0].texts if measure.axes else [""], series, strict=False):
+        low, high = np.nanquantile(values, (0.05, 0.95))
+        text = f"mean {np.nanmean(values):.4g}, 5 to 95 % of samples: {low:.4g} to {high:.4g}"
+        labels.append(f"{name}: {text}" if name else text)
+    page = MeasurePage(measure.label, [f"{heading}, of {measure.samples} samples"], labels)
+    page.lay_out([""])
+    figure = draw_samples(page, seeds, series)
+    page.write_legend()
+    return figure
+
+
+def _page(measure: Measure, roles: Roles, title: Sequence[str]) -> Figure:
+    """Draw a measure in the panels of a page, its largest value marked."""
+    heading, *further = title
+    over = joined([axis.label for axis in (roles.x, roles.y) if axis])
+    compared = joined([key.label for axis in (*roles.panels, *roles.curves) for key in axis.keys])
+    lines = [f"{heading}, over {over}" + (f", for each {compared}" if compared else ""), *further]
+    best = measure.largest()
+    # Of the bands the driven one has most.
+    marks_largest = all(axis.dimension != PART for axis in measure.axes)
+    if marks_largest:
+        largest = f"{float(measure.values.isel(best)):.4g} {measure.unit}".strip()
+        lines.append(f"largest (ring): {largest} at {measure.place_text(best)}")
+    if measure.samples:
+        lines.append(f"means over {measure.samples} samples" + ("" if roles.y else "; bands: 5 to 95 % of them"))
+    failed = int(measure.failed.sum())
+    if failed:
+        lines.append(f"{failed} of {measure.failed.size} members failed, and are left out")
+
+    panels = _by_place(measure, roles.panels)
+    page = MeasurePage(measure.label, lines, list(_by_place(measure, roles.curves)) if roles.curves else [])
+    page.lay_out(list(panels), columns=roles.panels[-1].size if len(roles.panels) > 1 else 0)
+
+    of_panels = {axis.dimension: best[axis.dimension] for axis in roles.panels}
+    marked = measure.place_text(of_panels) if marks_largest else None
+    if roles.y:
+        fields = [panel.values.transpose(roles.y.dimension, roles.x.dimension).values for panel in panels.values()]
+        ring = None
+        if marked is not None:
+            ring = LargestOnMap(best[roles.x.dimension], best[roles.y.dimension], list(panels).index(marked))
+        return draw_maps(page, roles.x, roles.y, fields, ring)
+
+    for axes, (text, panel) in zip(page.panels, panels.items(), strict=True):
+        largest_point = (best[roles.x.dimension], float(measure.values.isel(best))) if text == marked else None
+        draw_curves(axes, roles.x, _curves(panel, roles.curves), largest_point)
+    return page.finish_curves(roles.x, measure.values.values)
+
+
+def _by_place(measure: Measure, axes: Sequence[SweptAxis]) -> dict[str, Measure]:
+    """Return the measure at every combination of the values of ``axes``, by what these are."""
+    indices = product(*(range(axis.size) for axis in axes))
+    places = [dict(zip((axis.dimension for axis in axes), index, strict=True)) for index in indices]
+    return {measure.place_text(place): measure.at(place) for place in places}
+
+
+def _curves(panel: Measure, compared: Sequence[SweptAxis]) -> list[Curve]:
+    """Return the curves of a panel, one for each combination of what is ``compared`` in it."""
+    curves = []
+    for number, (label, one) in enumerate(_by_place(panel, compared).items()):
+        ends = one.band and (one.band[0].values, one.band[1].values)
+        curves.append(Curve(label, number, one.values.values, ends))
+    return curves

@@ -1,0 +1,272 @@
+"""Panels of a sweep's measures: curves with bands, maps with contours, samples; their titles, legends and ticks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from string import ascii_lowercase
+from textwrap import wrap
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+from vipetsc.figures import style
+from vipetsc.figures.panels import colour_bar
+from vipetsc.figures.swept_axes import SweptAxis
+
+MARKERS = "os^Dv*"  # of curves
+SINGLE = 4.8  # width in inches of a page with one panel
+LETTERS = 15  # of a title on an inch
+LEGEND_LETTERS = 17  # of a legend on an inch
+MOST_COLUMNS = 4
+LEAST_TICKS = 3  # of a logarithmic scale
+MOST_TICKS = 8  # values of a key that are all ticks
+LEAST_GAP = 0.07  # between ticks, of the axis
+LOG_RATIO = 100.0  # of the largest over the smallest value of a measure on a logarithmic scale
+CONTOURS = 6
+
+
+class Curve(NamedTuple):
+    """A curve of a panel: its ``label``, its ``number`` among those of all panels, values, and ends of its band."""
+
+    label: str
+    number: int
+    values: np.ndarray
+    band: tuple[np.ndarray, np.ndarray] | None
+
+    @property
+    def look(self) -> dict[str, Any]:
+        """The colour and the marker of the curve on all panels."""
+        return {"color": f"C{self.number}", "marker": MARKERS[self.number % len(MARKERS)], "ms": 3, "lw": 0.9}
+
+
+@dataclass
+class MeasurePage:
+    """A page of panels of a measure with its ``label``, under a ``title`` and over a legend of ``legend_labels``."""
+
+    label: str
+    title: Sequence[str]
+    legend_labels: Sequence[str] = ()
+    figure: Figure = field(init=False)
+    body: Figure | SubFigure = field(init=False)
+    _legend_figure: SubFigure = field(init=False)
+    panels: list[Axes] = field(init=False)
+    width: float = field(init=False)
+
+    def lay_out(self, titles: Sequence[str], columns: int = 0) -> None:
+        """Make the page with a panel for each of ``titles``, in ``columns`` if these are few."""
+        count = len(titles)
+        if not 0 < columns <= MOST_COLUMNS:
+            columns = -(-count // -(-count // MOST_COLUMNS))
+        rows = -(-count // columns)
+        self.width = SINGLE if count == 1 else style.PAGE
+
+        heading = [part for line in self.title if line for part in wrap(line, int(LETTERS * self.width))]
+        height = 0.15 * len(heading) + (2.4 if rows == 1 else 0.3 + 1.75 * rows)
+        strip = self._legend_height()
+        self.figure = style.new_figure(self.width, height + strip)
+        self.body = self.figure
+        if strip:
+            self.body, legend = self.figure.subfigures(2, 1, height_ratios=(height, strip), hspace=0)
+            self._legend_figure = legend
+        self.body.suptitle("\n".join(heading))
+
+        grid = self.body.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+        for tag, axes, title in zip(ascii_lowercase, grid, titles, strict=False):
+            if title:
+                axes.set_title("\n".join(wrap(f"({tag}) {title}", int(LETTERS * (self.width - 0.6) / columns))))
+        for axes in grid[count:]:
+            axes.set_axis_off()
+        for index, axes in enumerate(grid[:count]):
+            # A panel above an empty one is the last of its column.
+            axes.tick_params(labelbottom=index + columns >= count)
+        self.panels = list(grid[:count])
+
+    def _legend_columns(self) -> int:
+        letters = max(map(len, self.legend_labels)) + 6
+        return max(1, min(len(self.legend_labels), int(LEGEND_LETTERS * self.width / letters)))
+
+    def _legend_height(self) -> float:
+        """Return the height in inches of the strip that the legend takes."""
+        if not self.legend_labels:
+            return 0.0
+        return 0.08 + 0.14 * -(-len(self.legend_labels) // self._legend_columns())
+
+    def label_axes(self, x: SweptAxis, y: str) -> None:
+        """Write what the axes of all panels are, and ticks at the values of ``x``."""
+        columns = self.panels[0].get_subplotspec().get_gridspec().ncols
+        for axes in self.panels:
+            label_positions(axes.xaxis, x, self.width / columns)
+        self.body.supxlabel("\n".join(wrap(x.label, int(LETTERS * self.width))))
+        self.body.supylabel("\n".join(wrap(y, int(LETTERS * self.figure.get_figheight()))))
+
+    def finish_curves(self, x: SweptAxis, values: np.ndarray) -> Figure:
+        """Label and scale the axes of all panels of curves, whose ``values`` these are, and write the legend."""
+        finite = values[np.isfinite(values)]
+        first = self.panels[0]
+        if finite.min() > 0 and finite.max() > LOG_RATIO * finite.min():
+            first.set_yscale("log")
+            _set_log_ticks(first.yaxis, finite)
+        elif 0 <= finite.min() < 0.5 * finite.max():
+            first.set_ylim(bottom=0)
+        self.label_axes(x, self.label)
+        self.write_legend()
+        return self.figure
+
+    def write_legend(self) -> None:
+        """Write the legend of the curves in the strip below all panels."""
+        handles = self.panels[0].get_legend_handles_labels()[0]
+        if self.legend_labels:
+            columns = self._legend_columns()
+            self._legend_figure.legend(handles, self.legend_labels, loc="center", ncols=columns)
+
+
+def draw_curves(axes: Axes, x: SweptAxis, curves: Sequence[Curve], ring: tuple[int, float] | None) -> None:
+    """Draw ``curves`` over ``x``, points alone over categories, and a ``ring`` at an index and value."""
+    order = np.argsort(x.positions, kind="stable")
+    for curve in curves:
+        shift = 0.0 if x.is_number else 0.12 * (curve.number - 0.5 * (len(curves) - 1))
+        positions = x.positions[order] + shift
+        axes.plot(positions, curve.values[order], label=curve.label, **curve.look | {"ls": "-" if x.is_number else ""})
+        if curve.band:
+            _draw_band(axes, x, positions, *(end[order] for end in curve.band), colour=curve.look["color"])
+        if ring and curve.values[ring[0]] == ring[1]:
+            at = x.positions[ring[0]] + shift, ring[1]
+            axes.plot(*at, "o", mfc="none", mec=style.BLACK, ms=8, mew=0.8)
+    if x.scale == "log":
+        axes.set_xscale("log")
+
+
+def _draw_band(
+    axes: Axes, x: SweptAxis, positions: np.ndarray, low: np.ndarray, high: np.ndarray, *, colour: str
+) -> None:
+    """Draw what lies between the ends ``low`` and ``high`` at the ``positions``."""
+    if x.is_number:
+        axes.fill_between(positions, low, high, color=colour, alpha=0.25, lw=0)
+    else:
+        axes.vlines(positions, low, high, color=colour, lw=2.5, alpha=0.35)
+
+
+class LargestOnMap(NamedTuple):
+    """Where the largest value of a page of maps is: indices along x and y, and of its panel."""
+
+    x: int
+    y: int
+    panel: int
+
+
+def draw_maps(
+    page: MeasurePage, x: SweptAxis, y: SweptAxis, fields: Sequence[np.ndarray], ring: LargestOnMap | None
+) -> Figure:
+    """Draw ``fields`` (y, x) in the panels of ``page`` with one scale of colours, contours on them, and a ring."""
+    x_order = np.argsort(x.positions, kind="stable")
+    y_order = np.argsort(y.positions, kind="stable")
+    norm = _norm(np.stack(fields))
+    for axes, unordered in zip(page.panels, fields, strict=True):
+        values = unordered[np.ix_(y_order, x_order)]
+        axes.set(xscale=x.scale, yscale=y.scale, facecolor=style.PALE)
+        edges = cell_edges(x.positions[x_order], x.scale), cell_edges(y.positions[y_order], y.scale)
+        image = axes.pcolormesh(*edges, values, norm=norm, cmap="viridis", rasterized=True)
+        _draw_contours(axes, x.positions[x_order], y.positions[y_order], values, norm)
+        label_positions(axes.yaxis, y, page.width)
+
+    if ring:
+        at = x.positions[ring.x], y.positions[ring.y]
+        for colour, thickness in (("white", 2.2), (style.RED, 1.2)):
+            page.panels[ring.panel].plot(*at, "o", mfc="none", mec=colour, mew=thickness, ms=9)
+    page.label_axes(x, y.label)
+    ticks: dict[str, Any] = {}
+    if isinstance(norm, LogNorm):
+        ticks = {"ticks": log_ticks(norm.vmin, norm.vmax), "format": "%g"}
+    colour_bar(image, page.panels, page.label, extend="neither", **ticks)
+    return page.figure
+
+
+def _norm(values: np.ndarray) -> Normalize:
+    """Return colours for all finite ``values``: logarithmic where these are positive and range far."""
+    finite = values[np.isfinite(values)]
+    low = float(finite.min())
+    high = float(finite.max())
+    if low > 0 and high > LOG_RATIO * low:
+        return LogNorm(low, high)
+    return Normalize(low, high if high > low else low + 1)
+
+
+def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, norm: Normalize) -> None:
+    """Draw labelled contours of ``values`` (y, x), light where the map is dark."""
+    finite = values[np.isfinite(values)]
+    if len(finite) < 4 or np.ptp(finite) == 0:
+        return
+    locator = LogLocator(numticks=CONTOURS) if isinstance(norm, LogNorm) else MaxNLocator(CONTOURS)
+    levels = [level for level in locator.tick_values(norm.vmin, norm.vmax) if finite.min() < level < finite.max()]
+    if not levels:
+        return
+    colours = ["white" if norm(level) < 0.6 else "black" for level in levels]
+    lines = axes.contour(x, y, np.ma.masked_invalid(values), levels=levels, colors=colours, linewidths=0.6)
+    axes.clabel(lines, fmt="%.3g", fontsize=6)
+
+
+def draw_samples(page: MeasurePage, seeds: np.ndarray, series: Sequence[np.ndarray]) -> Figure:
+    """Draw every sample over its seed, with mean and band of each of ``series``, which the legend names."""
+    (axes,) = page.panels
+    for number, values in enumerate(series):
+        look = Curve("", number, values, None).look
+        axes.plot(seeds, values, label=f"samples {number}", **look | {"ls": ""})
+        axes.axhspan(*np.nanquantile(values, (0.05, 0.95)), color=look["color"], alpha=0.2, lw=0)
+        axes.axhline(np.nanmean(values), color=look["color"], lw=0.9)
+    axes.set(xlabel="disorder.seed", ylabel=page.label)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    return page.figure
+
+
+def cell_edges(positions: np.ndarray, scale: str) -> np.ndarray:
+    """Return the edges of the cells of a map about rising ``positions``, halfway between them on the ``scale``."""
+    on_scale = np.log(positions) if scale == "log" else positions
+    middles = 0.5 * (on_scale[1:] + on_scale[:-1])
+    first = 2 * on_scale[0] - middles[0]
+    last = 2 * on_scale[-1] - middles[-1]
+    edges = np.concatenate([[first], middles, [last]])
+    return np.exp(edges) if scale == "log" else edges
+
+
+def label_positions(axis: Axis, swept: SweptAxis, width: float) -> None:
+    """Put ticks at the values of a ``swept`` axis if these are few, else where a scale of numbers has them.
+
+    ``width`` in inches is that of the panel, for which long labels are turned.
+    """
+    positions = swept.positions
+    if not swept.is_number:
+        texts = swept.value_texts
+        is_long = axis.axis_name == "x" and sum(len(text) + 2 for text in texts) > LETTERS * width
+        axis.set_ticks(positions, texts, **({"rotation": 25, "ha": "right"} if is_long else {}))
+        return
+    on_scale = np.sort(np.log(positions) if swept.scale == "log" else positions)
+    gap = np.diff(on_scale).min() / np.ptp(on_scale)
+    least = LEAST_GAP if axis.axis_name == "y" else max(LEAST_GAP, 0.4 / width)
+    if len(positions) <= MOST_TICKS and gap >= least:
+        number = swept.first_number
+        axis.set_ticks(positions, number.value_texts if number else [])
+        axis.set_minor_locator(NullLocator())
+    elif swept.scale == "log":
+        _set_log_ticks(axis, positions)
+
+
+def _set_log_ticks(axis: Axis, values: np.ndarray) -> None:
+    """Label three places or more of a logarithmic ``axis`` within the range of ``values``."""
+    axis.set_major_locator(FixedLocator(log_ticks(float(values.min()), float(values.max()))))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Return three numbers or more between ``low`` and ``high``, both positive, for a logarithmic scale."""
+    exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    for steps in ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 5, 7)):
+        ticks = [step * 10.0**exponent for exponent in exponents for step in steps]
+        inside = [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
+        if len(inside) >= LEAST_TICKS:
+            return inside[:: -(-len(inside) // MOST_TICKS)]
+    return [float(tick) for tick in MaxNLocator(4).tick_values(low, high) if low <= tick <= high]

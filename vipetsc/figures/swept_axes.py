@@ -1,0 +1,189 @@
+"""The axes of a sweep as pictures name them: keys by their path in the case, values with units, scales of numbers."""
+
+import tomllib
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import xarray as xr
+
+from vipetsc.case.keys import unit_of
+from vipetsc.io.read import axes as axes_of
+
+FEW_TOGETHER = 6  # values of keys that vary together and stand as categories
+FRACTION_LIMIT = 36  # largest denominator of a wavenumber over pi that is written as a fraction
+LONGEST = 24  # letters of a list that stands in a legend
+DIGITS = range(3, 18)  # of a number; as many as tell the values apart
+LEAST_RATIO = 5.0  # of a logarithmic axis, largest over smallest value
+
+
+class SweptKey(NamedTuple):
+    """A key that varies: its ``path`` in the case, its ``unit`` (empty for none), and its ``values`` along the axis."""
+
+    path: str
+    unit: str
+    values: np.ndarray
+
+    @property
+    def label(self) -> str:
+        """The path with the unit in brackets."""
+        return f"{self.path} ({self.unit})" if self.unit else self.path
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the values are numbers of which no two are equal."""
+        return np.issubdtype(self.values.dtype, np.number) and len(np.unique(self.values)) == len(self.values)
+
+    @property
+    def value_texts(self) -> list[str]:
+        """The values as texts that differ where they do, without the unit."""
+        if self.path.endswith("wavenumber") and np.issubdtype(self.values.dtype, np.number):
+            return [in_pi(value) for value in self.values]
+        if np.issubdtype(self.values.dtype, np.number):
+            return _number_texts(self.values)
+        texts = [str(value) for value in self.values]
+        shortened = [_shortened(text) for text in texts]
+        if len(set(shortened)) < len(set(texts)):
+            shortened = [f"{text} (no. {number})" for number, text in enumerate(shortened, 1)]
+        return shortened
+
+    @property
+    def texts(self) -> list[str]:
+        """The path with each value and its unit: ``drive.amplitude 24.3 N``."""
+        unit = f" {self.unit}" if self.unit else ""
+        return [f"{self.path} {text}{unit}" for text in self.value_texts]
+
+
+def _number_texts(values: np.ndarray) -> list[str]:
+    """Return the ``values`` in as few digits as tell them apart."""
+    different = len(np.unique(values))
+    for digits in DIGITS:
+        texts = [_number_text(value, digits) for value in values]
+        if len(set(texts)) == different:
+            return texts
+    return [repr(value) for value in values]
+
+
+def _number_text(value: float, digits: int) -> str:
+    """Return ``value`` in ``digits``, without a power of ten where a few zeros do."""
+    text = f"{value:.{digits}g}"
+    if "e" in text and 1e-4 <= abs(value) < 1e6:
+        text = f"{float(text):.0f}" if abs(value) > 1 else f"{float(text):.{digits + 4}f}".rstrip("0")
+    return text
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…"
+
+
+class SweptAxis(NamedTuple):
+    """An axis of a measure along which keys vary: its ``dimension``, and the ``keys`` that vary along it."""
+
+    dimension: str
+    keys: tuple[SweptKey, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of values."""
+        return len(self.keys[0].values)
+
+    @property
+    def first_number(self) -> SweptKey | None:
+        """The key whose values are positions on an axis of numbers; None where the values are categories."""
+        if len(self.keys) > 1 and self.size <= FEW_TOGETHER:
+            return None
+        return next((key for key in self.keys if key.is_number), None)
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the axis has positions, and is not one of categories."""
+        return self.first_number is not None
+
+    @property
+    def label(self) -> str:
+        """The label of the axis in a picture, with every key that varies along it."""
+        first = self.first_number or self.keys[0]
+        others = [key for key in self.keys if key.path != first.path]
+        together = " and ".join(f"{key.label} from {key.value_texts[0]} to {key.value_texts[-1]}" for key in others)
+        if self.is_number and others:
+            return f"{first.label}, together with {together}"
+        return ", ".join(key.label for key in self.keys)
+
+    @property
+    def texts(self) -> list[str]:
+        """Every key with its value, for each position along the axis."""
+        return [", ".join(texts) for texts in zip(*(key.texts for key in self.keys), strict=True)]
+
+    @property
+    def value_texts(self) -> list[str]:
+        """The values alone, for each position along the axis."""
+        return [", ".join(texts) for texts in zip(*(key.value_texts for key in self.keys), strict=True)]
+
+    @property
+    def positions(self) -> np.ndarray:
+        """The numbers along the axis, or the numbers of its categories from 0."""
+        number = self.first_number
+        return np.arange(self.size, dtype=float) if number is None else number.values.astype(float)
+
+    @property
+    def scale(self) -> str:
+        """The scale on which the positions lie more evenly, "linear" or "log"."""
+        return even_scale(self.positions) if self.is_number else "linear"
+
+    @classmethod
+    def all_of(cls, ensemble: xr.Dataset) -> list[Self]:
+        """Return the axes of ``ensemble`` along which anything varies, in the order of its case."""
+        case = tomllib.loads(ensemble.attrs["case"])
+        axes = []
+        for dimension in axes_of(ensemble):
+            names = [name for name in ensemble.coords if ensemble[name].dims == (dimension,)]
+            keys = [_swept_key(ensemble[name], case) for name in names]
+            varying = [key for key in keys if len(set(key.values.tolist())) > 1]
+            if varying:
+                axes.append(cls(dimension, tuple(varying)))
+        return axes
+
+
+def _swept_key(values: xr.DataArray, case: dict[str, Any]) -> SweptKey:
+    """Return the key whose ``values`` are a coordinate of the sweep of ``case``."""
+    path = str(values.attrs["long_name"])
+    unit = _unit_of_amplitude(case.get("drive", {})) if path == "drive.amplitude" else unit_of(path)
+    return SweptKey(path, unit, values.values)
+
+
+def _unit_of_amplitude(drive: dict[str, Any]) -> str:
+    """Return the unit of the amplitude of what the table ``drive`` does: move an end, hit, or push."""
+    if "end" in drive:
+        return "m"
+    return "N s" if drive.get("waveform") == "impulse" else "N"
+
+
+def even_scale(values: np.ndarray) -> str:
+    """Return the scale, "linear" or "log", on which ``values`` lie more evenly."""
+    ordered = np.unique(values)
+    if len(ordered) < 3 or ordered[0] <= 0 or ordered[-1] < LEAST_RATIO * ordered[0]:
+        return "linear"
+    linear = np.diff(ordered)
+    logarithmic = np.diff(np.log(ordered))
+    return "log" if _unevenness(logarithmic) < _unevenness(linear) else "linear"
+
+
+def _unevenness(steps: np.ndarray) -> float:
+    return float(np.std(steps) / np.mean(steps))
+
+
+def in_pi(wavenumber: float) -> str:
+    """Return a wavenumber in rad/cell as 5π/9, or as a decimal where no such fraction is near."""
+    multiple = float(wavenumber) / np.pi
+    near = Fraction(multiple).limit_denominator(FRACTION_LIMIT)
+    if abs(float(near) - multiple) > 1e-6:
+        return f"{multiple:.3f}π"
+    numerator = "" if near.numerator == 1 else near.numerator
+    denominator = f"/{near.denominator}" if near.denominator > 1 else ""
+    return f"{numerator}π{denominator}"
+
+
+def joined(parts: Sequence[str]) -> str:
+    """Return the ``parts`` as a phrase: ``a``, ``a and b``, ``a, b and c``."""
+    return " and ".join(filter(None, [", ".join(parts[:-1]), *parts[-1:]]))
