@@ -96,10 +96,15 @@ def varied_in(member: xr.Dataset, ensemble: xr.Dataset) -> str:
     for axis in SweptAxis.all_of(ensemble):
         # Equal numbers of sites in other cells have one name.
         keys = [key for key in axis.keys if key.path not in NAMED or (key.values.dtype == object and key.path == SITES)]
-        at = int(np.argmax(ensemble["number"].values == member["number"].item()))
-        index = np.unravel_index(at, ensemble["number"].shape)[ensemble["number"].dims.index(axis.dimension)]
-        texts += [key.texts[int(index)] for key in keys]
+        texts += [key.texts[_place(member, ensemble)[axis.dimension]] for key in keys]
     return ", ".join(texts)
+
+
+def _place(member: xr.Dataset, ensemble: xr.Dataset) -> dict[str, int]:
+    """Return the index of a ``member`` along every dimension of its ``ensemble``."""
+    numbers = ensemble["number"]
+    index = np.argwhere(numbers.values == member["number"].item())[0]
+    return {str(dimension): int(i) for dimension, i in zip(numbers.dims, index, strict=True)}
 
 
 class DrivenWave(NamedTuple):
@@ -217,10 +222,10 @@ def series_of(sweeps: Sweeps, *needs: str) -> Iterator[AmplitudeSeries]:
 
 def _series_title(member: xr.Dataset, ensemble: xr.Dataset, case: Case, wave: DrivenWave) -> str:
     """Return the reading, whatever else varies, the number of sites and the driven wavenumber of a series."""
-    parts = [f"{case.lattice.reading.capitalize()} reading"]
-    for name in axes(ensemble):
-        if name not in (AMPLITUDE, "reading", "wavenumber", "sites"):
-            parts.append(_in_words(member, name, " "))
+    parts = [f"{case.lattice.reading.capitalize()} reading"] if case.lattice.preset else []
+    for axis in SweptAxis.all_of(ensemble):
+        if axis.dimension not in (AMPLITUDE, "reading", "wavenumber", "sites"):
+            parts.append(axis.texts[_place(member, ensemble)[axis.dimension]])
     parts.append(counted(len(sites_of(case)), "site"))
     if wave.band:
         parts.append(f"κ* = {in_pi(wave.wavenumber)}")
@@ -265,9 +270,10 @@ def grouped(items: Iterable[T], key: Callable[[T], str]) -> dict[str, list[T]]:
 
 
 def reading_of(ensemble: xr.Dataset) -> str:
-    """Return the reading of all members of a sweep that does not vary it."""
+    """Return the reading of all members of a sweep that does not vary it; empty for a cell that has none."""
     for _, number in curves(ensemble):
-        return Sweep.of(ensemble).case(number).lattice.reading
+        lattice = Sweep.of(ensemble).case(number).lattice
+        return lattice.reading if lattice.preset else ""
     return ""
 
 
@@ -282,6 +288,7 @@ def suffix(member: xr.Dataset, ensemble: xr.Dataset, named: bool, dims: Collecti
         parts.append(table(ensemble)["name"])
     if "reading" not in axes(ensemble):
         parts.append(reading_of(ensemble))
+    parts = [part for part in parts if part]
 
     for name in axes(ensemble):
         # Sweeps of one reading or wavenumber are drawn next to others, so these are always named.
@@ -296,7 +303,7 @@ def _in_file_name(member: xr.Dataset, name: str) -> str:
     """Return the value of a swept key in characters that every file system takes."""
     if name == "wavenumber":
         return in_pi(member[name].item()).replace("π", "pi").replace("/", "-")
-    return "".join(c if c.isalnum() or c in "-." else "-" for c in _in_words(member, name, "-"))
+    return in_file_name(_in_words(member, name, "-"))
 
 
 def counted(number: int, noun: str) -> str:
@@ -312,7 +319,7 @@ def sites_of(case: Case) -> list[int]:
 
 
 class Labels(NamedTuple):
-    """The names of a case on pages and, as a ``stem``, in their files' names."""
+    """The names of a case on pages and, as a ``stem``, in their files' names: of what applies to it, nothing else."""
 
     law: str  # Hertz
     configuration: str  # 5 sites, 30 cycles
@@ -322,18 +329,31 @@ class Labels(NamedTuple):
     member_stem: str
 
     @classmethod
-    def of(cls, case: Case) -> Self:
-        """Return the names of ``case``."""
-        law = case.contacts.law
-        reading = case.lattice.reading
+    def of(cls, case: Case, varied: str = "") -> Self:
+        """Return the names of ``case``, with further keys that are ``varied`` and their values."""
+        sites = len(sites_of(case))
+        law = case.contacts.law if sites else ""
+        reading = case.lattice.reading if case.lattice.preset else ""
         amplitude = f"{case.drive.amplitude:.4g}"
-        configuration = f"{counted(len(sites_of(case)), 'site')}, {case.drive.cycles:g} cycles"
-        page_stem = f"{reading}-{configuration}".replace(",", "").replace(" ", "-")
+        unit = "m" if case.drive.end else case.drive.record.unit
+        cycles = f"{case.drive.cycles:g} cycles" if "cycles" in case.drive.record.keys else ""
+        configuration = phrase(counted(sites, "site"), cycles, varied)
+        page_stem = in_file_name(phrase(reading, configuration).replace(", ", "-").replace(" ", "-"))
         return cls(
             law=law.capitalize(),
             configuration=configuration,
-            page=f"{reading.capitalize()}, {configuration}",
+            page=phrase(reading.capitalize(), configuration),
             page_stem=page_stem,
-            member=f"{law.capitalize()}, {reading}, {configuration}, {amplitude} N",
-            member_stem=f"{law}-{page_stem}-{amplitude}N",
+            member=phrase(law.capitalize(), reading, configuration, f"{amplitude} {unit}"),
+            member_stem="-".join(filter(None, [law, page_stem, in_file_name(f"{amplitude}{unit}")])),
         )
+
+
+def phrase(*parts: str) -> str:
+    """Return those of ``parts`` that are not empty, between commas."""
+    return ", ".join(filter(None, parts))
+
+
+def in_file_name(text: str) -> str:
+    """Return ``text`` in characters that every file system takes."""
+    return "".join(c if (c.isascii() and c.isalnum()) or c in "-._" else "-" for c in text.replace("π", "pi"))

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case.keys import unit_of
+from vipetsc.case.waveforms import DEFAULT, WAVEFORMS
 from vipetsc.io.read import axes as axes_of
 
 FEW_TOGETHER = 6  # values of keys that vary together and stand as categories
@@ -156,7 +157,7 @@ def _unit_of_amplitude(drive: dict[str, Any]) -> str:
     """Return the unit of the amplitude of what the table ``drive`` does: move an end, hit, or push."""
     if "end" in drive:
         return "m"
-    return "N s" if drive.get("waveform") == "impulse" else "N"
+    return WAVEFORMS[drive.get("waveform", DEFAULT)].unit
 
 
 def even_scale(values: np.ndarray) -> str:

@@ -49,7 +49,7 @@ def transfer(sweeps: Sweeps) -> Iterator[Drawing]:
     """Offer for every whole member: energy in space-time, dispersion and spectra before and behind the first site."""
     for member in transfer_members(sweeps):
         if "velocity" in member.run and all(name in member.analysis for name in (FIELD, *SEGMENTS)):
-            yield Drawing(Labels.of(member.case).member_stem, partial(nine_panels, member))
+            yield Drawing(member.labels.member_stem, partial(nine_panels, member))
 
 
 def nine_panels(member: MemberRun) -> Figure:
@@ -57,7 +57,7 @@ def nine_panels(member: MemberRun) -> Figure:
     run = member.run
     cell = member.model.chain.cell
     tags = iter(ascii_lowercase)
-    figure = style.new_figure(style.PAGE, 7.6, Labels.of(member.case).member)
+    figure = style.new_figure(style.PAGE, 7.6, member.labels.member)
     upper, middle, lower = figure.subfigures(3, 1, height_ratios=(1.15, 0.85, 1))
     _draw_space_time(upper, member, tags)
 
@@ -156,16 +156,17 @@ def _draw_spectra(axes: Axes, member: MemberRun, velocity: np.ndarray) -> None:
 
 
 class CaseFolder(NamedTuple):
-    """A member before its fields are read again: its case and the folder of its files."""
+    """A member before its fields are read again: its case, its names and the folder of its files."""
 
     case: Case
+    labels: Labels
     folder: Path
 
 
 def transfer_dispersions(sweeps: Sweeps) -> Iterator[Drawing]:
     """Offer every reading and configuration: laws in rows, amplitudes in columns."""
-    members = (CaseFolder(m.case, m.folder) for m in transfer_members(sweeps) if "dispersion" in m.analysis)
-    for name, group in grouped(members, lambda member: Labels.of(member.case).page_stem).items():
+    members = (CaseFolder(m.case, m.labels, m.folder) for m in transfer_members(sweeps) if "dispersion" in m.analysis)
+    for name, group in grouped(members, lambda member: member.labels.page_stem).items():
         yield Drawing(name, partial(_dispersion_table, group, sweeps.files))
 
 
@@ -174,7 +175,7 @@ def _dispersion_table(members: Sequence[CaseFolder], files: Files) -> Figure:
     folders = {(member.case.contacts.law, member.case.drive.amplitude): member.folder for member in members}
     laws = sorted({law for law, _ in folders}, reverse=True)
     amplitudes = sorted({amplitude for _, amplitude in folders})
-    figure = style.new_figure(style.PAGE, 0.4 + 2.1 * len(laws), Labels.of(members[0].case).page)
+    figure = style.new_figure(style.PAGE, 0.4 + 2.1 * len(laws), members[0].labels.page)
     grid = figure.subplots(len(laws), len(amplitudes), sharex=True, sharey=True, squeeze=False)
 
     for (i, j), axes in np.ndenumerate(grid):
@@ -200,7 +201,7 @@ def band_energies(sweeps: Sweeps) -> Iterator[Drawing]:
     """Offer energies of all parts and their sum over time for every whole member."""
     for member in transfer_members(sweeps):
         if member.analysis.sizes["bands/part"] and "bands/total" in member.analysis:
-            yield Drawing(Labels.of(member.case).member_stem, partial(energies_over_time, member))
+            yield Drawing(member.labels.member_stem, partial(energies_over_time, member))
 
 
 def band_shares(sweeps: Sweeps) -> Iterator[Drawing]:
@@ -235,7 +236,7 @@ def energies_over_time(member: MemberRun) -> Figure:
     series = np.stack([time, total, parts.sum(axis=0), *parts])
     mean_time, mean_total, mean_sum, *mean_parts = sliding_window_view(series, samples, axis=1).mean(axis=2)
 
-    figure = style.new_figure(style.PAGE * 0.8, 4.2, Labels.of(member.case).member)
+    figure = style.new_figure(style.PAGE * 0.8, 4.2, member.labels.member)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1))
     _draw_parts(upper, mean_time, analysis["bands/energy"].attrs["parts"], mean_parts)
     upper.plot(mean_time, mean_total, color=style.BLACK, lw=1.6, label="total")

@@ -22,6 +22,7 @@ from vipetsc.figures.sweep_members import (
     MemberRun,
     Sweeps,
     grouped,
+    phrase,
     sites_of,
     transfer_members,
 )
@@ -233,7 +234,8 @@ def _superposition(axes: Axes, aligned: TransferCurve) -> str:
     shade_regions(axes, shaded, region, left, at_top=False)
     axes.set(xscale="log", yscale="log", xlabel="Normalised energy (J)", xlim=(left, right), ylim=(0.25 * floor, 4.0))
     axes.legend(loc="upper right", fontsize=6)
-    return f"{Labels.of(aligned.case).law}; branch of the {curve['branch_reading']} reading"
+    law = Labels.of(aligned.case).law
+    return f"{law}; branch of the {curve['branch_reading']} reading" if aligned.case.lattice.preset else law
 
 
 class ContactMotion(NamedTuple):
@@ -262,39 +264,41 @@ class ContactMotion(NamedTuple):
 
 def phase_regimes(sweeps: Sweeps) -> Iterator[Drawing]:
     """Offer trajectories of one embedded contact cell, for every law and reading, next to the transfer curve."""
-    folders: dict[str, list[Path]] = {}
+    folders: dict[tuple[str, Labels], list[Path]] = {}
     for member in transfer_members(sweeps):
         run = member.run
         shows_its_site = len(recorded_sites(run)) == run.sizes["site"] == 1
         if shows_its_site and "displacement" in run and "velocity" in run:
-            folders.setdefault(_settings(member.case), []).append(member.folder)
+            # The names of a page are those of its members but for the amplitude.
+            labels = member.labels._replace(member="", member_stem="")
+            folders.setdefault((f"{member.case.contacts.law}-{labels.page_stem}", labels), []).append(member.folder)
 
-    curves_by_site = {(_settings(curve.case), *sites_of(curve.case)): curve for curve in transfer_curves(sweeps)}
-    for name, setting_folders in folders.items():
-        yield Drawing(name, partial(_regimes, setting_folders, sweeps.files, curves_by_site))
+    curves_by_site = {
+        (f"{curve.case.contacts.law}-{Labels.of(curve.case).page_stem}", *sites_of(curve.case)): curve
+        for curve in transfer_curves(sweeps)
+    }
+    for (name, labels), page_folders in folders.items():
+        # A page of members at one value of a further key has a name that no curve has.
+        (site,) = sites_of(sweeps.files.get(page_folders[0], MemberRun.open).case)
+        curve = curves_by_site.get((name, site))
+        yield Drawing(name, partial(_regimes, page_folders, sweeps.files, labels, curve))
 
 
-def _settings(case: Case) -> str:
-    """Return the settings common to all regimes of one page: law, reading, number of sites and cycles."""
-    return f"{case.contacts.law}-{Labels.of(case).page_stem}"
-
-
-def _regimes(folders: Sequence[Path], files: Files, curves_by_site: Mapping[tuple[Any, ...], TransferCurve]) -> Figure:
+def _regimes(folders: Sequence[Path], files: Files, labels: Labels, curve: TransferCurve | None) -> Figure:
     """Draw the transfer over the amplitude with the members numbered, and the portrait of each next to it."""
     motions = [ContactMotion.of(files.get(folder, MemberRun.open)) for folder in folders]
     motions.sort(key=lambda motion: motion.case.drive.amplitude)
     case = motions[0].case
-    labels = Labels.of(case)
     (site,) = sites_of(case)
     columns = -(-len(motions) // 2)
     window = f"{PERIODS} periods of the drive about the largest $|w|$"
-    heading = f"{labels.law}, {case.lattice.reading}, {labels.configuration}, cell {site}; {window}"
+    reading = case.lattice.reading if case.lattice.preset else ""
+    heading = f"{phrase(labels.law, reading, labels.configuration, f'cell {site}')}; {window}"
     figure = style.new_figure(style.PAGE, 3.4, heading)
     left, right = figure.subfigures(1, 2, width_ratios=(1, 0.62 * columns))
     transfer = left.subplots()
     panels = right.subplots(2, columns, squeeze=False).ravel()
 
-    curve = curves_by_site.get((_settings(case), site))
     if curve is not None:
         transfer.plot(curve.data["amplitude"], curve.data["ibtet"], "-o", color=style.GREY, ms=2, lw=0.7)
     for number, (axes, motion) in enumerate(zip(panels, motions, strict=False), 1):
