@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,14 +21,22 @@ LOSSES = (8.0, 10.0, 13.0, 17.0)
 def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) -> list[Source]:
     """The ``drives`` of a lattice as sources of waves: a wall that several springs are tied to is one."""
     loads: dict[tuple[Waveform, int], np.ndarray] = {}
-    for drive in drives:
-        waveform = drive.waveform
-        if isinstance(waveform, ToneBurst) and (len(drives) == 1 or not waveform.amplitude):
-            # The amplitude of one cancels, and is 0 where a lattice begins in motion.
-            waveform = replace(waveform, amplitude=1.0)
-        load = loads.setdefault((waveform, drive.cell), np.zeros(cell.dofs))
+    for drive in with_unit_amplitude(drives):
+        load = loads.setdefault((drive.waveform, drive.cell), np.zeros(cell.dofs))
         load[drive.mass] += drive.stiffness or 1.0
     return [Source(cell, ends, cells, place, load, waveform) for (waveform, place), load in loads.items()]
+
+
+def with_unit_amplitude(drives: Sequence[Drive]) -> tuple[Drive, ...]:
+    """The ``drives`` as far as fractions of energies depend on them: the amplitude of a single burst cancels."""
+    unit = []
+    for drive in drives:
+        waveform = drive.waveform
+        # An amplitude is 0 where a lattice begins in motion.
+        if isinstance(waveform, ToneBurst) and (len(drives) == 1 or not waveform.amplitude):
+            waveform = replace(waveform, amplitude=1.0)
+        unit.append(replace(drive, waveform=waveform))
+    return tuple(unit)
 
 
 def sections_of(table: AbsorbingTable, cell: UnitCell, ends: Ends, cells: int, strength: float) -> list[EndSection]:
@@ -60,23 +69,47 @@ def reflected(sources: Sequence[Source], sections: Sequence[EndSection]) -> floa
     return float(max(finite, default=np.nan))
 
 
-# Cached: each verb that reads a case resolves it, and each end that is tried costs hundreds of reflections.
-@lru_cache
 def designed_end(
-    table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: tuple[Drive, ...], cells: int
+    table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: Sequence[Drive], cells: int
 ) -> AbsorbingTable:
     """``table`` with a length, up to a third of ``cells``, and a strength; raises ValueError if none will do.
 
     What comes back is counted over all ``drives`` together.
     """
-    sources = sources_of(drives, cell, ends, cells)
-    waves = [wave for source in sources for wave in waves_at(cell, source.waveform.frequency)]
+    waves = [wave for drive in drives for wave in waves_at(cell, drive.waveform.frequency)]
     if not waves:
         raise ValueError("the drive is in a gap: no wave comes to the end")
 
     speed = max(wave[2] for wave in waves)
-    most = cells // 3
-    lengths = [table.cells] if table.cells else [length for length in LENGTHS if length <= most]
+    found = _first_end(table, cell, ends, with_unit_amplitude(drives), cells, speed)
+    if found.cells:
+        return table.model_copy(update={"cells": found.cells, "strength": found.strength})
+    raise ValueError(
+        f"no end of up to {cells // 3} cells has it, {found.back:.2g} comes back, mostly slow waves at band edges;"
+        " allow more, lengthen the lattice, or drive more cycles or a frequency farther from the edges"
+    )
+
+
+class TriedEnd(NamedTuple):
+    """An end of some ``cells`` and a ``strength``, from which the fraction ``back`` comes back.
+
+    Where none of those that were tried keeps the bound, ``cells`` is 0 and ``back`` the least of them.
+    """
+
+    cells: int
+    strength: float
+    back: float
+
+
+# Cached: each verb that reads a case resolves it, and so does each member of a sweep over amplitudes; each end that is
+# tried costs hundreds of reflections.
+@lru_cache
+def _first_end(
+    table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: tuple[Drive, ...], cells: int, speed: float
+) -> TriedEnd:
+    """The first end that keeps the bound of ``table`` where waves have a ``speed`` in cells/s."""
+    sources = sources_of(drives, cell, ends, cells)
+    lengths = [table.cells] if table.cells else [length for length in LENGTHS if length <= cells // 3]
     best = np.inf
     for length in lengths:
         # The dashpots take exp(-loss) of a wave's energy: the integral of strength x^3 through the end and back.
@@ -86,8 +119,5 @@ def designed_end(
             back = reflected(sources, sections)
             best = min(best, back)
             if back <= table.reflection:
-                return table.model_copy(update={"cells": length, "strength": strength})
-    raise ValueError(
-        f"no end of up to {most} cells has it, {best:.2g} comes back, mostly slow waves at band edges; allow more,"
-        " lengthen the lattice, or drive more cycles or a frequency farther from the edges"
-    )
+                return TriedEnd(cells=length, strength=strength, back=back)
+    return TriedEnd(cells=0, strength=0.0, back=best)

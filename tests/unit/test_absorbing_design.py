@@ -1,0 +1,46 @@
+"""The design of an absorbing end: computed once for all amplitudes of a burst, whether one is found or not."""
+
+from __future__ import annotations
+
+import pytest
+
+from vipetsc.case import Case, CaseError, absorbing
+
+pytestmark = pytest.mark.parallel(1)
+
+
+def case(amplitude: float, reflection: float) -> Case:
+    """A lattice of 60 cells under a burst in its fourth band, with an absorbing right end."""
+    return Case.from_table({
+        "lattice": {"preset": "four-band", "cells": 60, "absorbing": {"end": "right", "reflection": reflection}},
+        "contacts": {"sites": 0},
+        "drive": {"amplitude": amplitude, "cycles": 30},
+    })  # fmt: skip
+
+
+@pytest.fixture
+def tried(monkeypatch) -> list[float]:
+    """What comes back from the ends that are tried."""
+    absorbing._first_end.cache_clear()
+    fractions: list[float] = []
+    original = absorbing.reflected
+
+    def record(*arguments: object) -> float:
+        fractions.append(original(*arguments))
+        return fractions[-1]
+
+    monkeypatch.setattr(absorbing, "reflected", record)
+    return fractions
+
+
+def test_an_end_is_designed_once_for_all_amplitudes(tried):
+    ends = [case(amplitude, reflection=0.1).lattice.absorbing for amplitude in (1.0, 2.0, 30.0)]
+    assert ends[0] == ends[1] == ends[2]
+    assert len(tried) == 1 + sum(fraction > 0.1 for fraction in tried)
+
+
+def test_that_no_end_will_do_is_found_once(tried):
+    for amplitude in (1.0, 2.0):
+        with pytest.raises(CaseError, match="comes back, mostly slow waves"):
+            case(amplitude, reflection=1e-9)
+    assert len(tried) == len(set(tried))
