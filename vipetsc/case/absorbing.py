@@ -81,11 +81,11 @@ def designed_end(
         raise ValueError("the drive is in a gap: no wave comes to the end")
 
     speed = max(wave[2] for wave in waves)
-    found = _first_end(table, cell, ends, with_unit_amplitude(drives), cells, speed)
-    if found.cells:
-        return table.model_copy(update={"cells": found.cells, "strength": found.strength})
+    end = _first_end(table, cell, ends, with_unit_amplitude(drives), cells, speed)
+    if end.cells:
+        return table.model_copy(update={"cells": end.cells, "strength": end.strength})
     raise ValueError(
-        f"no end of up to {cells // 3} cells has it, {found.back:.2g} comes back, mostly slow waves at band edges;"
+        f"no end of up to {cells // 3} cells has it, {end.back:.2g} comes back, mostly slow waves at band edges;"
         " allow more, lengthen the lattice, or drive more cycles or a frequency farther from the edges"
     )
 
