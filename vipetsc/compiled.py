@@ -17,13 +17,15 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numba
+from numba.core import event
 
-from vipetsc.process import launched_rank
+from vipetsc.process import compiling, launched_rank, say
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 logger = logging.getLogger(__name__)
 
+PARENTS: set[Path] = set()  # folders in which kernels are kept
 HAS_KERNELS = re.compile(rb"^(from|import) (vipetsc\.compiled|numba)\b", re.MULTILINE)
 
 
@@ -51,13 +53,44 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
         chosen = config.CACHE_DIR
         file = Path(function.__code__.co_filename)
         folder = kernel_cache(Path(__file__).parent, file, chosen)
+        PARENTS.add(folder.parent)
         config.CACHE_DIR = str(folder)
+        # Callbacks and kernels with a signature are compiled here, others at their first call.
+        compiling.start()
         try:
             return compiler(*signature, cache=_can_keep(folder.parent), **options)(function)
         finally:
+            compiling.stop()
             config.CACHE_DIR = chosen
 
     return decorate
+
+
+class CompilerListener(event.Listener):
+    """Hears numba compile a function, which it does not where the cache has it: times it, and says so once."""
+
+    def on_start(self, event: Any) -> None:
+        """Begin to compile; a function that is called is compiled within."""
+        compiling.start()
+        function = event.data["dispatcher"].py_func
+        # Functions of others, which numba compiles too, take their own time.
+        if function.__module__.split(".")[0] == __package__:
+            _announce()
+
+    def on_end(self, event: Any) -> None:
+        """End it."""
+        compiling.stop()
+
+
+@cache
+def _announce() -> None:
+    """Say once, on one rank, why the first run of a version takes a minute more than the next."""
+    # Where kernels cannot be kept, a warning has said that they are compiled at every start.
+    if not launched_rank() and all(_can_keep(parent) for parent in PARENTS):
+        say("vipetsc: compiling kernels (once, about a minute)")
+
+
+event.register("numba:compile", CompilerListener())
 
 
 @cache

@@ -1,11 +1,15 @@
-"""The process before MPI is started: whether it is the first of its job, and requests to stop."""
+"""The process itself: its rank before MPI is started, requests to stop until then, lines that it reports, compiling."""
 
+import logging
 import os
 import signal
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+logger = logging.getLogger(__name__)
 STOP_SIGNALS = signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1
 # What launchers tell a process of its rank: Open MPI's, those with PMI (MPICH, Intel MPI, Slurm's), Slurm's own.
 RANKS = "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"
@@ -49,3 +53,52 @@ def _end(number: int, frame: FrameType | None) -> None:
         os.write(2, b"vipetsc: stopped on request\n")
     # Without unwinding: modules that are being loaded would swallow an exception, or report one of their own.
     os._exit(os.EX_TEMPFAIL)
+
+
+def has_log() -> bool:
+    """Whether a log takes the lines of this process, as that of the command line does."""
+    return logger.isEnabledFor(logging.INFO) and logger.hasHandlers()
+
+
+def say(text: str) -> None:
+    """Report ``text`` in the log where one takes it, else on stderr.
+
+    Scripts and notebooks seldom set up a log. A level above WARNING of the logger ``vipetsc`` silences both.
+    """
+    if has_log():
+        logger.info("%s", text)
+    elif logger.isEnabledFor(logging.WARNING):
+        sys.stderr.write(f"{text}\n")
+        sys.stderr.flush()
+
+
+class CompileClock:
+    """Clock of the compiler: the ``seconds`` that this process has compiled kernels for, those of now among them.
+
+    Progress leaves this time out of its rates: it passes once, at the first calls.
+    """
+
+    def __init__(self) -> None:
+        self._depth = 0
+        self._begin = 0.0
+        self._seconds = 0.0
+
+    @property
+    def seconds(self) -> float:
+        """Time in s until now."""
+        running = time.monotonic() - self._begin if self._depth else 0.0
+        return self._seconds + running
+
+    def start(self) -> None:
+        """Begin to compile a kernel; one that it calls may begin meanwhile."""
+        if self._depth == 0:
+            self._begin = time.monotonic()
+        self._depth += 1
+
+    def stop(self) -> None:
+        """End what was begun last."""
+        self._seconds = self.seconds if self._depth == 1 else self._seconds
+        self._depth -= 1
+
+
+compiling = CompileClock()

@@ -7,43 +7,29 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
+from vipetsc.process import compiling, has_log, say
+
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-logger = logging.getLogger(__name__)
 BAR = "vipetsc.bar"  # the logger whose level switches bars off
 LINE_EVERY = 5.0  # s between lines where there is no bar
 LAYOUT = "{percentage:3.0f}%|{bar}| {n:.4g}/{total:.4g} {unit} [{elapsed}<{remaining}]"
 
 
-def say(text: str) -> None:
-    """Report ``text`` in the log where one takes it, as that of the command line does; else on stderr.
-
-    Scripts and notebooks seldom set up a log. A level above WARNING of the logger ``vipetsc`` silences both.
-    """
-    if has_log():
-        logger.info("%s", text)
-    elif logger.isEnabledFor(logging.WARNING):
-        sys.stderr.write(f"{text}\n")
-        sys.stderr.flush()
-
-
-def has_log() -> bool:
-    """Whether a log takes lines of progress."""
-    return logger.isEnabledFor(logging.INFO) and logger.hasHandlers()
-
-
 class Progress:
     """Progress of a run, on rank 0: a bar on a terminal or in a notebook, otherwise a line every five seconds.
 
-    In a script without a log the end is a line, too, so that work of a few seconds says something.
+    Rates and times left are those of the work: the time in which kernels are compiled does not count. In a script
+    without a log the end is a line, too, so that work of a few seconds says something.
     """
 
     def __init__(self, comm: MPI.Comm, total: float, unit: str, show: bool = True) -> None:
         self._total = total
         self._unit = unit
-        self._begin = time.monotonic()
-        self._last = self._begin
+        self._last = time.monotonic()
+        self._compiled = compiling.seconds
+        self._begin = self._last - self._compiled
         self._first = 0.0
         self._done = 0.0
         self._show = show and comm.rank == 0
@@ -68,9 +54,11 @@ class Progress:
         now = time.monotonic()
         self._done = done
         if self._bar is not None:
+            self._leave_out_compiling()
             self._bar.update(done - self._bar.n)
         elif self._show and now - self._last >= LINE_EVERY:
-            rate = (done - self._first) / (now - self._begin)
+            worked = self._worked()
+            rate = (done - self._first) / worked if worked > 0 else 0.0
             left = (self._total - done) / rate if rate > 0 else float("inf")
             say(f"{self._position()}, {left:.0f} s left")
             self._last = now
@@ -80,7 +68,18 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
         elif self._show and not has_log():
-            say(f"{self._position()} in {time.monotonic() - self._begin:.1f} s")
+            say(f"{self._position()} in {self._worked():.1f} s")
+
+    def _worked(self) -> float:
+        """Seconds since the beginning in which no kernel was compiled."""
+        return time.monotonic() - compiling.seconds - self._begin
+
+    def _leave_out_compiling(self) -> None:
+        """Move the times from which the bar takes its rate behind what was compiled since."""
+        compiled = compiling.seconds
+        self._bar.start_t += compiled - self._compiled
+        self._bar.last_print_t += compiled - self._compiled
+        self._compiled = compiled
 
     def _position(self) -> str:
         """How much of the total is done."""

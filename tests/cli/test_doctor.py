@@ -15,9 +15,11 @@ import h5py
 import numpy as np
 import pytest
 
+from tests.conftest import set_words
 from vipetsc.cli import installation
 from vipetsc.cli.installation import PACKAGES, check_mpi, check_package, check_scalars
 from vipetsc.cli.verbs.doctor_verb import doctor_table
+from vipetsc.studies import first_calls
 
 ROOT = Path(__file__).parents[2]
 NAMED = {package.name: package for package in PACKAGES}
@@ -128,3 +130,30 @@ def test_a_library_that_does_not_load_is_named():
     assert ended.returncode == 2
     assert "pydantic" in ended.stderr and "chapter install" in ended.stderr
     assert "Traceback" not in ended.stderr
+
+
+def test_doctor_compiles_kernels_where_it_is_asked_to(in_process, monkeypatch):
+    """With --compile the last line says how long that took, or that all are there; without it nothing is compiled."""
+    took = [83.0]
+    monkeypatch.setattr(first_calls, "compile_kernels", lambda comm: took[0])
+    ended = in_process("doctor", "--compile")
+    assert ended.returncode == 0
+    assert ended.stdout.splitlines()[-1] == "kernels of runs, modes and measures: compiled in 83 s"
+
+    took = [0.1]
+    assert in_process("doctor", "--compile").stdout.splitlines()[-1] == "kernels of runs, modes and measures: all there"
+    assert "kernels" not in in_process("doctor").stdout
+
+
+@pytest.mark.slow
+def test_after_that_a_run_compiles_nothing(vipetsc, tmp_path):
+    """Runs by both engines and their measures find all their kernels."""
+    compiled = vipetsc(0, "doctor", "--compile", timeout=600)
+    assert compiled.returncode == 0, compiled.stderr
+
+    for engine in ("ts", "propagator"):
+        small = set_words("lattice.cells=40", "contacts.sites=[6]", "time.end=0.02", "output.figures=false")
+        ended = vipetsc(0, "run", *small, "--set", f"time.engine={engine}", "--out", tmp_path / engine)
+        assert ended.returncode == 0, ended.stderr
+        assert "compiling" not in ended.stderr
+        assert "compiled" not in ended.stdout

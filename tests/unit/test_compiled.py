@@ -169,3 +169,39 @@ def test_kernels_work_without_a_cache(package, tmp_path):
     assert json.loads(done.stdout)[0] == [12.0, 7.0]
     assert done.stderr.count("cannot be written") == 1
     assert not list(folder.glob("__pycache__/kernels-*"))
+
+
+@pytest.mark.slow
+def test_that_kernels_are_compiled_is_said_once(package, tmp_path):
+    """The first process says it in one line, on the first rank alone; the next finds the kernels and says nothing."""
+
+    def say(**environment: str) -> list[str]:
+        environment = {"PYTHONPATH": ".", **environment}
+        done = subprocess.run(
+            [sys.executable, "-c", ASK], cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stderr.splitlines()
+
+    assert say(OMPI_COMM_WORLD_RANK="1", NUMBA_CACHE_DIR=str(tmp_path / "other")) == []
+    assert say(OMPI_COMM_WORLD_RANK="0") == ["vipetsc: compiling kernels (once, about a minute)"]
+    assert say() == []
+
+
+@pytest.mark.slow
+def test_compiling_is_timed(package, tmp_path):
+    """The clock runs where a first call compiles, and stands still where it finds the kernel."""
+    code = """
+from vipetsc.outer import twice
+from vipetsc.process import compiling
+before = compiling.seconds
+twice(3.0)
+print(compiling.seconds > before)
+"""
+
+    def ran() -> str:
+        done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env={"PYTHONPATH": "."}, capture_output=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.decode().strip()
+
+    assert [ran(), ran()] == ["True", "False"]

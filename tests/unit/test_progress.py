@@ -10,8 +10,9 @@ from mpi4py import MPI
 
 import pytest
 
-from vipetsc import progress as reports
-from vipetsc.progress import Progress, say
+from vipetsc import process
+from vipetsc.process import CompileClock, say
+from vipetsc.progress import Progress
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.parallel(1)
 @pytest.fixture
 def written(monkeypatch, capsys) -> Callable[[], str]:
     """Make this a process that has set up no log, as a script or a notebook; returns what it writes to stderr."""
-    monkeypatch.setattr(reports.logger, "hasHandlers", lambda: False)
+    monkeypatch.setattr(process.logger, "hasHandlers", lambda: False)
     monkeypatch.setattr(logging.getLogger("vipetsc"), "level", logging.NOTSET)
     monkeypatch.setattr(logging.getLogger(), "level", logging.WARNING)
     # Loggers remember the levels that they have asked for.
@@ -30,7 +31,7 @@ def written(monkeypatch, capsys) -> Callable[[], str]:
 def test_a_script_has_lines_and_an_end(written, monkeypatch):
     """Without a log the lines go to stderr every five seconds, and the end is one."""
     now = [0.0]
-    monkeypatch.setattr(reports.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(process.time, "monotonic", lambda: now[0])
     progress = Progress(MPI.COMM_SELF, 20.0, "s")
     for second in range(1, 13):
         now[0] = float(second)
@@ -65,3 +66,53 @@ def test_a_notebook_has_a_bar(written, monkeypatch):
     progress.update(1.0)
     progress.close()
     assert " 50%|" in written()
+
+
+class Clock:
+    """Replaces the clock of the machine by one that a test moves."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.now = 100.0
+        monkeypatch.setattr(process.time, "monotonic", lambda: self.now)
+
+
+def test_the_compiler_is_timed_once_where_kernels_call_others(monkeypatch):
+    """What is compiled within another one is part of its time, and the clock goes on meanwhile."""
+    clock = Clock(monkeypatch)
+    compiling = CompileClock()
+    compiling.start()
+    clock.now += 1.0
+    compiling.start()
+    clock.now += 2.0
+    assert compiling.seconds == 3.0
+    compiling.stop()
+    clock.now += 4.0
+    compiling.stop()
+    clock.now += 8.0
+    assert compiling.seconds == 7.0
+
+
+def test_the_time_left_is_that_of_the_work(written, monkeypatch):
+    """A minute in which kernels are compiled counts neither in the rate nor in the time at the end."""
+    clock = Clock(monkeypatch)
+    progress = Progress(MPI.COMM_SELF, 20.0, "s")
+    process.compiling.start()
+    clock.now += 60.0
+    process.compiling.stop()
+    clock.now += 2.0
+    progress.update(1.0)
+    progress.close()
+    assert written().splitlines() == ["  5 %  1 of 20 s, 38 s left", "  5 %  1 of 20 s in 2.0 s"]
+
+
+def test_the_bar_leaves_it_out_as_well(written, monkeypatch):
+    """A bar, which has a clock of its own, gives the rate of the work."""
+    monkeypatch.setitem(sys.modules, "ipykernel", object())
+    compiled = [0.0]
+    monkeypatch.setattr(CompileClock, "seconds", property(lambda clock: compiled[0]))
+    progress = Progress(MPI.COMM_SELF, 2.0, "runs")
+    begin = progress._bar.start_t
+    compiled[0] = 60.0
+    progress.update(1.0)
+    assert progress._bar.start_t == begin + 60.0
+    progress.close()

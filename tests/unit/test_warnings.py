@@ -143,3 +143,43 @@ def test_verbs_warn_of_what_concerns_them():
 
     (sentence,) = PredictCase.load("runs/predict.toml", ["output.every=2", "time.end=20.0"]).warnings()[:1]
     assert "before time.end" in sentence
+
+
+def drive_of_samples(folder, unit: float = 1.0, **keys) -> dict:
+    """Return a drive of a burst at the four-band lattice's 1020 rad/s, whose file has its times in a ``unit`` (s)."""
+    times = np.arange(600) * 1e-4
+    values = np.sin(1020 * times) * np.sin(np.pi * times / times[-1]) ** 2
+    np.savetxt(folder / "record.csv", np.column_stack([times / unit, values]), delimiter=",")
+    return {"waveform": "samples", "samples": {"file": str(folder / "record.csv")}} | keys
+
+
+@pytest.mark.parametrize(("unit", "span"), [(1e-3, 59.9), (1e-6, 5.99e4)])
+def test_times_that_are_not_in_seconds(tmp_path, unit, span):
+    """Samples far under the waves are asked about, with the unit in which they would be among them."""
+    name = {1e-3: "ms", 1e-6: "us"}[unit]
+    case = Case(lattice={"cells": 60}, contacts={"sites": 0}, drive=drive_of_samples(tmp_path, unit), time={"end": 0.1})
+    (sentence,) = [sentence for sentence in case.warnings() if "in s?" in sentence]
+    assert sentence.startswith("drive.samples: 95 % of their energy lies below ")
+    assert "far under the waves of this lattice" in sentence
+    assert f"are the times, to {span:.4g} s, in s? In {name} they would be largest at 10" in sentence
+    assert sentence.endswith("rad/s and last 0.0599 s")
+
+
+def test_samples_far_over_the_waves(tmp_path):
+    """Samples that no wave of the lattice follows are asked about, in a further drive too."""
+    drive = {"amplitude": 1.0, "cycles": 5, "more": [drive_of_samples(tmp_path, 1e4, frequency=1020.0)]}
+    case = Case(lattice={"cells": 60}, contacts={"sites": 0}, drive=drive, time={"end": 0.05})
+    (sentence,) = [sentence for sentence in case.warnings() if "samples:" in sentence]
+    assert sentence.startswith("drive.more[1].samples: 95 % of their energy lies above 9")
+    assert "in s, and the lattice in kg and N/m?" in sentence
+
+
+def test_samples_among_the_waves_raise_no_question(tmp_path):
+    """A burst in a band and a slow push within the lattice's own time are as they should be."""
+    quiet = Case(lattice={"cells": 60}, contacts={"sites": 0}, drive=drive_of_samples(tmp_path), time={"end": 0.1})
+    assert not [sentence for sentence in quiet.warnings() if "samples:" in sentence]
+
+    samples = {"time": [0.0, 0.01, 0.02, 0.03], "value": [0.0, 1.0, 1.0, 0.0]}
+    push = {"waveform": "samples", "samples": samples, "frequency": 100.0}
+    pushed = Case(lattice={"cells": 60}, contacts={"sites": 0}, drive=push, time={"end": 0.1})
+    assert not [sentence for sentence in pushed.warnings() if "samples:" in sentence]

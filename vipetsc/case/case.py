@@ -33,7 +33,7 @@ from vipetsc.case.resolve import (
 from vipetsc.case.samples import with_samples
 from vipetsc.case.schema import CONTACTS, AnalysisTable, LatticeTable, OutputTable, PetscTable, TimeTable
 from vipetsc.case.sites import ContactsTable
-from vipetsc.case.warnings import loss_warnings, warnings_of
+from vipetsc.case.warnings import loss_warnings, unit_warnings, warnings_of
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.lattice import Chain, Drive, UnitCell, pass_bands
 
@@ -246,7 +246,11 @@ class Case(CaseFile):
     def warnings(self) -> list[str]:
         """Sentences about what is allowed but likely not meant."""
         options = (self.petsc.model_extra if self.petsc else None) or {}
-        return [*loss_warnings(self.lattice), *warnings_of(self.model(), self.output, options)]
+        return [
+            *unit_warnings(self.drive, self.model().chain),
+            *loss_warnings(self.lattice),
+            *warnings_of(self.model(), self.output, options),
+        ]
 
 
 def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem]]:

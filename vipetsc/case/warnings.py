@@ -8,16 +8,20 @@ from math import pi
 
 import numpy as np
 
+from vipetsc.case.drive import DriveTable
 from vipetsc.case.model import Model
 from vipetsc.case.schema import LatticeTable, OutputTable
-from vipetsc.lattice import max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice import Chain, bloch, max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.damped import KAPPAS, damped_bloch
+from vipetsc.lattice.drive import main_frequency, spectrum
 
 SLOW = 0.1  # of the band's fastest group velocity
 WAVELENGTHS = 4.0  # that a lattice should hold
 MISSED = 0.1  # of the loss asked, in the mean over the wavenumbers of a band
 TINY = 1e-6  # a loss that is none
 BRIEF = 0.1  # a contact's time over the sample interval
+MOST_ENERGY = 0.95  # of samples
+FAR = 3.0  # times the lattice's highest frequency, or that part of its lowest
 STEPS = 10.0  # of fixed length that a contact should take
 DEFAULT_STEP = 0.05  # of 1/frequency: the first step of ``ts`` where -ts_dt does not give one
 
@@ -79,6 +83,46 @@ def wave_warnings(model: Model) -> Iterator[str]:
             f"{frequency} lies at an edge of band {band}: its waves make {speed:.3g} of {fastest:.3g} cells/s"
             f" and spread; the fastest are at {best:.6g} rad/s"
         )
+
+
+def unit_warnings(drives: DriveTable, chain: Chain) -> Iterator[str]:
+    """Questions about the units of samples whose spectrum lies far from all waves of the lattice."""
+    cell = chain.cell
+    if not cell.springs:
+        return
+    bands = pass_bands(cell)
+    highest = bands[-1].high
+    lowest = bands[0].low
+    if lowest < TINY * highest:
+        # Where waves begin at 0, the slowest is one that is as long as the lattice.
+        lowest = float(bloch(cell, 2 * pi / chain.cells).frequency[0])
+
+    for path, drive in drives.every:
+        samples = drive.samples
+        if samples is None:
+            continue
+        frequency, content = spectrum(samples.time, samples.value)
+        energy = np.cumsum(content**2)
+        least, most = np.interp([1 - MOST_ENERGY, MOST_ENERGY], energy / energy[-1], frequency)
+        span = samples.time[-1] - samples.time[0]
+        about = f"{path}.samples: {100 * MOST_ENERGY:.0f} % of their energy lies"
+        waves = f"the waves of this lattice ({lowest:.4g} to {highest:.4g} rad/s)"
+        if FAR * most < lowest:
+            hint = _fitting_unit(main_frequency(samples.time, samples.value), span, lowest, highest)
+            yield f"{about} below {most:.3g} rad/s, far under {waves}; are the times, to {span:.4g} s, in s?{hint}"
+        elif least > FAR * highest:
+            yield (
+                f"{about} above {least:.3g} rad/s, far over {waves}; are the times, to {span:.4g} s, in s, and the"
+                " lattice in kg and N/m?"
+            )
+
+
+def _fitting_unit(frequency: float, span: float, lowest: float, highest: float) -> str:
+    """The unit of times in which samples that are largest at ``frequency`` would be waves; empty if there is none."""
+    for unit, factor in (("ms", 1e-3), ("us", 1e-6)):
+        if lowest <= frequency / factor <= highest:
+            return f" In {unit} they would be largest at {frequency / factor:.4g} rad/s and last {span * factor:.4g} s"
+    return ""
 
 
 def length_warnings(model: Model) -> Iterator[str]:

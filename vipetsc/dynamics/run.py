@@ -31,6 +31,7 @@ from vipetsc.io.folder import RUN, claimed, provenance
 from vipetsc.io.read import open_results
 from vipetsc.io.store import RunFolder, RunMemory, RunOutput
 from vipetsc.parallel import StopRequest, install_abort_hook
+from vipetsc.process import compiling
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 ENGINES = (Propagator, Integrator)
 # Cells times samples between two looks at requests to stop: a fraction of a second.
 BLOCK_CELLS = 1_000_000
+NOTICED = 1.0  # s of the compiler's clock, in which kernels that are there may be loaded
 COMPLETE, STOPPED, FAILED = "complete", "stopped", "failed"
 # Statistics that a notebook shows, with their words.
 SHOWN = {
@@ -57,6 +59,14 @@ class Failure(NamedTuple):
 
     reason: str
     time: float
+
+
+class Begin(NamedTuple):
+    """Readings in s, when a run begins, of the clocks of the wall, of this process, of its compiler."""
+
+    wall: float
+    cpu: float
+    compiled: float
 
 
 @dataclass(frozen=True)
@@ -192,7 +202,7 @@ class Simulation:
 
     def make(self, output: RunOutput) -> Result:
         """Simulate into ``output``, from its last checkpoint on if it has one; all ranks must call it."""
-        begin = time.perf_counter(), time.process_time()
+        begin = Begin(time.perf_counter(), time.process_time(), compiling.seconds)
         output.begin(self.case.to_toml())
         sys.audit("vipetsc.set-up", self.case.name)
         with log.SET_UP, petsc_options(options_of(self.case)):
@@ -325,7 +335,7 @@ class Run:
             state |= {f"{observer.name}/{key}": value for key, value in observer.checkpoint().items()}
         self.setup.output.save_state(state)
 
-    def finish(self, ending: str, sentence: str, begin: tuple[float, float], note: dict[str, str]) -> Result:
+    def finish(self, ending: str, sentence: str, begin: "Begin", note: dict[str, str]) -> Result:
         """Write the last checkpoint of a run that was stopped, or the files of one that ended."""
         engine = self.setup.engine
         output = self.setup.output
@@ -345,9 +355,12 @@ class Run:
         if ending == FAILED:
             warnings.append(f"the record ends at sample {self.samples} of {self.setup.model.samples}: {sentence}")
 
-        wall = time.perf_counter() - begin[0]
-        cpu = comm.allreduce(time.process_time() - begin[1])
+        wall = time.perf_counter() - begin.wall
+        cpu = comm.allreduce(time.process_time() - begin.cpu)
         statistics |= {**note, "wall_seconds": round(wall, 3), "cpu_seconds": round(cpu, 3)}
+        compiled = compiling.seconds - begin.compiled
+        if compiled > NOTICED:
+            statistics["compile_seconds"] = round(compiled, 3)
         about = {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics, "warnings": warnings}
         attributes = comm.bcast(provenance(comm) | about)  # what rank 0 states counts
         if ending == COMPLETE and isinstance(output, RunMemory):

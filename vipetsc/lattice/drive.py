@@ -316,6 +316,12 @@ def spline(amplitude: float, times: ArrayLike, values: ArrayLike, frequency: flo
 
 def main_frequency(times: ArrayLike, values: ArrayLike) -> float:
     """The angular frequency in rad/s at which the spectrum of samples is largest, but for 0."""
+    frequency, content = spectrum(times, values)
+    return float(frequency[1 + np.argmax(content[1:])])
+
+
+def spectrum(times: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Angular frequencies in rad/s, and the magnitude there of the transform of samples joined by a cubic spline."""
     times = np.asarray(times, float)
     values = np.asarray(values, float)
     steps = (times[-1] - times[0]) / np.diff(times).min()
@@ -323,4 +329,4 @@ def main_frequency(times: ArrayLike, values: ArrayLike) -> float:
     even = np.linspace(times[0], times[-1], count)
     # Padded with zeros, the transform has four times as many frequencies as the record's length resolves.
     content = np.abs(np.fft.rfft(scipy.interpolate.CubicSpline(times, values)(even), 4 * count))
-    return float(2 * np.pi * (1 + np.argmax(content[1:])) / (4 * count * (even[1] - even[0])))
+    return 2 * np.pi * np.arange(len(content)) / (4 * count * (even[1] - even[0])), content

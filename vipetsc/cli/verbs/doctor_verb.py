@@ -4,19 +4,36 @@ import argparse
 
 from mpi4py import MPI
 
+from vipetsc.cli.arguments import argument
 from vipetsc.cli.installation import checks
 from vipetsc.cli.messages import echo
-from vipetsc.cli.tables import table
+from vipetsc.cli.tables import duration, table
 from vipetsc.cli.verb import BAD_INPUT, DONE, PlainVerb
 from vipetsc.io.folder import provenance
 from vipetsc.parallel import StopRequest
+
+LOADING = 1.0  # s of the compiler's clock in which kernels that are there are loaded
 
 
 def doctor(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Print versions, MPI, HDF5 and ranks; what the program cannot work with, and how to get it."""
     text, is_healthy = doctor_table(comm)
     echo(comm, text)
-    return DONE if is_healthy else BAD_INPUT
+    if not is_healthy:
+        return BAD_INPUT
+    if options.compile:
+        compile_now(comm)
+    return DONE
+
+
+def compile_now(comm: MPI.Comm) -> None:
+    """Compile the kernels that are not there yet, and say how long that took; all ranks must call it."""
+    # Imported here: what it loads may be what is missing.
+    from vipetsc.studies.first_calls import compile_kernels
+
+    seconds = compile_kernels(comm)
+    outcome = f"compiled in {duration(seconds)}" if seconds > LOADING else "all there"
+    echo(comm, f"kernels of runs, modes and measures: {outcome}")
 
 
 def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
@@ -41,4 +58,13 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
     return f"{table(rows)}\n{verdict}", not faults
 
 
-VERB = PlainVerb(name="doctor", text="versions and what is missing", example="doctor", function=doctor, is_answer=True)
+COMPILE = argument("--compile", action="store_true", help="compile the kernels now, not in the first run; mpirun helps")
+
+VERB = PlainVerb(
+    name="doctor",
+    text="versions and what is missing",
+    example="doctor --compile",
+    arguments=(COMPILE,),
+    function=doctor,
+    is_answer=True,
+)

@@ -146,6 +146,9 @@ def run_table(result: "Result", faster: str = "") -> str:
     restitution = f"{first_few([f'{e:.3f}' for e in rebounds])} (effective)" if rebounds else ""
     limits = [f"{name} {numbers[name]}" for name in ("grazes", "floored", "clipped", "pulled") if numbers[name]]
     note = numbers.get("engine_note")
+    time = f"{numbers['wall_seconds']:.2f} s wall, {numbers['cpu_seconds']:.2f} s CPU of all ranks"
+    if compiled := numbers.get("compile_seconds"):
+        time += f"; {compiled:.1f} s of it compiled kernels, once"
 
     rows = [
         ("energy", energy),
@@ -153,7 +156,7 @@ def run_table(result: "Result", faster: str = "") -> str:
         ("restitution", restitution),
         ("limits", ", ".join(limits)),
         ("steps", steps),
-        ("time", f"{numbers['wall_seconds']:.2f} s wall, {numbers['cpu_seconds']:.2f} s CPU of all ranks"),
+        ("time", time),
         ("folder", str(result.folder)),
         ("engine", f"{numbers['engine']}: {note}" if note else ""),
         ("faster", faster),

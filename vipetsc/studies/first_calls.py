@@ -1,0 +1,76 @@
+"""First calls of compiled kernels: small runs and branches, after which those of most studies are compiled and kept."""
+
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from vipetsc.case import Case, NnmCase
+from vipetsc.dynamics.run import simulate
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.parallel import on_every_rank
+from vipetsc.process import compiling
+from vipetsc.studies.analysis import analyse
+
+# Both sites are touched, so that all that contacts call is called.
+RUN: dict[str, Any] = {
+    "lattice": {"cells": 40},
+    "contacts": {"sites": [6, 12], "clearance": 1e-4},
+    "time": {"end": 0.08},
+}
+# A mode of the cell, with the other two flows beside it; a breather of a lattice, shot without dense matrices.
+CELL: dict[str, Any] = {
+    "lattice": {"preset": "four-band", "reading": "printed"},
+    "contacts": {"law": "bilinear", "modulus": 1e8},
+    "nnm": {"modes": [2], "energy": [0.0, 1e9], "chart": "auto", "compare": ["newmark", "tsrk"], "points": 2},
+}
+BREATHER: dict[str, Any] = {
+    "lattice": {"preset": "four-band", "cells": 20},
+    "contacts": {"sites": [7]},
+    "nnm": {"system": "chain", "start_frequency": [1600.0], "tolerance": 1e-12, "first_step": 1e-2, "points": 2},
+}
+
+
+def compile_kernels(comm: MPI.Comm) -> float:
+    """Compile the kernels of runs and branches that are not kept yet; returns the seconds of the slowest rank.
+
+    The calls are divided over the ranks, those together that share the fewest kernels; all ranks must call it.
+    """
+    calls: list[Callable[[], object]] = [
+        partial(follow, CELL),
+        partial(run, "propagator"),
+        partial(run, "ts"),
+        partial(follow, BREATHER),
+        find_fonts,
+    ]
+    before = compiling.seconds
+
+    def call_own() -> float:
+        for call in calls[comm.rank :: comm.size]:
+            call()
+        return compiling.seconds - before
+
+    return max(comm.allgather(on_every_rank(comm, call_own)))
+
+
+def run(engine: str) -> None:
+    """A run by one of the engines, and its measures."""
+    case = Case.from_table(RUN | {"time": {**RUN["time"], "engine": engine}})
+    run = simulate(case, comm=MPI.COMM_SELF).dataset
+    assert run is not None
+    analyse(run)
+
+
+def follow(table: dict[str, Any]) -> None:
+    """Two points of a branch, whatever it comes to."""
+    with tempfile.TemporaryDirectory() as folder:
+        follow_all(NnmCase.from_table(table), Path(folder), MPI.COMM_SELF)
+
+
+def find_fonts() -> None:
+    """Matplotlib's list of the machine's fonts, which is written where the module is loaded first."""
+    import_module("matplotlib.font_manager")
