@@ -233,3 +233,12 @@ def test_a_sweep_of_many_sites_that_is_no_case_is_refused_by_one_member():
     sweep = "[sweep.drive]\namplitude = { linear = [1, 2], count = 60 }\n[contacts]\nsites = 250000"
     with pytest.raises(CaseError, match=r"contacts\.sites"):
         Sweep.from_table(tomllib.loads(BASE + sweep)).tried()
+
+
+@pytest.mark.parametrize(("section", "value"), [("contacts", [0]), ("contacts", "1e9"), ("output", 0)])
+def test_a_section_of_a_sweep_that_is_no_table_is_refused(section, value):
+    sweep = Sweep.from_table({section: value, "sweep": {"drive": {"amplitude": [1.0, 2.0]}}})
+    with pytest.raises(CaseError) as error:
+        sweep.tried()
+    assert error.value.problems[0].key == section
+    assert sweep.wants_pictures == (section != "output")

@@ -213,7 +213,8 @@ class Sweep(CaseFile):
     @property
     def wants_pictures(self) -> bool:
         """Whether the results are drawn, ``output.figures`` of the members."""
-        return bool(self.table.get("output", {}).get("figures", True))
+        output = self.table.get("output", {})
+        return bool(output.get("figures", True)) if isinstance(output, dict) else False
 
     def names(self) -> dict[str, str]:
         """A short name for every key that varies: its last part, or all of it where that is not unique."""
@@ -225,7 +226,8 @@ class Sweep(CaseFile):
 
 def _site_count(table: Table) -> int:
     """The number of sites that a table asks for, which need not be a valid case; 0 where it does not say."""
-    sites = table.get("contacts", {}).get("sites", 0)
+    contacts = table.get("contacts", {})
+    sites = contacts.get("sites", 0) if isinstance(contacts, dict) else 0
     if isinstance(sites, dict):
         sites = sites.get("count", 0)
     if isinstance(sites, list):
