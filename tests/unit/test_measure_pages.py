@@ -28,6 +28,9 @@ LAWS = {"contacts.law": ["hertz", "bilinear"]}
 SITES = {"contacts.sites": [[9], [9, 20], [4, 30]]}
 
 
+BLANKS = str.maketrans("\n\u00a0", "  ")  # breaks of lines, and blanks where none may be
+
+
 @pytest.fixture(autouse=True)
 def style():
     with rc_style():
@@ -87,7 +90,7 @@ def panels(figure: Figure) -> list[Axes]:
 
 def title(figure: Figure) -> str:
     bodies = [figure, *figure.subfigs]
-    return " ".join(body._suptitle.get_text() for body in bodies if body._suptitle).replace("\n", " ")
+    return " ".join(body._suptitle.get_text() for body in bodies if body._suptitle).translate(BLANKS)
 
 
 def legend(figure: Figure) -> list[str]:

@@ -92,7 +92,8 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
 
 def left_out(pictures: Pictures, folders: Sequence[Path], names: list[str] | None) -> list[str]:
     """Sentences about what is not drawn of sweeps; on one rank. Raises FolderError for a figure asked for by name."""
-    from vipetsc.figures.registry import reasons_without_pages
+    from vipetsc.figures.registry import OVER_BRANCHES, reasons_without_pages
+    from vipetsc.figures.transfer_curves import curves_left_out
 
     if pictures.source != SWEEP_FIGURES:
         return []
@@ -103,7 +104,16 @@ def left_out(pictures: Pictures, folders: Sequence[Path], names: list[str] | Non
     by_reason: dict[str, list[str]] = {}
     for name, reason in reasons.items():
         by_reason.setdefault(reason, []).append(name)
-    return [f"no picture of {', '.join(named)}: {reason}" for reason, named in by_reason.items()]
+    sentences = [f"no picture of {', '.join(named)}: {reason}" for reason, named in by_reason.items()]
+
+    # Branches stand on one page alone, and of the sweep's curves perhaps not all.
+    branches = [str(folder) for folder in folders if not (folder / "ensemble.h5").exists()]
+    if branches and names and OVER_BRANCHES not in names:
+        drawn = ", ".join(names)
+        sentences.append(f"{drawn}: without the branches of {', '.join(branches)}; --fig {OVER_BRANCHES} draws both")
+    elif branches and OVER_BRANCHES not in reasons and (unrelated := curves_left_out(folders)):
+        sentences.append(f"{OVER_BRANCHES}: without {unrelated}")
+    return sentences
 
 
 def newest_result(folders: Sequence[Path]) -> float:

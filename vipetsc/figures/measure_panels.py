@@ -24,7 +24,11 @@ LEGEND_LETTERS = 17  # of a legend on an inch
 MOST_COLUMNS = 4
 LEAST_TICKS = 3  # of a logarithmic scale
 MOST_TICKS = 8  # values of a key that are all ticks
-LEAST_GAP = 0.07  # between ticks, of the axis
+SIDES = 0.9  # inches of a page's width that its labels and its colour bar take
+PANEL_HEIGHT = 1.4  # inches, at least
+LETTER = 0.062  # inches of a letter of a tick's label
+LINE = 0.14  # inches of its height
+USED = 0.85  # of an axis that lies between the first and the last position
 LOG_RATIO = 100.0  # of the largest over the smallest value of a measure on a logarithmic scale
 CONTOURS = 6
 
@@ -99,7 +103,7 @@ class MeasurePage:
         """Write what the axes of all panels are, and ticks at the values of ``x``."""
         columns = self.panels[0].get_subplotspec().get_gridspec().ncols
         for axes in self.panels:
-            label_positions(axes.xaxis, x, self.width / columns)
+            label_positions(axes.xaxis, x, (self.width - SIDES) / columns)
         self.body.supxlabel("\n".join(wrap(x.label, int(LETTERS * self.width))))
         self.body.supylabel("\n".join(wrap(y, int(LETTERS * self.figure.get_figheight()))))
 
@@ -109,7 +113,7 @@ class MeasurePage:
         first = self.panels[0]
         if finite.min() > 0 and finite.max() > LOG_RATIO * finite.min():
             first.set_yscale("log")
-            _set_log_ticks(first.yaxis, finite)
+            _set_log_ticks(first.yaxis, finite, PANEL_HEIGHT)
         elif 0 <= finite.min() < 0.5 * finite.max():
             first.set_ylim(bottom=0)
         self.label_axes(x, self.label)
@@ -171,7 +175,7 @@ def draw_maps(
         edges = cell_edges(x.positions[x_order], x.scale), cell_edges(y.positions[y_order], y.scale)
         image = axes.pcolormesh(*edges, values, norm=norm, cmap="viridis", rasterized=True)
         _draw_contours(axes, x.positions[x_order], y.positions[y_order], values, norm)
-        label_positions(axes.yaxis, y, page.width)
+        label_positions(axes.yaxis, y, PANEL_HEIGHT)
 
     if ring:
         at = x.positions[ring.x], y.positions[ring.y]
@@ -232,31 +236,45 @@ def cell_edges(positions: np.ndarray, scale: str) -> np.ndarray:
     return np.exp(edges) if scale == "log" else edges
 
 
-def label_positions(axis: Axis, swept: SweptAxis, width: float) -> None:
+def label_positions(axis: Axis, swept: SweptAxis, length: float) -> None:
     """Put ticks at the values of a ``swept`` axis if these are few, else where a scale of numbers has them.
 
-    ``width`` in inches is that of the panel, for which long labels are turned.
+    ``length`` in inches is that of the axis, on which the labels must have room.
     """
     positions = swept.positions
+    texts = swept.value_texts
     if not swept.is_number:
-        texts = swept.value_texts
-        is_long = axis.axis_name == "x" and sum(len(text) + 2 for text in texts) > LETTERS * width
+        is_long = axis.axis_name == "x" and not _have_room(axis, positions, texts, length)
         axis.set_ticks(positions, texts, **({"rotation": 25, "ha": "right"} if is_long else {}))
+        if axis.axis_name == "x":
+            axis.axes.set_xlim(-0.5, len(positions) - 0.5)
         return
-    on_scale = np.sort(np.log(positions) if swept.scale == "log" else positions)
-    gap = np.diff(on_scale).min() / np.ptp(on_scale)
-    least = LEAST_GAP if axis.axis_name == "y" else max(LEAST_GAP, 0.4 / width)
-    if len(positions) <= MOST_TICKS and gap >= least:
-        number = swept.first_number
-        axis.set_ticks(positions, number.value_texts if number else [])
+
+    on_scale = np.log(positions) if swept.scale == "log" else positions
+    number = swept.first_number
+    if number and len(positions) <= MOST_TICKS and _have_room(axis, on_scale, number.value_texts, length):
+        axis.set_ticks(positions, number.value_texts)
         axis.set_minor_locator(NullLocator())
     elif swept.scale == "log":
-        _set_log_ticks(axis, positions)
+        _set_log_ticks(axis, positions, length)
 
 
-def _set_log_ticks(axis: Axis, values: np.ndarray) -> None:
-    """Label three places or more of a logarithmic ``axis`` within the range of ``values``."""
-    axis.set_major_locator(FixedLocator(log_ticks(float(values.min()), float(values.max()))))
+def _have_room(axis: Axis, positions: np.ndarray, texts: Sequence[str], length: float) -> bool:
+    """Whether labels ``texts`` at ``positions``, along an axis of ``length`` inches, stand apart."""
+    if len(positions) < 2:
+        return True
+    order = np.argsort(positions)
+    gaps = np.diff(positions[order]) / np.ptp(positions) * USED * length
+    sizes = np.array([LETTER * (len(texts[i]) + 1) if axis.axis_name == "x" else LINE for i in order])
+    return bool((gaps >= 0.5 * (sizes[1:] + sizes[:-1])).all())
+
+
+def _set_log_ticks(axis: Axis, values: np.ndarray, length: float) -> None:
+    """Label places of a logarithmic ``axis`` of ``length`` inches within the range of ``values``, three if it can."""
+    ticks = log_ticks(float(values.min()), float(values.max()))
+    while len(ticks) > 2 and not _have_room(axis, np.log(ticks), [f"{tick:g}" for tick in ticks], length):
+        ticks = ticks[::2]
+    axis.set_major_locator(FixedLocator(ticks))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())
 

@@ -93,10 +93,12 @@ BRANCH_FIGURES: Mapping[str, Callable[[Sequence[Path]], Figure]] = {
     branch_kinds.RESPONSES: nfrc.frequency_response,
 }
 
+OVER_BRANCHES = "ibtet_backbone"  # the figure of sweeps that shows branches too
+
 # What sweeps must hold for a figure.
 WHOLE_MEMBERS = "members with their fields ([sweep] fields = true), contact sites and a band above the driven one"
 THREE_AMPLITUDES = "members with their fields ([sweep] fields = true) at three values of drive.amplitude"
-BRANCHES_TOO = "branches of the same law, in a further folder, and six values of drive.amplitude"
+BRANCHES_TOO = "branches of the same law, in a further folder, and a sweep over drive.amplitude"
 
 _SPECS = (
     # The dearest of a run first, so that ranks which divide the work among them finish together.
@@ -121,7 +123,7 @@ _SPECS = (
     FigureSpec("band_energies", SWEEP, transfer.band_energies, measure="transfer", needs=WHOLE_MEMBERS),
     FigureSpec("band_energies-shares", PAPER, transfer.band_shares, measure="transfer"),
     FigureSpec("ibtet", PAPER, transfer_curves.ibtet, measure="transfer"),
-    FigureSpec("ibtet_backbone", SWEEP, transfer_curves.ibtet_backbone, measure="transfer", needs=BRANCHES_TOO),
+    FigureSpec(OVER_BRANCHES, SWEEP, transfer_curves.ibtet_backbone, measure="transfer", needs=BRANCHES_TOO),
     FigureSpec("phase_regimes", SWEEP, transfer_curves.phase_regimes, measure="transfer", needs=WHOLE_MEMBERS),
     FigureSpec("branch", BRANCHES, branch),
     FigureSpec("deflections", DESIGN, cost_maps.deflections),
@@ -168,18 +170,23 @@ def _with_ensemble(folders: Iterable[Path]) -> list[Path]:
 
 
 def reasons_without_pages(folders: Sequence[Path], names: Sequence[str] | None = None) -> dict[str, str]:
-    """Return why figures of the sweeps in ``folders`` are not drawn, by name; those in ``names``, by default measures.
+    """Return why figures of the sweeps in ``folders`` are not drawn, by name.
 
+    They are those in ``names``, by default measures, and what lays branches over them where ``folders`` hold any.
     Raises KeyError as ``figure_names``.
     """
+    expected = {*(names or ())}
+    if len(_with_ensemble(folders)) < len(folders) and names is None:
+        expected.add(OVER_BRANCHES)
     reasons: dict[str, str] = {}
     with Files() as files:
         ensembles = [files.get(folder, open_ensemble) for folder in _with_ensemble(folders)]
         for name in figure_names(SWEEP, names, folders):
             spec = FIGURES.get(name)
             if spec and spec.source == SWEEP:
-                if names and not any(_specified_drawings(spec, ensembles, files)):
-                    reasons[name] = f"needs {spec.needs}"
+                if name in expected and not any(_specified_drawings(spec, ensembles, files)):
+                    unrelated = transfer_curves.curves_left_out(folders) if name == OVER_BRANCHES else ""
+                    reasons[name] = unrelated or f"needs {spec.needs}"
                 continue
             by_sweep = [_reason(ensemble, name, by_name=names is not None) for ensemble in ensembles]
             if all(by_sweep):

@@ -16,6 +16,7 @@ FEW_TOGETHER = 6  # values of keys that vary together and stand as categories
 FRACTION_LIMIT = 36  # largest denominator of a wavenumber over pi that is written as a fraction
 LONGEST = 24  # letters of a list that stands in a legend
 DIGITS = range(3, 18)  # of a number; as many as tell the values apart
+NO_BREAK = "\u00a0"  # the space between a value and its unit
 LEAST_RATIO = 5.0  # of a logarithmic axis, largest over smallest value
 
 
@@ -52,7 +53,7 @@ class SweptKey(NamedTuple):
     @property
     def texts(self) -> list[str]:
         """The path with each value and its unit: ``drive.amplitude 24.3 N``."""
-        unit = f" {self.unit}" if self.unit else ""
+        unit = f"{NO_BREAK}{self.unit}" if self.unit else ""
         return [f"{self.path} {text}{unit}" for text in self.value_texts]
 
 
@@ -75,7 +76,11 @@ def _number_text(value: float, digits: int) -> str:
 
 
 def _shortened(text: str) -> str:
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…"
+    """Return ``text`` in at most ``LONGEST`` letters, with the number of entries of a list."""
+    if len(text) <= LONGEST:
+        return text
+    entries = f" {text.count(',') + 1} entries" if text.startswith("[") else ""
+    return f"{text[: LONGEST - len(entries)]}…{entries}"
 
 
 class SweptAxis(NamedTuple):

@@ -1,6 +1,7 @@
 """Inter-band transfer over the amplitude (paper, Fig. 9), next to a branch (Figs. 12, S7, S8), and its regimes."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from string import ascii_lowercase
@@ -181,6 +182,16 @@ def ibtet_backbone(sweeps: Sweeps) -> Iterator[Drawing]:
         aligned = [TransferCurve(Case.from_toml(table["case"]), table) for table in _groups(values)]
         for name, columns in grouped(aligned, lambda curve: Labels.of(curve.case).page_stem).items():
             yield Drawing(name, partial(columns_of_laws, columns, BACKBONE_LABEL, _superposition))
+
+
+def curves_left_out(folders: Iterable[Path]) -> str:
+    """Return which curves of the sweeps in ``folders`` could not be laid over branches, and why; empty for none."""
+    sentences: list[str] = []
+    for path in (folder / "backbone.h5" for folder in folders):
+        if path.exists():
+            with open_netcdf(path, "backbone", ("case",)) as file:
+                sentences += json.loads(file.attrs.get("left_out", "[]"))
+    return "; ".join(sentences)
 
 
 def _groups(values: Mapping[Any, Any]) -> list[dict[str, Any]]:

@@ -1,0 +1,142 @@
+"""Pictures of sweeps as a user asks for them: pages of measures, sentences about what is not drawn, exit codes."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import set_words
+from vipetsc.cli.drawing import left_out
+from vipetsc.cli.main import main
+from vipetsc.cli.verbs.sweep_verb import PICTURES
+
+LATTICE = """
+[lattice]
+cells = 24
+[lattice.cell]
+masses = [0.010, 0.004, 0.002]
+springs = [
+    { start = 1, end = 1, stiffness = 2.0e4, next_cell = true },
+    { start = 1, end = 2, stiffness = 6.0e3 },
+    { start = 2, end = 3, stiffness = 1.0e3 },
+]
+contact = [2, 3]
+[contacts]
+modulus = 1.0e8
+radius = 0.005
+poisson = 0.3
+sites = [8, 12]
+clearance = 1.0e-3
+"""
+BURST = """
+[drive]
+amplitude = 12.0
+cycles = 4
+band = 2
+at = "max-group-velocity"
+[time]
+end = 0.05
+rtol = 1e-6
+[sweep]
+measures = ["transfer"]
+[sweep.contacts]
+clearance = [5e-4, 1e-3, 2e-3]
+restitution = [0.3, 0.6, 0.9]
+"""
+HARMONIC = """
+[drive]
+waveform = "harmonic"
+amplitude = 12.0
+[time]
+end = 0.05
+rtol = 1e-6
+[sweep]
+measures = ["transfer"]
+fields = true
+[sweep.drive]
+frequency = [800.0, 900.0, 1000.0]
+"""
+PAGES = ("bands_share", "contact_episodes", "dissipated_fraction", "ibtet", "upper_share_at_end")
+
+
+def sweep(folder: Path, case: str, *changes: str) -> Path:
+    """The folder of a sweep that was simulated, without pictures."""
+    path = folder / "case.toml"
+    path.write_text(LATTICE + case)
+    out = folder / "out"
+    assert main(["sweep", str(path), "--out", str(out), "--quiet", *set_words("output.figures=false", *changes)]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def burst(tmp_path_factory) -> Path:
+    """Three clearances and three restitutions."""
+    return sweep(tmp_path_factory.mktemp("burst"), BURST)
+
+
+def drawn(folder: Path) -> set[str]:
+    """The names of the pictures in a folder, which are then removed."""
+    paths = list((folder / "figures").glob("*"))
+    names = {path.name for path in paths}
+    for path in paths:
+        path.unlink()
+    return names
+
+
+@pytest.mark.slow
+def test_every_measure_has_a_page_over_the_keys_that_vary(burst):
+    assert main(["plot", str(burst)]) == 0
+    keys = "contacts.clearance-contacts.restitution"
+    assert drawn(burst) == {f"{name}-over-{keys}{'-band' * (name == 'bands_share')}.png" for name in PAGES}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ibtet", "work", "bands_modal_energy"])
+def test_a_measure_asked_for_by_name_is_drawn_alone(burst, name):
+    assert main(["plot", str(burst), "--fig", name]) == 0
+    (picture,) = drawn(burst)
+    assert picture.startswith(f"{name}-over-contacts.clearance")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("transfer", "--fig transfer: needs members with their fields ([sweep] fields = true)"),
+        ("ibtet_backbone", "--fig ibtet_backbone: needs branches of the same law"),
+        ("entropy", "no figure 'entropy' of a sweep"),
+    ],
+)
+def test_a_figure_that_cannot_be_drawn_is_refused(burst, name, message, capsys):
+    assert main(["plot", str(burst), "--fig", name]) == 2
+    assert message in capsys.readouterr().err
+    assert drawn(burst) == set()
+
+
+@pytest.mark.slow
+def test_an_own_cell_under_a_harmonic_drive_has_pages_over_its_frequency(tmp_path):
+    """No picture has the name of another, or of a law, a reading or cycles that the case has not."""
+    out = sweep(tmp_path, HARMONIC)
+    assert main(["plot", str(out)]) == 0
+    names = drawn(out)
+    assert {"ibtet-over-drive.frequency.png", "contact_episodes-over-drive.frequency.png"} <= names
+    for frequency in (800, 900, 1000):
+        assert f"transfer-hertz-2-sites-drive.frequency-{frequency}-rad-s-12N.png" in names
+    assert not [name for name in names if "calibrated" in name or "cycles" in name]
+
+
+@pytest.mark.slow
+def test_what_is_zero_for_every_member_is_said_and_drawn_on_request(tmp_path, capsys):
+    out = sweep(tmp_path, BURST, "sweep.contacts.clearance=[1.0, 2.0, 3.0]")
+    assert main(["plot", str(out)]) == 0
+    assert "no picture of contact_episodes, dissipated_fraction: 0 for every member" in capsys.readouterr().err
+    assert main(["plot", str(out), "--fig", "contact_episodes"]) == 0
+    assert "contact_episodes-over-contacts.clearance-contacts.restitution.png" in drawn(out)
+
+
+@pytest.mark.slow
+def test_branches_that_a_figure_does_not_show_are_named(burst, tmp_path):
+    (sentence,) = left_out(PICTURES, [burst, tmp_path], ["ibtet"])
+    assert sentence == f"ibtet: without the branches of {tmp_path}; --fig ibtet_backbone draws both"
+
+    (sentence,) = left_out(PICTURES, [burst, tmp_path], None)
+    assert sentence.startswith("no picture of ibtet_backbone: needs branches of the same law")
