@@ -24,3 +24,17 @@ def test_same_bits_with_closed_contacts_across_borders(folder, engine, initial, 
         time={"engine": engine, "end": 0.02},
     )
     runs_alike(folder, case)
+
+
+@pytest.mark.parallel([2, 3])
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+def test_struck_masses_of_any_rank_have_the_same_bits(folder, engine):
+    """Masses in the first, the last and a cell next to a border between ranks are struck."""
+    strikes = [{"cell": 12, "mass": 2, "velocity": -0.4}, {"cell": 13, "velocity": 0.2}, {"cell": 24, "velocity": -0.3}]
+    case = small_case(
+        contacts={"sites": [6, 12, 13], "clearance": 1e-5},
+        drive={"amplitude": 0.0},
+        initial={"kind": "velocity", "cell": 1, "velocity": 0.5, "more": strikes},
+        time={"engine": engine, "end": 0.01},
+    )
+    runs_alike(folder, case)

@@ -91,7 +91,7 @@ def test_a_case_may_name_the_mode_near_a_frequency(ends):
         time={"end": 0.01},
     )
     # Half a spacing of the 20,000 modes, which is largest in the middle of the band.
-    assert case.drive.frequency == pytest.approx(300, abs=0.2)
+    assert case.initial.frequency == pytest.approx(300, abs=0.2)
     assert case.initial.number == number_near(case.model().chain, 300.0)
 
 
@@ -125,7 +125,9 @@ def test_a_lattice_at_rest_is_the_default():
 def test_without_a_drive_the_frequency_and_the_cell_are_those_of_the_motion():
     case = case_with(initial=PACKET)
     assert (case.drive.amplitude, case.drive.cell) == (0.0, 12)
-    assert case.drive.frequency == pytest.approx(bloch(four_band("calibrated"), np.pi / 2).frequency[1])
+    assert case.drive.frequency is None
+    assert case.initial.frequency == pytest.approx(bloch(four_band("calibrated"), np.pi / 2).frequency[1])
+    assert case.model().drive.frequency == case.wave_frequency == case.initial.frequency
     assert case.initial.energy is None
     assert case.warnings() == []
 
@@ -144,7 +146,7 @@ def test_a_drive_acts_in_addition_to_the_motion():
 
 def test_a_mode_near_an_edge_is_counted():
     case = case_with(initial={"kind": "mode", "near": 2034.0, "energy": 1e-3})
-    assert case.drive.frequency == pytest.approx(2034.8251, abs=1e-4)
+    assert case.initial.frequency == pytest.approx(2034.8251, abs=1e-4)
     assert case.initial.number == 48
 
 
@@ -226,7 +228,7 @@ def branch(tmp_path):
 
 def test_a_run_may_begin_with_an_orbit_of_a_branch(branch):
     case = case_with(initial={"kind": "file", "path": str(branch), "orbit": 1})
-    assert case.drive.frequency == pytest.approx(2 * np.pi / 0.004)
+    assert case.initial.frequency == pytest.approx(2 * np.pi / 0.004)
     # The cell that moves most is the fourth, by 7 times the size.
     assert case.drive.cell == 4
     assert case.initial.amplitude == pytest.approx(7e-4)

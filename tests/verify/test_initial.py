@@ -57,7 +57,7 @@ def test_a_mode_stays_a_mode(engine, ends):
     chain = case.model().chain
     omega = mode_frequency(chain, 50)
     # Nothing is driven: the frequency, which sets tolerances, is that of the motion.
-    assert case.drive.frequency == omega
+    assert case.initial.frequency == omega
 
     data = run(case)
 
@@ -133,7 +133,7 @@ def test_a_run_goes_on_from_a_sample_of_another_in_the_middle_of_a_contact(engin
 
     initial = {"kind": "file", "path": str(tmp_path / "first" / "run.h5"), "time": float(time[start])}
     second = moving(initial, contacts=contacts, time={"engine": engine, "end": 0.02, "rtol": 1e-12})
-    assert second.drive.frequency == first.drive.frequency
+    assert second.initial.frequency == first.initial.frequency
     data = run(second)
 
     later = data["displacement"].values

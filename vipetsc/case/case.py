@@ -26,6 +26,8 @@ from vipetsc.case.resolve import (
     check_contacts,
     check_unsprung,
     clearances,
+    contact_frequency,
+    reference_drive,
     resolve,
     site_cells,
     with_preset,
@@ -157,7 +159,8 @@ class Case(CaseFile):
         # ``read`` has replaced both words by numbers; the assertion narrows their types.
         assert time.end != "traverse" and time.sample_interval != "auto"
         chain = build_chain(self.lattice, contacts)
-        drives = build_drives(self.drive, chain)
+        drive = reference_drive(self.drive, self.initial)
+        drives = build_drives(drive, chain)
         scale = self._scale(chain, drives)
 
         return Model(
@@ -168,13 +171,20 @@ class Case(CaseFile):
             sample_interval=time.sample_interval,
             method=time.method,
             rtol=time.rtol,
-            atol=self._tolerances(scale),
+            atol=self._tolerances(scale, drives[0].waveform.frequency),
             scale=scale,
-            speed=packet_speed(chain.cell, self.drive),
+            speed=packet_speed(chain.cell, drive),
             initial=self.initial,
             laws=laws_of_sites(contacts, len(chain.sites)),
             gaps=gaps_of_sites(contacts, list(chain.clearances)),
         )
+
+    @property
+    def wave_frequency(self) -> float | None:
+        """Frequency in rad/s of the drive, or of the wave that an undriven lattice begins with; None without either."""
+        if self.drive.frequency is None and self.initial and self.initial.kind != "velocity":
+            return self.initial.frequency
+        return self.drive.frequency
 
     def _scale(self, chain: Chain, drives: tuple[Drive, ...]) -> float:
         """Displacement in m of the drives' linear waves together, or of the motion at the beginning if that is more."""
@@ -187,15 +197,14 @@ class Case(CaseFile):
             scale = max(scale, self.initial.amplitude or 0.0)
         return scale
 
-    def _tolerances(self, scale: float) -> tuple[float, float]:
-        """Absolute tolerances of displacements in m and velocities in m/s where waves have the ``scale`` in m."""
+    def _tolerances(self, scale: float, frequency: float) -> tuple[float, float]:
+        """Absolute tolerances in m and m/s where waves have the ``scale`` in m and the ``frequency`` in rad/s."""
         time = self.time
         drive = self.drive
-        assert drive.frequency is not None
         if time.atol == "scaled":
             small = WEAKEST * time.rtol * scale
             # The velocity of a harmonic wave is its frequency times its displacement.
-            return small, small * drive.frequency
+            return small, small * frequency
         if time.atol == "paper":
             # The paper's tolerance is one number for displacements and velocities.
             small = 1e-9 * abs(drive.amplitude)
@@ -259,10 +268,16 @@ def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem
     drive = sections["drive"]
     if initial is None or not initial.moves:
         return None, []
+    lattice = sections["lattice"]
     frequency = None
     if drive.wave_choices:
-        frequency, _ = driven_wave(sections["lattice"].unit_cell(), drive)
-    return beginning_of(initial, sections["lattice"], frequency)
+        frequency, _ = driven_wave(lattice.unit_cell(), drive)
+
+    def touching(speed: float) -> float:
+        """The frequency of contacts at a speed; of a lattice without any, of one half of its time."""
+        return contact_frequency(lattice, sections["contacts"], speed) or np.pi / sections["time"].end
+
+    return beginning_of(initial, lattice, frequency, touching)
 
 
 def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[Problem]:
@@ -302,6 +317,9 @@ def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]
     """A lattice without a force needs a motion to begin with, and a tolerance that is no part of the force."""
     drive = sections["drive"]
     initial = sections.get("initial")
+    has_wave = drive.amplitude != 0 or bool(drive.wave_choices)
+    if initial is not None and initial.frequency and has_wave and valid("initial", "drive"):
+        yield Problem("initial.frequency", initial.frequency, "the drive has a frequency; leave this one out")
     if drive.amplitude != 0:
         return
     moves = initial is not None and initial.moves

@@ -55,6 +55,7 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
         ("contact", "; ".join(dict.fromkeys(map(str, laws))) if chain.sites else ""),
         ("sites", _first_few(sites)),
         ("clearance", _first_few(describe_stops(model.gaps, chain.clearances))),
+        ("begins with", model.initial.describe() if model.initial else ""),
         ("drive", "; ".join(drives) if model.is_driven else "none"),
         ("end", f"{model.end:.5g} s, {model.samples} samples"),
     ]

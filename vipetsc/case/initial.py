@@ -2,7 +2,7 @@
 
 import hashlib
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from vipetsc.case.case_file import CaseError, Problem, Section, Valid
-from vipetsc.case.schema import LatticeTable, Positive, Wavenumber
+from vipetsc.case.schema import Finite, LatticeTable, Positive, Wavenumber
 from vipetsc.io.names import path_named, readable
 from vipetsc.io.state import State
 from vipetsc.lattice import Chain, UnitCell, bloch
@@ -19,6 +19,7 @@ from vipetsc.lattice.packet import Packet, gaussian_packet
 
 # A packet's envelope has fallen below 1e-10, the tolerance of a landing, so many widths from its middle.
 PACKET_WIDTHS = 6.8
+MOST_SHOWN = 8  # struck masses that are named in words
 
 
 class KindKeys(NamedTuple):
@@ -38,10 +39,21 @@ class KindKeys(NamedTuple):
 
 KINDS = {
     "zero": KindKeys(),
-    "mode": KindKeys(one_of=("number", "near"), is_scaled=True),
-    "packet": KindKeys(needs=("band", "wavenumber", "cell", "width"), others=("direction",), is_scaled=True),
-    "file": KindKeys(needs=("path",), others=("time", "orbit", "sha256", "amplitude")),
+    "mode": KindKeys(one_of=("number", "near"), others=("frequency",), is_scaled=True),
+    "packet": KindKeys(
+        needs=("band", "wavenumber", "cell", "width"), others=("direction", "frequency"), is_scaled=True
+    ),
+    "velocity": KindKeys(needs=("cell", "velocity"), others=("mass", "more", "amplitude", "frequency")),
+    "file": KindKeys(needs=("path",), others=("time", "orbit", "sha256", "amplitude", "frequency")),
 }
+
+
+class StrikeTable(Section):
+    """The initial ``velocity`` in m/s of one ``mass`` of a ``cell`` (from 1)."""
+
+    cell: int = Field(ge=1)
+    mass: int = Field(1, ge=1)
+    velocity: Finite
 
 
 class InitialTable(Section):
@@ -51,12 +63,14 @@ class InitialTable(Section):
     ``near`` a frequency in rad/s, at its turning point. ``packet``: Gaussian, of the waves of a ``band`` about a
     ``wavenumber``, ``width`` cells its standard deviation, in the middle of the ``cell``, that goes up the cells
     (``direction`` 1) or down (-1). Both have an ``amplitude``, the largest displacement of the packet's envelope or of
-    the mode in m, or an ``energy`` in J. ``file``: the state in the file ``path``: of a run at ``time`` in s, of a
-    branch's ``orbit`` (from 1), the last if not given, or a state alone; cells that are not in it are at rest. Its
-    ``sha256`` and ``amplitude`` are filled in.
+    the mode in m, or an ``energy`` in J. ``velocity``: the ``mass`` of a ``cell`` is struck, and so are ``more`` of
+    them: they have a ``velocity`` in m/s, and all else is at rest. ``file``: the state in the file ``path``: of a run
+    at ``time`` in s, of a branch's ``orbit`` (from 1), the last if not given, or a state alone; cells that are not in
+    it are at rest; its ``sha256`` is filled in. So is the ``frequency`` in rad/s of the motion, by which tolerances and
+    measures are judged where nothing is driven, and the ``amplitude`` of a state or of what is struck.
     """
 
-    kind: Literal["zero", "mode", "packet", "file"] = "zero"
+    kind: Literal["zero", "mode", "packet", "velocity", "file"] = "zero"
     number: int | None = Field(None, ge=1)
     near: Positive | None = None
     band: int | None = Field(None, ge=1)
@@ -70,6 +84,23 @@ class InitialTable(Section):
     time: Annotated[float, Field(ge=0)] | None = None
     orbit: int | None = Field(None, ge=1)
     sha256: str | None = None
+    mass: int | None = Field(None, ge=1)
+    velocity: Finite | None = None
+    more: list[StrikeTable] | None = None
+    frequency: Positive | None = None
+
+    def __hash__(self) -> int:
+        # Engines keep tables by model; a list has no hash of its own.
+        return hash(self.model_dump_json())
+
+    @property
+    def strikes(self) -> list[tuple[str, StrikeTable]]:
+        """The masses that are struck, by the path of their keys; [] for another kind, or where keys are missing."""
+        if self.kind != "velocity" or self.cell is None or self.velocity is None:
+            return []
+        first = StrikeTable(cell=self.cell, mass=self.mass or 1, velocity=self.velocity)
+        others = [(f"initial.more[{i}]", strike) for i, strike in enumerate(self.more or [], 1)]
+        return [("initial", first), *others]
 
     @property
     def moves(self) -> bool:
@@ -80,7 +111,30 @@ class InitialTable(Section):
         """Whether masses of the ``cell`` (from 1) are at rest at t = 0, as far as the section itself says."""
         if self.kind == "packet" and self.cell and self.width:
             return abs(cell - self.cell) > PACKET_WIDTHS * self.width
+        if self.kind == "velocity":
+            return all(strike.cell != cell for _, strike in self.strikes)
         return not self.moves
+
+    def describe(self) -> str:
+        """The motion in words; empty for a lattice at rest."""
+        if self.kind == "velocity":
+            struck = [f"{one.velocity:g} m/s of mass {one.mass} of cell {one.cell}" for _, one in self.strikes]
+            more = f", ... ({len(struck)})" if len(struck) > MOST_SHOWN else ""
+            return ", ".join(struck[:MOST_SHOWN]) + more
+        if self.kind == "file":
+            at = f" at {self.time:g} s" if self.time is not None else ""
+            return f"{self.path}{at}" + (f", orbit {self.orbit}" if self.orbit is not None else "")
+
+        size = f"{self.amplitude:.4g} m" if self.amplitude else f"{self.energy or 0.0:.4g} J"
+        about = f", Om = {self.frequency:.4f} rad/s" if self.frequency else ""
+        if self.kind == "mode":
+            return f"mode {self.number or f'near {self.near:g} rad/s'}, {size}{about}"
+        if self.kind == "packet":
+            return (
+                f"a packet of band {self.band} about kappa = {(self.wavenumber or 0) / np.pi:.4f} pi,"
+                f" {self.width:g} cells wide in cell {self.cell}, {size}{about}"
+            )
+        return ""
 
     def packet(self, cell: UnitCell) -> Packet:
         """The packet, of 1 m; only of that kind."""
@@ -117,9 +171,12 @@ def check_initial(
         if len(given.keys() & {*group}) != 1 and valid(*(f"initial.{key}" for key in group)):
             yield Problem(f"initial.{group[0]}", given.get(group[0]), f"give one of {' and '.join(group)}")
 
-    if initial.cell and valid("lattice.cells") and initial.cell > lattice.cells:
-        remedy = f"outside the lattice; cells count from 1 to {lattice.cells}"
-        yield Problem("initial.cell", initial.cell, remedy)
+    yield from _check_strikes(initial, cell)
+    others = [(path, strike.cell) for path, strike in initial.strikes[1:]]
+    for path, at in [("initial", initial.cell), *others]:
+        if at and valid("lattice.cells") and at > lattice.cells:
+            remedy = f"outside the lattice; cells count from 1 to {lattice.cells}"
+            yield Problem(f"{path}.cell", at, remedy)
     if cell and initial.band and initial.band > cell.dofs:
         yield Problem("initial.band", initial.band, f"the cell has {cell.dofs} bands")
 
@@ -127,24 +184,41 @@ def check_initial(
     if dofs and initial.number and initial.number > dofs:
         yield Problem("initial.number", initial.number, f"the lattice has {dofs} modes")
     elif initial.kind in ("mode", "packet") and cell and not cell.springs:
-        remedy = 'a lattice without springs has no modes and no waves; kind = "file" begins with a state of your own'
+        remedy = 'a lattice without springs has no modes and no waves; kind = "velocity" strikes masses of it'
         yield Problem("initial.kind", initial.kind, remedy)
     elif initial.kind == "mode" and (lattice.profiles or lattice.scatter):
         remedy = "the mode of a lattice whose cells differ; a packet, or a state in a file"
         yield Problem("initial.kind", "mode", remedy)
 
 
+def _check_strikes(initial: InitialTable, cell: UnitCell | None) -> Iterator[Problem]:
+    """Problems with masses that are struck: those that the ``cell`` lacks, one that is struck twice, no velocity."""
+    places: set[tuple[int, int]] = set()
+    for path, strike in initial.strikes:
+        if cell and strike.mass > cell.dofs:
+            yield Problem(f"{path}.mass", strike.mass, f"the cell has {cell.dofs} masses")
+        if (strike.cell, strike.mass) in places:
+            yield Problem(f"{path}.cell", strike.cell, f"mass {strike.mass} of this cell is struck already")
+        if strike.velocity == 0:
+            yield Problem(f"{path}.velocity", 0.0, "must not be zero; give it in m/s")
+        places.add((strike.cell, strike.mass))
+
+
 def beginning_of(
-    initial: InitialTable, lattice: LatticeTable, frequency: float | None
+    initial: InitialTable, lattice: LatticeTable, frequency: float | None, touching: Callable[[float], float]
 ) -> tuple[Beginning | None, list[Problem]]:
     """Numbers that follow from a valid section with motion, or the problems with it.
 
-    ``frequency`` in rad/s is the case's, if any.
+    ``frequency`` in rad/s is the case's, if any; ``touching`` gives that of a contact at a speed in m/s, where contacts
+    alone hold a mass that is struck.
     """
     # Without contacts, and with equal cells: modes and packets are those of the linear, uniform lattice.
     chain = Chain(lattice.unit_cell(), lattice.cells, lattice.ends)
-    resolve = {"mode": _mode, "packet": _packet, "file": _file}[initial.kind]
+    frequency = frequency or initial.frequency
     try:
+        if initial.kind == "velocity":
+            return _velocity(initial, chain, frequency, touching), []
+        resolve = {"mode": _mode, "packet": _packet, "file": _file}[initial.kind]
         return resolve(initial, chain, frequency), []
     except CaseError as error:
         return None, error.problems
@@ -177,6 +251,22 @@ def _packet(initial: InitialTable, chain: Chain, frequency: float | None) -> Beg
     return Beginning(initial, frequency or omega, cell=initial.cell or 1)
 
 
+def _velocity(
+    initial: InitialTable, chain: Chain, frequency: float | None, touching: Callable[[float], float]
+) -> Beginning:
+    """Masses that are struck, with the displacement of an oscillation at their frequency."""
+    _, fastest = max(initial.strikes, key=lambda item: abs(item[1].velocity))
+    speed = abs(fastest.velocity)
+    if not frequency:
+        # That of the mass on its own springs while all others are held; without springs, of its contact.
+        mass = fastest.mass - 1
+        stiffness = sum(end.stiffness for end in chain.cell.couplings() if end.mass == mass)
+        omega = float(np.sqrt(stiffness / chain.cell.masses[mass])) if stiffness > 0 else touching(speed)
+        frequency = omega
+    amplitude = initial.amplitude or speed / frequency
+    return Beginning(initial.model_copy(update={"amplitude": amplitude}), frequency, fastest.cell)
+
+
 def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Beginning:
     """A state in a file by its path, hash and largest displacement."""
     # A resolved section, which has a hash, is taken as it is: runs are read where their file is gone.
@@ -188,7 +278,7 @@ def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
     _check_state(state, path, initial, chain)
     frequency = frequency or state.frequency()
     if not frequency:
-        remedy = "tells no frequency; give drive.frequency, that of the motion in rad/s, and drive.amplitude = 0"
+        remedy = "tells no frequency; give initial.frequency, that of the motion in rad/s"
         raise CaseError([Problem("initial.path", initial.path, remedy)])
 
     amplitude, cell = state.largest(frequency)

@@ -8,7 +8,7 @@ import numpy as np
 
 from vipetsc.case.absorbing import designed_end
 from vipetsc.case.case_file import Problem, Table, Valid
-from vipetsc.case.contacts import check_per_site, pairs_of_sites, resolved_per_site
+from vipetsc.case.contacts import check_per_site, contact_of, laws_of_sites, pairs_of_sites, resolved_per_site
 from vipetsc.case.drive import DriveTable, build_drives, packet_speed, resolve_drives, waveform_of
 from vipetsc.case.inhomogeneity import cell_variation
 from vipetsc.case.initial import Beginning, InitialTable
@@ -237,26 +237,52 @@ def resolve(sections: Mapping[str, Any], beginning: Beginning | None) -> dict[st
     lattice = sections["lattice"]
     cell = lattice.unit_cell()
     drive = _resolved_drive(sections["drive"], cell, lattice.cells, beginning)
+    initial = _resolved_initial(beginning, drive)
+    reference = reference_drive(drive, initial)
 
     resolved = dict(sections)
-    resolved["lattice"] = _resolved_lattice(lattice, cell, drive)
+    resolved["lattice"] = _resolved_lattice(lattice, cell, reference)
     resolved["contacts"] = _resolved_contacts(sections["contacts"], lattice)
     resolved["drive"] = drive
-    resolved["time"] = _resolved_time(sections["time"], cell, lattice.cells, drive)
+    resolved["time"] = _resolved_time(sections["time"], cell, lattice.cells, reference)
     resolved.pop("initial", None)  # a lattice at rest says nothing
-    if beginning:
-        resolved["initial"] = beginning.section
+    if initial:
+        resolved["initial"] = initial
     return resolved
 
 
 def _resolved_drive(drive: DriveTable, cell: UnitCell, cells: int, beginning: Beginning | None) -> DriveTable:
-    """The drives; without a force, frequency and cell are those of the motion at the beginning."""
+    """The drives; without a force there is no frequency, and the cell is that of the motion at the beginning."""
     if beginning is None or drive.amplitude != 0:
         return resolve_drives(drive, cell, cells)
-    resolved = resolve_drives(drive, cell, cells, beginning.frequency)
+    resolved = resolve_drives(drive, cell, cells, beginning.frequency).model_copy(update={"frequency": None})
     if "cell" in drive.model_fields_set:
         return resolved
     return resolved.model_copy(update={"cell": beginning.cell})
+
+
+def _resolved_initial(beginning: Beginning | None, drive: DriveTable) -> InitialTable | None:
+    """The motion at the beginning, with its frequency where nothing is driven; None for a lattice at rest."""
+    if beginning is None:
+        return None
+    frequency = beginning.frequency if drive.amplitude == 0 else None
+    return beginning.section.model_copy(update={"frequency": frequency})
+
+
+def reference_drive(drive: DriveTable, initial: InitialTable | None) -> DriveTable:
+    """The drives by which times and tolerances are judged: without a force at the frequency of the initial motion."""
+    if drive.frequency is None and initial is not None:
+        return drive.model_copy(update={"frequency": initial.frequency})
+    return drive
+
+
+def contact_frequency(lattice: LatticeTable, contacts: ContactsTable, speed: float) -> float | None:
+    """Frequency in rad/s of which the shortest contact at a ``speed`` in m/s is half a period; None without sites."""
+    resolved = _resolved_contacts(contacts, lattice)
+    chain = build_chain(lattice, resolved)
+    laws = laws_of_sites(resolved, len(chain.sites)) or (contact_of(resolved),) * len(chain.sites)
+    impacts = {*zip(laws, chain.reduced_masses(), strict=True)}
+    return max((np.pi / law.impact_time(speed, mass) for law, mass in impacts), default=None)
 
 
 def _resolved_lattice(lattice: LatticeTable, cell: UnitCell, drive: DriveTable) -> LatticeTable:
@@ -313,8 +339,8 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
 def check_unsprung(drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
     """A lattice that contacts alone join has no bands from which times could follow."""
     remedy = "missing; without springs there are no bands that it follows from"
-    # The frequency of other waveforms follows from their own keys.
-    if drive.frequency is None and drive.is_sine:
+    # The frequency of other waveforms follows from their own keys, that of a struck lattice from what is struck.
+    if drive.frequency is None and drive.is_sine and drive.amplitude != 0:
         yield Problem("drive.frequency", None, remedy)
     if time.end == "traverse":
         yield Problem("time.end", time.end, remedy)

@@ -5,7 +5,6 @@ import numpy as np
 from vipetsc.case import Case
 from vipetsc.case.absorbing import reflected, reflected_at, sections_of, sources_of
 from vipetsc.case.contacts import describe_stops
-from vipetsc.case.initial import InitialTable
 from vipetsc.case.warnings import losses
 from vipetsc.cli.tables import first_few
 from vipetsc.lattice import gaps, pass_bands
@@ -73,23 +72,3 @@ def describe_losses(case: Case) -> str:
             sentence += f" (asked {asked:.3g})"
         sentences.append(sentence)
     return "; ".join(sentences)
-
-
-def describe_initial(initial: InitialTable | None) -> str:
-    """Initial motion in words; empty for a lattice at rest."""
-    if initial is None:
-        return ""
-    if initial.kind == "file":
-        if initial.time is not None:
-            return f"{initial.path} at {initial.time:g} s"
-        if initial.orbit is not None:
-            return f"{initial.path}, orbit {initial.orbit}"
-        return str(initial.path)
-
-    size = f"{initial.amplitude:.4g} m" if initial.amplitude else f"{initial.energy:.4g} J"
-    if initial.kind == "mode":
-        return f"mode {initial.number or f'near {initial.near:g} rad/s'}, {size}"
-    return (
-        f"a packet of band {initial.band} about kappa = {(initial.wavenumber or 0) / np.pi:.4f} pi,"
-        f" {initial.width:g} cells wide in cell {initial.cell}, {size}"
-    )

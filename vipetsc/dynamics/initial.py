@@ -53,6 +53,12 @@ def _fields(model: Model, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         return _read_fields(initial, layout)
 
     assert initial.amplitude
+    if initial.kind == "velocity":
+        v = np.zeros((layout.stop - layout.start, chain.cell.dofs))
+        for _, strike in initial.strikes:
+            if layout.start < strike.cell <= layout.stop:
+                v[strike.cell - 1 - layout.start, strike.mass - 1] = strike.velocity
+        return np.zeros_like(v), v
     if initial.kind == "packet":
         u, v = initial.packet(chain.cell).on(chain, layout.start, layout.stop)
         return initial.amplitude * u, initial.amplitude * v

@@ -76,11 +76,12 @@ class State(NamedTuple):
         return frozenset(self.cell[is_moving].tolist())
 
     def frequency(self) -> float | None:
-        """Frequency in rad/s of an orbit, or of a run's drive; None for a state alone."""
+        """Frequency in rad/s of an orbit, of a run's drive or of the motion it began with; None for a state alone."""
         if self.period:
             return 2 * np.pi / self.period
         if self.case:
-            return float(tomllib.loads(self.case)["drive"]["frequency"])
+            case = tomllib.loads(self.case)
+            return float(case["drive"].get("frequency") or case["initial"]["frequency"])
         return None
 
     def largest(self, frequency: float) -> tuple[float, int]:

@@ -51,29 +51,34 @@ def write_bands(case: Case, folder: Path, as_json: bool) -> str:
     from vipetsc.figures.registry import draw_bands
 
     cell = case.lattice.unit_cell()
-    numbers = bands_table(cell) | damping_table(cell, case.drive.frequency or 0.0)
+    numbers = bands_table(cell) | damping_table(cell, case.wave_frequency or 0.0)
     # This rank alone is here, so that the lock must not wait for others.
     with locked(MPI.COMM_SELF, folder):
-        picture = draw_bands(cell, folder / "bands.png", case.drive.frequency)
-        text = json.dumps(numbers | {"picture": str(picture)} | origin(), indent=2)
+        picture: dict[str, str] = {}
+        if cell.springs:
+            picture["picture"] = str(draw_bands(cell, folder / "bands.png", case.wave_frequency))
+        text = json.dumps(numbers | picture | origin(), indent=2)
         write_text(folder / "bands.json", text + "\n")
 
     if as_json:
         return text
-    return f"{bands_report(numbers)}{damping_report(numbers)}\n  {picture}"
+    if not cell.springs:
+        return "no pass bands: contacts alone join the masses, and no wave is linear"
+    return f"{bands_report(numbers)}{damping_report(numbers)}\n  {picture['picture']}"
 
 
 def bands_table(cell: UnitCell) -> dict[str, Any]:
-    """Bands of a cell with edges and largest group velocity, and gaps."""
+    """Bands of a cell with edges and largest group velocity, and gaps; neither of a cell without springs."""
     rows = []
-    for band in pass_bands(cell):
+    edges = pass_bands(cell) if cell.springs else []
+    for band in edges:
         kappa, frequency, speed = max_group_velocity(cell, band.number)
         fastest = {"wavenumber": kappa, "frequency": frequency, "group_velocity": speed}
         rows.append({"band": band.number, "low": band.low, "high": band.high, "max_group_velocity": fastest})
     return {
         "units": {"frequency": "rad/s", "group_velocity": "cells/s", "wavenumber": "rad/cell"},
         "bands": rows,
-        "gaps": [{"low": low, "high": high} for low, high in gaps(pass_bands(cell))],
+        "gaps": [{"low": low, "high": high} for low, high in gaps(edges)],
     }
 
 
@@ -92,7 +97,7 @@ def bands_report(numbers: dict[str, Any]) -> str:
 
 def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
     """Damping ratio and decay time in s of each band's fastest wave; the decay length in cells at ``frequency``."""
-    if not cell.is_damped:
+    if not (cell.is_damped and cell.springs):
         return {}
 
     rows = []

@@ -12,7 +12,7 @@ import numpy as np
 from vipetsc.case import Case, Sweep
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.cli.arguments import CASE, OF_STUDIES, argument
-from vipetsc.cli.case_rows import describe_initial, lattice_rows
+from vipetsc.cli.case_rows import lattice_rows
 from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.messages import logger
 from vipetsc.cli.tables import duration, first_few, table
@@ -79,9 +79,11 @@ def run_rows(case: Case, ranks: int) -> Rows:
     chain = model.chain
     cost = estimate(case, ranks)
 
+    # Where nothing is driven, they are of the motion that the lattice begins with.
+    omega = case.wave_frequency if chain.cell.springs else None
     waves = [
         f"band {band}, kappa = {kappa / np.pi:.4f} pi, v_g = {speed:.2f} cells/s"
-        for band, kappa, speed in waves_at(chain.cell, model.drive.frequency)
+        for band, kappa, speed in waves_at(chain.cell, omega or 0.0)
     ]
     drive_end = max(drive.waveform.duration for drive in model.drives)
     drive_words = f"{drive_end:.6g} s" if drive_end < np.inf else "it goes on"
@@ -106,10 +108,10 @@ def run_rows(case: Case, ranks: int) -> Rows:
 
     return [
         *lattice_rows(case),
-        ("begins with", describe_initial(case.initial)),
-        *(("drive", drive.describe()) for _, drive in case.drive.every),
-        ("waves at Om", ("; ".join(waves) or "none: in a gap") if chain.cell.springs else ""),
-        (f"{noun}, end", f"{drive_words}, {model.end:.6g} s"),
+        ("begins with", case.initial.describe() if case.initial else ""),
+        *(("drive", drive.describe() if drive.amplitude else "none") for _, drive in case.drive.every),
+        ("waves at Om", ("; ".join(waves) or "none: in a gap") if omega else ""),
+        (f"{noun}, end", f"{drive_words}, {model.end:.6g} s") if model.is_driven else ("end", f"{model.end:.6g} s"),
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
         ("engine", f"{cost.engine}: {cost.note}" if cost.note else cost.engine),

@@ -1,0 +1,114 @@
+"""Masses that are struck: the section [initial] with velocities, what it resolves to, and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vipetsc.case import Case, CaseError, LawCase
+
+STIFFNESS = 7.4e9
+MASS = 2.05e-3
+
+
+def beads(initial: dict, **sections: dict) -> Case:
+    """Return five beads that just touch, of which some are struck."""
+    table = {
+        "lattice": {"cells": 5, "ends": "free", "cell": {"masses": [MASS]}},
+        "contacts": {
+            "stiffness": STIFFNESS,
+            "sites": [1, 2, 3, 4],
+            "next_cell": True,
+            "side": "minus",
+            "clearance": 0.0,
+        },
+        "initial": {"kind": "velocity"} | initial,
+        "time": {"end": 1e-3, "sample_interval": 2e-6},
+    }
+    return Case.from_table(table | sections)
+
+
+def test_a_struck_lattice_has_no_frequency_of_a_drive():
+    """Nothing drives it; the frequency of its motion is that of a contact, and its scale that of the fastest mass."""
+    case = beads({"cell": 1, "velocity": 0.1, "more": [{"cell": 5, "velocity": -0.5}]})
+    assert case.drive.frequency is None
+    assert case.wave_frequency is None
+    assert case.drive.amplitude == 0.0
+    # The cell of the motion is that of the fastest mass.
+    assert case.drive.cell == 5
+
+    contact = case.model().contact
+    frequency = np.pi / contact.impact_time(0.5, MASS / 2)
+    assert case.initial.frequency == pytest.approx(frequency)
+    assert case.initial.amplitude == pytest.approx(0.5 / frequency)
+    assert case.model().scale * case.model().drive.frequency == pytest.approx(0.5)
+    assert Case.from_toml(case.to_toml()) == case
+    assert case.initial.describe() == "0.1 m/s of mass 1 of cell 1, -0.5 m/s of mass 1 of cell 5"
+
+
+def test_on_springs_the_frequency_is_that_of_the_mass_while_others_are_held():
+    """Of two springs of 2e4 N/m, and one of 6e3 N/m to its resonator."""
+    springs = [
+        {"start": 1, "end": 1, "stiffness": 2.0e4, "next_cell": True},
+        {"start": 1, "end": 2, "stiffness": 6.0e3},
+    ]
+    lattice = {"cells": 20, "cell": {"masses": [0.01, 0.004], "springs": springs}}
+    initial = {"kind": "velocity", "cell": 3, "velocity": 1.0}
+    case = Case(lattice=lattice, initial=initial)
+    assert case.initial.frequency == pytest.approx(np.sqrt(4.6e4 / 0.01))
+    assert Case(lattice=lattice, initial=initial | {"mass": 2}).initial.frequency == pytest.approx(np.sqrt(6e3 / 0.004))
+
+    # A drive has a frequency of its own.
+    driven = Case(lattice=lattice, initial=initial, drive={"amplitude": 1.0, "frequency": 900.0})
+    assert driven.drive.frequency == 900.0
+    assert driven.initial.frequency is None
+
+
+@pytest.mark.parametrize(
+    ("initial", "message"),
+    [
+        ({"cell": 1}, r"initial\.velocity: missing; kind = 'velocity' needs cell, velocity"),
+        ({"cell": 1, "velocity": 0.0}, r"initial\.velocity = 0\.0: must not be zero; give it in m/s"),
+        ({"cell": 9, "velocity": 1.0}, r"initial\.cell = 9: outside the lattice; cells count from 1 to 5"),
+        ({"cell": 1, "mass": 2, "velocity": 1.0}, r"initial\.mass = 2: the cell has 1 masses"),
+        ({"cell": 1, "velocity": 1.0, "number": 2}, r"initial\.number = 2: belongs to another kind than 'velocity'"),
+        (
+            {"cell": 1, "velocity": 1.0, "more": [{"cell": 1, "velocity": 2.0}]},
+            r"initial\.more\[1\]\.cell = 1: mass 1 of this cell is struck already",
+        ),
+        (
+            {"cell": 1, "velocity": 1.0, "more": [{"cell": 6, "velocity": 2.0}]},
+            r"initial\.more\[1\]\.cell = 6: outside the lattice",
+        ),
+        ({"cell": 1, "velocity": 1.0, "more": [{"cell": 2, "speed": 2.0}]}, r"initial\.more\[1\]\.speed"),
+        ({"kind": "zero", "velocity": 1.0}, r"initial\.velocity = 1\.0: belongs to another kind than 'zero'"),
+    ],
+)
+def test_what_is_refused(initial, message):
+    """Each problem names its key, the value and what to do."""
+    with pytest.raises(CaseError, match=message):
+        beads(initial)
+
+
+def test_two_frequencies_are_refused():
+    """The frequency of a drive is the reference where there is one."""
+    initial = {"cell": 1, "velocity": 1.0, "frequency": 1e4}
+    with pytest.raises(
+        CaseError, match=r"initial\.frequency = 10000\.0: the drive has a frequency; leave this one out"
+    ):
+        beads(initial, drive={"amplitude": 1.0, "frequency": 2e4})
+    assert beads(initial).model().drive.frequency == 1e4
+
+
+def test_lossy_sites_at_rest_are_refused_next_to_struck_ones():
+    """A site with a loss that touches at rest has no approach velocity; that of the struck mass has one."""
+    lossy = {"stiffness": STIFFNESS, "next_cell": True, "side": "minus", "clearance": 0.0, "restitution": 0.9}
+    with pytest.raises(CaseError, match="site 1 touches its stop at rest"):
+        beads({"cell": 1, "velocity": 1.0}, contacts=lossy | {"sites": [3]})
+    assert beads({"cell": 3, "velocity": 1.0}, contacts=lossy | {"sites": [3]})
+
+
+def test_verbs_about_waves_refuse_it():
+    """A law is about a wave in a lattice at rest."""
+    with pytest.raises(CaseError, match=r"initial\.kind = 'velocity': this verb is about a wave in a lattice at rest"):
+        LawCase.from_table({"initial": {"kind": "velocity", "cell": 1, "velocity": 1.0}, "law": {}})

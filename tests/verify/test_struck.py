@@ -1,0 +1,73 @@
+"""Struck masses move as theory says, on both engines, and pictures and measures of such runs are made."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+
+from tests.conftest import simulated
+from vipetsc.case import Case
+from vipetsc.studies.analysis import analyse
+
+pytestmark = pytest.mark.parallel(1)
+
+
+def test_a_struck_bead_gives_its_velocity_to_the_next():
+    """Of two equal beads the struck one stops and the other goes on, as momentum and energy ask."""
+    case = Case(
+        lattice={"cells": 2, "ends": "free", "cell": {"masses": [2.05e-3]}},
+        contacts={"stiffness": 7.4e9, "sites": [1], "next_cell": True, "side": "minus", "clearance": 1e-6},
+        initial={"kind": "velocity", "cell": 1, "velocity": 0.5},
+        time={"end": 2e-4, "sample_interval": 1e-6},
+    )
+    data, result = simulated(case)
+    velocity = data["velocity"].values[:, :, 0]
+    assert velocity[0].tolist() == [0.5, 0.0]
+    assert velocity[-1] == pytest.approx([0.0, 0.5], abs=1e-9)
+    assert result.statistics["episodes"] == 1
+    # The work begins with what the lattice was given.
+    assert data["energy/work"].values[0] == pytest.approx(0.5 * 2.05e-3 * 0.5**2)
+    # The first contact is after the clearance.
+    assert data["impacts/onset"].values[0] == pytest.approx(1e-6 / 0.5)
+
+
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+def test_a_struck_chain_moves_as_its_modes(engine):
+    """Without contacts the motion is the sum of all modes, each with its part of the two velocities."""
+    springs = [
+        {"start": 1, "end": 1, "stiffness": 2.0e4, "next_cell": True},
+        {"start": 1, "end": 2, "stiffness": 6.0e3},
+    ]
+    case = Case(
+        lattice={"cells": 12, "cell": {"masses": [0.01, 0.004], "springs": springs}},
+        initial={
+            "kind": "velocity", "cell": 2, "velocity": 1.0, "more": [{"cell": 12, "mass": 2, "velocity": -0.3}]
+        },
+        time={"end": 0.02, "engine": engine, "rtol": 1e-12},
+    )  # fmt: skip
+    data, _ = simulated(case)
+
+    chain = case.model().chain
+    masses = chain.masses()
+    squares, shapes = eigh(chain.stiffness_matrix().toarray(), np.diag(masses))
+    omega = np.sqrt(squares)
+    velocity = np.zeros(24)
+    velocity[2] = 1.0
+    velocity[23] = -0.3
+    parts = shapes.T @ (masses * velocity)
+    exact = np.sin(np.outer(data["time"].values, omega)) * (parts / omega) @ shapes.T
+    assert data["displacement"].values.reshape(-1, 24) == pytest.approx(exact, abs=1e-9 * np.abs(exact).max())
+
+
+def test_its_measures_are_taken():
+    """A run that begins with a velocity is measured as others are."""
+    case = Case(
+        lattice={"cells": 24},
+        contacts={"sites": [6, 12], "clearance": 1e-5},
+        initial={"kind": "velocity", "cell": 1, "velocity": 0.5},
+        time={"end": 0.02},
+    )
+    data, _ = simulated(case)
+    analysis = analyse(data)
+    assert {"kinetic_energy", "dispersion", "modal/energy"} & {*map(str, analysis.data_vars)}
