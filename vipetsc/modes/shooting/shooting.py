@@ -19,7 +19,7 @@ from vipetsc.modes.shooting.flow import Arc, Flow
 from vipetsc.modes.shooting.graze import Touch, graze
 from vipetsc.modes.shooting.maps import ShootingMap
 from vipetsc.modes.shooting.orbit import resonance
-from vipetsc.modes.shooting.stability import half_traces, multipliers
+from vipetsc.modes.shooting.stability import HalfTraceAbove, half_traces, multipliers, real_half_traces
 from vipetsc.modes.system import System
 
 # A half-trace is (lambda + 1/lambda)/2 of a pair of multipliers. Along narrow tongues it only touches +-1: a change of
@@ -356,7 +356,7 @@ class Shooting(ShootingEquations[Arc]):
         if self.map.quarter:
             levels = {1.0: "branch-point", -1.0: "symmetry-breaking", 0.0: "period-doubling"}
         for level, name in levels.items():
-            for i in range(self.system.dofs - 1):
+            for i in real_half_traces(left, right):
                 yield SpecialKind(name, HalfTraceAbove(i, level), LEAST_CROSSING)
         if left.episodes != right.episodes:
             yield SpecialKind(
@@ -376,18 +376,6 @@ class Shooting(ShootingEquations[Arc]):
     def with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
         """A fold of the energy with the resonance whose tongue it begins or ends."""
         return replace(fold, resonance=resonance(self, fold))
-
-
-class HalfTraceAbove:
-    """Distance of half-trace ``number`` (from 0) of a point above a ``level``."""
-
-    def __init__(self, number: int, level: float) -> None:
-        self.number = number
-        self.level = level
-
-    def __call__(self, point: Point) -> float:
-        """The difference at a point."""
-        return float(np.real(point.half_traces[self.number])) - self.level
 
 
 def without_touch(grazing: Point, left: Point, right: Point) -> Point:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from vipetsc.modes.point import Point
 from vipetsc.modes.shooting.flow import Arc
 from vipetsc.modes.shooting.maps import ShootingMap
 from vipetsc.modes.system import System
@@ -55,3 +56,24 @@ def multipliers(traces: np.ndarray, quarter: bool) -> np.ndarray:
     mu = np.where(np.abs(c + root) >= np.abs(c - root), c + root, c - root)  # the larger one, no cancellation
     mu = np.concatenate([mu, 1 / mu])
     return mu**2 if quarter else mu
+
+
+def real_half_traces(left: Point, right: Point) -> list[int]:
+    """Numbers (from 0) of the half-traces that are real at one of two points or at both.
+
+    A complex one belongs to multipliers off the real axis, which do not come to 1 or -1, whatever its real part does.
+    """
+    are_complex = (np.imag(left.half_traces) != 0) & (np.imag(right.half_traces) != 0)
+    return np.flatnonzero(~are_complex).tolist()
+
+
+class HalfTraceAbove:
+    """Distance of half-trace ``number`` (from 0) of a point above a ``level``."""
+
+    def __init__(self, number: int, level: float) -> None:
+        self.number = number
+        self.level = level
+
+    def __call__(self, point: Point) -> float:
+        """The difference at a point."""
+        return float(np.real(point.half_traces[self.number])) - self.level

@@ -1,0 +1,35 @@
+"""Which half-traces of Floquet multipliers may come to a level between two points of a branch."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from vipetsc.modes.shooting.stability import HalfTraceAbove, real_half_traces
+
+pytestmark = pytest.mark.parallel(1)
+
+
+def point(*half_traces: complex) -> SimpleNamespace:
+    return SimpleNamespace(half_traces=np.array(half_traces))
+
+
+def test_all_real_half_traces_may_cross_a_level():
+    assert real_half_traces(point(-0.2, 0.9), point(-0.1, 1.1)) == [0, 1]
+
+
+def test_a_pair_that_stays_complex_crosses_none():
+    """Its multipliers, a quadruple off the real axis and off the unit circle, are not 1 where its real part is."""
+    before = point(-0.5, 0.9 - 0.2j, 0.9 + 0.2j)
+    after = point(-0.5, 1.1 - 0.2j, 1.1 + 0.2j)
+    assert real_half_traces(before, after) == [0]
+
+
+def test_a_pair_that_collides_within_the_step_may_cross():
+    assert real_half_traces(point(0.9 - 0.1j, 0.9 + 0.1j), point(0.95, 1.1)) == [0, 1]
+
+
+def test_a_half_trace_is_measured_from_its_level_by_its_real_part():
+    assert HalfTraceAbove(1, -1.0)(point(0.3, -0.75 + 0.1j)) == pytest.approx(0.25)
