@@ -220,8 +220,8 @@ def set_words(*changes: str) -> list[str]:
 def clean_environment() -> dict[str, str]:
     """The environment without what this process's own MPI put into it: a child may then be an mpirun.
 
-    Ranks of tests are on one machine: without its layers for networks, Open MPI 5 writes no lines about interfaces among
-    those that the program prints, and Open MPI 4 starts in a quarter of the time that it takes to look for some of them.
+    Ranks of tests are on one machine. Without its layers for networks Open MPI 5 writes no lines about interfaces among
+    those that the program prints, and Open MPI 4 starts in a quarter of the time that it takes to try some of them.
     """
     kept = {name: value for name, value in os.environ.items() if not NAMES_OF_RANKS.match(name)}
     as_root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
