@@ -234,6 +234,12 @@ def test_members_that_failed_are_gaps_and_counted():
     assert "1 of 12 members failed" in title(figure)
 
 
+def test_a_value_that_is_not_finite_is_no_largest():
+    ensemble = ensemble_of(AMPLITUDES)
+    ensemble["ibtet"][0] = np.inf
+    assert "largest (ring): 0.06 at drive.amplitude 32 N" in title(only(ensemble))
+
+
 def test_what_cannot_be_drawn_has_a_reason():
     ensemble = ensemble_of(AMPLITUDES)
     assert reason_without_page(ensemble, "ibtet", by_name=True) == ""
@@ -265,7 +271,7 @@ def test_the_amplitude_has_the_unit_of_its_drive(drive):
     [("contacts.clearance", "m"), ("contacts.restitution", ""), ("lattice.cell.masses", "kg"), ("disorder.seed", "")],
 )
 def test_units_are_those_of_the_manual(path, unit):
-    assert unit_of(path) == unit
+    assert unit_of(path, {}) == unit
 
 
 def test_values_are_told_apart_in_few_digits():

@@ -13,8 +13,10 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from vipetsc.case.case import Case
+from vipetsc.case.case_file import Table
 from vipetsc.case.schema import MULTIPLE_OF_PI
 from vipetsc.case.verb_cases import SECTIONS
+from vipetsc.case.waveforms import DEFAULT, WAVEFORMS
 from vipetsc.lattice.contact import PARAMETERS
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -39,8 +41,14 @@ def unit_and_text(name: str, key: str) -> tuple[str, str]:
     return unit, text
 
 
-def unit_of(path: str) -> str:
-    """Unit of the key with that ``path`` in a case (``contacts.clearance``); empty where it has none of its own."""
+def unit_of(path: str, case: Table) -> str:
+    """Unit of the key with that ``path`` in a ``case`` (``contacts.clearance``); empty where it has none of its own.
+
+    An amplitude has that of its waveform, or of the wall that it moves.
+    """
+    drive = case.get("drive", {})
+    if path == "drive.amplitude":
+        return "m" if "end" in drive else WAVEFORMS[drive.get("waveform") or DEFAULT].unit
     section, *keys = path.split(".")
     table: type[BaseModel] | None = SECTIONS.get(section)
     for key in keys[:-1]:

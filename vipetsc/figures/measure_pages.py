@@ -121,7 +121,7 @@ class Measure(NamedTuple):
             name=name,
             unit="" if unit == "1" else unit,
             text=str(values.attrs.get("long_name", "")),
-            values=values.isel(fixed),
+            values=values.isel(fixed).where(np.isfinite),
             band=band and (band[0].isel(fixed), band[1].isel(fixed)),
             samples=samples,
             axes=tuple(axis for axis in axes if axis.size > 1),

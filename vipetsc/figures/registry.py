@@ -220,7 +220,7 @@ def draw(
         Contents of the folders: "run" (one folder), "sweep" (perhaps with branches), "branches" (of the same
         names, side by side), "design", "optimum", "law" or "prediction" (one folder).
     names
-        Figures, by default all.
+        Figures, and of sweeps measures; by default all figures, and the measures that most readers look at.
     rank, ranks
         Every ``ranks``-th picture from number ``rank`` on is drawn.
     newest

@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case.keys import unit_of
-from vipetsc.case.waveforms import DEFAULT, WAVEFORMS
 from vipetsc.io.read import axes as axes_of
 
 FEW_TOGETHER = 6  # values of keys that vary together and stand as categories
@@ -154,15 +153,7 @@ class SweptAxis(NamedTuple):
 def _swept_key(values: xr.DataArray, case: dict[str, Any]) -> SweptKey:
     """Return the key whose ``values`` are a coordinate of the sweep of ``case``."""
     path = str(values.attrs["long_name"])
-    unit = _unit_of_amplitude(case.get("drive", {})) if path == "drive.amplitude" else unit_of(path)
-    return SweptKey(path, unit, values.values)
-
-
-def _unit_of_amplitude(drive: dict[str, Any]) -> str:
-    """Return the unit of the amplitude of what the table ``drive`` does: move an end, hit, or push."""
-    if "end" in drive:
-        return "m"
-    return WAVEFORMS[drive.get("waveform", DEFAULT)].unit
+    return SweptKey(path, unit_of(path, case), values.values)
 
 
 def even_scale(values: np.ndarray) -> str:

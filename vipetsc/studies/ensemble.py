@@ -12,6 +12,7 @@ import xarray as xr
 import vipetsc
 from vipetsc.case import Sweep
 from vipetsc.case.disorder import SEED
+from vipetsc.case.keys import unit_of
 from vipetsc.case.sweep import coordinate
 from vipetsc.io.folder import origin
 from vipetsc.io.netcdf import Variables, variable, write_netcdf
@@ -32,16 +33,6 @@ STATISTICS = {
     "dissipated_fraction": ("", "1", "dissipated energy over the drive's work"),
     "work": ("", "J", "work done by the drive"),
     "ledger_error": ("", "1", "largest error of the energy ledger over the work"),
-}
-UNITS = {
-    AMPLITUDE: "N",
-    "drive.frequency": "rad/s",
-    "drive.wavenumber": "rad/cell",
-    "time.end": "s",
-    "time.sample_interval": "s",
-    "contacts.clearance": "m",
-    "contacts.modulus": "Pa",
-    "contacts.radius": "m",
 }
 FIT = {
     "peak_amplitude": ("N", "amplitude of the largest value"),
@@ -237,7 +228,7 @@ def _coordinates(plan: Sweep) -> Variables:
     data: Variables = {}
     for axis, dimension in zip(plan.axes, _dimensions(plan), strict=True):
         for key, values in axis.items():
-            data[names[key]] = variable(dimension, coordinate(values), UNITS.get(key, "1"), key)
+            data[names[key]] = variable(dimension, coordinate(values), unit_of(key, plan.table) or "1", key)
     return data
 
 
