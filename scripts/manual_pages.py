@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import json
 import re
 import shutil
 import sys
@@ -29,6 +30,7 @@ from vipetsc.case.keys import chapter as all_keys
 PACKAGE = ROOT / "vipetsc"
 CHAPTERS = PACKAGE / "manual"
 GALLERY = CHAPTERS / "gallery"
+NOTEBOOKS = CHAPTERS / "notebooks"
 # Pages that are no chapters.
 START = "start"
 KEYS = "case-keys"
@@ -68,7 +70,11 @@ def write_sources(folder: Path, packages: list[str]) -> None:
         text = (CHAPTERS / f"{name}.md").read_text(encoding="utf-8")
         if name == GALLERY.name:
             text += contents("", re.findall(r"\]\((gallery/[\w-]+)\.md\)", text))
+        if name == NOTEBOOKS.name:
+            text += contents("", [f"notebook-{path.stem}" for path in sorted(NOTEBOOKS.glob("*.ipynb"))], hidden=False)
         put(folder / f"{name}.md", text, CHAPTERS)
+    for path in NOTEBOOKS.glob("*.ipynb"):
+        put(folder / f"notebook-{path.stem}.md", notebook_page(path), CHAPTERS)
     for path in GALLERY.glob("*.md"):
         text = path.read_text(encoding="utf-8")
         put(folder / GALLERY.name / path.name, text + case_files(text), GALLERY)
@@ -95,6 +101,15 @@ def case_files(text: str) -> str:
         if path.exists():
             blocks.append(f"\n## {name}\n\n```toml\n{path.read_text(encoding='utf-8')}```\n")
     return "".join(blocks)
+
+
+def notebook_page(path: Path) -> str:
+    """The cells of a notebook as a page: text as it stands, code in blocks."""
+    parts = []
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        text = "".join(cell["source"])
+        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+    return "\n\n".join(parts) + "\n"
 
 
 def put(path: Path, text: str, home: Path) -> None:
