@@ -163,6 +163,9 @@ def test_keys_that_vary_together_are_named_together():
     together = {"contacts.sites": [[9], [9, 20], [9]], "drive.cycles": [4, 4, 6]}
     figure = only(ensemble_of(together, AMPLITUDES))
     assert legend(figure)[1] == "contacts.sites [9, 20], drive.cycles 4"
+    pairs = {"drive.frequency": [900.0, 1000.0, 1100.0], "drive.cycles": [3, 4, 5]}
+    labels = [text.translate(BLANKS) for text in legend(only(ensemble_of(pairs, AMPLITUDES)))]
+    assert labels[1] == "drive.frequency 1000 rad/s, drive.cycles 4"
 
 
 def test_what_does_not_vary_stands_nowhere():
@@ -277,6 +280,8 @@ def test_units_are_those_of_the_manual(path, unit):
 def test_values_are_told_apart_in_few_digits():
     (axis,) = SweptAxis.all_of(ensemble_of({"drive.frequency": [1000.0, 1000.5, 1100.0]}))
     assert axis.value_texts == ["1000", "1000.5", "1100"]
+    (axis,) = SweptAxis.all_of(ensemble_of({"drive.frequency": [600.0, 1000.0, 1100.0]}))
+    assert axis.value_texts == ["600", "1000", "1100"]
     long = [[*range(40)], [*range(41)]]
     (axis,) = SweptAxis.all_of(ensemble_of({"contacts.sites": long}))
     assert len(set(axis.texts)) == 2
@@ -289,6 +294,12 @@ def test_a_logarithmic_axis_has_three_labels_at_least(low, ratio):
     assert 3 <= len(ticks) <= 10
     assert low * 0.999 <= min(ticks)
     assert max(ticks) <= low * ratio * 1.001
+
+
+def test_labels_of_a_logarithmic_axis_are_round():
+    assert log_ticks(1.0, 12.0) == [1, 3, 10]
+    assert log_ticks(0.9, 1100.0) == [1, 10, 100, 1000]
+    assert log_ticks(0.2, 1.1) == [0.2, 0.5, 1]
 
 
 def test_edges_of_a_map_lie_between_its_positions():
