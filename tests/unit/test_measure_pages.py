@@ -313,6 +313,30 @@ def test_scales_follow_the_spacing():
     assert even_scale(np.array([-1.0, 1.0, 10.0])) == "linear"
 
 
+def test_a_lattice_of_one_band_has_its_page():
+    ensemble = ensemble_of(RESTITUTIONS, AMPLITUDES, parts=2)
+    figure = only(ensemble, "bands/share")
+    assert legend(figure) == ["contacts.restitution 0.3", "contacts.restitution 0.9"]
+    np.testing.assert_allclose(curves(panels(figure)[0])[0].get_ydata(), ensemble["bands/share"][0, :, 1])
+
+    without = ensemble_of(AMPLITUDES, parts=1)
+    assert reason_without_page(without, "bands/share", by_name=True) == "the cell has no pass band"
+
+
+def test_samples_of_bands_are_those_of_the_bands():
+    ensemble = ensemble_of({"disorder.seed": list(range(8))}, {"contacts.law": ["hertz"]}, parts=3)
+    for name in ("contact_episodes", "bands/share"):
+        values = ensemble[name]
+        quantiles = values.quantile([0.05, 0.95], dim="seed")
+        ensemble[f"statistics/{name}/mean"] = values.mean("seed")
+        ensemble[f"statistics/{name}/quantiles"] = quantiles.drop_vars("quantile")
+    ensemble["statistics/samples"] = ensemble["contact_episodes"].count("seed")
+    figures = drawn(ensemble, "bands/share")
+    assert list(figures) == ["bands_share-over-disorder.seed-band"]
+    points = [line for line in panels(figures.popitem()[1])[0].lines if line.get_label().startswith("samples")]
+    np.testing.assert_allclose([line.get_ydata() for line in points], ensemble["bands/share"][:, 0, 1:].T)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("numbers", [0, 1, 2, 3])
 @pytest.mark.parametrize("words", [0, 1, 2])

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.figures.measure_panels import Curve, LargestOnMap, MeasurePage, draw_curves, draw_maps, draw_samples
 from vipetsc.figures.style import Drawing
-from vipetsc.figures.sweep_members import table
+from vipetsc.figures.sweep_members import in_file_name, table
 from vipetsc.figures.swept_axes import SweptAxis, SweptKey, joined
 from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import over_samples
@@ -25,7 +25,8 @@ MOST_CURVES = 6
 MOST_PANELS = 16
 MOST_PAGES = 12  # of a measure; a longer study is cut through its largest value
 LEAST_ON_A_MAP = 3  # values of a number that is an axis of a map
-PART = "part"
+PART = "part"  # the dimension of parts of the frequency axis
+BAND = "band"  # how those begin that are pass bands
 LONGEST_STEM = 150  # letters: file systems take 255, and figures of a report have prefixes
 
 # Not about the lattice's motion, but about the members and how well they were computed.
@@ -95,37 +96,35 @@ class Measure(NamedTuple):
     @classmethod
     def of(cls, ensemble: xr.Dataset, name: str) -> Self:
         """Return the measure ``name`` of an ensemble, means over its samples if it has any."""
-        samples = _seeds(ensemble).size
         means = over_samples(ensemble)
         values = means[name]
-        band = None
+        ends = []
         if f"statistics/{name}/quantiles" in means:
             quantiles = means[f"statistics/{name}/quantiles"]
-            band = (quantiles.isel(quantile=0), quantiles.isel(quantile=-1))
+            ends = [quantiles.isel(quantile=0), quantiles.isel(quantile=-1)]
 
         axes = SweptAxis.all_of(means)
+        place: dict[str, Any] = {}
         if PART in values.dims:
-            parts = [str(part) for part in np.atleast_1d(values.attrs["parts"])]
-            bands = [number for number, part in enumerate(parts) if part.startswith("band")]
-            numbers = np.array([parts[number].removeprefix("band ") for number in bands], dtype=object)
-            values = values.isel(part=bands)
-            band = band and (band[0].isel(part=bands), band[1].isel(part=bands))
-            axes.append(SweptAxis(PART, (SweptKey("band", "", numbers),)))
-
+            numbers, bands = _bands_of(values)
+            place[PART] = numbers
+            axes += [bands]
         # Axes of one value have no part in a picture.
+        axes = [axis for axis in axes if axis.size > 1]
         shown = {axis.dimension for axis in axes}
-        fixed = {dimension: 0 for dimension in values.dims if dimension not in shown}
-        episodes = means["contact_episodes"]
+        first = {str(dimension): 0 for dimension in values.dims if dimension not in shown}
+        values, *ends = (item.isel(place).isel(first) for item in (values, *ends))
+
         unit = str(values.attrs.get("units", "1"))
         return cls(
             name=name,
             unit="" if unit == "1" else unit,
             text=str(values.attrs.get("long_name", "")),
-            values=values.isel(fixed).where(np.isfinite),
-            band=band and (band[0].isel(fixed), band[1].isel(fixed)),
-            samples=samples,
-            axes=tuple(axis for axis in axes if axis.size > 1),
-            failed=episodes.isel({d: 0 for d in episodes.dims if d in fixed}).isnull(),
+            values=values.where(np.isfinite),
+            band=(ends[0], ends[1]) if ends else None,
+            samples=_seeds(ensemble).size,
+            axes=tuple(axes),
+            failed=means["contact_episodes"].isel(first, missing_dims="ignore").isnull(),
         )
 
     @property
@@ -151,6 +150,14 @@ class Measure(NamedTuple):
     def place_text(self, place: Mapping[str, int]) -> str:
         """Return what the keys are at the indices ``place``."""
         return ", ".join(axis.texts[place[axis.dimension]] for axis in self.axes if axis.dimension in place)
+
+
+def _bands_of(values: xr.DataArray) -> tuple[list[int], SweptAxis]:
+    """Return the indices of the pass bands among the parts of the frequency axis, and the axis of the bands alone."""
+    parts = [str(part) for part in np.atleast_1d(values.attrs["parts"])]
+    indices = [index for index, part in enumerate(parts) if part.startswith(BAND)]
+    numbers = np.array([parts[index].removeprefix(f"{BAND} ") for index in indices], dtype=object)
+    return indices, SweptAxis(PART, (SweptKey(BAND, "", numbers),))
 
 
 def _seeds(ensemble: xr.Dataset) -> np.ndarray:
@@ -189,6 +196,8 @@ def reason_without_page(ensemble: xr.Dataset, name: str, by_name: bool) -> str:
     values = ensemble[name].values
     if not np.isfinite(values).any():
         return "no member has a value"
+    if PART in ensemble[name].dims and not _bands_of(ensemble[name])[0]:
+        return "the cell has no pass band"
     if not by_name and not np.nan_to_num(values).any():
         return "0 for every member"
     if not SweptAxis.all_of(over_samples(ensemble)) and _seeds(ensemble).size < 2:
@@ -199,49 +208,56 @@ def reason_without_page(ensemble: xr.Dataset, name: str, by_name: bool) -> str:
 def measure_pages(ensemble: xr.Dataset, name: str, sweep: str = "") -> Iterator[Drawing]:
     """Offer the pages of the measure ``name``; ``sweep`` names it where pictures of several lie in one folder."""
     measure = Measure.of(ensemble, name)
-    begin = "-".join(filter(None, [figure_name(name), sweep]))
-    heading = f"{table(ensemble)['name']}: {name}, {measure.text}"
-    if not SweptAxis.all_of(over_samples(ensemble)):
-        samples = np.atleast_2d(ensemble[name].squeeze().transpose(..., "seed").values)
-        yield Drawing(
-            f"{begin}-over-disorder.seed", partial(_samples_page, measure, heading, _seeds(ensemble), samples)
-        )
-        return
+    keys = [key.path for axis in measure.axes for key in axis.keys]
+    heading = f"{table(ensemble)['name']}: {name}"
+    if measure.text != name.replace("_", " "):
+        heading += f", {measure.text}"
 
+    begin = "-".join(filter(None, [figure_name(name), sweep, "over"]))
+    if set(keys) <= {BAND}:
+        stem = in_file_name("-".join([begin, "disorder.seed", *keys]))
+        yield Drawing(stem, partial(_samples_page, ensemble, measure, heading))
+        return
+    stem = in_file_name("-".join([begin, *keys]))[:LONGEST_STEM]
+    yield from _pages_over_keys(measure, heading, stem)
+
+
+def _pages_over_keys(measure: Measure, heading: str, stem: str) -> Iterator[Drawing]:
+    """Offer a page, or one at each value of the keys for which a page has no room."""
     roles = Roles.of(measure.axes)
-    stem = _file_name(f"{begin}-over-{'-'.join(key.path for axis in measure.axes for key in axis.keys)}")
-    places = list(product(*(range(axis.size) for axis in roles.pages)))
+    dimensions = [axis.dimension for axis in roles.pages]
+    places = [dict(zip(dimensions, index, strict=True)) for index in product(*(range(a.size) for a in roles.pages))]
     cut = ""
     if len(places) > MOST_PAGES:
         best = measure.largest()
-        places = [tuple(best[axis.dimension] for axis in roles.pages)]
+        places = [{dimension: best[dimension] for dimension in dimensions}]
         cut = "through the largest value of all: "
-    for number, indices in enumerate(places, 1):
-        place = {axis.dimension: index for axis, index in zip(roles.pages, indices, strict=True)}
+
+    for number, place in enumerate(places, 1):
         page = measure.at(place)
-        if not np.isfinite(page.values).any():
-            continue
-        title = [heading, cut + measure.place_text(place)]
-        page_stem = f"{stem}-{number}" if roles.pages else stem
-        yield Drawing(page_stem, partial(_page, page, roles, title))
+        if np.isfinite(page.values).any():
+            page_stem = f"{stem}-{number}" if dimensions else stem
+            yield Drawing(page_stem, partial(_page, page, roles, [heading, cut + measure.place_text(place)]))
 
 
-def _file_name(text: str) -> str:
-    """Return ``text`` in characters that every file system takes."""
-    allowed = "".join(c if (c.isascii() and c.isalnum()) or c in "-._" else "-" for c in text)
-    return allowed[:LONGEST_STEM]
+def _samples_page(ensemble: xr.Dataset, measure: Measure, heading: str) -> Figure:
+    """Draw a measure of every sample over its seed, for each pass band if it has parts."""
+    dimension = _seed_dimension(ensemble)
+    values = ensemble[measure.name].isel({other: 0 for other in axes_of(ensemble) if other != dimension})
+    names = [""]
+    if PART in values.dims:
+        indices, bands = _bands_of(values)
+        values = values.isel(part=indices)
+        names = [f"{text}: " for text in bands.texts]
+    series = np.atleast_2d(values.transpose(..., dimension).values)
 
-
-def _samples_page(measure: Measure, heading: str, seeds: np.ndarray, series: Sequence[np.ndarray]) -> Figure:
-    """Draw a measure of every sample over its seed: ``series`` (part, sample)."""
     labels = []
-    for name, values in zip(measure.axes[0].texts if measure.axes else [""], series, strict=False):
-        low, high = np.nanquantile(values, (0.05, 0.95))
-        text = f"mean {np.nanmean(values):.4g}, 5 to 95 % of samples: {low:.4g} to {high:.4g}"
-        labels.append(f"{name}: {text}" if name else text)
-    page = MeasurePage(measure.label, [f"{heading}, of {measure.samples} samples"], labels)
+    for name, samples in zip(names, series, strict=True):
+        low, high = np.nanquantile(samples, (0.05, 0.95))
+        labels.append(f"{name}mean {np.nanmean(samples):.4g}, 5 to 95 % of samples: {low:.4g} to {high:.4g}")
+    page = MeasurePage(measure.label, [heading, f"of {measure.samples} samples"], labels)
     page.lay_out([""])
-    figure = draw_samples(page, seeds, series)
+    figure = draw_samples(page, _seeds(ensemble), list(series))
     page.write_legend()
     return figure
 
@@ -251,7 +267,7 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str]) -> Figure:
     heading, *further = title
     over = joined([axis.label for axis in (roles.x, roles.y) if axis])
     compared = joined([key.label for axis in (*roles.panels, *roles.curves) for key in axis.keys])
-    lines = [f"{heading}, over {over}" + (f", for each {compared}" if compared else ""), *further]
+    lines = [heading, f"over {over}" + (f", for each {compared}" if compared else ""), *further]
     best = measure.largest()
     # Of the bands the driven one has most.
     marks_largest = all(axis.dimension != PART for axis in measure.axes)
