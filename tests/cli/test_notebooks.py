@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -81,15 +80,3 @@ def test_its_cells_run(path, monkeypatch, tmp_path, capsys):
         assert "in s? In ms they would be largest at 10" in printed
         assert printed.splitlines()[-2] == "[]"
         assert names["result"].statistics["episodes"] > 0
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not (find_spec("nbclient") and find_spec("ipykernel")), reason="no nbclient with a kernel")
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_kernel_executes_it(path, tmp_path):
-    """A kernel executes the notebook from top to bottom."""
-    import nbclient
-    import nbformat
-
-    notebook = nbformat.read(path, as_version=4)
-    nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
