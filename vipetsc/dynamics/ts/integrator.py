@@ -252,7 +252,13 @@ class Integrator(Engine):
         """
         comm = self.comm
         tracker = self.tracker
-        owner = comm.allreduce(comm.rank if change.position == position else comm.size, MPI.MIN)
+        candidate = comm.rank if change.position == position else comm.size
+        # A site whose motion is NaN would land for ever; the reduction that finds the owner tells all ranks.
+        if not np.isfinite(tracker.end).all():
+            candidate = -1
+        owner = comm.allreduce(candidate, MPI.MIN)
+        if owner < 0:
+            raise StalledError("the motion of a site is not finite")
         attempt = Landing(length=position * h, longest=h, residual=np.inf, attempts=0)
         outcome = RETRY
         self.counts["landings"] += 1
