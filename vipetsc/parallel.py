@@ -67,6 +67,14 @@ def all_meet(comm: MPI.Comm, patience: float) -> bool:
     return True
 
 
+def on_one_machine(comm: MPI.Comm) -> bool:
+    """Whether all ranks of ``comm`` are on one machine, and see its temporary folders; all must call it."""
+    machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
+    size = machine.size
+    machine.Free()
+    return bool(comm.allreduce(size == comm.size, MPI.LAND))
+
+
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on rank 0, on all ranks; what it raises is raised on all ranks."""
     attempt = _attempt(function) if comm.rank == 0 else None

@@ -117,3 +117,13 @@ def test_text_in_a_table_is_text():
     assert "x &lt; y" in html
     assert "gone" not in html
     assert "none" not in html
+
+
+def test_a_notebook_shows_what_a_sweep_varies():
+    """Each key that varies stands with its values, and the number of members in the title."""
+    values = {"amplitude": [1.0, 2.0], "cycles": list(range(1, 13))}
+    html = Sweep(**TABLE, sweep={"drive": values})._repr_html_()
+    assert "<b>case: 24 members</b>" in html
+    assert "drive.amplitude</th>" in html
+    assert ">1.0, 2.0<" in html
+    assert ">1, 2, 3, 4, 5, 6, 7, 8, ... (12)<" in html

@@ -14,6 +14,7 @@ from tests.conftest import small_case
 from vipetsc.case import CaseError, Sweep
 from vipetsc.dynamics import simulate
 from vipetsc.parallel import StopRequest
+from vipetsc.studies import sweep as sweeps
 from vipetsc.studies.sweep import run_sweep
 
 pytestmark = pytest.mark.parallel(1)
@@ -90,3 +91,10 @@ def test_fields_of_members_need_a_folder():
     """A sweep that keeps the runs of its members is refused without a folder, before anything is simulated."""
     with pytest.raises(CaseError, match=r"sweep\.fields = True: keeps files of every member: name a folder"):
         run_sweep(small_sweep(fields=True))
+
+
+def test_ranks_of_several_machines_need_a_folder(monkeypatch):
+    """A temporary folder of one machine is not seen by the others."""
+    monkeypatch.setattr(sweeps, "on_one_machine", lambda comm: False)
+    with pytest.raises(ValueError, match="ranks on several machines need a folder that all of them see"):
+        run_sweep(small_sweep())

@@ -51,10 +51,10 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
     sites = [f"cell {site + 1}" for site in chain.sites]
     rows = [
         ("lattice", f"{chain.cells} cells of {masses}, {ends} ends"),
-        ("pass bands in rad/s", _first_few(edges)),
+        ("pass bands in rad/s", first_few(edges)),
         ("contact", "; ".join(dict.fromkeys(map(str, laws))) if chain.sites else ""),
-        ("sites", _first_few(sites)),
-        ("clearance", _first_few(describe_stops(model.gaps, chain.clearances))),
+        ("sites", first_few(sites)),
+        ("clearance", first_few(describe_stops(model.gaps, chain.clearances))),
         ("begins with", model.initial.describe() if model.initial else ""),
         ("drive", "; ".join(drives) if model.is_driven else "none"),
         ("end", f"{model.end:.5g} s, {model.samples} samples"),
@@ -63,7 +63,7 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
     return html_table(name, rows, cell_svg(cell, pair))
 
 
-def _first_few(items: Sequence[str]) -> str:
+def first_few(items: Sequence[str]) -> str:
     """The first of ``items``, and how many there are if these are not all."""
     more = f", ... ({len(items)})" if len(items) > MOST_SHOWN else ""
     return ", ".join(items[:MOST_SHOWN]) + more

@@ -17,6 +17,7 @@ from pydantic import Field
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import LARGEST, CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.disorder import SEED
+from vipetsc.case.html import first_few, html_table
 from vipetsc.case.schema import number
 
 MOST_MEMBERS = 1_000_000
@@ -113,6 +114,13 @@ class Sweep(CaseFile):
     def count(self) -> int:
         """Number of members."""
         return math.prod(self.shape)
+
+    def _repr_html_(self) -> str:
+        """The keys that vary and their values, as a notebook shows them."""
+        rows = [
+            (key, first_few([f"{value}" for value in values])) for axis in self.axes for key, values in axis.items()
+        ]
+        return html_table(f"{self.name}: {self.count} members", rows)
 
     def ids(self) -> list[str]:
         """A name for every member, a hash of the table and of what its keys take; equal members have one name."""

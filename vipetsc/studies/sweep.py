@@ -22,7 +22,7 @@ from vipetsc.case.html import html_table
 from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.folder import SWEEP, FolderError, claimed
 from vipetsc.io.read import open_ensemble, outdated
-from vipetsc.parallel import StopRequest, on_every_rank, on_root
+from vipetsc.parallel import StopRequest, on_every_rank, on_one_machine, on_root
 from vipetsc.progress import Progress, say
 from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
 from vipetsc.studies.linear_run import LinearRun, leading_cell, linear_name
@@ -101,7 +101,8 @@ def run_sweep(
     ``comm`` work, ``[sweep] ranks`` of them together on each member.
 
     Raises CaseError if no member is a valid case (of those drawn, where they are many), or if fields of members are to
-    be kept without a folder, FolderError if the folder holds anything but this sweep.
+    be kept without a folder, FolderError if the folder holds anything but this sweep, ValueError without a folder where
+    ranks are on several machines.
     """
     on_root(comm, lambda: plan.tried()[:0])  # raises; the cases are not sent
     if folder is None:
@@ -122,6 +123,8 @@ def _in_memory(plan: Sweep, comm: MPI.Comm, stop: StopRequest | None, progress: 
     if plan.options.fields:
         remedy = "keeps files of every member: name a folder for them, as in sweep(plan, 'my-sweep')"
         raise CaseError([Problem("sweep.fields", True, remedy)], plan.name)
+    if not on_one_machine(comm):
+        raise ValueError("ranks on several machines need a folder that all of them see, as in sweep(plan, 'my-sweep')")
     folder = Path(on_root(comm, lambda: tempfile.mkdtemp(prefix="vipetsc-sweep-")))
     try:
         result = run_sweep(plan, folder, comm, stop=stop, progress=progress)
