@@ -19,7 +19,8 @@ from vipetsc.figures.swept_axes import SweptAxis
 
 MARKERS = "os^Dv*"  # of curves
 SINGLE = 4.8  # width in inches of a page with one panel
-LETTERS = 15  # of a title on an inch
+LETTERS = 17  # of a title on an inch
+PANEL_LETTERS = 15  # of that of a panel, which stands next to others
 LEGEND_LETTERS = 17  # of a legend on an inch
 MOST_COLUMNS = 4
 LEAST_TICKS = 3  # of a logarithmic scale
@@ -81,7 +82,7 @@ class MeasurePage:
         grid = self.body.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for tag, axes, title in zip(ascii_lowercase, grid, titles, strict=False):
             if title:
-                axes.set_title("\n".join(wrap(f"({tag}) {title}", int(LETTERS * (self.width - 0.6) / columns))))
+                axes.set_title("\n".join(wrap(f"({tag}) {title}", int(PANEL_LETTERS * (self.width - 0.6) / columns))))
         for axes in grid[count:]:
             axes.set_axis_off()
         for index, axes in enumerate(grid[:count]):
