@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import shortest_path
 
 from vipetsc.case import Case
-from vipetsc.case.contacts import Gaps, describe_stops
+from vipetsc.case.contacts import Gaps
 from vipetsc.figures import style
 from vipetsc.figures.panels import band_diagram, note
 from vipetsc.figures.style import with_prefix
@@ -374,7 +374,10 @@ def _draw_sites(axes: Axes, chain: Chain, gaps: Gaps) -> None:
     """Draw a mark for every site, with its cell above and its clearance in mm below where there is room."""
     n = chain.cells
     width = max(0.006 * n, 1)
-    texts = describe_stops(gaps, ()) if gaps else [f"{1e3 * clearance:#.3g}" for clearance in chain.clearances]
+    if gaps:
+        texts = [_gap_label(plus, minus) for plus, minus in gaps]
+    else:
+        texts = [f"{1e3 * clearance:#.3g}" for clearance in chain.clearances]
     last_labelled = -np.inf
     for site, text in sorted(zip(chain.sites, texts, strict=True)):
         axes.add_patch(Rectangle((site + 1 - width / 2, 0), width, 1, fc=style.VERMILION, lw=0))
@@ -383,6 +386,15 @@ def _draw_sites(axes: Axes, chain: Chain, gaps: Gaps) -> None:
         if site - last_labelled > 0.06 * n:
             axes.text(site + 1, 1.2, f"{site + 1}", ha="center", va="bottom", fontsize=7)
             below = {"color": style.VERMILION, "ha": "center", "va": "top", "linespacing": 1.0}
-            clearance = "0" if text in ("+0", "-0") else text.replace(" ", "\n")
-            axes.text(site + 1, -0.2, clearance, **below)
+            axes.text(site + 1, -0.2, text, **below)
             last_labelled = site
+
+
+def _gap_label(plus: float, minus: float) -> str:
+    """The clearances in mm of a site's stops by their side, a line each; a stop that touches is 0."""
+    lines = []
+    for side, gap in (("+", plus), ("-", minus)):
+        if np.isfinite(gap):
+            # The side + is where the clearance is positive: a stop that is pressed has a sign of its own.
+            lines.append(f"{side} {1e3 * gap:.4g}" if gap else "0")
+    return "\n".join(lines)
