@@ -13,11 +13,13 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+from vipetsc.case import Case
 from vipetsc.case.keys import unit_of
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures.measure_pages import MOST_PAGES, Measure, Roles, measure_pages, measures_of, reason_without_page
 from vipetsc.figures.measure_panels import cell_edges, log_ticks
 from vipetsc.figures.style import rc_style, save
+from vipetsc.figures.sweep_members import Labels
 from vipetsc.figures.swept_axes import SweptAxis, even_scale
 
 AMPLITUDES = {"drive.amplitude": [1.0, 2.0, 4.0, 8.0, 16.0, 32.0]}
@@ -361,3 +363,39 @@ def test_roles_do_not_depend_on_equal_sizes():
     assert roles.y is not None
     assert [roles.x.label, roles.y.label] == ["drive.frequency (rad/s)", "drive.ramp (s)"]
     assert [axis.label for axis in roles.panels] == ["drive.duration (s)"]
+
+
+OWN = {
+    "cells": 30,
+    "cell": {
+        "masses": [0.01, 0.002],
+        "springs": [
+            {"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True},
+            {"start": 1, "end": 2, "stiffness": 1e3},
+        ],
+        "contact": [1, 2],
+    },
+}
+STOPS = {"modulus": 1e8, "radius": 0.005, "poisson": 0.3, "sites": [10, 15], "clearance": 1e-3}
+
+
+@pytest.mark.parametrize(
+    ("table", "name"),
+    [
+        ({"lattice": {"preset": "four-band"}}, "Hertz, calibrated, 5 sites, 30 cycles, 24.33 N"),
+        (
+            {
+                "lattice": OWN,
+                "contacts": STOPS,
+                "drive": {"waveform": "harmonic", "frequency": 900.0, "amplitude": 12.0},
+                "time": {"end": 0.1},
+            },
+            "Hertz, 2 sites, 12 N",
+        ),
+    ],
+)
+def test_a_case_is_named_by_what_applies_to_it(table, name):
+    """No reading of a cell of one's own, no cycles of a harmonic drive."""
+    case = Case.from_table({"name": "tried"} | table)
+    assert Labels.of(case).member == name
+    assert Labels.of(case, "drive.ramp 2 s").page.endswith("drive.ramp 2 s")

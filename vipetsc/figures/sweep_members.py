@@ -334,9 +334,11 @@ class Labels(NamedTuple):
         sites = len(sites_of(case))
         law = case.contacts.law if sites else ""
         reading = case.lattice.reading if case.lattice.preset else ""
-        amplitude = f"{case.drive.amplitude:.4g}"
         unit = "m" if case.drive.end else case.drive.record.unit
-        cycles = f"{case.drive.cycles:g} cycles" if "cycles" in case.drive.record.keys else ""
+        # A lattice that begins in motion may have no drive.
+        amplitude = f"{case.drive.amplitude:.4g} {unit}" if case.drive.amplitude else ""
+        has_cycles = amplitude and "cycles" in case.drive.record.keys
+        cycles = f"{case.drive.cycles:g} cycles" if has_cycles else ""
         configuration = phrase(counted(sites, "site"), cycles, varied)
         page_stem = in_file_name(phrase(reading, configuration).replace(", ", "-").replace(" ", "-"))
         return cls(
@@ -344,8 +346,8 @@ class Labels(NamedTuple):
             configuration=configuration,
             page=phrase(reading.capitalize(), configuration),
             page_stem=page_stem,
-            member=phrase(law.capitalize(), reading, configuration, f"{amplitude} {unit}"),
-            member_stem="-".join(filter(None, [law, page_stem, in_file_name(f"{amplitude}{unit}")])),
+            member=phrase(law.capitalize(), reading, configuration, amplitude),
+            member_stem="-".join(filter(None, [law, page_stem, in_file_name(amplitude.replace(" ", ""))])),
         )
 
 
