@@ -15,7 +15,7 @@ from vipetsc.case.schema import TimeTable
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.observers import Guard, Ledger, Setup
-from vipetsc.dynamics.run import Run, select_engine
+from vipetsc.dynamics.run import Begin, Run, select_engine
 from vipetsc.io.store import RunMemory
 
 
@@ -72,7 +72,7 @@ class Flight:
         seconds = time.process_time() - begin
         if ending != "complete":
             raise RuntimeError(sentence)
-        self._run.finish(ending, sentence, (0.0, 0.0), {})
+        self._run.finish(ending, sentence, Begin(wall=0.0, cpu=0.0, compiled=0.0), {})
         assert self.output.dataset is not None
         return self.output.dataset.velocity.values, seconds
 
