@@ -33,3 +33,9 @@ def test_a_pair_that_collides_within_the_step_may_cross():
 
 def test_a_half_trace_is_measured_from_its_level_by_its_real_part():
     assert HalfTraceAbove(1, -1.0)(point(0.3, -0.75 + 0.1j)) == pytest.approx(0.25)
+
+
+def test_a_half_trace_that_is_complex_at_its_level_is_not_accepted():
+    crossing = HalfTraceAbove(1, -1.0)
+    assert crossing.is_real(point(-1.3, -1.0, 0.2))
+    assert not crossing.is_real(point(-1.3, -1.0 - 0.5j, -1.0 + 0.5j))

@@ -83,10 +83,15 @@ class Segment(Generic[S]):
         return replace(point, index=self.right.index, step=arclength)
 
     def roots(self, kind: SpecialKind[S], before: S | None) -> list[S]:
-        """Points where the kind's test vanishes: one between values of two signs, or two at both sides of a turn.
+        """Points of a kind, where its test vanishes: one between values of two signs, or two at both sides of a turn.
 
         A turn is seen with the point ``before`` the left one.
         """
+        found = self._zeros(kind, before)
+        return found if kind.accept is None else [point for point in found if kind.accept(point)]
+
+    def _zeros(self, kind: SpecialKind[S], before: S | None) -> list[S]:
+        """The points where the kind's test vanishes."""
         a = kind.test(self.left)
         b = kind.test(self.right)
         if min(abs(a), abs(b)) <= kind.floor:

@@ -357,7 +357,8 @@ class Shooting(ShootingEquations[Arc]):
             levels = {1.0: "branch-point", -1.0: "symmetry-breaking", 0.0: "period-doubling"}
         for level, name in levels.items():
             for i in real_half_traces(left, right):
-                yield SpecialKind(name, HalfTraceAbove(i, level), LEAST_CROSSING)
+                test = HalfTraceAbove(i, level)
+                yield SpecialKind(name, test, LEAST_CROSSING, accept=test.is_real)
         if left.episodes != right.episodes:
             yield SpecialKind(
                 "grazing",

@@ -77,3 +77,7 @@ class HalfTraceAbove:
     def __call__(self, point: Point) -> float:
         """The difference at a point."""
         return float(np.real(point.half_traces[self.number])) - self.level
+
+    def is_real(self, point: Point) -> bool:
+        """Whether the half-trace is real at a point; numbers change where two of them become a complex pair."""
+        return bool(np.imag(point.half_traces[self.number]) == 0)
