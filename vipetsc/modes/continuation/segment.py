@@ -87,8 +87,8 @@ class Segment(Generic[S]):
 
         A turn is seen with the point ``before`` the left one.
         """
-        found = self._zeros(kind, before)
-        return found if kind.accept is None else [point for point in found if kind.accept(point)]
+        points = self._zeros(kind, before)
+        return points if kind.accept is None else [point for point in points if kind.accept(point)]
 
     def _zeros(self, kind: SpecialKind[S], before: S | None) -> list[S]:
         """The points where the kind's test vanishes."""
