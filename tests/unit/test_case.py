@@ -214,6 +214,7 @@ def test_the_design_searches_eta_below_one():
         ("time.sample_interval=0.001", "time.sample_interval"),
         ("time.engine=magic", "time.engine"),
         ("output.window=[5, 4]", "output.window"),
+        ("output.stride=100000000000000000000", "output.stride"),
         ("name=''", "name"),
     ],
 )

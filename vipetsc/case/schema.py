@@ -41,6 +41,7 @@ def once(values: list[Any]) -> list[Any]:
 
 MOST_CELLS = 10**12
 MOST_SITES = 10**6
+MOST_STRIDE = 10**9  # samples, cells or pixels; array indices hold no more than 2^63
 
 
 def _text(value: Any) -> Any:
@@ -227,8 +228,8 @@ class OutputTable(Section):
         ["displacement", "velocity"]
     )
     window: list[int] | None = Field(None, min_length=2, max_length=2)
-    every: int = Field(1, ge=1)
-    stride: int = Field(1, ge=1)
+    every: int = Field(1, ge=1, le=MOST_STRIDE)
+    stride: int = Field(1, ge=1, le=MOST_STRIDE)
     writer: Literal["auto", "gather", "parallel"] = "auto"
     figures: bool = True
 
@@ -243,11 +244,11 @@ class AnalysisTable(Section):
     that.
     """
 
-    band_stride: int = Field(10, ge=1)
-    snapshot_stride: int = Field(2, ge=1)
-    cell_stride: int = Field(2, ge=1)
-    modal_stride: int = Field(50, ge=1)
-    pixels: int = Field(600, ge=2)
+    band_stride: int = Field(10, ge=1, le=MOST_STRIDE)
+    snapshot_stride: int = Field(2, ge=1, le=MOST_STRIDE)
+    cell_stride: int = Field(2, ge=1, le=MOST_STRIDE)
+    modal_stride: int = Field(50, ge=1, le=MOST_STRIDE)
+    pixels: int = Field(600, ge=2, le=MOST_STRIDE)
     memory: Positive = 1.0
 
 
