@@ -210,6 +210,11 @@ class StopRequest:
             if self.requested:
                 raise EndedError
             yield
+        except Exception:
+            # A library that is left halfway may raise an error of its own on the way out.
+            if self.requested:
+                raise EndedError from None
+            raise
         finally:
             self._ends_at_once = False
 

@@ -68,6 +68,20 @@ def test_what_has_nothing_to_save_does_not_begin_after_a_request():
             pytest.fail("the work began")
 
 
+def test_an_error_that_the_end_of_such_work_causes_is_not_reported():
+    """A library left halfway may fail while it clears up, in place of the exception that left it."""
+    with StopRequest().listening() as stop, pytest.raises(EndedError), stop.at_once():
+        try:
+            signal.raise_signal(signal.SIGUSR1)
+        finally:
+            raise KeyError(0)
+
+
+def test_errors_of_such_work_are_reported_where_nobody_asked_to_stop():
+    with StopRequest().listening() as stop, pytest.raises(KeyError), stop.at_once():
+        raise KeyError(0)
+
+
 def test_after_such_work_a_request_is_kept_again():
     with StopRequest().listening() as stop:
         with stop.at_once():
