@@ -205,6 +205,8 @@ class StopRequest:
     @contextmanager
     def at_once(self) -> Iterator[None]:
         """Let a request raise EndedError where the work is: within the block nothing has to be saved."""
+        # A verb that has nothing to save at all may hold such a block within its own.
+        outside = self._ends_at_once
         self._ends_at_once = True
         try:
             if self.requested:
@@ -216,7 +218,7 @@ class StopRequest:
                 raise EndedError from None
             raise
         finally:
-            self._ends_at_once = False
+            self._ends_at_once = outside
 
     @contextmanager
     def listening(self) -> Iterator[Self]:

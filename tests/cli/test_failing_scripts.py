@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -32,13 +33,18 @@ simulate(Case.from_table({"time": {"end": 0.01}}), "out")
 """
 
 
+def run_script(text: str, folder: Path, ranks: int) -> subprocess.CompletedProcess:
+    """Run a Python script on several ranks."""
+    script = folder / "fails.py"
+    script.write_text(text)
+    command = ["mpirun", "--oversubscribe", "-n", str(ranks), sys.executable, str(script)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
+
+
 @pytest.mark.mpirun
 def test_what_rank_0_raises_for_all_is_said_once(tmp_path):
     """An error of rank 0 that all ranks raise is printed once, and all end with 1."""
-    script = tmp_path / "fails.py"
-    script.write_text(FAILS_ON_RANK_0_FOR_ALL)
-    command = ["mpirun", "--oversubscribe", "-n", "3", sys.executable, str(script)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
+    ended = run_script(FAILS_ON_RANK_0_FOR_ALL, tmp_path, ranks=3)
 
     assert ended.returncode == 1
     assert ended.stderr.count("no right to write") == 1
@@ -47,10 +53,7 @@ def test_what_rank_0_raises_for_all_is_said_once(tmp_path):
 @pytest.mark.mpirun
 def test_a_rank_of_a_script_that_raises_ends_all(tmp_path):
     """An error of one rank ends the others, which wait for it, and is printed with its rank."""
-    script = tmp_path / "fails.py"
-    script.write_text(FAILS_ON_ONE_RANK)
-    command = ["mpirun", "--oversubscribe", "-n", "2", sys.executable, str(script)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
+    ended = run_script(FAILS_ON_ONE_RANK, tmp_path, ranks=2)
 
     assert ended.returncode == 1
     assert "rank 1: " in ended.stderr

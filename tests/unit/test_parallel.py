@@ -82,6 +82,14 @@ def test_errors_of_such_work_are_reported_where_nobody_asked_to_stop():
         raise KeyError(0)
 
 
+def test_such_work_goes_on_after_a_part_of_it_that_says_the_same():
+    with StopRequest().listening() as stop, pytest.raises(EndedError), stop.at_once():
+        with stop.at_once():
+            pass
+        signal.raise_signal(signal.SIGUSR1)
+        pytest.fail("the work went on")
+
+
 def test_after_such_work_a_request_is_kept_again():
     with StopRequest().listening() as stop:
         with stop.at_once():

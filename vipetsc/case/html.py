@@ -148,12 +148,18 @@ def _mass(place: Point, number: str, style: str, label: str = "") -> str:
     return f'<g>{title}<circle cx="{x:g}" cy="{y:g}" r="{RADIUS:g}" {style}/>{text}</g>'
 
 
-def _zigzag(begin: Point, end: Point) -> str:
-    """A spring between two masses."""
+def _directions(begin: Point, end: Point) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The first point, the way from it to the second, and the unit vector across that way."""
     start = np.array(begin)
     along = np.array(end) - start
     length = float(np.hypot(*along)) or 1.0
     across = np.array([-along[1], along[0]]) / length
+    return start, along, across
+
+
+def _zigzag(begin: Point, end: Point) -> str:
+    """A spring between two masses."""
+    start, along, across = _directions(begin, end)
     points = [start]
     for number in range(COILS + 1):
         side = 0.0 if number in (0, COILS) else COIL_HEIGHT * (-1) ** number
@@ -165,10 +171,7 @@ def _zigzag(begin: Point, end: Point) -> str:
 
 def _stops(host: Point, resonator: Point) -> str:
     """The clearance between the masses of a contact pair: two stops that face each other beside their spring."""
-    start = np.array(host)
-    along = np.array(resonator) - start
-    length = float(np.hypot(*along)) or 1.0
-    across = np.array([-along[1], along[0]]) / length
+    start, along, across = _directions(host, resonator)
     # From inside the circles, which are drawn over them.
     beside = 0.7 * RADIUS
     parts = []

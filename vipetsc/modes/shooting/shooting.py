@@ -355,6 +355,8 @@ class Shooting(ShootingEquations[Arc]):
         levels = {1.0: "branch-point", -1.0: "period-doubling"}
         if self.map.quarter:
             levels = {1.0: "branch-point", -1.0: "symmetry-breaking", 0.0: "period-doubling"}
+        # Pairs that stay complex are not even looked for, each search being a dozen integrations; where two half-traces
+        # meet within the step, what is found has to be real.
         for level, name in levels.items():
             for i in real_half_traces(left, right):
                 test = HalfTraceAbove(i, level)
