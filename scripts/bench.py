@@ -134,7 +134,7 @@ def print_rows(found: dict) -> None:
     for run in found.get("large", {}).get("runs", []):
         speed = f"{run['steps']} steps, {run['wall']:.1f} s"
         memory = f"{run['peak_gib_a_rank']:.2f} GiB a rank, triad {run['triad_gb_per_second']:.1f} GB/s"
-        print(f"runs/large.toml, {run['ranks']} rank(s): {speed}, {memory}")
+        print(f"runs/examples/large.toml, {run['ranks']} rank(s): {speed}, {memory}")
     print(f"measured in {found['minutes']:.1f} min\n")
 
 

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from vipetsc.case import Sweep
 from vipetsc.studies.sweep import run_sweep
 
-RUNS = Path(__file__).parents[1] / "runs"
+EXAMPLES = Path(__file__).parents[1] / "vipetsc" / "examples"
 MEMBERS = 4
 
 
@@ -47,7 +47,7 @@ KINDS = {
 
 def _sweep_seconds(kind: Kind, members: int, folder: Path) -> float:
     """CPU seconds of a whole sweep over so many amplitudes, which lie close together: members cost the same."""
-    table = tomllib.loads((RUNS / kind.file).read_text(encoding="utf-8")) | {"name": folder.name}
+    table = tomllib.loads((EXAMPLES / kind.file).read_text(encoding="utf-8")) | {"name": folder.name}
     for section, changes in kind.changes.items():
         table[section] = table.get(section, {}) | changes
     amplitudes = [kind.amplitude * (1 + 1e-4 * k) for k in range(members)]

@@ -187,8 +187,8 @@ def _spread(cells: int, sites: int) -> Case:
 
 
 def large(folder: str) -> dict:
-    """The whole program on a million cells: runs/large.toml, files included."""
-    result = simulate(Case.load("runs/large.toml", ["output.window=[1, 2000]"]), folder, force=True)
+    """The whole program on a million cells: runs/examples/large.toml, files included."""
+    result = simulate(Case.load("runs/examples/large.toml", ["output.window=[1, 2000]"]), folder, force=True)
     memory = peak()
     return {
         "steps": result.statistics["steps"],

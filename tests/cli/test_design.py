@@ -185,7 +185,7 @@ def test_results_of_other_kinds_are_never_replaced(in_process, case, tmp_path):
     search.mkdir()
     (search / "case.toml").write_text("")
     (search / "design.h5").write_text("results")
-    for verb in (("run",), ("nnm", "runs/nnm-cubic.toml")):
+    for verb in (("run",), ("nnm", "runs/examples/nnm-cubic.toml")):
         done = in_process(*verb, "--out", search, "--force")
         assert done.returncode == 2
         assert "of this kind" in done.stderr

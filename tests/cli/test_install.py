@@ -61,7 +61,8 @@ def built(tmp_path_factory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("built")
     for name in tracked():
         (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(ROOT / name, folder / "source" / name)
+        # The link to the folder of the examples stays a link.
+        shutil.copy2(ROOT / name, folder / "source" / name, follow_symlinks=not (ROOT / name).is_dir())
 
     # The wheel comes from the sdist, so that what the sdist lacks is missed.
     call(sys.executable, "-c", BUILD, folder, cwd=folder / "source")

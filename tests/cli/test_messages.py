@@ -40,7 +40,7 @@ def test_every_verb_has_an_example_that_it_takes(in_process):
 
     shown = in_process("law", "--help")
     assert shown.returncode == 0
-    assert "example: vipetsc law runs/law.toml" in shown.stdout
+    assert "example: vipetsc law runs/examples/law.toml" in shown.stdout
 
 
 def test_quiet_tells_nothing_but_warnings(in_process, tmp_path):

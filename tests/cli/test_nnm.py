@@ -163,7 +163,7 @@ def test_branches_and_runs_never_share_a_folder(in_process, tmp_path):
         (folder / "case.toml").write_text("")
         (folder / evidence).write_text("results")
 
-    for arguments in (("nnm", "runs/nnm-cubic.toml", "--out", run), ("run", "--out", branches)):
+    for arguments in (("nnm", "runs/examples/nnm-cubic.toml", "--out", run), ("run", "--out", branches)):
         ended = in_process(*arguments, "--force")
         assert ended.returncode == 2
         assert "of this kind" in ended.stderr

@@ -20,7 +20,7 @@ from vipetsc.case.verb_cases import SECTIONS, load_every
 from vipetsc.cli.verbs.verb_list import VERBS
 
 ROOT = Path(package.__file__).parents[1]
-CASES = sorted([*(ROOT / "runs").glob("*.toml"), *(ROOT / "vipetsc/paper/cases").glob("*.toml")])
+CASES = sorted([*(ROOT / "vipetsc/examples").glob("*.toml"), *(ROOT / "vipetsc/paper/cases").glob("*.toml")])
 
 
 def classes() -> dict[str, set[str]]:

@@ -73,17 +73,17 @@ def test_a_run_that_another_program_writes_is_one(in_process, tmp_path, verb):
 
 def test_bands_of_beads_are_none(in_process, tmp_path):
     """A cell without springs has no band: a sentence and an empty list say so, and there is no picture."""
-    answer = in_process("bands", "runs/beads.toml", "--out", tmp_path)
+    answer = in_process("bands", "runs/examples/beads.toml", "--out", tmp_path)
     assert answer.returncode == 0
     assert answer.stdout == "no pass bands: contacts alone join the masses, and no wave is linear\n"
     assert [path.name for path in tmp_path.iterdir()] == ["bands.json"]
-    numbers = json.loads(in_process("bands", "runs/beads.toml", "--out", tmp_path, "--json").stdout)
+    numbers = json.loads(in_process("bands", "runs/examples/beads.toml", "--out", tmp_path, "--json").stdout)
     assert numbers["bands"] == numbers["gaps"] == []
 
 
 def test_what_is_not_driven_has_no_drive(in_process):
     """Of a lattice that only begins in motion validate names the motion, and no burst of 0 N."""
-    shown = in_process("validate", "runs/packet.toml").stdout
+    shown = in_process("validate", "runs/examples/packet.toml").stdout
     assert re.search(r"^  begins with  a packet .*, Om = 927.0256 rad/s$", shown, flags=re.M)
     assert re.search(r"^  drive +none$", shown, flags=re.M)
     assert re.search(r"^  end +0.7 s$", shown, flags=re.M)

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.parallel(1)
 
 # Each takes a tenth of a second or more.
 HEAVY = {"matplotlib", "numba", "pandas", "scipy.interpolate", "scipy.optimize", "xarray"}
-CASE = Path("runs", "three-mass.toml")
+CASE = Path("runs/examples/three-mass.toml")
 
 REPORT = f"""
 import sys

@@ -27,7 +27,7 @@ from vipetsc.dynamics.options import check_options
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest
 
-RUNS = Path(__file__).parents[2] / "runs"
+EXAMPLES = Path(__file__).parents[2] / "vipetsc" / "examples"
 HOSTILE: list[Any] = [
     0, 1, 2, -1, 0.0, -1.0, 0.5, 1.5, float("nan"), float("inf"), -float("inf"), 1e308, -1e308, 1e-320, 1e-300, 1e300,
     1e17, 1e-17, 10**9, 10**12, 10**30, -(10**30), 10**400, True, "", " ", "pi", "0pi", "1e9", "foo", "traverse",
@@ -84,7 +84,7 @@ class Verdict:
 
 def parents() -> dict[str, dict[str, Any]]:
     """Return the tables that are spoilt, by name."""
-    files = {path.stem: tomllib.loads(path.read_text(encoding="utf-8")) for path in sorted(RUNS.glob("*.toml"))}
+    files = {path.stem: tomllib.loads(path.read_text(encoding="utf-8")) for path in sorted(EXAMPLES.glob("*.toml"))}
     return {"builtin": copy.deepcopy(Case.builtin_table), "own": OWN} | files
 
 

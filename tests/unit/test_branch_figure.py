@@ -12,7 +12,7 @@ from vipetsc.figures import frequency_energy, nfrc, registry, style
 from vipetsc.io import branch_kinds
 from vipetsc.io.netcdf import write_netcdf
 
-RUNS = Path(__file__).parents[2] / "runs"
+EXAMPLES = Path(__file__).parents[2] / "vipetsc" / "examples"
 
 
 def branch_of(**columns: np.ndarray | list) -> xr.Dataset:
@@ -120,7 +120,7 @@ def test_the_axis_of_a_response_names_what_drives_the_sites(options, label):
 
 def put_condensed_branch(path: Path, points: int) -> None:
     """Write a condensed branch as it stands before its end: without motions."""
-    case = NnmCase.load(RUNS / "breather.toml")
+    case = NnmCase.load(EXAMPLES / "breather.toml")
     branch = branch_of(energy=[1.0, 2.0, 3.0], frequency=[1.0, 2.0, 3.0], multiplier_max=[1.0, 2.0, 3.0])
     branch["kind"] = xr.Variable("point", np.zeros(3, np.int8), {"flag_meanings": "regular fold-energy"})
     branch["elongation"] = (("point", "place"), np.ones((3, 1)))

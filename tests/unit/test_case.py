@@ -34,7 +34,7 @@ PLAIN = {
     "drive": {"frequency": 1.0},
     "time": {"end": 10.0, "sample_interval": 0.125},
 }
-RUNS = Path(__file__).parents[2] / "runs"
+EXAMPLES = Path(__file__).parents[2] / "vipetsc" / "examples"
 
 
 def problems(table: dict[str, Any], *overrides: str) -> dict[str, str]:
@@ -76,7 +76,7 @@ def test_a_drive_may_be_given_by_its_wavenumber(wavenumber):
     assert Case.from_table(table).drive.frequency == pytest.approx(5520.026, abs=1e-3)
 
 
-@pytest.mark.parametrize("path", sorted(RUNS.glob("*.toml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)
 def test_every_case_file_is_sound_and_survives_a_round_trip(path):
     case = Case.load(path)
     assert Case.from_toml(case.to_toml()) == case
@@ -99,7 +99,7 @@ def test_the_model_of_a_case_is_built_once_and_not_carried_by_copies():
 
 
 def test_a_varied_case_is_that_of_a_run_with_other_values():
-    law = LawCase.load(RUNS / "law.toml", ["output.stride=2", "time.rtol=1e-9"])
+    law = LawCase.load(EXAMPLES / "law.toml", ["output.stride=2", "time.rtol=1e-9"])
     varied = law.varied(name="ring", without=("output",), lattice={"ends": "periodic"}, drive={"amplitude": 3.0})
     assert type(varied) is Case
     assert varied.name == "ring"

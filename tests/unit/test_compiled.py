@@ -112,8 +112,11 @@ def test_kernels_may_be_kept_in_a_chosen_folder(package, tmp_path):
 
 def test_tables_of_numbers_come_with_the_package():
     project = tomllib.loads((ROOT.parent / "pyproject.toml").read_text())
-    declared = project["tool"]["setuptools"]["package-data"]["vipetsc.modes.shooting"]
-    assert set(ROOT.rglob("*.csv")) == set((ROOT / "modes" / "shooting").glob(*declared))
+    declared = project["tool"]["setuptools"]["package-data"]
+    shipped = {path for package in ("vipetsc", "vipetsc.modes.shooting") for pattern in declared[package]
+               for path in ROOT.joinpath(*package.split(".")[1:]).glob(pattern)}  # fmt: skip
+    assert set(ROOT.rglob("*.csv")) <= shipped
+    assert set((ROOT / "examples").glob("*.toml")) <= shipped
 
 
 def test_importing_the_package_changes_no_environment():

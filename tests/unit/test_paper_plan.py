@@ -43,9 +43,9 @@ def test_every_case_file_comes_with_the_package():
 
 
 def test_examples_of_the_same_name_are_the_same_files():
-    """An example in ``runs`` with the name of a step's case is a link to it, so that they cannot differ."""
+    """An example with the name of a step's case is a link to it, so that they cannot differ."""
     for path in {step.file for step in paper_plan(FULL).steps}:
-        assert (ROOT / "runs" / path.name).resolve() == path
+        assert (ROOT / "runs/examples" / path.name).resolve() == path
 
 
 def test_every_step_is_a_case_that_can_be_used():

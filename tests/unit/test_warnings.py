@@ -19,7 +19,7 @@ SILENT = ("diatomic", "four-band", "four-band-bilinear", "interband", "interband
 @pytest.mark.parametrize("name", SILENT)
 def test_cases_that_are_as_they_should_be(name):
     """The cases in ``runs`` give no warning."""
-    assert Case.load(f"runs/{name}.toml").warnings() == []
+    assert Case.load(f"runs/examples/{name}.toml").warnings() == []
 
 
 @pytest.mark.parametrize("preset", ["four-band", "diatomic"])
@@ -135,13 +135,13 @@ def test_verbs_warn_of_what_concerns_them():
     """Recording one cell in two concerns a run and a search; a law and a frequency response curve record nothing."""
     sparse = ["output.every=2"]
 
-    assert "one cell in 2" in Case.load("runs/law.toml", sparse).warnings()[0]
-    assert LawCase.load("runs/law.toml", sparse).warnings() == []
-    assert NfrcCase.load("runs/nfrc.toml", sparse).warnings() == []
-    search = OptimiseCase.load("runs/optimise-clearances.toml", sparse)
+    assert "one cell in 2" in Case.load("runs/examples/law.toml", sparse).warnings()[0]
+    assert LawCase.load("runs/examples/law.toml", sparse).warnings() == []
+    assert NfrcCase.load("runs/examples/nfrc.toml", sparse).warnings() == []
+    search = OptimiseCase.load("runs/examples/optimise-clearances.toml", sparse)
     assert search.warnings() == search.base.warnings() != []
 
-    (sentence,) = PredictCase.load("runs/predict.toml", ["output.every=2", "time.end=20.0"]).warnings()[:1]
+    (sentence,) = PredictCase.load("runs/examples/predict.toml", ["output.every=2", "time.end=20.0"]).warnings()[:1]
     assert "before time.end" in sentence
 
 

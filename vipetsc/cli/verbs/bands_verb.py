@@ -152,7 +152,7 @@ def modes_report(case: Case, options: argparse.Namespace, folder: Path, comm: MP
 VERB = PlainVerb(
     name="bands",
     text="pass bands, gaps and group velocities of a cell",
-    example="bands runs/three-mass.toml --json",
+    example="bands runs/examples/three-mass.toml --json",
     arguments=(CASE, MODES, NEAR, SET, OUT, JSON),
     function=bands,
     is_answer=True,

@@ -213,7 +213,7 @@ PICTURES = Pictures(source="branches", file="branch-*.h5", noun=BRANCHES.noun, r
 NNM = StudyVerb(
     name="nnm",
     text="nonlinear normal modes: frequency-energy branches",
-    example="nnm runs/nnm-hertz.toml --quiet --log nnm.log",
+    example="nnm runs/examples/nnm-hertz.toml --quiet --log nnm.log",
     arguments=(case_with("nnm"), *OF_STUDIES),
     case=NnmCase,
     study=follow_modes,
@@ -225,7 +225,7 @@ NNM = StudyVerb(
 NFRC = StudyVerb(
     name="nfrc",
     text="steady states under a wave or a force, with stability",
-    example="nfrc runs/nfrc.toml",
+    example="nfrc runs/examples/nfrc.toml",
     arguments=(CASE, *OF_STUDIES),
     case=NfrcCase,
     study=follow_responses,

@@ -25,7 +25,7 @@ def design_rows(case: DesignCase, ranks: int) -> Rows:
 VERB = StudyVerb(
     name="design",
     text="the (lambda, eta) search of the four-band cell",
-    example="design runs/design.toml --set design.lambda.count=10",
+    example="design runs/examples/design.toml --set design.lambda.count=10",
     arguments=(CASE, *OF_STUDIES),
     case=DesignCase,
     study=search_cells,

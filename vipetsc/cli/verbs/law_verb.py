@@ -27,7 +27,7 @@ def law_rows(case: LawCase, ranks: int) -> Rows:
 VERB = StudyVerb(
     name="law",
     text="the scattering law of one site, refined; goes on where it was",
-    example="law runs/law.toml --set law.tolerance=0.02",
+    example="law runs/examples/law.toml --set law.tolerance=0.02",
     arguments=(CASE, *OF_STUDIES),
     case=LawCase,
     study=take_law,

@@ -78,7 +78,7 @@ def prediction_table(data: xr.Dataset) -> str:
 VERB = StudyVerb(
     name="predict",
     text="several sites from the answer of one, beside simulations",
-    example="predict runs/predict.toml",
+    example="predict runs/examples/predict.toml",
     arguments=(CASE, *OF_STUDIES),
     case=PredictCase,
     study=compose_sites,

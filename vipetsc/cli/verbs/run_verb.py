@@ -189,7 +189,7 @@ def measure_where_missing(folders: Sequence[Path]) -> None:
 VERB = StudyVerb(
     name="run",
     text="one simulation, its analysis and pictures",
-    example="run runs/diatomic.toml --set drive.amplitude=0.8 --out runs/soft",
+    example="run runs/examples/diatomic.toml --set drive.amplitude=0.8 --out runs/soft",
     arguments=(CASE, MEMBER, *OF_STUDIES),
     case=Case,
     load=load,

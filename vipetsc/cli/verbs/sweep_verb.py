@@ -85,7 +85,7 @@ PICTURES = Pictures(
 VERB = StudyVerb(
     name="sweep",
     text="every combination in [sweep]; goes on where it was",
-    example="sweep runs/interband-amplitudes.toml --set sweep.ranks=1",
+    example="sweep runs/examples/interband-amplitudes.toml --set sweep.ranks=1",
     arguments=(case_with("sweep"), *OF_STUDIES),
     case=Sweep,
     study=simulate_members,

@@ -62,7 +62,7 @@ def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> Rows:
 VERB = PlainVerb(
     name="validate",
     text="check a case; print band edges, frequency, end time, size and cost",
-    example="validate runs/three-mass.toml",
+    example="validate runs/examples/three-mass.toml",
     arguments=(CASE, SET),
     function=validate,
     is_answer=True,
