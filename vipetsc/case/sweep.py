@@ -24,6 +24,8 @@ MOST_MEMBERS = 1_000_000
 # Members whose cases are resolved to check a sweep before it begins, and sites that they have together.
 MOST_TRIED = 1_000
 MOST_TRIED_SITES = 200_000
+DIGITS = 12  # of numbers that a range is meant to meet
+ROUNDINGS = 8  # by which a value of a range may miss such a number
 Values = dict[str, tuple[Any, ...]]  # what each key takes in turn; an axis has those of keys that vary together
 
 
@@ -278,7 +280,20 @@ def _values(value: Any) -> tuple[Any, ...]:
 
     first, last = map(float, ends)
     spaced = np.geomspace if kind == "log" else np.linspace
-    return tuple(spaced(first, last, count).tolist())
+    return tuple(_without_rounding(value, max(abs(first), abs(last))) for value in spaced(first, last, count).tolist())
+
+
+def _without_rounding(value: float, largest: float) -> float:
+    """The decimal number that a ``value`` of a range is but for its rounding (5 for 4.999999999999999), or itself.
+
+    ``largest`` is the magnitude of the range's larger end, to which sums of a linear range round.
+    """
+    rounding = ROUNDINGS * np.finfo(float).eps
+    if abs(value) <= rounding * largest:
+        return 0.0
+    decimal = float(f"{value:.{DIGITS}g}")
+    # Other values keep their bits, and with them the names of members.
+    return decimal if math.isclose(value, decimal, rel_tol=rounding) else value
 
 
 def _axes(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], list[Problem]]:
