@@ -22,6 +22,7 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vipetsc.case.changes import has_more_keys, value_of
+from vipetsc.case.named_files import with_absolute_names
 from vipetsc.case.nearest_type import BRANCH, of_nearest_type
 from vipetsc.case.nesting import DEEPEST, TOO_DEEP, is_deeper
 from vipetsc.case.plain import plain_table
@@ -244,7 +245,10 @@ def _check_name(name: Any) -> Iterator[Problem]:
 
 
 def read_toml(path: str | Path) -> Table:
-    """The table in a TOML file, named after the file if it has no name; raises CaseError."""
+    """The table in a TOML file, named after the file if it has no name, with absolute names of files.
+
+    Raises CaseError.
+    """
     sys.audit("vipetsc.read", str(path))
     path = Path(path)
     try:
@@ -256,7 +260,7 @@ def read_toml(path: str | Path) -> Table:
         remedy = f"not a TOML file ({error})"
     else:
         if not is_deeper(table):
-            return table
+            return with_absolute_names(table, path.parent)
         remedy = TOO_DEEP
     raise CaseError([Problem(readable(path), None, remedy)])
 

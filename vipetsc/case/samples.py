@@ -10,6 +10,7 @@ from pydantic import Field
 
 from vipetsc.case.case_file import LARGEST, Problem, Section, Table
 from vipetsc.case.initial import file_hash
+from vipetsc.case.named_files import MISSING
 from vipetsc.case.schema import Finite
 from vipetsc.io.names import path_named, readable
 
@@ -60,6 +61,8 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
     try:
         rows = _read(file, samples.get("dataset"))
         digest = file_hash(file)
+    except FileNotFoundError:
+        return drive, [Problem(key, samples["file"], MISSING)]
     except (OSError, ValueError, KeyError) as error:
         return drive, [Problem(key, samples["file"], str(error))]
 

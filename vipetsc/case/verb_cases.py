@@ -60,6 +60,12 @@ def _kinds(table: Table) -> list[type[CaseFile]]:
     return kinds
 
 
+def verbs_of(path: str | Path) -> list[str]:
+    """The verbs for which a case file has a section of their own, else ``run``; raises CaseError."""
+    table, _ = _table(path)
+    return [kind.verb for section, kind in OF_SECTION.items() if section in table] or [Case.verb]
+
+
 def disorder_of(
     path: str | Path | None, overrides: Iterable[str], cases: Iterable[CaseFile] = ()
 ) -> tuple[DisorderTable, Case, Case] | None:

@@ -1,0 +1,122 @@
+"""The verb ``examples``: the case files that come with the program, listed and copied."""
+
+import argparse
+import difflib
+import tomllib
+from collections.abc import Iterable
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+from vipetsc.case import CaseError, Problem
+from vipetsc.case.named_files import relative_names
+from vipetsc.cli.arguments import argument
+from vipetsc.cli.messages import echo, echo_paths
+from vipetsc.cli.verb import DONE, PlainVerb
+from vipetsc.io.atomic import atomic_write
+from vipetsc.io.folder import FolderError
+from vipetsc.parallel import StopRequest, on_root
+
+
+class Example(NamedTuple):
+    """A case file of the package: its path, the sentence in its first line, the verbs that it has sections for."""
+
+    path: Path
+    sentence: str
+    verbs: list[str]
+
+
+def examples(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
+    """Print a list of the case files of the package, or copy those that are named."""
+    shipped = on_root(comm, shipped_examples)
+    if not (options.name or options.all or options.out or options.force):
+        echo(comm, _listed(shipped.values()))
+        echo(comm, "vipetsc examples NAME copies a case file, with the data that it reads, into the current folder")
+        return DONE
+
+    chosen = on_root(comm, lambda: _chosen(shipped, list(shipped) if options.all else options.name))
+    echo_paths(comm, on_root(comm, lambda: copy_examples(chosen, options.out or Path(), force=options.force)))
+    return DONE
+
+
+def shipped_examples() -> dict[str, Example]:
+    """The case files of the package by their names."""
+    # Imported here: the classes of cases take a second to load, which the list of verbs does without.
+    from vipetsc.case.verb_cases import verbs_of
+
+    shipped = {}
+    for path in sorted(Path(str(files("vipetsc") / "examples")).glob("*.toml")):
+        first_line, _, _ = path.read_text(encoding="utf-8").partition("\n")
+        shipped[path.stem] = Example(path, first_line.removeprefix("# "), verbs_of(path))
+    return shipped
+
+
+def _listed(shipped: Iterable[Example]) -> str:
+    """The ``shipped`` case files as lines of name, verbs and sentence."""
+    rows = [(one.path.stem, ", ".join(one.verbs), one.sentence) for one in shipped]
+    name_width = max(len(name) for name, _, _ in rows)
+    verb_width = max(len(verbs) for _, verbs, _ in rows)
+    return "\n".join(f"  {name:<{name_width}}  {verbs:<{verb_width}}  {text}" for name, verbs, text in rows)
+
+
+def _chosen(shipped: dict[str, Example], names: list[str]) -> list[Example]:
+    """The examples with these ``names``, with or without ``.toml``; raises CaseError for others."""
+    problems = []
+    if not names:
+        problems.append(Problem("NAME", None, "name the case files to copy, or take --all"))
+
+    chosen = []
+    for name in names:
+        stem = name.removesuffix(".toml")
+        if stem in shipped:
+            chosen.append(shipped[stem])
+            continue
+        near = difflib.get_close_matches(stem, shipped, n=3, cutoff=0.5)
+        remedy = f"did you mean {' or '.join(near)}?" if near else "`vipetsc examples` lists them"
+        problems.append(Problem("NAME", name, f"no such case file; {remedy}"))
+    if problems:
+        raise CaseError(problems, "examples")
+    return chosen
+
+
+def copy_examples(chosen: Iterable[Example], folder: Path, *, force: bool = False) -> list[Path]:
+    """Copy case files and the data files that they read into ``folder``; on one rank.
+
+    Returns the copies. Raises FolderError, with nothing written, where another file of the name is in the folder and
+    ``force`` is not given, and for a folder that cannot be written.
+    """
+    contents: dict[Path, bytes] = {}
+    for example in chosen:
+        names = relative_names(tomllib.loads(example.path.read_text(encoding="utf-8")))
+        for name in (example.path.name, *names):
+            contents[folder / name] = (example.path.parent / name).read_bytes()
+
+    try:
+        # A copy that is there already, as it is here, is no file to lose.
+        others = [path for path, content in contents.items() if path.exists() and path.read_bytes() != content]
+        if others and not force:
+            raise FolderError(f"{', '.join(map(str, others))}: exists and differs; --force replaces it")
+        for path, content in contents.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(path) as aside:
+                aside.write_bytes(content)
+    except OSError as error:
+        raise FolderError(f"{error.filename or folder}: {error.strerror or error}") from None
+    return list(contents)
+
+
+VERB = PlainVerb(
+    name="examples",
+    text="the case files that come with the program: a list of them, or copies",
+    example="examples three-mass --out my-cases",
+    arguments=(
+        argument("name", nargs="*", metavar="NAME", help="case files to copy; a list of all if left out"),
+        argument("--all", action="store_true", help="copy all of them"),
+        argument("--out", type=Path, metavar="DIR", help="folder of the copies; the current one if left out"),
+        argument("--force", action="store_true", help="replace files of these names in the folder"),
+    ),
+    function=examples,
+    is_answer=True,
+)
