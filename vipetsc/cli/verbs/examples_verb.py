@@ -20,10 +20,16 @@ from vipetsc.io.folder import FolderError
 from vipetsc.parallel import StopRequest, on_root
 
 
-class Example(NamedTuple):
-    """A case file of the package: its path, the sentence in its first line, the verbs that it has sections for."""
+FOLDER = Path(str(files("vipetsc") / "examples"))
 
-    path: Path
+
+class Example(NamedTuple):
+    """A case file of the package: its name, the sentence in its first line, the verbs that it has sections for.
+
+    The ``name`` is its path in the folder of examples without ``.toml``.
+    """
+
+    name: str
     sentence: str
     verbs: list[str]
 
@@ -47,15 +53,17 @@ def shipped_examples() -> dict[str, Example]:
     from vipetsc.case.verb_cases import verbs_of
 
     shipped = {}
-    for path in sorted(Path(str(files("vipetsc") / "examples")).glob("*.toml")):
+    # Those of the folder itself before those of the gallery.
+    for path in (*sorted(FOLDER.glob("*.toml")), *sorted(FOLDER.glob("*/*.toml"))):
+        name = path.relative_to(FOLDER).with_suffix("").as_posix()
         first_line, _, _ = path.read_text(encoding="utf-8").partition("\n")
-        shipped[path.stem] = Example(path, first_line.removeprefix("# "), verbs_of(path))
+        shipped[name] = Example(name, first_line.removeprefix("# "), verbs_of(path))
     return shipped
 
 
 def _listed(shipped: Iterable[Example]) -> str:
     """The ``shipped`` case files as lines of name, verbs and sentence."""
-    rows = [(one.path.stem, ", ".join(one.verbs), one.sentence) for one in shipped]
+    rows = [(one.name, ", ".join(one.verbs), one.sentence) for one in shipped]
     name_width = max(len(name) for name, _, _ in rows)
     verb_width = max(len(verbs) for _, verbs, _ in rows)
     return "\n".join(f"  {name:<{name_width}}  {verbs:<{verb_width}}  {text}" for name, verbs, text in rows)
@@ -89,9 +97,12 @@ def copy_examples(chosen: Iterable[Example], folder: Path, *, force: bool = Fals
     """
     contents: dict[Path, bytes] = {}
     for example in chosen:
-        names = relative_names(tomllib.loads(example.path.read_text(encoding="utf-8")))
-        for name in (example.path.name, *names):
-            contents[folder / name] = (example.path.parent / name).read_bytes()
+        case_file = FOLDER / f"{example.name}.toml"
+        data = relative_names(tomllib.loads(case_file.read_text(encoding="utf-8")))
+        for path in (case_file, *(case_file.parent / name for name in data)):
+            # What is not shipped is left by another command, as a branch whose motion begins a run.
+            if path.exists():
+                contents[folder / path.relative_to(FOLDER)] = path.read_bytes()
 
     try:
         # A copy that is there already, as it is here, is no file to lose.
