@@ -66,7 +66,7 @@ def test_a_file_that_differs_is_replaced_on_request_alone(in_process, tmp_path):
         (["wavefrm"], "NAME = 'wavefrm': no such case file; did you mean waveform?"),
         (["x"], "`vipetsc examples` lists them"),
         (["--out", "y"], "name the case files to copy, or take --all"),
-        (["beads", "--out", __file__], f"{__file__}: File exists"),
+        (["beads", "--out", __file__], "is a file, not a folder; choose another --out"),
     ],
 )
 def test_what_cannot_be_copied_is_refused(in_process, tmp_path, words, problem):

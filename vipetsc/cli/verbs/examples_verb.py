@@ -17,8 +17,8 @@ from vipetsc.cli.messages import echo, echo_paths
 from vipetsc.cli.verb import DONE, PlainVerb
 from vipetsc.io.atomic import atomic_write
 from vipetsc.io.folder import FolderError
+from vipetsc.io.lock import locked
 from vipetsc.parallel import StopRequest, on_root
-
 
 FOLDER = Path(str(files("vipetsc") / "examples"))
 
@@ -93,7 +93,7 @@ def copy_examples(chosen: Iterable[Example], folder: Path, *, force: bool = Fals
     """Copy case files and the data files that they read into ``folder``; on one rank.
 
     Returns the copies. Raises FolderError, with nothing written, where another file of the name is in the folder and
-    ``force`` is not given, and for a folder that cannot be written.
+    ``force`` is not given, and where ``folder`` is a file.
     """
     contents: dict[Path, bytes] = {}
     for example in chosen:
@@ -104,18 +104,21 @@ def copy_examples(chosen: Iterable[Example], folder: Path, *, force: bool = Fals
             if path.exists():
                 contents[folder / path.relative_to(FOLDER)] = path.read_bytes()
 
-    try:
-        # A copy that is there already, as it is here, is no file to lose.
-        others = [path for path, content in contents.items() if path.exists() and path.read_bytes() != content]
-        if others and not force:
-            raise FolderError(f"{', '.join(map(str, others))}: exists and differs; --force replaces it")
+    # A copy that is there already is no file to lose.
+    others = [path for path, content in contents.items() if path.exists() and not _holds(path, content)]
+    if others and not force:
+        raise FolderError(f"{', '.join(map(str, others))}: exists and differs; --force replaces it")
+    # This rank alone is here, so that the lock must not wait for others.
+    with locked(MPI.COMM_SELF, *{path.parent for path in contents}):
         for path, content in contents.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(path) as aside:
                 aside.write_bytes(content)
-    except OSError as error:
-        raise FolderError(f"{error.filename or folder}: {error.strerror or error}") from None
     return list(contents)
+
+
+def _holds(path: Path, content: bytes) -> bool:
+    """Whether ``path`` is a file with this ``content``."""
+    return path.is_file() and path.read_bytes() == content
 
 
 VERB = PlainVerb(
