@@ -5,6 +5,11 @@
 Everything becomes Markdown in ``FOLDER/source``, which Sphinx reads through MyST; warnings are errors. The interface
 is read from the sources, not imported: compiled kernels, PETSc and names loaded late are no matter. Docstrings are
 Markdown as they stand: indented formulas are code.
+
+Formulas are LaTeX that MathJax sets in the reader's browser. The pages hold MathJax as one file that needs no other,
+from the package sphinx-mathjax-offline, so that they can be read without a network; as an extension that package would
+add all of MathJax, 24 MB. Pictures of formulas (sphinx.ext.imgmath) need LaTeX where pages are built, and neither scale
+nor follow a dark theme; KaTeX sets formulas as well, from sixty files of fonts.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 from sphinx.application import Sphinx
@@ -26,15 +32,18 @@ sys.path.insert(0, str(ROOT))
 
 import vipetsc
 from vipetsc.case.keys import chapter as all_keys
+from vipetsc.cli.chapters import parts
 
 PACKAGE = ROOT / "vipetsc"
 CHAPTERS = PACKAGE / "manual"
 GALLERY = CHAPTERS / "gallery"
 NOTEBOOKS = CHAPTERS / "notebooks"
-# Pages that are no chapters.
+# Pages that no file of the manual holds: the README, and those that are written from the sources.
 START = "start"
 KEYS = "case-keys"
 API = "api"
+MATHJAX = "tex-svg.js"  # its letters are curves, so that it needs no font either
+STYLE = "manual.css"
 CONFIGURATION = {
     "project": "vipetsc",
     "release": vipetsc.__version__,
@@ -42,7 +51,9 @@ CONFIGURATION = {
     "extensions": ["myst_parser"],
     "html_theme": "furo",
     "highlight_language": "none",  # of formulas
-    "myst_enable_extensions": ["colon_fence"],
+    "myst_enable_extensions": ["amsmath", "colon_fence", "dollarmath"],
+    "mathjax_path": MATHJAX,
+    "html_css_files": [STYLE],
     "myst_heading_anchors": 3,
     "suppress_warnings": ["ref.python"],  # a name in a signature that two modules have
     "smartquotes": False,  # w' is a velocity
@@ -58,15 +69,17 @@ def write_sources(folder: Path, packages: list[str]) -> None:
     """All pages as Markdown in ``folder``, with their pictures; the interface of ``packages``, all if there is none."""
     (folder / GALLERY.name).mkdir(parents=True)
 
-    # Chapters in the order of the index, then those that it leaves out.
+    # The pages that are no chapters stand where a reader looks for them.
+    listed = parts()
+    listed["Tutorials"] = [START, *listed["Tutorials"]]
+    listed["Reference"] = [*listed["Reference"], API]
     index = (CHAPTERS / "index.md").read_text(encoding="utf-8")
-    names = re.findall(r"^\| \[[^]]*\]\(([\w-]+)\.md\)", index, flags=re.M)
-    names += sorted({path.stem for path in CHAPTERS.glob("*.md")} - {"index", *names})
-    put(folder / "index.md", index + contents("Chapters", [START, *names, KEYS]) + contents("Python", [API]), CHAPTERS)
+    tables = "".join(contents(title, names) for title, names in listed.items())
+    put(folder / "index.md", index + tables, CHAPTERS)
     start = (ROOT / "README.md").read_text(encoding="utf-8")
     put(folder / f"{START}.md", start.replace("# vipetsc", "# Get going", 1), ROOT)
     put(folder / f"{KEYS}.md", all_keys(), CHAPTERS)
-    for name in names:
+    for name in (path.stem for path in CHAPTERS.glob("*.md") if path.stem != "index"):
         text = (CHAPTERS / f"{name}.md").read_text(encoding="utf-8")
         if name == GALLERY.name:
             text += contents("", re.findall(r"\]\((gallery/[\w-]+)\.md\)", text))
@@ -126,6 +139,17 @@ def put(path: Path, text: str, home: Path) -> None:
         return f"]({target.name})"
 
     path.write_text(re.sub(r"\]\((?!https?:|#)([^)#\s]+)(#[^)\s]*)?\)", link, text), encoding="utf-8")
+
+
+def add_static(folder: Path) -> None:
+    """Put what pages load into the ``_static`` of ``folder``: MathJax, and the style of formulas and wide tables."""
+    package = find_spec("sphinx-mathjax-offline")
+    if package is None or package.origin is None:
+        raise ModuleNotFoundError("pages with formulas need the package sphinx-mathjax-offline (the extra manual)")
+    static = folder / "_static"
+    static.mkdir(exist_ok=True)
+    shutil.copy(Path(package.origin).parent / "static/mathjax" / MATHJAX, static)
+    shutil.copy(Path(__file__).parent / STYLE, static)
 
 
 def dotted(path: Path) -> str:
@@ -204,6 +228,7 @@ def main(arguments: list[str] | None = None) -> int:
     source = folder / "source"
     shutil.rmtree(source, ignore_errors=True)
     write_sources(source, options.python)
+    add_static(folder)
     with docutils_namespace():
         app = Sphinx(
             source, None, folder, folder / ".doctrees", "html", CONFIGURATION, status=None, warningiserror=True

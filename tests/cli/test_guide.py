@@ -43,7 +43,7 @@ NOT_TYPED = {
     "movies": "half a minute of drawing; tests/unit/test_movie.py draws short ones",
     "install": "other machines; tests/cli/test_install.py makes the wheel, installs and runs it",
     "paper": "minutes; tests/cli/test_paper.py makes it in small",
-    "performance": "a quarter of an hour; tests/cli/test_bench.py runs the bench in small",
+    "measurements": "a quarter of an hour; tests/cli/test_bench.py runs the bench in small",
     "trust": "hours; tests/faults meets every phase once",
     "extend": "they change the program; what does not is called below",
 }

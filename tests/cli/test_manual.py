@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -11,12 +12,16 @@ import pytest
 
 import vipetsc
 from tests.cli.browser import NEEDED, SCREENS, browsing
+from vipetsc.cli.chapters import parts
 
 ROOT = Path(vipetsc.__file__).parents[1]
 CHAPTERS = {path.stem for path in (ROOT / "vipetsc/manual").glob("*.md")}
 pytestmark = [
     pytest.mark.browser,
-    pytest.mark.skipif(not find_spec("furo"), reason="no Sphinx with furo; scripts/test installs it"),
+    pytest.mark.skipif(
+        not (find_spec("furo") and find_spec("sphinx-mathjax-offline")),
+        reason="no Sphinx with furo and MathJax; scripts/test installs them",
+    ),
 ]
 
 
@@ -54,7 +59,7 @@ def browser(tmp_path_factory):
 # Elements beyond the window's right edge, but for those that scroll by themselves.
 WIDE = """
 return [...document.querySelectorAll('article *')].filter(e => e.getBoundingClientRect().right > innerWidth + 1
-    && !e.closest('.table-wrapper, .highlight')).map(e => e.tagName + e.textContent.slice(0, 40));
+    && !e.closest('.table-wrapper, .highlight, div.math')).map(e => e.tagName + e.textContent.slice(0, 40));
 """
 
 
@@ -63,7 +68,7 @@ return [...document.querySelectorAll('article *')].filter(e => e.getBoundingClie
 def test_pages_fit_a_phone_and_a_desk(pages, browser, width, height):
     """Pages are no wider than the window, and no picture, link or script of them fails or leads outside."""
     session = browser.open(pages / "index.html", width, height)
-    for name in ("index", "start", "measures", "files", "case-keys", "performance", "paper", "vipetsc.contact"):
+    for name in ("index", "start", "theory", "measures", "files", "case-keys", "glossary", "paper", "vipetsc.contact"):
         browser.show(session, pages / f"{name}.html")
         found = browser.measure(session)
         assert found["page"] <= width, name
@@ -72,3 +77,51 @@ def test_pages_fit_a_phone_and_a_desk(pages, browser, width, height):
         assert found["errors"] == [], name
         assert browser.ask(session, WIDE) == [], name
         assert [url for url in found["linked"] if not url.startswith("file:")] == []
+
+
+# Formulas that were not set, and the beginnings of formulas and blocks of code that are cut at their right edge.
+CUT = """
+return (window.MathJax ? MathJax.startup.promise : Promise.resolve()).then(() => ({
+    raw: [...document.querySelectorAll('.math')].filter(e => !e.querySelector('mjx-container svg')).map(
+        e => e.textContent),
+    wrong: [...document.querySelectorAll('mjx-container [data-mjx-error], mjx-container [fill="red"]')].map(
+        e => e.textContent),
+    cut: [...document.querySelectorAll('div.math, .highlight pre')].filter(e => e.scrollWidth > e.clientWidth + 1).map(
+        e => e.textContent.slice(0, 60)),
+    set: document.querySelectorAll('mjx-container svg').length,
+}));
+"""
+
+
+@NEEDED
+def test_formulas_are_set_and_nothing_is_cut_on_a_desk(pages, browser):
+    """On every page its own MathJax sets every formula, and no formula or block of code is cut at 1200 px."""
+    session = browser.open(pages / "index.html", 1200, 900)
+    formulas = {}
+    for page in sorted(pages.glob("*.html")):
+        browser.show(session, page)
+        found = browser.ask(session, CUT)
+        assert found["raw"] == [], page.name
+        assert found["wrong"] == [], page.name
+        assert found["cut"] == [], page.name
+        formulas[page.stem] = found["set"]
+    assert formulas["theory"] > 60
+    assert formulas["measures"] > 40
+    assert formulas["engines"] > 15
+
+
+def test_the_manual_has_four_parts_and_every_chapter_is_in_one(pages):
+    """The margin of every page lists tutorials, how-to, theory and reference; every chapter is in one of them."""
+    page = (pages / "index.html").read_text(encoding="utf-8")
+    captions = re.findall(r'class="caption-text">([^<]+)<', page)
+    assert captions == ["Tutorials", "How to", "Theory", "Reference"]
+    listed = [name for names in parts().values() for name in names]
+    assert len(listed) == len(set(listed))
+    assert set(listed) == CHAPTERS - {"index"} | {"case-keys"}
+
+
+def test_terms_lead_to_the_glossary(pages):
+    """A term in a chapter is a link to its entry, with the text that the chapter gives it."""
+    page = (pages / "theory.html").read_text(encoding="utf-8")
+    assert 'href="glossary.html#term-ibtet"' in page
+    assert "contact sites" in page

@@ -151,6 +151,7 @@ def test_the_manual_at_the_prompt(in_process):
     trust = in_process("manual", "trust").stdout
     assert "performance (manual performance)" in trust
     assert "](" not in trust
+    assert "w = Δ" in in_process("manual", "theory").stdout
     study = in_process("manual", "gallery/designed").stdout
     assert study.startswith("# A designed lattice")
     assert "optimise (manual optimise)" in study
@@ -158,3 +159,4 @@ def test_the_manual_at_the_prompt(in_process):
     wrong = in_process("manual", "cooking")
     assert wrong.returncode == 2
     assert ", case-file, case-keys" in wrong.stderr
+    assert re.findall(r"^(\w[\w ]+)$", listed, flags=re.M)[:4] == ["Tutorials", "How to", "Theory", "Reference"]

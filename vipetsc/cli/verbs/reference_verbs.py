@@ -1,75 +1,32 @@
 """Verbs on the program itself: chapters of the manual, the schema of case files, completion in a shell."""
 
 import argparse
+import itertools
 import json
-import re
-from importlib.resources import files
 
 from mpi4py import MPI
 
 from vipetsc.case import CaseError, Problem
 from vipetsc.cli.arguments import argument
+from vipetsc.cli.chapters import chapter, contents, parts, plain, studies
 from vipetsc.cli.messages import echo
 from vipetsc.cli.verb import DONE, PlainVerb
 from vipetsc.parallel import StopRequest, on_root
 
-KEYS = "case-keys"  # the chapter that is written from the schema
-
-
-def chapters(index: str = "index") -> dict[str, str]:
-    """Names and titles of the manual's chapters, or of the pages that another ``index`` than its own leads to."""
-    names = re.findall(r"\]\((\S+)\.md\)", chapter(index))
-    if index == "index":
-        # No file holds this chapter, and no index names it.
-        names.append(KEYS)
-    return {name: chapter(name).partition("\n")[0].removeprefix("# ") for name in sorted(names)}
-
-
-def chapter(name: str) -> str:
-    """The text of a chapter; the one of all keys is written from their schema."""
-    if name == KEYS:
-        from vipetsc.case.keys import chapter as all_keys
-
-        return all_keys()
-    return (files("vipetsc") / "manual" / f"{name}.md").read_text(encoding="utf-8")
-
 
 def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Print a chapter of the manual as plain text, or a list of them."""
-    titles, studies = on_root(comm, lambda: (chapters(), chapters("gallery")))
     if options.topic is None:
-        width = max(map(len, titles))
-        echo(comm, "\n".join(f"  {name:<{width}}  {title}" for name, title in titles.items()))
+        echo(comm, on_root(comm, contents))
         echo(comm, "vipetsc manual TOPIC shows one")
-    elif options.topic in titles | studies:
-        echo(comm, on_root(comm, lambda: plain(chapter(options.topic))))
-    else:
-        names = ", ".join(titles | studies)
-        raise CaseError([Problem("TOPIC", options.topic, f"no chapter; there are {names}")], "manual")
+        return DONE
+
+    names = on_root(comm, lambda: [*itertools.chain(*parts().values()), *studies()])
+    if options.topic not in names:
+        listed = ", ".join(sorted(names))
+        raise CaseError([Problem("TOPIC", options.topic, f"no chapter; there are {listed}")], "manual")
+    echo(comm, on_root(comm, lambda: plain(chapter(options.topic))))
     return DONE
-
-
-def plain(text: str) -> str:
-    """Markdown for a terminal: links and pictures by their words, tables in columns."""
-    # Pictures before links, whose pattern matches those too.
-    text = re.sub(r"!\[([^\]]*)\]\([^)]*\)", r"[picture: \1]", text)
-    text = re.sub(r"\[([^\]]+)\]\((?!http)(?:\.\./)?(\w[\w/-]*)\.md\)", r"\1 (manual \2)", text)
-    return re.sub(r"(?m)(^\|.*\n)+", lambda rows: _columns(rows[0]), text)
-
-
-def _columns(rows: str) -> str:
-    """The rows of a table in columns of equal width; the last one is free."""
-    # An escaped bar is text of a cell.
-    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", row.strip("|"))] for row in rows.splitlines()]
-    cells = [row for row in cells if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]) - 1)]
-
-    lines = []
-    for row in cells:
-        # Not strict: the last column has no width.
-        padded = [f"{cell:<{width}}" for cell, width in zip(row, widths, strict=False)]
-        lines.append("  ".join([*padded, row[-1]]).rstrip())
-    return "\n".join(lines) + "\n"
 
 
 def schema(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:

@@ -1,0 +1,159 @@
+"""The pictures of the chapters theory and read-pictures, drawn by the package and made small.
+
+    python scripts/manual_pictures.py [--folder FOLDER]
+
+The built-in run and a sweep over two keys are made in ``FOLDER``, by default a temporary one: a minute of CPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+from vipetsc.case import Case
+from vipetsc.figures import schematics, style
+from vipetsc.io.read import open_run
+from vipetsc.lattice import Contact
+
+PICTURES = ROOT / "vipetsc/manual/pictures"
+WIDTH = 760  # pixels
+COLOURS = 255
+MOST = 60_000  # bytes
+SPEED = 2.0  # m/s, of the impact that is drawn
+STEPS = 4000  # of that impact
+# Figures of runs: the file in the manual, and where it is among the results.
+DRAWN = {
+    "spacetime": "four-band/figures/spacetime.png",
+    "impacts": "four-band/figures/impacts.png",
+    "ledger": "four-band/figures/ledger.png",
+    "phase": "four-band/figures/phase.png",
+    "sweep-curve": "curve/figures/upper_share_at_end-over-drive.amplitude.png",
+    "sweep-map": "map/figures/upper_share_at_end-over-drive.amplitude-contacts.restitution.png",
+}
+CASE = """
+[lattice]
+preset = "four-band"
+cells = 150
+
+[contacts]
+sites = [40, 55, 70]
+
+[time]
+engine = "propagator"
+
+[sweep]
+measures = ["transfer"]
+
+[sweep.drive]
+amplitude = { log = [16.0, 200.0], count = 9 }
+"""
+RESTITUTIONS = "--set=sweep.contacts.restitution=[0.5, 0.6, 0.7, 0.8, 0.9, 1.0]"
+COMMANDS = (
+    ("run", "--set=time.engine=propagator", "--out=four-band"),
+    ("sweep", "case.toml", "--out=curve"),
+    ("sweep", "case.toml", RESTITUTIONS, "--out=map"),
+)
+
+
+def impact(contact: Contact, mass: float, clearance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Relative displacement in m and force in N during an impact of a free pair with the reduced ``mass`` in kg."""
+    dt = 2 * contact.impact_time(SPEED, mass) / STEPS
+    x, rate = 0.0, SPEED
+    indentation, force = [0.0], [0.0]
+    for _ in range(2 * STEPS):
+        pressed = float(contact.elastic_force(x) * contact.dissipation_factor(rate, SPEED))
+        rate -= dt * pressed / mass
+        x += dt * rate
+        if x < 0:
+            break
+        indentation.append(x)
+        force.append(pressed)
+    return clearance + np.array(indentation), np.array(force)
+
+
+def contact_law(case: Case) -> Figure:
+    """Draw the force of one impact over the relative displacement, and what impacts return by damping factor."""
+    model = case.model()
+    cell = model.chain.cell
+    host, resonator = cell.masses[cell.host], cell.masses[cell.resonator]
+    law = model.used_laws[0]
+    clearance = model.chain.clearances[-1]
+
+    figure = style.new_figure(style.PAGE, 2.6)
+    left, right = figure.subplots(1, 2)
+    for restitution, colour in ((1.0, style.BLACK), (0.7, style.BLUE), (0.3, style.VERMILION)):
+        contact = Contact("hertz", law.stiffness, restitution)
+        w, force = impact(contact, mass=host * resonator / (host + resonator), clearance=clearance)
+        left.plot(1e3 * w, force, color=colour, label=f"r = {restitution:g}")
+    left.plot([1.6, 1e3 * clearance], [0, 0], color=style.BLACK, lw=2.0)  # between the stops nothing acts
+    left.axvline(1e3 * clearance, color=style.GREY, lw=0.8, ls="--")
+    left.annotate(
+        "clearance Δ", (1e3 * clearance, 6), (-4, 0), textcoords="offset points", ha="right", color=style.GREY
+    )
+    left.set(xlabel="Relative displacement w (mm)", ylabel="Contact force (N)", xlim=(1.6, None), ylim=(-0.5, None))
+    left.legend(loc="upper left")
+    left.set_title(f"(a) One impact at {SPEED:g} m/s")
+
+    asked = np.linspace(0.06, 1, 95)
+    for factor, colour in (("paper", style.BLUE), ("flores", style.ORANGE), ("exact", style.BLACK)):
+        effective = [Contact("hertz", 1.0, r, factor=factor).effective_restitution for r in asked]
+        right.plot(asked, effective, color=colour, label=factor)
+    right.set(xlabel="Restitution asked for", ylabel="Effective restitution", xlim=(0, 1), ylim=(0, 1))
+    right.legend(loc="upper left")
+    right.set_title("(b) What an impact returns")
+    return figure
+
+
+def save_small(image: Image.Image, target: Path) -> None:
+    """Save a picture as a PNG of few colours, at most ``WIDTH`` wide; raises ValueError for one too large."""
+    image = image.convert("RGB")
+    height = round(image.height * min(WIDTH / image.width, 1))
+    image = image.resize((min(WIDTH, image.width), height), Image.Resampling.LANCZOS)
+    # By coverage rare colours stay: those of lines and of the ends of scales.
+    few = image.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    few.save(target, optimize=True)
+    if target.stat().st_size > MOST:
+        raise ValueError(f"{target}: {target.stat().st_size} bytes")
+
+
+def drawn(folder: Path, draw: Callable[[], Figure]) -> Image.Image:
+    """The picture of a figure, drawn in the package's style."""
+    path = folder / "drawn.png"
+    with style.rc_style():
+        style.save(draw(), path)
+    return Image.open(path)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Make the runs, draw, and write the pictures."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--folder", type=Path, help="where results are made; a temporary one if left out")
+    options = parser.parse_args(arguments)
+
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.folder or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "case.toml").write_text(CASE, encoding="utf-8")
+        for verb, *settings in COMMANDS:
+            subprocess.run([sys.executable, "-m", "vipetsc", verb, "--quiet", *settings], cwd=folder, check=True)
+        for name, path in DRAWN.items():
+            save_small(Image.open(folder / path), PICTURES / f"{name}.png")
+        with open_run(folder / "four-band/run.h5") as run:
+            save_small(drawn(folder, lambda: schematics.unit_cell(run, None)), PICTURES / "cell.png")
+            save_small(drawn(folder, lambda: contact_law(Case.of(run))), PICTURES / "contact-law.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

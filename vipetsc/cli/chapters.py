@@ -1,0 +1,92 @@
+"""Chapters of the manual: which there are, part by part, and their Markdown as text for a terminal."""
+
+import itertools
+import re
+from importlib.resources import files
+from textwrap import indent
+
+from vipetsc.cli.formulas import FormulaError, formula_text
+
+KEYS = "case-keys"  # the chapter that is written from the schema
+# What no formula is in: blocks of code, and code in a paragraph.
+CODE = re.compile(r"(^```.*?^```$|`(?:[^`\n]|\n(?!\n))+`)", flags=re.M | re.S)
+
+
+def parts() -> dict[str, list[str]]:
+    """Names of the manual's chapters by part, as the headings and tables of its index list them."""
+    sections = re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", chapter("index"), flags=re.M | re.S)
+    listed = {title: re.findall(r"^\| \[[^]]*\]\(([\w-]+)\.md\)", text, flags=re.M) for title, text in sections}
+    # No file holds this chapter, and no index links to it.
+    listed["Reference"].append(KEYS)
+    return {title: names for title, names in listed.items() if names}
+
+
+def studies() -> list[str]:
+    """Names of the gallery's pages."""
+    return re.findall(r"\]\((gallery/\S+)\.md\)", chapter("gallery"))
+
+
+def chapter(name: str) -> str:
+    """The text of a chapter; the one of all keys is written from their schema."""
+    if name == KEYS:
+        from vipetsc.case.keys import chapter as all_keys
+
+        return all_keys()
+    return (files("vipetsc") / "manual" / f"{name}.md").read_text(encoding="utf-8")
+
+
+def contents() -> str:
+    """Names and titles of the chapters, part by part."""
+    listed = parts()
+    width = max(map(len, itertools.chain(*listed.values())))
+    lines = []
+    for part, names in listed.items():
+        lines.append(part)
+        for name in names:
+            title = chapter(name).partition("\n")[0].removeprefix("# ")
+            lines.append(f"  {name:<{width}}  {title}")
+    return "\n".join(lines)
+
+
+def plain(text: str) -> str:
+    """Markdown for a terminal: links and pictures by their words, formulas in Unicode, tables in columns."""
+    # Pictures before links, whose pattern matches those too.
+    text = re.sub(r"!\[([^\]]*)\]\([^)]*\)", r"[picture: \1]", text)
+    text = re.sub(r"\[([^\]]+)\]\((?!http)(?:\.\./)?(\w[\w/-]*)\.md(?:#[^)]*)?\)", r"\1 (manual \2)", text)
+    text = re.sub(r"\{term\}`([^`<]+?)(?: <[^`]*)?`", r"\1", text)
+
+    # The fences of a directive go; what they hold is text.
+    text = re.sub(r"(?ms)^```\{\w+\}.*?\n(.*?)^```$", r"\1", text)
+    pieces = CODE.split(text)
+    for i in range(0, len(pieces), 2):
+        pieces[i] = _without_latex(pieces[i])
+    return re.sub(r"(?m)(^\|.*\n)+", lambda rows: _columns(rows[0]), "".join(pieces))
+
+
+def _without_latex(text: str) -> str:
+    """Text without code, its formulas in Unicode; displayed ones are indented."""
+    text = re.sub(r"(?s)\$\$(.+?)\$\$", lambda shown: indent(_formula(shown[1]), " " * 4), text)
+    return re.sub(r"(?s)\$([^$]+?)\$", lambda inline: _formula(inline[1]), text)
+
+
+def _formula(latex: str) -> str:
+    """A formula in Unicode, or as it stands where that cannot be."""
+    try:
+        return formula_text(latex)
+    except FormulaError:
+        return latex.strip()
+
+
+def _columns(rows: str) -> str:
+    """The rows of a table in columns of equal width; the last one is free."""
+    # An escaped bar is text of a cell.
+    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", row.strip("|"))] for row in rows.splitlines()]
+    cells = [row for row in cells if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]) - 1)]
+
+    lines = []
+    for row in cells:
+        # Not strict: the last column has no width.
+        padded = [f"{cell:<{width}}" for cell, width in zip(row, widths, strict=False)]
+        lines.append("  ".join([*padded, row[-1]]).rstrip())
+    return "\n".join(lines) + "\n"

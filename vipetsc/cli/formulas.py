@@ -1,0 +1,146 @@
+"""Formulas of the manual as a terminal shows them: the LaTeX that its chapters use, in Unicode."""
+
+import re
+import unicodedata
+
+WIDE = "\N{EM SPACE}"
+SYMBOLS = {
+    **{name: unicodedata.lookup(f"GREEK SMALL LETTER {name.upper()}") for name in (
+        "alpha", "beta", "gamma", "delta", "zeta", "eta", "theta", "kappa", "mu", "nu", "xi", "pi", "rho", "sigma",
+        "tau", "chi", "psi", "omega",
+    )},
+    "lambda": "λ", "epsilon": "ε", "varepsilon": "ε", "phi": "φ", "varphi": "φ",
+    "Delta": "Δ", "Omega": "Ω", "Phi": "Φ", "Psi": "Ψ", "Lambda": "Λ",
+    "sum": "∑", "int": "∫", "infty": "∞", "partial": "∂", "sqrt": "√",
+    "cdot": "·", "times": "×", "pm": "±", "mp": "∓", "ast": "*", "top": "ᵀ", "dagger": "†", "star": "*",
+    "le": "≤", "ge": "≥", "ne": "≠", "approx": "≈", "sim": "∼", "propto": "∝", "ll": "≪", "gg": "≫", "equiv": "≡",
+    "in": "∈", "to": "→", "mapsto": "↦", "dots": "…", "langle": "⟨", "rangle": "⟩", "lvert": "∣", "rvert": "∣",
+    "prime": "′",
+    "quad": WIDE, "qquad": WIDE, ",": " ", ";": " ", ":": " ", "!": "", " ": " ",
+    "{": "{", "}": "}", "%": "%", "_": "_", "|": "‖",
+}  # fmt: skip
+FUNCTIONS = ("sin", "cos", "exp", "log", "det", "min", "max", "arg", "Re", "Im", "mean", "sgn", "tan")
+ACCENTS = {
+    "dot": "\N{COMBINING DOT ABOVE}",
+    "ddot": "\N{COMBINING DIAERESIS}",
+    "hat": "\N{COMBINING CIRCUMFLEX ACCENT}",
+    "bar": "\N{COMBINING MACRON}",
+    "tilde": "\N{COMBINING TILDE}",
+}
+# What changes the look of its argument alone, and what makes a delimiter as tall as what it holds.
+LOOKS = ("mathrm", "mathbf", "boldsymbol", "text", "operatorname", "mathcal", "mathit")
+SIZES = ("left", "right", "big", "Big", "bigl", "bigr", "displaystyle")
+FRACTIONS = ("frac", "tfrac", "dfrac")
+RAISED = dict(zip("0123456789+−=()ijkmnptx*′ᵀ", "⁰¹²³⁴⁵⁶⁷⁸⁹⁺⁻⁼⁽⁾ⁱʲᵏᵐⁿᵖᵗˣ*′ᵀ", strict=True))
+LOWERED = dict(zip("0123456789+−=()aehijklmnoprstuvx", "₀₁₂₃₄₅₆₇₈₉₊₋₌₍₎ₐₑₕᵢⱼₖₗₘₙₒₚᵣₛₜᵤᵥₓ", strict=True))
+TOKEN = re.compile(r"\\[a-zA-Z]+|\\.|\s+|.", flags=re.S)
+# One factor, which a fraction or a root takes without brackets.
+FACTOR = re.compile(r"[^\s+\-−=·×/()]*")
+ROWS = re.compile(r"\\(?:begin|end)\{\w+\*?\}|&+")
+
+
+class FormulaError(ValueError):
+    """A formula has LaTeX that is not among what the manual uses."""
+
+
+def formula_text(formula: str) -> str:
+    r"""Return a formula in LaTeX as Unicode text, a line for every row that ends in ``\\``.
+
+    Fractions become quotients, with brackets where they need some; scripts are raised and lowered where Unicode has
+    all their letters, and follow ``^`` or ``_`` elsewhere. Raises FormulaError for a command that no table has.
+    """
+    rows = re.split(r"\\\\(?:\[[^]]*\])?", ROWS.sub(lambda mark: _gap(mark[0]), formula))
+    texts = [_rendered([token[0] for token in TOKEN.finditer(row)]) for row in rows]
+    # Blanks of the source and thin spaces are one blank together; wide spaces stay wide.
+    lines = [re.sub(r"\s+", lambda blank: "    " if WIDE in blank[0] else " ", line).strip() for line in texts]
+    return "\n".join(line for line in lines if line)
+
+
+def _gap(mark: str) -> str:
+    """Return what takes the place of ``mark``, which begins or ends an environment or parts its columns."""
+    return {"&": " ", "&&": WIDE}.get(mark, "")
+
+
+def _rendered(tokens: list[str]) -> str:
+    """Return the text of all tokens, which are consumed."""
+    parts = []
+    while tokens:
+        parts.append(_next(tokens))
+    # An accent joins its letter.
+    return unicodedata.normalize("NFC", "".join(parts))
+
+
+def _next(tokens: list[str]) -> str:
+    """Return the text of the next token with its argument; they are consumed."""
+    token = tokens.pop(0)
+    if token == "{":
+        return _rendered(_group(tokens))
+    if token in "^_":
+        is_word = tokens[:1] in (["\\text"], ["\\mathrm"])
+        return _script(token, _argument(tokens), is_word)
+    if token.startswith("\\"):
+        return _command(token[1:], tokens)
+    if token.isspace():
+        return WIDE if WIDE in token else " "
+    return {"-": "−", "'": "′", "~": " "}.get(token, token)
+
+
+def _command(name: str, tokens: list[str]) -> str:
+    """Return the text of a command with its arguments, which are consumed."""
+    if name in FRACTIONS:
+        upper, lower = _argument(tokens), _argument(tokens)
+        return f"{_factor(upper)}/{_factor(lower)}"
+    if name == "sqrt":
+        return "√" + _factor(_argument(tokens))
+    if name in ACCENTS:
+        return _argument(tokens) + ACCENTS[name]
+    if name == "text" and tokens[:1] == ["{"]:
+        tokens.pop(0)
+        return "".join(_group(tokens)).replace("\\", "")
+    if name in LOOKS:
+        return _argument(tokens)
+    if name in SIZES:
+        return ""
+    if name in FUNCTIONS:
+        # A blank before letters, none before brackets and scripts.
+        is_followed = bool(tokens) and (tokens[0].isalnum() or tokens[0].startswith("\\"))
+        return name + " " * is_followed
+    if name not in SYMBOLS:
+        raise FormulaError(f"\\{name} is no command of the manual's formulas")
+    return SYMBOLS[name]
+
+
+def _script(mark: str, text: str, is_word: bool) -> str:
+    """Return an exponent or index (``mark`` ^ or _) raised or lowered, if it can be and is no word."""
+    letters = RAISED if mark == "^" else LOWERED
+    if text and not is_word and all(character in letters for character in text):
+        return "".join(letters[character] for character in text)
+    return mark + (text if FACTOR.fullmatch(text) else f"({text})")
+
+
+def _factor(text: str) -> str:
+    """Return a numerator, denominator or radicand, in brackets unless it is one factor."""
+    text = text.strip()
+    return text if FACTOR.fullmatch(text) else f"({text})"
+
+
+def _argument(tokens: list[str]) -> str:
+    """Return the text of the next group or single token; they are consumed."""
+    while tokens and tokens[0].isspace():
+        tokens.pop(0)
+    if not tokens:
+        raise FormulaError("a command lacks its argument")
+    return _next(tokens)
+
+
+def _group(tokens: list[str]) -> list[str]:
+    """Return the tokens up to the bracket that ends the group; they and the bracket are consumed."""
+    depth = 1
+    inner: list[str] = []
+    while tokens:
+        token = tokens.pop(0)
+        depth += (token == "{") - (token == "}")
+        if depth == 0:
+            return inner
+        inner.append(token)
+    raise FormulaError("a bracket { is not closed")
