@@ -18,7 +18,7 @@ from vipetsc.case.disorder import Deviation
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.verb_cases import load_every
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.objective import ObjectiveRuns
+from vipetsc.studies.objective import Judgement, ObjectiveRuns
 from vipetsc.studies.optimum_search import OptimumSearch
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.sampler import CmaEs, smooth
@@ -184,11 +184,11 @@ class Bowl:
     def runs(self, case):
         return {(1.0, 0): case}
 
-    def losses(self, case):
+    def judge(self, case):
         if self.fails(case):
-            return [np.nan], "1 N: stalled"
+            return Judgement([np.nan], [], reason="1 N: stalled")
         logarithms = np.log(np.array(case.contacts.clearance) / 1e-3)
-        return [float((logarithms**2).sum())], ""
+        return Judgement([float((logarithms**2).sum())], [])
 
 
 class Recorder(CmaEs):
@@ -315,13 +315,13 @@ def test_the_worst_or_the_mean_over_amplitudes_of_the_mean_over_what_scatters():
     for key, run in runs.items():
         records[case_id(run)] = {"values": {"upper_share_at_end": upper[key], "transmitted": 0.4}}
 
-    losses, reason = GivenRecords(small, records).losses(small.base)
+    losses, _, _, reason = GivenRecords(small, records).judge(small.base)
     # Means 0.2 at 2 N and 0.35 at 5 N, the smaller of which counts; what is maximised is a loss with its sign turned.
     assert losses == pytest.approx([-0.2, 0.4])
     assert reason == ""
 
     records[case_id(runs[5.0, 1])] = {"reason": "stalled"}
-    losses, reason = GivenRecords(small, records).losses(small.base)
+    losses, _, _, reason = GivenRecords(small, records).judge(small.base)
     assert np.isnan(losses).all()
     assert reason == "5 N: stalled"
 

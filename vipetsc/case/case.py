@@ -20,6 +20,7 @@ from vipetsc.case.html import case_html
 from vipetsc.case.inhomogeneity import check_inhomogeneity
 from vipetsc.case.initial import Beginning, InitialTable, beginning_of, check_initial
 from vipetsc.case.model import Model
+from vipetsc.case.points import check_points
 from vipetsc.case.resolve import (
     build_chain,
     check_cell,
@@ -134,6 +135,7 @@ class Case(CaseFile):
 
         yield from _check_undriven(sections, valid)
         length = lattice.cells if valid("lattice.cells") else None
+        yield from _check_output(sections["output"], length, cell)
         problems = list(check_drives(drive, lattice, cell, length, valid))
         yield from problems
         # Only of drives that are sound, since waves are computed for it.
@@ -143,10 +145,6 @@ class Case(CaseFile):
             yield from check_unsprung(drive, time)
             cell = None  # it has no bands that samples could be too coarse for
         yield from _check_sampling(time, cell, valid)
-
-        window = sections["output"].window
-        if window is not None and length is not None and not 1 <= window[0] <= window[1] <= length:
-            yield Problem("output.window", window, f"must be [first, last] within cells 1 to {length}")
 
     def model(self) -> Model:
         """The case in the terms of ``vipetsc.lattice``, built once, since a case does not change."""
@@ -327,6 +325,14 @@ def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]
         yield Problem("drive.amplitude", 0.0, "must not be zero in a lattice at rest; see [initial]")
     if sections["time"].atol == "paper":
         yield Problem("time.atol", "paper", 'is 1e-9 of the drive, and there is none; give "scaled" or a number')
+
+
+def _check_output(output: OutputTable, cells: int | None, cell: UnitCell | None) -> Iterator[Problem]:
+    """The window and the points are within the lattice's ``cells``, its masses those of the ``cell``; None: invalid."""
+    window = output.window
+    if window is not None and cells is not None and not 1 <= window[0] <= window[1] <= cells:
+        yield Problem("output.window", window, f"must be [first, last] within cells 1 to {cells}")
+    yield from check_points(output.points or [], output.transmission or [], cells, cell.dofs if cell else None)
 
 
 def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:

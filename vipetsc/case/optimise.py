@@ -13,12 +13,11 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
 from vipetsc.case.disorder import with_cell
 from vipetsc.case.features import refusals
+from vipetsc.case.objective import ConstraintTable, MeasuredTable, ObjectiveTable, Pair, measured_problems
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import Positive
-from vipetsc.lattice import pass_bands
 
 MOST_DESIGNS = 100_000
-Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -38,42 +37,8 @@ class VariablesTable(Section):
     springs: dict[str, Pair] = Field({})
 
 
-class ObjectiveTable(Section):
-    """What is to become large or small.
-
-    ``measure``: at the run's end over the drive's work, the energy in the pass bands above the driven one
-    (``upper_share_at_end``), in the pass band ``band`` or in ``part`` of it in rad/s (``band_share``), beyond the last
-    site (``transmitted``); or ``ibtet``, or the energy-weighted ``entropy`` in bit. Of the ``amplitudes`` in N, by
-    default the case's, the ``worst`` or the ``mean`` counts.
-    """
-
-    measure: Literal["upper_share_at_end", "ibtet", "band_share", "entropy", "transmitted"] = "upper_share_at_end"
-    goal: Literal["maximise", "minimise"] = "maximise"
-    band: int | None = Field(None, ge=1)
-    part: Pair | None = None
-    amplitudes: list[Positive] = Field([])
-    over: Literal["worst", "mean"] = "worst"
-
-    @property
-    def name(self) -> str:
-        """The measure, with its band and part."""
-        name: str = self.measure
-        if self.band:
-            name += f" {self.band}"
-        if self.part:
-            name += f" {self.part[0]:g}-{self.part[1]:g}"
-        return name
-
-    def describe(self) -> str:
-        """The objective in words."""
-        if not self.amplitudes:
-            return f"{self.goal} {self.name}"
-        amplitudes = ", ".join(f"{amplitude:g}" for amplitude in self.amplitudes)
-        return f"{self.goal} {self.name}, the {self.over} at {amplitudes} N"
-
-
 class OptimiseTable(Section):
-    """One objective is searched by CMA-ES, two by NSGA-II, for a Pareto front.
+    """One objective is searched by CMA-ES, two by NSGA-II, for a Pareto front; designs are to meet each ``constraint``.
 
     ``start``: the case, or clearances ``matched`` to its wave by the scattering law of a site; ``budget`` in designs,
     the case among them; ``population``: designs a generation; ``step``: first standard deviation over the range between
@@ -83,6 +48,7 @@ class OptimiseTable(Section):
 
     variables: VariablesTable = Field(default_factory=lambda: VariablesTable.model_validate({}))
     objective: list[ObjectiveTable] = Field([ObjectiveTable.model_validate({})], min_length=1, max_length=2)
+    constraint: list[ConstraintTable] | None = None
     start: Literal["case", "matched"] = "case"
     budget: int = Field(100, ge=2, le=MOST_DESIGNS)
     population: int | None = Field(None, ge=4)
@@ -91,6 +57,11 @@ class OptimiseTable(Section):
     samples: int = Field(1, ge=1, le=10_000)
     curve: list[Positive] = Field([])
     ranks: int = Field(1, ge=1)
+
+    @property
+    def measured(self) -> list[MeasuredTable]:
+        """All that a design is measured for: the objectives, then the constraints."""
+        return [*self.objective, *(self.constraint or [])]
 
 
 class Variable(NamedTuple):
@@ -261,7 +232,7 @@ class OptimiseCase(CaseFile):
         if sample is not None and disorder is not None:
             # The seed depends on the sample alone, so that all designs meet the same scatter.
             changes["disorder"] = disorder | {"seed": disorder.get("seed", 0) + sample}
-        return design.varied(name="design", without=("output",), **changes)
+        return design.varied(name="design", without=("output",), output=design.output.of_points(), **changes)
 
 
 def _case(table: Table, disorder: Any = None) -> Case:
@@ -285,8 +256,17 @@ def _problems(options: OptimiseTable, base: Case, disorder: bool) -> Iterator[Pr
         yield Problem("optimise.samples", options.samples, "there is no [disorder] to draw them from")
     if options.start == "matched" and not (bounds.clearance or bounds.profile):
         yield Problem("optimise.start", options.start, "clearances are matched: let clearance or profile vary")
+    varied = bool(bounds.masses or bounds.springs)
     for number, objective in enumerate(options.objective, 1):
-        yield from _problems_of(objective, f"optimise.objective[{number}]", base, bool(bounds.masses or bounds.springs))
+        yield from measured_problems(objective, f"optimise.objective[{number}]", base, varied)
+    for number, constraint in enumerate(options.constraint or [], 1):
+        at = f"optimise.constraint[{number}]"
+        yield from measured_problems(constraint, at, base, varied)
+        low, high = constraint.at_least, constraint.at_most
+        if low is None and high is None:
+            yield Problem(at, None, "has no bound; give at_least, at_most or both")
+        elif low is not None and high is not None and low > high:
+            yield Problem(f"{at}.at_least", low, f"is above at_most = {high:g}")
 
 
 def _bounds_problems(bounds: VariablesTable, base: Case, sites: int) -> Iterator[Problem]:
@@ -312,36 +292,3 @@ def _bounds_problems(bounds: VariablesTable, base: Case, sites: int) -> Iterator
         if not 1 <= low < high <= base.lattice.cells or high - low + 1 < sites:
             remedy = f"must lie within cells 1 to {base.lattice.cells} and hold all {sites} sites"
             yield Problem(f"{at}.sites", bounds.sites, remedy)
-
-
-def _problems_of(objective: ObjectiveTable, at: str, base: Case, varied: bool) -> Iterator[Problem]:
-    """Problems with an objective, of a cell that stays as it is unless ``varied``."""
-    bands = pass_bands(base.lattice.unit_cell())
-    band = objective.band
-    part = objective.part
-
-    # The top of the driven band and of those that overlap it.
-    top = base.drive.frequency or 0.0
-    for other in sorted(bands, key=lambda band: band.low):
-        if other.low <= top:
-            top = max(top, other.high)
-
-    if objective.measure == "transmitted" and base.lattice.ends == "periodic":
-        remedy = "nothing lies beyond the last site of a ring; lattice.ends = fixed or free, or another measure"
-        yield Problem(f"{at}.measure", objective.measure, remedy)
-    elif objective.measure in ("upper_share_at_end", "ibtet") and top >= max(b.high for b in bands):
-        remedy = f"the driven band is the highest of {len(bands)}; band_share of another, or a drive on a lower one"
-        yield Problem(f"{at}.measure", objective.measure, remedy)
-    elif (objective.measure == "band_share") != (band is not None):
-        remedy = "only band_share has a band" if band else f"missing; band_share needs a band, 1 to {len(bands)}"
-        yield Problem(f"{at}.band", band, remedy)
-    elif band and band > len(bands):
-        yield Problem(f"{at}.band", band, f"the cell has {len(bands)} bands")
-    elif part and not band:
-        yield Problem(f"{at}.part", part, "only band_share has a part of a band")
-    elif part and band:
-        low, high = bands[band - 1].low, bands[band - 1].high
-        if not part[0] < part[1] or (not varied and (part[1] <= low or part[0] >= high)):
-            yield Problem(
-                f"{at}.part", part, f"must be [low, high] in rad/s and meet band {band}, {low:.5g}-{high:.5g}"
-            )

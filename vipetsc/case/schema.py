@@ -10,6 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_v
 
 from vipetsc.case.case_file import Section
 from vipetsc.case.inhomogeneity_sections import AbsorbingTable, Defects, Finite, NotNegative, Profile, ScatterTable
+from vipetsc.case.points import MOST_POINTS, PointTable
 from vipetsc.lattice import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.damped import fitted_dashpots
 
@@ -221,7 +222,8 @@ class OutputTable(Section):
     """Which part of the fields is kept: cells ``window``, every n-th cell, every n-th sample; who writes.
 
     ``writer``: ``gather`` sends samples to rank 0, ``parallel`` has every rank write its own cells,
-    ``auto`` takes ``parallel`` when a run's fields exceed 2 GiB.
+    ``auto`` takes ``parallel`` when a run's fields exceed 2 GiB. Besides the fields, the motion of named ``points`` and
+    with ``forces`` the force of every contact are recorded at every sample; ``transmission`` are pairs of points.
     """
 
     fields: Annotated[list[Literal["displacement", "velocity"]], AfterValidator(once)] = Field(
@@ -232,6 +234,13 @@ class OutputTable(Section):
     stride: int = Field(1, ge=1, le=MOST_STRIDE)
     writer: Literal["auto", "gather", "parallel"] = "auto"
     figures: bool = True
+    points: list[PointTable] | None = Field(None, max_length=MOST_POINTS)
+    transmission: list[Annotated[list[str], Field(min_length=2, max_length=2)]] | None = None
+    forces: bool | None = None
+
+    def of_points(self) -> dict[str, Any]:
+        """The keys about named points, for a run of which nothing else is kept."""
+        return self.model_dump(include={"points", "transmission"}, exclude_none=True)
 
 
 class AnalysisTable(Section):
@@ -241,7 +250,8 @@ class AnalysisTable(Section):
     ``cell_stride``: of the snapshots (500 at most) and of the cells whose entropy is taken. ``modal_stride``: samples
     between those, in addition to those before and after contacts, at which the energies of the linear modes are taken.
     ``pixels``: most rows and columns of a map. Fields larger than ``memory``, in GiB, are read in blocks of at most
-    that.
+    that. A steady amplitude is that of the last ``steady_periods`` of the drive, where it differs from those of the two
+    windows before by no more than the fraction ``steady_tolerance``.
     """
 
     band_stride: int = Field(10, ge=1, le=MOST_STRIDE)
@@ -250,6 +260,8 @@ class AnalysisTable(Section):
     modal_stride: int = Field(50, ge=1, le=MOST_STRIDE)
     pixels: int = Field(600, ge=2, le=MOST_STRIDE)
     memory: Positive = 1.0
+    steady_periods: int | None = Field(None, ge=1, le=MOST_STRIDE)
+    steady_tolerance: Annotated[float, Field(gt=0, lt=1)] | None = None
 
 
 # PETSc 3.25 renamed these options: their names there, and the ones before.

@@ -33,11 +33,12 @@ class SweepTable(Section):
     """What is done with the members of a sweep, besides the keys that vary.
 
     ``measures``: what is measured of every run: ``entropy`` over wavenumbers (the paper's section II), ``transfer``
-    between bands (section III). ``fields``: keep every run's full fields and analysis. ``ranks``: how many ranks
+    between bands (section III); ``motion`` asks for neither, but for what every run is measured for: the largest force
+    and the motion of named points. ``fields``: keep every run's full fields and analysis. ``ranks``: how many ranks
     share a run. ``zip``: groups of keys that vary together.
     """
 
-    measures: list[Literal["entropy", "transfer"]] = Field(["entropy", "transfer"], min_length=1)
+    measures: list[Literal["entropy", "transfer", "motion"]] = Field(["entropy", "transfer"], min_length=1)
     fields: bool = False
     ranks: int = Field(1, ge=1)
     zip: list[list[str]] = Field([])

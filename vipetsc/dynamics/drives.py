@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import kernel
+from vipetsc.compiled import kernel, njit
 from vipetsc.lattice.drive import PIECE, Drive, Pieces
 
 # Fraction of a time, and of a step, within which a piece that begins has begun.
@@ -125,3 +125,14 @@ def wall_energy(drives: Drives, i: int, t: float, u: float) -> float:
     select_piece(drives, i, t)
     force = drive_force(drives, i, t)
     return 0.5 * force * force / stiffness - force * u
+
+
+@njit(error_model="numpy")
+def drive_forces(drives: Drives, times: np.ndarray) -> np.ndarray:
+    """Forces (drive, t) in N of all drives at the ``times`` (t,) in s."""
+    forces = np.zeros((drives.rows.size, times.size))
+    for i in range(drives.rows.size):
+        for k in range(times.size):
+            select_piece(drives, i, times[k])
+            forces[i, k] = drive_force(drives, i, times[k])
+    return forces

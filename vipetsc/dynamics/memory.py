@@ -23,8 +23,9 @@ PROPAGATOR_STATES = 3.0
 # Copies of a chunk on the rank that keeps it, and further ones on rank 0 while the chunks of all are gathered.
 COPIES = 2
 GATHERED = 3
-# Bytes of one sample's energies; of a site on every rank, and on the one that owns it.
+# Bytes of one sample's energies, and of a point's motion; of a site on every rank, and on the one that owns it.
 SAMPLE_BYTES = 300
+POINT_BYTES = 48
 SITE_BYTES = 600
 OWN_SITE_BYTES = 2500
 REMEDIES = {
@@ -49,7 +50,7 @@ def memory_needed(model: Model, output: OutputTable, engine: str, ranks: int) ->
         "lattice.cells": _bytes_of_states(model, engine, ranks),
         "contacts.sites": SITE_BYTES * len(chain.sites) + OWN_SITE_BYTES * own_sites,
         "output.window": _bytes_of_chunk(model, output, ranks, own_sites),
-        "time.sample_interval": model.samples * SAMPLE_BYTES,
+        "time.sample_interval": model.samples * (SAMPLE_BYTES + POINT_BYTES * len(output.points or [])),
     }
 
 
@@ -73,8 +74,9 @@ def _bytes_of_chunk(model: Model, output: OutputTable, ranks: int, own_sites: in
     chain = model.chain
     recorded = len(recorded_cells(output, chain.cells))
     per_cell = len(output.fields) * chain.cell.dofs
-    local = min(-(-chain.cells // ranks), recorded) * per_cell + own_sites
-    every = recorded * per_cell + len(chain.sites)
+    per_site = 2 if output.forces else 1
+    local = min(-(-chain.cells // ranks), recorded) * per_cell + per_site * own_sites
+    every = recorded * per_cell + per_site * len(chain.sites)
     # A chunk that is gathered lies on rank 0 whole: its length follows from all cells.
     together = ranks == 1 or written_together(model, output, ranks)
     rows = min(chunk_samples(8 * (local if together else every)), model.samples)

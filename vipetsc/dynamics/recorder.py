@@ -10,11 +10,13 @@ import h5py
 import numpy as np
 
 from vipetsc.case import CaseError, Model, Problem
+from vipetsc.case.points import PointTable
 from vipetsc.case.schema import OutputTable
 from vipetsc.dynamics.energies import ENERGY_SUMS, Energies
 from vipetsc.dynamics.observers import Observer, Setup
+from vipetsc.dynamics.points import PointMotion
 from vipetsc.dynamics.samples import Block, Samples
-from vipetsc.io.chunks import DAMPED, LOSSES, Recording, ranges
+from vipetsc.io.chunks import DAMPED, FORCES, LOSSES, MOTION, Recording, ranges
 from vipetsc.io.store import GATHER_LIMIT
 
 # A chunk is at most this many samples, and at most this many bytes of fields on a rank.
@@ -75,17 +77,22 @@ class Recorder(Observer):
         local = recorded[first:stop] - layout.start
         together = bool(setup.output.folder) and written_together(setup.model, output, layout.comm.size)
 
+        points = output.points or []
+        self._points = PointMotion(points, setup.model, layout) if points else None
+        self._of_sites = (LOSSES, FORCES) if output.forces else (LOSSES,)
         self._energies = [energy for energy, name in ENERGIES.items() if name != DAMPED or setup.model.chain.is_damped]
+        sampled = ["time", "field_time", *(ENERGIES[energy] for energy in self._energies)]
         setup.output.recording = Recording(
-            given=_coordinates(setup.model, recorded),
+            given=_coordinates(setup.model, recorded) | _places(points),
             fields=tuple(output.fields),
             together=together,
             rows=-(-setup.model.samples // output.stride),
-            sampled=("time", "field_time", *(ENERGIES[energy] for energy in self._energies)),
+            sampled=(*sampled, *MOTION) if points else sampled,
+            of_sites=self._of_sites,
         )
         self._columns = np.array([[first, stop] if together else [0, len(recorded)]])
 
-        numbers = len(output.fields) * layout.dofs * local.size + len(layout.sites)
+        numbers = len(output.fields) * layout.dofs * local.size + len(self._of_sites) * len(layout.sites)
         # Gathered chunks lie on rank 0 together.
         most = layout.comm.allreduce(numbers, MPI.MAX if together else MPI.SUM)
         self._length = chunk_samples(8 * most)
@@ -101,7 +108,13 @@ class Recorder(Observer):
         self._held = self._rows = self._number = 0
         self._sums = np.zeros((n, ENERGY_SUMS, 2), np.int64)
         self._work = np.zeros((n, len(self.setup.model.drives)))
-        self._losses = np.zeros((n, len(self.setup.layout.sites)))
+        sites = len(self.setup.layout.sites)
+        self._losses = np.zeros((n, sites))
+        # Empty arrays are not filled.
+        takes_forces = FORCES in self._of_sites or (self._points is not None and self._points.sites.size > 0)
+        self._forces = np.zeros((n if takes_forces else 0, sites))
+        watched = self._points.own_cells.size if self._points else 0
+        self._motion = np.zeros((n, 2 * self.setup.layout.dofs, watched))
         self._kept = {name: np.zeros(n) for name in ("time", *(ENERGIES[energy] for energy in self._energies))}
         self._fields = self.setup.output.room(self._shape)
 
@@ -124,6 +137,9 @@ class Recorder(Observer):
             lattice=meter.lattice,
             unit=meter.unit,
             interval=self.setup.model.sample_interval,
+            forces=self._forces[here],
+            motion=self._motion[here],
+            watched=self._points.own_cells if self._points else np.zeros(0, np.int64),
         )
 
     def observe(self, block: Block) -> None:
@@ -159,6 +175,9 @@ class Recorder(Observer):
         episodes = episodes[episodes["onset"] <= self.end]
 
         chunk = self._gather(episodes)
+        if self._points:
+            held = slice(self._held)
+            chunk |= self._points.gather(self._kept["time"][held], self._motion[held], self._forces[held])
         if comm.rank == 0:
             chunk |= {name: values[: self._held] for name, values in self._kept.items()}
             chunk["field_time"] = chunk["time"][-self._number % self._stride :: self._stride]
@@ -173,24 +192,21 @@ class Recorder(Observer):
         comm = self.setup.layout.comm
         recording = self.setup.output.recording
         sites = np.array(self.setup.layout.sites, np.int64)
-        rank_part = sites, self._losses[: self._held], episodes, self._fields[:, : self._rows]
+        of_sites = [values[: self._held] for values in (self._losses, self._forces)][: len(self._of_sites)]
+        rank_part = sites, np.array(of_sites), episodes, self._fields[:, : self._rows]
         gathered = [rank_part] if recording.together or comm.size == 1 else comm.gather(rank_part)
         if gathered is None:
             return {}
 
-        all_sites, all_losses, all_episodes, all_fields = zip(*gathered, strict=True)
+        all_sites, all_of_sites, all_episodes, all_fields = zip(*gathered, strict=True)
         numbers = np.concatenate(all_sites)
         order = np.argsort(numbers)
         log = np.concatenate(all_episodes)
         log["site"] += 1  # counted from 1
         # One rank's fields may be large: they are not copied.
         all_cells = all_fields[0] if len(all_fields) == 1 else np.concatenate(all_fields, axis=3)
-        chunk = {
-            LOSSES: np.concatenate(all_losses, axis=1)[:, order],
-            "sites": ranges(numbers[order]),
-            "impacts": log,
-            "columns": self._columns,
-        }
+        chunk = {"sites": ranges(numbers[order]), "impacts": log, "columns": self._columns}
+        chunk |= dict(zip(self._of_sites, np.concatenate(all_of_sites, axis=2)[:, :, order], strict=True))
         return chunk | dict(zip(recording.fields, all_cells, strict=True))
 
     def finish(self, stopped: bool) -> None:
@@ -236,3 +252,14 @@ def _coordinates(model: Model, recorded: np.ndarray) -> dict[str, np.ndarray]:
         given |= {f"lattice/{name}": array[recorded] for name, array in chain.variation.items()}
         given["spring"] = np.arange(1, len(chain.cell.springs) + 1)
     return given
+
+
+def _places(points: list[PointTable]) -> dict[str, np.ndarray]:
+    """The arrays of ``GIVEN`` that say where ``points`` are; none without points."""
+    if not points:
+        return {}
+    return {
+        "point": np.arange(1, len(points) + 1),
+        "points/cell": np.array([point.cell for point in points]),
+        "points/mass": np.array([point.mass for point in points]),
+    }

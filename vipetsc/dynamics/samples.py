@@ -8,9 +8,11 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.compiled import kernel, njit
+from vipetsc.contact.law import contact_force
 from vipetsc.dynamics.drives import wall_energy
 from vipetsc.dynamics.energies import LARGEST, Energies, add_energy, measure
 from vipetsc.dynamics.lattice_record import LatticeRecord
+from vipetsc.dynamics.site_dofs import relative_motion
 
 
 class Samples(NamedTuple):
@@ -19,7 +21,9 @@ class Samples(NamedTuple):
     Energies: ``sums`` (sample, energy, 2) as ``measure`` gives them, ``work`` (sample, drive) of all drives and
     ``losses`` (sample, owned site) in J. ``fields`` (field, recorded sample, dof, cell) are those of the samples whose
     numbers ``stride`` divides: velocities where ``moving`` (field,), else displacements, of every n-th owned cell from
-    ``first_cell`` on, n = ``every``. ``interval`` in s is that of all samples.
+    ``first_cell`` on, n = ``every``. ``interval`` in s is that of all samples. ``forces`` (sample, owned site) in N are
+    those of the contacts, and ``motion`` (sample, 2 dof, cell) displacements before velocities of the owned cells
+    ``watched``.
     """
 
     number: int
@@ -34,6 +38,9 @@ class Samples(NamedTuple):
     lattice: LatticeRecord
     unit: float
     interval: float
+    forces: np.ndarray
+    motion: np.ndarray
+    watched: np.ndarray
 
     def rows(self, samples: int) -> int:
         """Number of the first so many ``samples`` whose fields are recorded."""
@@ -41,8 +48,11 @@ class Samples(NamedTuple):
 
 
 @njit(error_model="numpy")
-def take_sample(y: np.ndarray, k: int, samples: Samples) -> bool:
-    """Store the rank's part ``y`` of the state, ghosts up to date, as sample ``k``; False if it is not finite."""
+def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> bool:
+    """Store the rank's part ``y`` of the state, ghosts up to date, as sample ``k``; False if it is not finite.
+
+    The modes of the owned sites are those of ``contacts[rows]``.
+    """
     shape = samples.lattice.shape
     drives = samples.lattice.drives
     number = samples.number + k
@@ -61,6 +71,11 @@ def take_sample(y: np.ndarray, k: int, samples: Samples) -> bool:
     # By the number in the run, not in the block: blocks may begin anywhere, and a resumed run records the same samples.
     if number % samples.stride == 0:
         _record_fields(y, number, samples)
+    if samples.forces.shape[0] > 0:
+        _record_forces(y, k, samples, contacts, rows)
+    for i in range(samples.watched.size):
+        for row in range(2 * shape.dofs):
+            samples.motion[k, row, i] = y[row * shape.cells + samples.watched[i]]
     return samples.sums[k, :, 0].max() < LARGEST and np.abs(samples.work[k]).max() < np.inf
 
 
@@ -75,6 +90,17 @@ def _record_fields(y: np.ndarray, number: int, samples: Samples) -> None:
             first = (mass + shape.dofs * samples.moving[i]) * shape.cells + samples.first_cell
             for c in range(out.size):
                 out[c] = y[first + c * samples.every]
+
+
+@kernel
+def _record_forces(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> None:
+    """Record the contact forces of sample ``k``; contacts and their rows as in ``take_sample``."""
+    lattice = samples.lattice
+    for i in range(lattice.site_dofs.size):
+        column = lattice.site_dofs[i].ledger - lattice.shape.dissipated
+        if column >= 0:
+            w, rate = relative_motion(y, lattice.site_dofs, i)
+            samples.forces[k, column] = contact_force(contacts, rows[column], w, rate)[0]
 
 
 @dataclass(frozen=True)

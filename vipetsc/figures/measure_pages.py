@@ -40,6 +40,7 @@ ON_REQUEST = {
     "entropy/error",
     "entropy/start",
     "bands/modal_energy",
+    "steady_drift",
 }
 
 
@@ -169,6 +170,11 @@ def _seeds(ensemble: xr.Dataset) -> np.ndarray:
 
 def _seed_dimension(ensemble: xr.Dataset) -> str:
     return next(dim for dim in axes_of(ensemble) if ensemble[dim].attrs["long_name"] == "disorder.seed")
+
+
+def is_on_request(name: str) -> bool:
+    """Whether the measure ``name``, perhaps of a point, has pages only where it is asked for."""
+    return name in ON_REQUEST or name.partition("/")[0] in ON_REQUEST
 
 
 def figure_name(measure: str) -> str:

@@ -7,8 +7,10 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
+from vipetsc.case.objective import ObjectiveTable
+from vipetsc.case.optimise import OptimiseCase
 from vipetsc.figures import style
+from vipetsc.spectra.measures import row_of
 
 # The names of compared designs, in the order of drawing.
 COLOURS = {"case": style.GREY, "best-1": style.VERMILION, "best": style.BLUE, "best-2": style.GREEN}
@@ -31,8 +33,18 @@ class ComparedDesign(NamedTuple):
 
 def _label(objective: ObjectiveTable) -> str:
     """Return what an objective measures, for an axis."""
+    if objective.is_of_runs:
+        _, unit, _ = row_of(str(objective.measure))
+        return objective.name if unit == "1" else f"{objective.name} ({unit})"
     part = f", {objective.part[0]:g}-{objective.part[1]:g} rad/s" if objective.part else ""
     return SYMBOLS.get(objective.measure, f"band {objective.band}{part} at the end / work")
+
+
+def _misses_constraint(optimum: xr.Dataset) -> np.ndarray:
+    """Return whether each design misses a constraint."""
+    if "excess" not in optimum:
+        return np.zeros(optimum.sizes["design"], bool)
+    return np.asarray(optimum["excess"].values > 0)
 
 
 def _compared(optimum: xr.Dataset) -> list[ComparedDesign]:
@@ -71,8 +83,18 @@ def _draw_one_objective(axes: Axes, optimum: xr.Dataset, objective: ObjectiveTab
     number = optimum["design"].values
     value = optimum["value"].values[:, 0]
     best = np.fmax if objective.goal == "maximise" else np.fmin
-    axes.plot(number, value, ".", color=style.SKY, ms=3, label="designs")
-    axes.step(number, best.accumulate(value), where="post", color=style.BLACK, lw=0.8, label="best so far")
+    misses = _misses_constraint(optimum)
+    axes.plot(number[~misses], value[~misses], ".", color=style.SKY, ms=3, label="designs")
+    if misses.any():
+        axes.plot(number[misses], value[misses], ".", color=style.GREY, ms=3, label="miss a constraint")
+    axes.step(
+        number,
+        best.accumulate(np.where(misses, np.nan, value)),
+        where="post",
+        color=style.BLACK,
+        lw=0.8,
+        label="best so far",
+    )
 
     failed = optimum["reason"].values != ""
     if failed.any():
@@ -91,6 +113,9 @@ def _draw_two_objectives(axes: Axes, optimum: xr.Dataset, first: ObjectiveTable,
     # The scale of colours begins below zero: the first designs would be white.
     shades = {"c": number, "cmap": "Blues", "vmin": -0.5 * len(number)}
     axes.scatter(value[:, 0], value[:, 1], s=6, label="designs (later: darker)", **shades)
+    misses = _misses_constraint(optimum)
+    if misses.any():
+        axes.plot(*value[misses].T, "x", color=style.GREY, ms=3, label="miss a constraint")
     front = value[optimum["front"].values]
     axes.plot(front[:, 0], front[:, 1], color=style.BLACK, lw=0.8, label="front")
     axes.set(xlabel=f"{first.goal} {_label(first)}", title="Both objectives")

@@ -152,7 +152,7 @@ def figure_names(source: str, names: Sequence[str] | None = None, folders: Seque
                 measure_pages.figure_name(name): name for name in measure_pages.measures_of(open_ensemble(folder))
             }
     if names is None:
-        return [*(name for name in measures if measures[name] not in measure_pages.ON_REQUEST), *specified]
+        return [*(name for name in measures if not measure_pages.is_on_request(measures[name])), *specified]
 
     valid = [*measures, *specified]
     for name in names:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 # Variables of the file by name: dimensions, units, text.
-# Rank 0 has ``SAMPLED`` and ``DAMPING`` of every sample; ``GIVEN`` exists before the first one. ``LARGE`` are the
-# fields, the losses and the log of contacts: of ranks that write together each holds only its own part.
+# Rank 0 has ``SAMPLED``, ``DAMPING`` and ``MOTION`` of every sample; ``GIVEN`` exists before the first one. ``LARGE``
+# are the fields, losses and forces and the log of contacts: of ranks that write together each holds only its part.
 SAMPLED = {
     "time": ("time", "s", "time"),
     "field_time": ("field_time", "s", "time of the recorded fields"),
@@ -36,13 +36,20 @@ SAMPLED = {
 }
 DAMPED = "energy/dissipated_by_damping"
 DAMPING = {DAMPED: ("time", "J", "energy dissipated in dashpots")}
+MOTION = {
+    "points/displacement": ("time point", "m", "displacement of the point"),
+    "points/velocity": ("time point", "m/s", "velocity of the point"),
+    "points/acceleration": ("time point", "m/s2", "acceleration of the point, by the equation of motion"),
+}
 LOSSES = "energy/dissipated_by_site"
+FORCES = "sites/force"
 LARGE = {
     "displacement": ("field_time cell dof", "m", "displacement of each mass"),
     "velocity": ("field_time cell dof", "m/s", "velocity of each mass"),
     "end/displacement": ("cell dof", "m", "displacement of each mass at the last sample"),
     "end/velocity": ("cell dof", "m/s", "velocity of each mass at the last sample"),
     LOSSES: ("time site", "J", "energy dissipated at each site"),
+    FORCES: ("time site", "N", "contact force on the host, its opposite on the resonator"),
     "episode": ("episode", "1", "contact episode, by onset"),
     "impacts/site": ("episode", "1", "site, counted from 1"),
     "impacts/side": ("episode", "1", "side of the clearance: +1 or -1"),
@@ -65,6 +72,9 @@ GIVEN = {
     "sites/cell": ("site", "1", "cell of the site"),
     "sites/clearance": ("site", "m", "clearance of the site"),
     "sites/clearance_minus": ("site", "m", "clearance on the side of negative relative displacement, if it differs"),
+    "point": ("point", "1", "point, counted from 1"),
+    "points/cell": ("point", "1", "cell of the point"),
+    "points/mass": ("point", "1", "mass of the point, within its cell"),
 }
 
 
@@ -74,7 +84,8 @@ class Recording:
 
     ``given``: the arrays of ``GIVEN``; ``fields``: names of the recorded ones; ``together``: whether all ranks write
     into one common file, instead of rank 0 alone; ``rows``: samples in a field of the whole run. ``sampled``: names of
-    the variables that rank 0 has of every sample, from ``SAMPLED`` and ``DAMPING``.
+    the variables that rank 0 has of every sample, from ``SAMPLED``, ``DAMPING`` and ``MOTION``; ``of_sites``: names of
+    those over (time, site).
     """
 
     given: Arrays
@@ -82,6 +93,7 @@ class Recording:
     together: bool
     rows: int
     sampled: Collection[str] = tuple(SAMPLED)
+    of_sites: tuple[str, ...] = (LOSSES,)
 
 
 class Chunks(Protocol):
@@ -116,7 +128,7 @@ def small_dataset(output: Chunks, attributes: Mapping[str, Any]) -> xr.Dataset:
     arrays = {**joined(output, output.recording.sampled), **output.recording.given}
     if len(arrays["field_time"]) == len(arrays["time"]):
         del arrays["field_time"]  # fields are of every sample
-    variables = tabulated(SAMPLED | DAMPING | GIVEN, arrays)
+    variables = tabulated(SAMPLED | DAMPING | MOTION | GIVEN, arrays)
     return xr.Dataset(variables, attrs={"case": output.case, **attributes})
 
 
@@ -171,10 +183,10 @@ def log_columns(log: np.ndarray, first: int = 0) -> Arrays:
 
 
 def put_chunks(dataset: h5py.Dataset, output: Chunks, name: str) -> None:
-    """Copy the losses or a field, ``name``, of all chunks to ``dataset``; each writer copies the parts it reads."""
+    """Copy what ``name`` is, of sites or a field, of all chunks to ``dataset``; each writer copies what it reads."""
     time = "field_time"
     places = "columns"
-    if name == LOSSES:
+    if name in output.recording.of_sites:
         time = "time"
         places = "sites"
 

@@ -2,16 +2,20 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as Xml
 
 import numpy as np
 import xarray as xr
 
 from vipetsc.io.atomic import atomic_write, write_text
+from vipetsc.io.chunks import FORCES, MOTION
 from vipetsc.io.read import field_time, open_results, open_run
 
 MOST_FRAMES = 5000  # of a run with more samples, every n-th; a frame takes about 1 kB of the text
 MOST_ROWS = 1_000_000  # of a table
+MOST_NUMBERS = 20_000_000  # of a table with a column for each point or site
+ANALYSIS = "analysis.h5"
 FIELDS = "displacement", "velocity"
 HEAD = '<Xdmf Version="3.0"><Domain><Grid Name="run" GridType="Collection" CollectionType="Temporal">\n'
 TAIL = "</Grid></Domain></Xdmf>\n"
@@ -83,7 +87,9 @@ def write_curves(path: Path) -> list[Path]:
     """Write the curves of the results in ``path`` as CSV files to ``curves/`` in their folder.
 
     Variables over the same dimensions are one table, with a row a point, their coordinates first, units in the head.
-    Fields and maps, over other dimensions than the axes of a sweep, are left out. Raises as ``open_results``.
+    Of a run with ``analysis.h5`` beside it there is a table of its numbers, ``analysis-measures.csv``, and where they
+    were recorded ``run-points.csv`` and ``run-forces.csv``, with a column for each point and site. Fields and maps,
+    over other dimensions than the axes of a sweep, are left out. Raises as ``open_results``.
     """
     written = []
     with open_results(path) as data:
@@ -103,7 +109,51 @@ def write_curves(path: Path) -> list[Path]:
             stem = f"{source.stem}-{over}".replace("/", "-")
             path_of_table = source.parent / "curves" / f"{stem}.csv"
             written.append(_write_table(path_of_table, table.drop_vars(foreign)))
+        written += _write_wide(data, source)
+
+    # The numbers of a run are in the file beside it.
+    measured = source if source.name == ANALYSIS else source.with_name(ANALYSIS)
+    if source.name in ("run.h5", ANALYSIS) and measured.exists():
+        with open_results(measured) as analysis:
+            numbers = _numbers(analysis)
+        if numbers["measure"]:
+            written.append(_write_frame(measured.parent / "curves" / f"{measured.stem}-measures.csv", numbers))
     return written
+
+
+def _write_wide(run: xr.Dataset, source: Path) -> list[Path]:
+    """Write the motion of points and the forces of sites of a ``run`` over time, with a column for each of these."""
+    columns: dict[str, dict[str, np.ndarray]] = {"points": {}, "forces": {}}
+    for name in MOTION:
+        if name in run:
+            unit = run[name].attrs["units"]
+            for point, values in zip(run["point"].values, run[name].values.T, strict=True):
+                columns["points"][f"{point} {name.removeprefix('points/')} ({unit})"] = values
+    if FORCES in run:
+        for site, values in zip(run["site"].values, run[FORCES].values.T, strict=True):
+            columns["forces"][f"force of site {site} (N)"] = values
+
+    written = []
+    for kind, table in columns.items():
+        if table and len(table) * run.sizes["time"] <= MOST_NUMBERS:
+            path = source.parent / "curves" / f"{source.stem}-{kind}.csv"
+            written.append(_write_frame(path, {"time (s)": run["time"].values} | table))
+    return written
+
+
+def _numbers(analysis: xr.Dataset) -> dict[str, list[Any]]:
+    """Columns of a table of all numbers in an ``analysis``, a row each; those of parts of the frequency axis too."""
+    rows = []
+    for name, item in analysis.data_vars.items():
+        unit = item.attrs.get("units", "1")
+        text = item.attrs.get("long_name", "")
+        if not item.dims:
+            rows.append((str(name), item.item(), unit, text))
+        elif "parts" in item.attrs and len(item.dims) == 1:
+            parts = zip(np.atleast_1d(item.attrs["parts"]), item.values.tolist(), strict=True)
+            rows += [(f"{name} {part}", value, unit, text) for part, value in parts]
+    names = ("measure", "value", "unit", "text")
+    return {name: [row[i] for row in rows] for i, name in enumerate(names)}
 
 
 def _write_table(path: Path, table: xr.Dataset) -> Path:
@@ -114,8 +164,14 @@ def _write_table(path: Path, table: xr.Dataset) -> Path:
         unit = table[name].attrs.get("units", "1") if name in table.variables else "1"
         heads.append(name if unit in ("1", "") else f"{name} ({unit})")
     frame.columns = heads
+    return _write_frame(path, frame)
+
+
+def _write_frame(path: Path, columns: Any) -> Path:
+    """Write a table of named ``columns`` as CSV."""
+    import pandas as pd
 
     path.parent.mkdir(exist_ok=True)
     with atomic_write(path) as aside:
-        frame.to_csv(aside, index=False, float_format="%.17g")
+        pd.DataFrame(columns).to_csv(aside, index=False, float_format="%.17g")
     return path

@@ -31,8 +31,19 @@ def open_run(path: str | Path) -> xr.Dataset:
     ``encoding["source"]`` is the path. Raises OSError or ValueError as ``open_netcdf``.
     """
     run = open_netcdf(path, "run", ("time", "cell", "energy", "case"))
+    run = with_point_names(run)
     run.encoding["source"] = str(path)
     return run
+
+
+def with_point_names(run: xr.Dataset) -> xr.Dataset:
+    """The ``run`` with the names of its points, which its case has, as their coordinate, so that ``sel`` takes them."""
+    if "point" not in run.sizes:
+        return run
+    names = [point["name"] for point in tomllib.loads(run.attrs["case"])["output"]["points"]]
+    named = run.assign_coords(point=("point", np.array(names, dtype=object), run["point"].attrs))
+    named.set_close(run.close)
+    return named
 
 
 def open_results(path: str | Path) -> xr.Dataset:
@@ -52,6 +63,7 @@ def open_results(path: str | Path) -> xr.Dataset:
     if len(files) != 1:
         raise ValueError(f"{path}: holds {', '.join(file.name for file in files) or 'no results'}; name a file")
     data = open_netcdf(files[0], "result")
+    data = with_point_names(data)
     data.encoding["source"] = str(files[0])
     return data.set_coords([name for name in ("impacts/onset",) if name in data])
 

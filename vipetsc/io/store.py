@@ -26,10 +26,10 @@ import numpy as np
 
 from vipetsc.io import chunks
 from vipetsc.io.atomic import Arrays, discard, load_arrays, save_arrays, unwritten, write_text
-from vipetsc.io.chunks import LOSSES, Recording
+from vipetsc.io.chunks import Recording
 from vipetsc.io.lock import FolderError
 from vipetsc.io.netcdf import add_variable, put_dataset
-from vipetsc.io.read import open_run
+from vipetsc.io.read import open_run, with_point_names
 from vipetsc.parallel import SortedRows, on_every_rank, on_root, sort_over_ranks
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ class RunFolder:
             put_dataset(file, contents.small, write=self.comm.rank == 0)
             # All of them first: ranks create together, but each copies and may fail alone.
             large = {}
-            for name in (*columns, LOSSES, *self.recording.fields):
+            for name in (*columns, *self.recording.of_sites, *self.recording.fields):
                 description = chunks.described(name, contents.small)
                 dtype = columns[name].dtype if name in columns else float
                 about = description.attributes | chunks.coordinates(name)
@@ -304,7 +304,7 @@ class RunMemory:
         if self.comm.rank == 0:
             self.dataset = chunks.small_dataset(self, attributes)
             log = sort_over_ranks(MPI.COMM_SELF, chunks.read_log(self), ("onset", "site"))
-            large = {**chunks.joined(self, [LOSSES]), **chunks.log_columns(log.rows)}
+            large = {**chunks.joined(self, self.recording.of_sites), **chunks.log_columns(log.rows)}
             recorded = self._fields[:, : self._rows].swapaxes(2, 3)
             large |= dict(zip(self.recording.fields, recorded, strict=True))
             if self.end is not None:
@@ -313,6 +313,7 @@ class RunMemory:
             for name, values in large.items():
                 description = chunks.described(name, self.dataset)
                 self.dataset[name] = (description.dims, values, description.attributes)
+            self.dataset = with_point_names(self.dataset)
         self._chunks = []
 
 

@@ -8,7 +8,7 @@ gaps, the inter-band targeted energy transfer, and the energies of the linear mo
 
 import json
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,10 @@ from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import tabulated
 from vipetsc.lattice import pass_bands
 from vipetsc.lattice.chain import cells_between
+from vipetsc.spectra.measures import MEASURES, PART, RunRecord, row_of, take
 from vipetsc.studies.band_measures import BANDS, band_energies
 from vipetsc.studies.modal_measures import MODAL, modal_energies
+from vipetsc.studies.run_record import record_of
 from vipetsc.studies.velocity_record import VelocityRecord, options_of
 
 FORMAT_VERSION = 3
@@ -31,7 +33,11 @@ SNAPSHOTS = 500  # at most this many samples are transformed by wavelets
 MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: left to those who window the record
 
 # What is measured of a run whose fields are kept; "maps" are the space-time maps of the other measures.
-FULL = ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "modal", "transfers", "maps")
+# "motion" are the measures of named points and the largest force, "statistics" those of the run's ledger and log.
+FULL = (
+    *("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "modal", "transfers", "maps"),
+    *("motion", "statistics"),
+)
 # Of a member of a sweep whose fields are kept, by the sweep's ``measures``: what its pictures show.
 WHOLE = {
     "entropy": ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "maps"),
@@ -53,10 +59,10 @@ LAYOUT = (
         "dispersion_after": ("wavenumber frequency", "J", "mean kinetic energy per bin, cells after the first site"),
         "entropy/snapshot": ("entropy/snapshot", "s", "time of a snapshot"),
         "entropy/history": ("entropy/snapshot", "bit", "energy-weighted mean entropy of a snapshot"),
-        "entropy/energy_weighted": ("", "bit", "mean over time of the energy-weighted entropy"),
-        "entropy/masked": ("", "bit", "mean entropy where the wave is louder than 1 % of its loudest"),
-        "entropy/joint": ("", "bit", "mean over time of the entropy over cells and wavenumbers together"),
-        "entropy/error": ("", "bit", "deviation over the cells of the masked time mean"),
+        "entropy/energy_weighted": MEASURES["entropy/energy_weighted"].row,
+        "entropy/masked": MEASURES["entropy/masked"].row,
+        "entropy/joint": MEASURES["entropy/joint"].row,
+        "entropy/error": MEASURES["entropy/error"].row,
         "entropy/cell": ("entropy/cell", "1", "cell"),
         "entropy/local": ("entropy/snapshot entropy/cell", "bit", "entropy over wavenumbers at a cell"),
         "entropy/weight": ("entropy/snapshot entropy/cell", "m2/s2", "wavelet energy at a cell"),
@@ -99,28 +105,62 @@ def analyse(
         "status": run.attrs.get("status", ""),
         "analysis": describe_options(options),
     }
+    seen = record_of(run, options)
+    taken = take(seen, measures)
+    layout, numbers, attributes = _numbers(seen, taken)
     if "velocity" not in run:
-        return xr.Dataset(attrs=about | {"left_out": "everything: the velocity was not recorded"})
+        left_out = "all measures of fields: the velocity was not recorded"
+        about |= {"left_out": left_out, "warnings": json.dumps(seen.warnings)}
+        return _dataset(LAYOUT | layout, numbers, about, attributes)
 
     record = VelocityRecord(run, options)
-    values = _measure(run, record, set(measures) - record.unresolved(), arrival)
+    values = _measure(run, record, set(measures) - record.unresolved(), arrival) | numbers
+    record.warnings += seen.warnings
     about["left_out"] = "; ".join(record.left_out + record.warnings)
     about["warnings"] = json.dumps(record.warnings)
     about |= record.attributes.pop("", {})
 
     # Axes are written only where some variable needs them.
-    dims = {dim for name in values for dim in LAYOUT[name][0].split()}
+    dims = {dim for name in values for dim in (LAYOUT | layout)[name][0].split()}
     axes = {"time": record.mean_time, "cell": record.mean_cells, "bands/sample": record.time}
     values = {name: axis for name, axis in axes.items() if name in dims} | values
-    data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
-    for name, attributes in record.attributes.items():
-        data[name].attrs.update(attributes)
+    return _dataset(LAYOUT | layout, values, about, record.attributes | attributes)
+
+
+def _dataset(
+    layout: Mapping[str, tuple[str, str, str]],
+    values: Mapping[str, Any],
+    about: Mapping[str, Any],
+    attributes: Mapping[str, Mapping[str, Any]],
+) -> xr.Dataset:
+    """The dataset of ``values`` by name in the ``layout``, with attributes of its own and of variables."""
+    data = xr.Dataset(tabulated(layout, values), attrs=dict(about))
+    for name, texts in attributes.items():
+        data[name].attrs.update(texts)
     return data
+
+
+def _numbers(
+    record: RunRecord, taken: Mapping[str, Any]
+) -> tuple[dict[str, tuple[str, str, str]], dict[str, Any], dict[str, dict[str, Any]]]:
+    """Rows of a layout, values and attributes, all by name, of the measures of the registry that were ``taken``."""
+    layout: dict[str, tuple[str, str, str]] = {}
+    values = dict(taken)
+    attributes: dict[str, dict[str, Any]] = {}
+    for name in taken:
+        dimension, unit, text = row_of(name)
+        layout[name] = ("bands/part" if dimension == PART else dimension, unit, text)
+        if dimension == PART:
+            values["bands/part"] = np.arange(1, len(record.parts) + 1)
+            attributes[name] = {"parts": list(record.parts)}
+        if name.startswith("steady"):
+            attributes[name] = {"periods": record.periods, "tolerance": record.tolerance}
+    return layout, values, attributes
 
 
 def describe_options(options: AnalysisTable) -> str:
     """The ``options`` that results depend on, as text for the attribute ``analysis`` of a file."""
-    return json.dumps(options.model_dump(exclude={"memory"}))
+    return json.dumps(options.model_dump(exclude={"memory"}, exclude_none=True))
 
 
 def _measure(

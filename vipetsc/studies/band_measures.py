@@ -7,14 +7,15 @@ import numpy as np
 
 from vipetsc import spectra
 from vipetsc.lattice import pass_bands
+from vipetsc.spectra.measures import MEASURES
 from vipetsc.studies.velocity_record import VelocityRecord
 
 ENDS = 0.02  # part of a record at either end where band energies are too inaccurate for a mean (manual, files.md)
 
 # Rows of ``studies.analysis.LAYOUT``.
 BANDS = {
-    "ibtet": ("", "1", "inter-band energy transfer"),
-    "ibtet_whole": ("", "1", "inter-band energy transfer as the paper's: the record's last samples are in the mean"),
+    "ibtet": MEASURES["ibtet"].row,
+    "ibtet_whole": MEASURES["ibtet_whole"].row,
     "bands/edge": ("bands/edge", "1", "edge of a part"),
     "bands/part": ("bands/part", "1", "part of the frequency axis"),
     "bands/edges": ("bands/edge", "rad/s", "edges of the pass bands and gaps"),

@@ -18,7 +18,9 @@ from vipetsc.io.folder import origin
 from vipetsc.io.netcdf import Variables, variable, write_netcdf
 from vipetsc.io.records import Line, Record, merge_records, read_records
 from vipetsc.spectra import FEWEST, doubt, normalised, power_law
-from vipetsc.studies.linear_run import FITTED, MEASURES, MEMBERS, LinearRun
+from vipetsc.spectra.measures import MEASURES as REGISTRY
+from vipetsc.spectra.measures import PART, power_of, row_of
+from vipetsc.studies.linear_run import FITTED, MEASURES, MEMBERS, LinearRun, of_motion
 from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.sample_statistics import over_samples
 
@@ -28,12 +30,7 @@ COMPLETE, SCALED, FAILED, MISSING = range(4)
 AMPLITUDE = "drive.amplitude"
 
 # What the ensemble takes of a member's statistics: as ``MEASURES`` of its analysis.
-STATISTICS = {
-    "contact_episodes": ("", "1", "contact episodes"),
-    "dissipated_fraction": ("", "1", "dissipated energy over the drive's work"),
-    "work": ("", "J", "work done by the drive"),
-    "ledger_error": ("", "1", "largest error of the energy ledger over the work"),
-}
+STATISTICS = {name: REGISTRY[name].row for name in ("contact_episodes", "dissipated_fraction", "work", "ledger_error")}
 FIT = {
     "peak_amplitude": ("N", "amplitude of the largest value"),
     "peak": ("1", "largest value, not normalised"),
@@ -54,10 +51,14 @@ FIT = {
 
 
 class LinearSource(NamedTuple):
-    """Source of a scaled member: the ``name`` of a linear run, measured for the first ``site`` (cell)."""
+    """Source of a scaled member: the ``name`` of a linear run, measured for the first ``site`` (cell).
+
+    The member's wave is that of the run times the ``factor``.
+    """
 
     name: str
     site: int
+    factor: float
 
 
 class Results:
@@ -110,7 +111,7 @@ class Results:
                 if number is not None:
                     self._enter(number, record, line)
                     if record["status"] == STATUS[SCALED]:
-                        sources[number] = LinearSource(record["linear"], record["site"])
+                        sources[number] = LinearSource(record["linear"], record["site"], record.get("factor", 1.0))
         return sources
 
     def _enter_linear(self, record: Record, line: Line) -> None:
@@ -181,7 +182,10 @@ class Results:
             if run is None or source.site not in run.measures:
                 self.status[numbers] = MISSING
                 continue
-            self._put(numbers, run.measures[source.site])
+            row = run.measures[source.site]
+            for name in of_motion(row):
+                row = row | {name: np.asarray(row[name], float) * source.factor ** power_of(name)}
+            self._put(numbers, row)
             if "bands/modal_energy" in run.measures[source.site]:
                 energy = self.tables["bands/modal_energy"]
                 energy[numbers] *= self.tables["work"][numbers, None] / run.statistics["work"]
@@ -201,7 +205,7 @@ def assemble(results: Results, warnings: Sequence[str] = ()) -> None:
     sys.audit("vipetsc.merge", str(results.folder))
     plan = results.plan
     data = _coordinates(plan) | _member_variables(results) | _measured_variables(results)
-    data |= _fit_variables(plan, data)
+    data |= _fit_variables(results, data)
 
     positions = np.argwhere(results.status.reshape(plan.shape) == FAILED).tolist()
     numbers = results.first[results.status == FAILED]
@@ -245,13 +249,13 @@ def _member_variables(results: Results) -> Variables:
 
 
 def _measured_variables(results: Results) -> Variables:
-    """``STATISTICS`` and those of ``MEASURES`` that some member has, with the coordinates that they need."""
+    """``STATISTICS`` and the measures that some member has, with the coordinates that they need."""
     plan = results.plan
     dims = _dimensions(plan)
     data: Variables = {}
-    for name, (further, *texts) in (STATISTICS | MEASURES).items():
+    for name, (further, *texts) in _layout(results).items():
         table = results.tables.get(name, np.full(plan.count, np.nan))[results.first]
-        if further == "part" and len(results.parts) != 1:  # cells whose bands overlap differently have no common parts
+        if further == PART and len(results.parts) != 1:  # cells whose bands overlap differently have no common parts
             continue
         if name in STATISTICS or table.ndim > 1 or not np.isnan(table).all():
             error: dict[str, Any] = {}
@@ -264,22 +268,29 @@ def _measured_variables(results: Results) -> Variables:
         number = np.arange(data["entropy/history"].shape[-1])
         data["snapshot"] = variable("snapshot", number, "1", "number of a snapshot")
         data["entropy/time"] = data.pop("entropy/snapshot")
-    for name in ("bands/share", "bands/modal_energy"):
-        if name in data:
-            data[name].attrs["parts"] = list(*results.parts)
+    for name in [name for name, item in data.items() if PART in item.dims]:
+        data[name].attrs["parts"] = list(*results.parts)
+        if PART not in data:
             number = np.arange(1, data[name].shape[-1] + 1)
             data["part"] = variable("part", number, "1", "part of the frequency axis")
     return data
 
 
-def _fit_variables(plan: Sweep, data: Variables) -> Variables:
+def _layout(results: Results) -> dict[str, tuple[str, str, str]]:
+    """Rows of all that the ``results`` may hold, in an order that does not depend on that of the members."""
+    of_points = sorted(of_motion(results.tables))
+    return STATISTICS | MEASURES | {name: row_of(name) for name in of_points}
+
+
+def _fit_variables(results: Results, data: Variables) -> Variables:
     """Power laws over the amplitude; statistics over samples of disorder, and power laws of their means."""
+    plan = results.plan
     names = plan.names()
     fits: Variables = {}
     if AMPLITUDE in names:
         fits |= _fits(data, names[AMPLITUDE])
     if any(axis.keys() == {SEED} for axis in plan.axes):
-        fits |= over_samples(data, names[SEED], [name for name in STATISTICS | MEASURES if name in data])
+        fits |= over_samples(data, names[SEED], [name for name in _layout(results) if name in data])
         if AMPLITUDE in names:
             amplitude = names[AMPLITUDE]
             means = {name: fits[f"statistics/{name}/mean"] for name in FITTED if name in data}

@@ -4,7 +4,7 @@ Until the first contact a lattice is linear, so displacements go with the drive'
 square. The linear run, under 1 N and without contacts, shows which members nothing touches; those are that run, scaled.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -17,7 +17,9 @@ from vipetsc.case.contacts import gaps_of_sites, pairs_of_sites
 from vipetsc.io.read import field_time
 from vipetsc.io.records import Record, read_records
 from vipetsc.lattice.chain import Pair, cells_between
-from vipetsc.studies.analysis import LAYOUT, analyse
+from vipetsc.spectra.measures import MEASURES as REGISTRY
+from vipetsc.spectra.measures import PART, group_of, is_measure, row_of
+from vipetsc.studies.analysis import analyse
 from vipetsc.studies.pair_motion import PairMotion
 from vipetsc.studies.recorded_runs import RecordPaths
 
@@ -28,14 +30,7 @@ MEMBERS = "members"  # what the records of a sweep are called
 
 # What the ensemble takes of a member's analysis: further dimension, units and description.
 FITTED = ("ibtet", "entropy/energy_weighted", "entropy/masked", "entropy/joint")
-MEASURES = {name: LAYOUT[name] for name in (*FITTED, "ibtet_whole", "entropy/error")} | {
-    "entropy/start": ("", "s", "time at which averages of the entropy begin"),
-    "entropy/history": ("snapshot", "bit", "entropy of a snapshot"),
-    "entropy/snapshot": ("snapshot", "s", "time of a snapshot"),
-    "upper_share_at_end": LAYOUT["upper_share_at_end"],
-    "bands/modal_energy": ("part", "J", "energy of the linear modes in a part at the end"),
-    "bands/share": ("part", "1", "mean share of a pass band or gap after the wave's arrival"),
-}
+MEASURES = {name: measure.row for name, measure in REGISTRY.items() if measure.group in ("entropy", "transfer")}
 
 
 class LinearRun(NamedTuple):
@@ -121,13 +116,14 @@ class LinearRun(NamedTuple):
 
 
 def measured(analysis: xr.Dataset) -> Record:
-    """Values that the ensemble takes from an ``analysis``: ``MEASURES`` and their attributes.
+    """Values that the ensemble takes from an ``analysis``: measures of the registry and their attributes.
 
     ``parts`` of the frequency axis by name, ``errors`` by the samples left out, the options of the ``analysis``.
     """
     row: Record = {}
     errors: dict[str, float] = {}
-    for name in MEASURES:
+    taken = [*MEASURES, *sorted(of_motion(map(str, analysis.data_vars)))]
+    for name in taken:
         if name in analysis:
             row[name] = analysis[name].values.tolist()
             error = analysis[name].attrs.get("sampling_error")
@@ -137,14 +133,19 @@ def measured(analysis: xr.Dataset) -> Record:
     if "analysis" in analysis.attrs:
         row["analysis"] = analysis.attrs["analysis"]
 
-    for name in ("bands/share", "bands/modal_energy"):
-        if name in row:
+    for name in taken:
+        if name in row and row_of(name)[0] == PART:
             row["parts"] = list(analysis[name].attrs["parts"])
     if "bands/modal_energy" in row:
         row["bands/modal_energy"] = analysis["bands/modal_energy"].values[:, -1].tolist()
     if "entropy/history" in row:
         row["entropy/start"] = float(analysis.attrs["entropy/start"])
     return row
+
+
+def of_motion(names: Iterable[str]) -> list[str]:
+    """Those of the ``names`` that are measures of the group "motion", perhaps of points."""
+    return [name for name in names if is_measure(name) and group_of(name) == "motion"]
 
 
 def _pairs(case: Case) -> tuple[Pair, ...]:
@@ -172,10 +173,12 @@ def linear_case(case: Case) -> Case:
     pair may be all that joins the cells: they stay.
     """
     amplitude = 1.0 if is_proportional(case) else case.drive.amplitude
+    output = case.output.of_points()
+    drive = {"amplitude": amplitude}
     if _pairs(case):
-        return case.varied(name="linear", without=("output",), drive={"amplitude": amplitude})
+        return case.varied(name="linear", without=("output",), drive=drive, output=output)
     without = ("output", "contacts")
-    return case.varied(name="linear", without=without, drive={"amplitude": amplitude}, contacts={"sites": 0})
+    return case.varied(name="linear", without=without, drive=drive, contacts={"sites": 0}, output=output)
 
 
 def linear_name(case: Case) -> str:

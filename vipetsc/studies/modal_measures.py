@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
+from vipetsc.spectra.measures import MEASURES
 from vipetsc.spectra.modal_energies import ModalParts, cluster_samples
 from vipetsc.studies.velocity_record import VelocityRecord
 
@@ -17,7 +18,7 @@ MOST_BRACKETS = 1000  # samples at bounds of clusters; where there were more, th
 
 # Rows of ``studies.analysis.LAYOUT``.
 MODAL = {
-    "upper_share_at_end": ("", "1", "energy of the bands above the driven one at the end, over the drive's work"),
+    "upper_share_at_end": MEASURES["upper_share_at_end"].row,
     "bands/instant": ("bands/instant", "s", "time of an energy of the linear modes"),
     "bands/modal_energy": ("bands/part bands/instant", "J", "energy of the linear modes in a part"),
     "bands/bin": ("bands/bin", "1", "wavenumber bin, of twelve from 0 to pi"),

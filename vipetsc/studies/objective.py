@@ -1,7 +1,8 @@
 """The runs by which a design is judged: simulated by teams of ranks, measured, and recorded as they end."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,22 +12,33 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case, Model, case_id
-from vipetsc.case.optimise import ObjectiveTable, OptimiseCase
+from vipetsc.case.objective import MeasuredTable
+from vipetsc.case.optimise import OptimiseCase
+from vipetsc.io.records import Record
 from vipetsc.lattice import pass_bands
 from vipetsc.parallel import StopRequest, on_root
+from vipetsc.spectra.measures import group_of
 from vipetsc.spectra.modal_energies import ModalParts
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.recorded_runs import Key, RecordedRuns
 
+SHARE = "band_share"
+# What ``analyse`` is asked for, by the group of a measure.
+ANALYSED = {"entropy": "entropy", "transfer": "bands", "motion": "motion", "statistics": "statistics"}
+# Names in searches of measures that have another one in results.
+RENAMED = {"entropy": "entropy/energy_weighted"}
 
-class Analysed(NamedTuple):
-    """A measure that ``analyse`` is asked for, and the variable of its result that is the objective."""
 
-    measure: str
-    variable: str
+class Judgement(NamedTuple):
+    """Judgement of a design: ``losses`` (objective), small for a good one, NaN if a run failed, with the ``reason``.
 
+    ``constraints`` are the values of what is constrained, ``excess`` sums by how much they are outside their bounds.
+    """
 
-ANALYSED = {"ibtet": Analysed("bands", "ibtet"), "entropy": Analysed("entropy", "entropy/energy_weighted")}
+    losses: list[float]
+    constraints: list[float]
+    excess: float = 0.0
+    reason: str = ""
 
 
 class ObjectiveRuns:
@@ -49,13 +61,13 @@ class ObjectiveRuns:
         """The runs of a ``design`` by amplitude in N and number of the disorder's sample; raises CaseError."""
         # A dictionary names each amplitude once and keeps the order, which is the same on all ranks.
         amplitudes: dict[float, None] = {}
-        for objective in self.plan.options.objective:
-            amplitudes |= dict.fromkeys(self._amplitudes(objective))
+        for measured_table in self.plan.options.measured:
+            amplitudes |= dict.fromkeys(self._amplitudes(measured_table))
         pairs = itertools.product(amplitudes, range(self.plan.options.samples))
         return {(amplitude, sample): self.plan.run(design, amplitude, sample) for amplitude, sample in pairs}
 
-    def _amplitudes(self, objective: ObjectiveTable) -> list[float]:
-        """Amplitudes in N that an ``objective`` is measured at."""
+    def _amplitudes(self, objective: MeasuredTable) -> list[float]:
+        """Amplitudes in N that an ``objective`` or a constraint is measured at."""
         return objective.amplitudes or [self.amplitude]
 
     def make(self, runs: Iterable[Case]) -> None:
@@ -67,39 +79,66 @@ class ObjectiveRuns:
     def _measure(self, case: Case) -> dict[str, Any]:
         """Values measured of a run, by its whole team."""
         data, result = self.recorded.run_in_memory(case)
-        objectives = self.plan.options.objective
-        return on_root(self.recorded.team, lambda: measured(data, result.statistics, objectives))
+        tables = self.plan.options.measured
+        return on_root(self.recorded.team, lambda: measured(data, result.statistics, tables))
 
-    def losses(self, design: Case) -> tuple[list[float], str]:
-        """Losses of a ``design`` whose runs are recorded, small for a good one; NaN if a run failed, and the reason."""
-        objectives = self.plan.options.objective
+    def judge(self, design: Case) -> Judgement:
+        """The judgement of a ``design`` whose runs are recorded."""
+        options = self.plan.options
+        constraints = options.constraint or []
+        missing = [[np.nan] * len(options.objective), [np.nan] * len(constraints)]
         records = {key: self.recorded.records[case_id(run)] for key, run in self.runs(design).items()}
         for (amplitude, _), record in records.items():
-            if "reason" in record:
-                return [np.nan] * len(objectives), f"{amplitude:g} N: {record['reason']}"
+            reason = self._failure(record)
+            if reason:
+                return Judgement(*missing, reason=f"{amplitude:g} N: {reason}")
 
         losses = []
-        for objective in objectives:
+        for objective in options.objective:
             sign = -1 if objective.goal == "maximise" else 1
-            by_amplitude = []
-            for amplitude in self._amplitudes(objective):
-                samples = [row["values"][objective.name] for (at, _), row in records.items() if at == amplitude]
-                by_amplitude.append(sign * float(np.mean(samples)))
+            by_amplitude = [sign * mean for mean in self._means(objective, records)]
             # Losses are small for good designs, so the worst is the largest.
-            worst = objective.over == "worst"
-            losses.append(max(by_amplitude) if worst else float(np.mean(by_amplitude)))
-        return losses, ""
+            losses.append(max(by_amplitude) if objective.over == "worst" else float(np.mean(by_amplitude)))
+
+        bounded = []
+        excess = 0.0
+        for constraint in constraints:
+            means = self._means(constraint, records)
+            # The worst is the one that is farthest outside the bounds.
+            worst = max(means, key=constraint.excess)
+            value = worst if constraint.over == "worst" else float(np.mean(means))
+            bounded.append(value)
+            excess += constraint.excess(value)
+        return Judgement(losses, bounded, excess)
+
+    def _failure(self, record: Record) -> str:
+        """Why a run says nothing about its design; empty if it does."""
+        if "reason" in record:
+            return str(record["reason"])
+        values = record["values"]
+        for table in self.plan.options.measured:
+            if np.isnan(values[table.name]):
+                return "; ".join([f"{table.name} has no value", *values.get("warnings", [])])
+        return ""
+
+    def _means(self, table: MeasuredTable, records: Mapping[tuple[float, int], Record]) -> list[float]:
+        """The mean over the samples at each amplitude of a measure; ``records`` by amplitude and sample."""
+        means = []
+        for amplitude in self._amplitudes(table):
+            samples = [row["values"][table.name] for (at, _), row in records.items() if at == amplitude]
+            means.append(float(np.mean(samples)))
+        return means
 
     def values(self, run: Case) -> dict[str, Any]:
         """Values measured of a ``run`` that has a record; none of one that failed."""
         return dict(self.recorded.records[case_id(run)].get("values", {}))
 
 
-def measured(run: xr.Dataset, statistics: dict[str, Any], objectives: Sequence[ObjectiveTable]) -> dict[str, Any]:
-    """Values of a ``run`` that the ``objectives`` need, by their names, and those that every run has.
+def measured(run: xr.Dataset, statistics: dict[str, Any], tables: Sequence[MeasuredTable]) -> dict[str, Any]:
+    """Values of a ``run`` that objectives and constraints, the ``tables``, need, by their names; and some of all runs.
 
     ``upper_share_at_end``, ``bands`` (pass band): energy at the end over the work; ``transmitted``: that beyond the
-    last site; ``dissipated``, ``episodes``, ``ibtet`` and ``entropy`` where they are asked for.
+    last site; ``dissipated``, ``episodes``.
     """
     model = Case.of(run).model()
     work = float(run["energy/work"][-1])
@@ -123,18 +162,42 @@ def measured(run: xr.Dataset, statistics: dict[str, Any], objectives: Sequence[O
         "transmitted": _energy_beyond(model, u, v) / work,
     }
 
-    asked = {o.measure: ANALYSED[o.measure] for o in objectives if o.measure in ANALYSED}
-    if asked:
-        analysis = analyse(run, {analysed.measure for analysed in asked.values()})
-        for name, analysed in asked.items():
-            values[name] = float(analysis[analysed.variable])
-
-    for objective in objectives:
-        if objective.band:
-            low, high = objective.part or (0.0, np.inf)
-            within = inside[objective.band] & (frequency >= low) & (frequency < high)
-            values[objective.name] = float(energy[within].sum())
+    values |= _analysed(run, [table for table in tables if table.measure not in values and table.measure != SHARE])
+    for table in tables:
+        if table.measure == SHARE and table.band:
+            low, high = table.part or (0.0, np.inf)
+            within = inside[table.band] & (frequency >= low) & (frequency < high)
+            values[table.name] = float(energy[within].sum())
     return values
+
+
+def _analysed(run: xr.Dataset, tables: Sequence[MeasuredTable]) -> dict[str, Any]:
+    """Values of those ``tables`` that ask for a measure of the registry, by their names, and ``warnings``."""
+    if not tables:
+        return {}
+    names = {table.name: RENAMED.get(table.measure, table.measure) for table in tables}
+    analysis = analyse(run, {ANALYSED[group_of(name)] for name in names.values()})
+
+    values: dict[str, Any] = {}
+    for table in tables:
+        # What the run cannot give is left out of its analysis.
+        value = analysis.get(names[table.name])
+        if value is None:
+            values[table.name] = np.nan
+        elif table.band:
+            values[table.name] = float(value[_part_of(value.attrs["parts"], table.band)])
+        else:
+            values[table.name] = float(value)
+    warnings = json.loads(analysis.attrs["warnings"])
+    return values | ({"warnings": warnings} if warnings else {})
+
+
+def _part_of(parts: Sequence[str], band: int) -> int:
+    """The number (from 0) of that of the ``parts``, named as ``spectra.Parts`` does, that holds a ``band``."""
+    for number, name in enumerate(parts):
+        if name.startswith("band ") and str(band) in name.removeprefix("band ").split("+"):
+            return number
+    raise ValueError(f"no part holds band {band}")
 
 
 def _energy_beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray) -> float:

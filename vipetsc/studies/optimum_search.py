@@ -49,6 +49,9 @@ LAYOUT = {
     "generation": ("design", "1", "generation; 0 holds the case and the start"),
     "parameter": ("design variable", "1", "what varies, in the unit of its variable"),
     "value": ("design objective", "1", "value of an objective; NaN for a design that failed"),
+    "constraint": ("constraint", "1", "what is bounded"),
+    "constrained": ("design constraint", "1", "value of what is bounded, in its unit; NaN for a design that failed"),
+    "excess": ("design", "1", "by how much bounds are missed, over the bounds; 0 for a design that misses none"),
     "upper_share_at_end": ("design", "1", "energy of the bands above the driven one at the end, mean over its runs"),
     "dissipated": ("design", "1", "dissipated energy over the work, mean over its runs"),
     "reason": ("design", "1", "why a design failed"),
@@ -73,7 +76,8 @@ class Design:
     """A design that was tried: its ``values`` (variable) and what became of it.
 
     ``case`` and ``runs`` are None and empty for an impossible one; ``losses`` (objective) are small for a good one, NaN
-    if it failed for a ``reason``.
+    if it failed for a ``reason``. ``constraints`` are the values of what is bounded, ``excess`` is by how much they are
+    out of bounds.
     """
 
     values: np.ndarray
@@ -82,6 +86,8 @@ class Design:
     runs: Sequence[Case] = ()
     reason: str = ""
     losses: list[float] = field(default_factory=list)
+    constraints: list[float] = field(default_factory=list)
+    excess: float = 0.0
 
 
 class OptimumSearch:
@@ -114,9 +120,15 @@ class OptimumSearch:
     def tell_and_ask(self) -> bool:
         """Judge the designs whose runs are recorded, report to the sampler, and ask for more; whether there are any."""
         for design in self.asked:
-            design.losses = [np.nan] * len(self.plan.options.objective)
+            options = self.plan.options
+            design.losses = [np.nan] * len(options.objective)
+            design.constraints = [np.nan] * len(options.constraint or [])
             if design.case:
-                design.losses, design.reason = self.objective.losses(design.case)
+                judgement = self.objective.judge(design.case)
+                design.losses = judgement.losses
+                design.constraints = judgement.constraints
+                design.excess = judgement.excess
+                design.reason = judgement.reason
 
         left = self.plan.options.budget - len(self.designs)
         if left <= 0:
@@ -131,19 +143,34 @@ class OptimumSearch:
         return True
 
     def _tell(self) -> None:
-        """Give the sampler the losses of the designs that it asked for; one that failed is worse than all others."""
-        judged = self.losses()
+        """Give the sampler the losses of the designs that it asked for.
+
+        One that misses a constraint is worse than all that miss none, the more so the more it misses (Deb 2000, Comput.
+        Methods Appl. Mech. Eng. 186, 311); one that failed is worse than all others.
+        """
+        judged = self.feasible_losses()
         worst = np.max(judged, axis=0, initial=0.0, where=np.isfinite(judged)) + 1
-        losses = np.array([design.losses for design in self.asked])
-        self.sampler.tell(np.where(np.isfinite(losses), losses, worst))
+        most = max(design.excess for design in self.designs)
+        losses = []
+        for design in self.asked:
+            row = np.array(design.losses)
+            if design.excess > 0:
+                row = worst + design.excess
+            losses.append(np.where(np.isfinite(row), row, worst + most))
+        self.sampler.tell(np.array(losses))
 
     def losses(self) -> np.ndarray:
         """Losses of all designs (design, objective)."""
         return np.array([design.losses for design in self.designs])
 
+    def feasible_losses(self) -> np.ndarray:
+        """Losses of all designs (design, objective), NaN for those that miss a constraint."""
+        is_feasible = np.array([design.excess == 0 for design in self.designs])
+        return np.where(is_feasible[:, None], self.losses(), np.nan)
+
     def compared(self) -> dict[str, int]:
         """The numbers of the designs to be compared by name: the case, and the best or the front's ends and knee."""
-        losses = self.losses()
+        losses = self.feasible_losses()
         best = front(losses)
         if not best.size:
             return {"case": 0}
@@ -251,7 +278,7 @@ def _curves(search: OptimumSearch) -> dict[str, list[Case]]:
     case_amplitude = search.objective.amplitude
     amplitudes = options.curve
     if not amplitudes:
-        asked = [a for objective in options.objective for a in objective.amplitudes or [case_amplitude]]
+        asked = [a for table in options.measured for a in table.amplitudes or [case_amplitude]]
         amplitudes = np.geomspace(min(asked) / CURVE_SPREAD, max(asked) * CURVE_SPREAD, CURVE_POINTS).tolist()
     amplitudes = sorted({*amplitudes, case_amplitude})
 
@@ -301,8 +328,13 @@ def _design_values(search: OptimumSearch) -> dict[str, Any]:
         "parameter": [design.values for design in designs],
         "value": signs * search.losses(),
         "reason": [design.reason for design in designs],
-        "front": front(search.losses()),
+        "front": front(search.feasible_losses()),
     }
+    constraints = search.plan.options.constraint or []
+    if constraints:
+        values["constraint"] = [f"{number}: {table.describe()}" for number, table in enumerate(constraints, 1)]
+        values["constrained"] = [design.constraints for design in designs]
+        values["excess"] = [design.excess for design in designs]
 
     measured = [[search.objective.values(run) for run in design.runs] for design in designs]
     for name in SHOWN:
@@ -354,6 +386,9 @@ def _summary(data: xr.Dataset, plan: OptimiseCase) -> str:
     if reasons:
         lines.append(f"  such as: {reasons[0]}")
     lines += [f"  {number}: {objective.describe()}" for number, objective in enumerate(plan.options.objective, 1)]
+    if "excess" in data:
+        met = int(((data["excess"] == 0) & (data["reason"] == "")).sum())
+        lines += [f"  {met} designs meet the constraints:", *(f"    {text}" for text in data["constraint"].values)]
 
     columns = [*data["objective"].values, "upper share", "dissipated"]
     lines.append(f"  {'design':<8}{'number':>7}" + "".join(f"{name:>24}" for name in columns))

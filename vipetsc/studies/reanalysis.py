@@ -1,19 +1,25 @@
 """New analyses of finished runs: of one run, or of all members of a sweep whose fields were kept."""
 
-from collections.abc import Collection, Iterator, Sequence
+import json
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from mpi4py import MPI
 
+import numpy as np
+import xarray as xr
+
 import vipetsc
 from vipetsc.case import Case, Sweep
+from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import FolderError, origin
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
 from vipetsc.io.read import open_run, outdated
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import on_every_rank, on_root
+from vipetsc.spectra.measures import is_measure
 from vipetsc.studies.analysis import FULL, analyse, describe_options
 from vipetsc.studies.ensemble import MISSING, Results
 from vipetsc.studies.linear_run import leading_cell, measured, read_linear
@@ -119,7 +125,31 @@ def measure_run(
         arrival = linear.arrival_at(leading_cell(case)) if linear else None
         analysis = analyse(run, measures, arrival, options_of(run, folder, overrides))
         write_netcdf(folder / "analysis.h5", analysis.assign_attrs(origin() | analysis.attrs))
+    _put_into_summary(folder / "summary.json", numbers_of(analysis))
     return folder / "analysis.h5"
+
+
+def _put_into_summary(path: Path, numbers: Mapping[str, float | list[float]]) -> None:
+    """Write the ``numbers`` of a run into its summary, if it has one; what is not finite is null there."""
+    if not path.exists():
+        return
+    summary = json.loads(path.read_text(encoding="utf-8"))
+    finite = {}
+    for name, value in numbers.items():
+        values = [item if np.isfinite(item) else None for item in np.atleast_1d(value).tolist()]
+        finite[name] = values if isinstance(value, list) else values[0]
+    text = json.dumps(summary | {"measures": finite}, indent=2, allow_nan=False)
+    write_text(path, text + "\n")
+
+
+def numbers_of(analysis: xr.Dataset) -> dict[str, float | list[float]]:
+    """The measures of the registry that an ``analysis`` has, by name; lists over the parts of the frequency axis."""
+    numbers = {}
+    for name in map(str, analysis.data_vars):
+        is_number = not analysis[name].dims or "parts" in analysis[name].attrs
+        if is_measure(name) and is_number and analysis[name].ndim < 2:
+            numbers[name] = analysis[name].values.tolist()
+    return numbers
 
 
 def is_measured(folder: Path) -> bool:

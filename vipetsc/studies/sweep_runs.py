@@ -173,6 +173,7 @@ def _scaled(case: Case, linear: LinearRun, name: str, site: int) -> Record:
         "reason": "complete: scaled from the linear run",
         "linear": name,
         "site": site,
+        "factor": factor(case),
         "statistics": {
             "engine": linear.statistics["engine"],
             "ledger_error": linear.statistics["ledger_error"],
@@ -193,7 +194,7 @@ def _with_everything(case: Case, fields: list[str]) -> Case:
 def measures_of(plan: Sweep) -> set[str]:
     """Measures that ``analyse`` takes of a member: those that its pictures show if its fields are kept."""
     asked = WHOLE if plan.options.fields else ANALYSED
-    return {measure for name in plan.options.measures for measure in asked[name]}
+    return {"motion"} | {measure for name in plan.options.measures if name in asked for measure in asked[name]}
 
 
 def keeps_all(case: Case) -> bool:
@@ -210,6 +211,10 @@ def thinned(run: xr.Dataset, case: Case) -> xr.Dataset:
         run = run.assign({"end/displacement": run["displacement"].variable[-1]})
     run = run.drop_vars([name for name in FIELDS if name in run and name not in output.fields])
     run = run.isel(cell=list(recorded_cells(output, case.lattice.cells)))
+
+    if "point" in run.coords:
+        # Names stand in the case; files count points, as those of single runs do.
+        run = run.assign_coords(point=("point", np.arange(1, run.sizes["point"] + 1), run["point"].attrs))
 
     fields = {}
     for name in output.fields:

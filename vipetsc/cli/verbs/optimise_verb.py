@@ -22,6 +22,7 @@ def optimise_rows(plan: OptimiseCase, ranks: int) -> Rows:
     return [
         ("optimise", f"{plan.options.budget} designs of {variables}"),
         *(("objective", objective.describe()) for objective in plan.options.objective),
+        *(("constraint", constraint.describe()) for constraint in plan.options.constraint or []),
     ]
 
 

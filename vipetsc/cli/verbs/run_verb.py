@@ -58,13 +58,18 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     # The run is saved; the command that goes on measures it.
     work.stop.check(work.comm)
 
-    # Measures of fields need a second sample: a run that fails in its first has none.
-    has_fields = bool(case.output.fields) and result.statistics["samples"] > 1
-    if has_fields:
+    # Measures need a second sample: a run that fails in its first has none.
+    has_two_samples = result.statistics["samples"] > 1
+    has_fields = bool(case.output.fields) and has_two_samples
+    if has_fields or (case.output.points and has_two_samples):
         # The linear run of its sweep has the time at which the wave arrives at the sites of a member.
         sweep = Path(work.options.case) if work.options.member else None
         on_root(work.comm, lambda: is_measured(work.folder) or measure_run(work.folder, sweep))
         on_root(work.comm, lambda: has_xdmf(work.folder) or write_xdmf(work.folder))
+        measured, unsettled = on_root(work.comm, lambda: measures_of_points(case, work.folder))
+        work.warn(unsettled)
+        if measured:
+            work.report(measured)
     return Outcome(complete=result.complete, drawable=has_fields)
 
 
@@ -164,6 +169,31 @@ def run_table(result: "Result", faster: str = "") -> str:
         ("faster", faster),
     ]
     return f"{result.sentence}\n{table(rows)}"
+
+
+def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
+    """A table of the measures of the run's named points, empty without points, and sentences about those without."""
+    from vipetsc.io.netcdf import open_netcdf
+    from vipetsc.spectra.measures import MEASURES, UNSETTLED, measures_of
+
+    points = [point.name for point in case.output.points or []]
+    if not points:
+        return "", []
+    rows = []
+    with open_netcdf(folder / "analysis.h5", "analysis") as analysis:
+        for name in measures_of(points, case.output.transmission or []):
+            if name in MEASURES or name not in analysis:
+                continue  # of no point, or not measured
+            item = analysis[name]
+            unit = "" if item.attrs["units"] == "1" else item.attrs["units"]
+            if np.isnan(item.values).all():
+                rows.append((name, "no value"))
+                continue
+            values = ", ".join(f"{value:.5g}" for value in np.atleast_1d(item.values))
+            parts = f" ({', '.join(np.atleast_1d(item.attrs['parts']))})" if "parts" in item.attrs else ""
+            rows.append((name, f"{values} {unit}".rstrip() + parts))
+        warnings = json.loads(analysis.attrs["warnings"])
+    return table(rows), [warning for warning in warnings if warning.startswith(UNSETTLED)]
 
 
 def measure_where_missing(folders: Sequence[Path]) -> None:

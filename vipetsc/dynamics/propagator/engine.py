@@ -140,9 +140,13 @@ def take_steps(
         if is_sample or steps == progress.last:
             ghosts = halo.columns[: states.ghost_rows, halo.columns.shape[1] - states.ghosts :]
             state[rows * owned :] = np.concatenate((clusters.energy[dofs.ledger], ghosts.T.flatten()))
-        if is_sample and not take_sample(state, k, samples) and progress.failed > progress.last:
-            progress.failed = steps
-            progress.cluster = -1
+        if is_sample:
+            # Behind the drives' works the ledger has the losses of the owned sites.
+            own_sites = dofs.ledger[samples.lattice.drives.rows.size :]
+            is_finite = take_sample(state, k, samples, clusters.contacts, own_sites)
+            if not is_finite and progress.failed > progress.last:
+                progress.failed = steps
+                progress.cluster = -1
         failed = progress.failed <= progress.last
         if steps == progress.last or (failed and halo.scatter == 0):
             break

@@ -60,6 +60,9 @@ def no_samples(model: Model, layout: Layout, number: int) -> Samples:
         lattice=create_record(model, layout),
         unit=1.0,
         interval=1.0,
+        forces=np.zeros((0, 0)),
+        motion=np.zeros((0, 0, 0)),
+        watched=np.zeros(0, np.int64),
     )
 
 

@@ -72,6 +72,7 @@ class Integrator(Engine):
         self.tracker = ImpactTracker(self.lattice.contacts, layout.contacts)
         self.counts = dict.fromkeys(("steps", "rejected", "landings", "switches"), 0)
         self._logged = np.isin(layout.contacts, layout.sites)  # other ranks log the others
+        self._own_rows = np.flatnonzero(self._logged)
         self._stop = stop or StopRequest()
         self._any_open = False
 
@@ -154,7 +155,7 @@ class Integrator(Engine):
             if not goes_on:
                 return FillResult(k, stopped=True)
             with self.state.localForm() as local:
-                take_sample(local.array, k, samples)
+                take_sample(local.array, k, samples, self.lattice.contacts, self._own_rows)
         return FillResult(len(samples.work))
 
     def advance(self, target: float) -> bool:

@@ -1,0 +1,312 @@
+"""Named points and contact forces: motion and measures against the complex compliance, the law, the matrices."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.conftest import StopAt, assert_same_bits, datasets, run_of, small_case
+from vipetsc.case import Case, CaseError
+from vipetsc.case.schema import AnalysisTable
+from vipetsc.dynamics import recorder, simulate
+from vipetsc.io import export
+from vipetsc.io.read import open_run
+from vipetsc.spectra import histories
+from vipetsc.studies.analysis import analyse
+from vipetsc.studies.reanalysis import measure_run
+
+FREQUENCY = 900.0
+FORCE = 2.0
+BASE = {"name": "base", "cell": 2}
+TIP = {"name": "tip", "cell": 6, "mass": 2}
+DIATOMIC = {
+    "masses": [0.01, 0.004],
+    "springs": [{"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 6e3}],
+}
+
+
+def shaken(engine: str) -> Case:
+    """A damped lattice of two masses a cell under a harmonic force, of which two points alone are recorded."""
+    table = {
+        "lattice": {"cells": 24, "cell": DIATOMIC, "damping": {"mass": 60.0, "stiffness": 2e-5}},
+        "drive": {"waveform": "harmonic", "amplitude": FORCE, "frequency": FREQUENCY, "cell": 2},
+        "time": {"end": 0.6, "engine": engine},
+        "output": {"fields": [], "points": [BASE, TIP], "transmission": [["base", "tip"]]},
+    }
+    return Case.from_table(table)
+
+
+@pytest.fixture(scope="module", params=["ts", "propagator"])
+def steady_run(request):
+    """The run of ``shaken`` by either engine."""
+    run = run_of(shaken(request.param))
+    assert json.loads(json.dumps(run.attrs["statistics"]))["engine"] == request.param
+    return run
+
+
+def test_steady_amplitudes_are_those_of_the_complex_compliance(steady_run):
+    """In the steady state (K + i w C - w^2 M) U = F: amplitudes of all three quantities, and the transmission."""
+    chain = Case.of(steady_run).model().chain
+    stiffness = chain.stiffness_matrix().toarray()
+    damping = chain.damping_rows(0, chain.cells).toarray()
+    force = np.zeros(len(stiffness))
+    force[2] = FORCE
+    dynamic = stiffness + 1j * FREQUENCY * damping - FREQUENCY**2 * np.diag(chain.masses())
+    expected = np.abs(np.linalg.solve(dynamic, force))[[2, 11]]
+
+    measured = analyse(steady_run)
+
+    for power, quantity in enumerate(("displacement", "velocity", "acceleration")):
+        amplitudes = [float(measured[f"steady_{quantity}/{point}"]) for point in ("base", "tip")]
+        assert amplitudes == pytest.approx(FREQUENCY**power * expected, rel=1e-7)
+    assert float(measured["steady_transmission/base-tip"]) == pytest.approx(expected[1] / expected[0], rel=1e-7)
+    assert float(measured["steady_drift/tip"]) < 1e-5
+    assert json.loads(measured.attrs["warnings"]) == []
+
+
+def test_what_has_not_settled_has_a_drift_and_no_amplitude(steady_run):
+    """A drift above the tolerance, or a record too short for three windows, gives NaN and a sentence."""
+    strict = AnalysisTable.model_validate({"steady_tolerance": 1e-14})
+    measured = analyse(steady_run, ["motion"], options=strict)
+    assert np.isnan(measured["steady_velocity/tip"])
+    assert np.isnan(measured["steady_transmission/base-tip"])
+    assert 1e-14 < measured["steady_drift/tip"] < 1e-5
+    assert "more than 1e-14" in json.loads(measured.attrs["warnings"])[-1]
+
+    # The ramp takes 10 periods, and three windows of 10 follow: 40 periods are .279 s.
+    short = analyse(steady_run.isel(time=slice(0, 1350)), ["motion"])
+    assert np.isnan(short["steady_velocity/tip"])
+    assert np.isnan(short["steady_drift/tip"])
+    long = analyse(steady_run.isel(time=slice(0, 1450)), ["motion"])
+    # Free vibrations after the ramp are still there in the first window.
+    assert 0.01 < long["steady_drift/tip"] < 0.1
+    assert np.isnan(long["steady_velocity/tip"])
+    # Shorter windows fit into the same record.
+    brief = analyse(
+        steady_run.isel(time=slice(0, 1350)), ["motion"], options=AnalysisTable.model_validate({"steady_periods": 8})
+    )
+    assert np.isfinite(brief["steady_drift/tip"])
+
+
+def test_peak_and_rms_are_those_of_the_samples(steady_run):
+    """Of the samples; the rms of the steady part alone is the amplitude over the root of two."""
+    measured = analyse(steady_run, ["motion"])
+    velocity = steady_run["points/velocity"].sel(point="tip").values
+
+    assert float(measured["peak_velocity/tip"]) == np.abs(velocity).max()
+    assert float(measured["rms_velocity/tip"]) == pytest.approx(np.sqrt((velocity**2).mean()), rel=1e-14)
+    last = velocity[-1396:]  # 40 periods of .00698 s
+    assert np.sqrt((last**2).mean()) == pytest.approx(float(measured["steady_velocity/tip"]) / np.sqrt(2), rel=2e-3)
+
+
+def test_transmission_by_part_is_that_of_each_frequency():
+    """Cosines of the transform itself fall into one part each; a part without the source has no value."""
+    count = 400
+    phase = np.pi * (np.arange(count) + 0.5) / count
+    interval = 1e-3
+    frequencies = np.pi * np.array([20, 60]) / (count * interval)
+    source = np.cos(20 * phase) + 3 * np.cos(60 * phase)
+    receiver = 0.5 * np.cos(20 * phase) - 6 * np.cos(60 * phase)
+    edges = [0.0, 0.5 * frequencies.sum(), 2 * frequencies[1], np.inf]
+
+    parts = histories.transmission_by_part(source, receiver, interval, edges)
+
+    assert parts[:2] == pytest.approx([0.5, 2.0], rel=1e-12)
+    assert np.isnan(parts[2])
+    # The parts' mean squares add up to that of the record.
+    assert histories.transmission(source, receiver) ** 2 == pytest.approx((0.25 + 4 * 9) / 10, rel=1e-12)
+
+
+# Every mass of cells with and without a site, at an end, of a driven mass.
+PLACES = [(1, 1), (6, 1), (6, 2), (6, 3), (6, 4), (12, 2), (13, 3), (24, 4)]
+POINTS = [{"name": f"c{cell}m{mass}", "cell": cell, "mass": mass} for cell, mass in PLACES]
+COLUMNS = [4 * (cell - 1) + mass - 1 for cell, mass in PLACES]
+IMPACTS = {"time": {"end": 0.03, "samples": 3001}, "output": {"points": POINTS, "forces": True}}
+LAWS = {"law": "hertz", "sites": [6, 12, 13], "restitution": 0.7}
+
+
+@pytest.fixture(scope="module", params=["ts", "propagator"])
+def impacts(request):
+    """A short run with impacts at three sites, ten samples a contact or more, with all fields."""
+    case = small_case(
+        lattice={"damping": {"mass": 5.0, "stiffness": 1e-6}},
+        contacts=LAWS,
+        time=IMPACTS["time"] | {"engine": request.param},
+        output=IMPACTS["output"],
+    )
+    run = run_of(case)
+    assert run.sizes["episode"] > 5
+    return run
+
+
+def test_the_force_is_the_law_at_the_samples(impacts):
+    """F = side k x^n (1 + c w'/w'_minus) within episodes, 0 outside; its largest sample is not above the log's."""
+    model = Case.of(impacts).model()
+    law = model.contact
+    time = impacts["time"].values
+    force = impacts["sites/force"].values
+    expected = np.zeros_like(force)
+    motion = {}
+    for name in ("displacement", "velocity"):
+        field = impacts[name].values[:, [5, 11, 12]]
+        motion[name] = field[..., model.chain.cell.resonator] - field[..., model.chain.cell.host]
+
+    log = {name: impacts[f"impacts/{name}"].values for name in ("site", "side", "onset", "separation", "force")}
+    log["approach"] = impacts["impacts/approach_velocity"].values
+    for k, site in enumerate(log["site"] - 1):
+        inside = (time >= log["onset"][k]) & ~(time > log["separation"][k])
+        side = log["side"][k]
+        x = side * motion["displacement"][inside, site] - model.chain.clearances[site]
+        rate = motion["velocity"][inside, site]
+        expected[inside, site] = side * law.elastic_force(x) * (1 + law.damping * rate / log["approach"][k])
+
+    largest = log["force"].max()
+    assert np.abs(force - expected).max() < 1e-8 * largest
+    assert np.count_nonzero(force) > 100
+    # Samples miss the largest force of an impact, by little where they are this fine.
+    sampled = np.abs(force).max()
+    assert 0.95 * largest < sampled <= largest * (1 + 1e-9)
+    assert float(analyse(impacts, ["motion"])["largest_force"]) == largest
+
+
+def test_the_acceleration_is_that_of_the_equation_of_motion(impacts):
+    """M a = drive - K u - C v + contacts with the assembled matrices, at every point and sample."""
+    model = Case.of(impacts).model()
+    chain = model.chain
+    samples = impacts.sizes["time"]
+    u = impacts["displacement"].values.reshape(samples, -1)
+    v = impacts["velocity"].values.reshape(samples, -1)
+    total = -(chain.stiffness_matrix() @ u.T).T - (chain.damping_rows(0, chain.cells) @ v.T).T
+    total[:, 0] += [_burst(model.drive, t) for t in impacts["time"].values]
+    for column, site in enumerate(chain.sites):
+        force = impacts["sites/force"].values[:, column]
+        total[:, 4 * site + chain.cell.host] += force
+        total[:, 4 * site + chain.cell.resonator] -= force
+    expected = (total / chain.masses())[:, COLUMNS]
+
+    for name, field in (("displacement", u), ("velocity", v)):
+        assert np.array_equal(impacts[f"points/{name}"].values, field[:, COLUMNS])
+    assert np.abs(impacts["points/acceleration"].values - expected).max() < 1e-11 * np.abs(expected).max()
+
+
+def _burst(drive, t: float) -> float:
+    """Eq. (3) of the paper."""
+    if not 0 < t < drive.duration:
+        return 0.0
+    phase = drive.frequency * t
+    return drive.window_amplitude * (1 - np.cos(phase / drive.cycles)) * np.sin(phase)
+
+
+CUBIC_SPRINGS = [
+    {"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True, "quadratic": -1e7, "cubic": 1e10},
+    {"start": 1, "end": 2, "stiffness": 2e3, "cubic": 1e9},
+]
+# Springs that are not linear, on a ring; beads that are pressed together and never part.
+RING = {
+    "lattice": {"cell": DIATOMIC | {"springs": CUBIC_SPRINGS}, "cells": 9, "ends": "periodic"},
+    "drive": {"amplitude": 20.0, "cycles": 4, "frequency": 500.0, "cell": 9},
+    "time": {"end": 0.03, "samples": 3001},
+    "output": {
+        "points": [{"name": f"c{cell}m{mass}", "cell": cell, "mass": mass} for cell in (1, 9) for mass in (1, 2)]
+    },
+}
+BEADS = {
+    "lattice": {"cells": 12, "ends": "free", "cell": {"masses": [2e-3]}},
+    "contacts": {
+        "law": "hertz",
+        "stiffness": 7e9,
+        "sites": {"first": 1, "last": 11, "count": 11},
+        "next_cell": True,
+        "side": "minus",
+        "clearance": 0.0,
+        "precompression": 1e-5,
+    },
+    "drive": {"amplitude": 10.0, "cycles": 2, "frequency": 1e4},
+    "time": {"end": 2e-3, "samples": 2001},
+    "output": {"points": [{"name": f"bead{cell}", "cell": cell} for cell in (1, 2, 7)], "forces": True},
+}
+
+
+@pytest.mark.parametrize("table", [RING, BEADS], ids=["ring", "beads"])
+def test_velocities_change_by_the_accelerations(table):
+    """Simpson's rule of the acceleration gives the change of the velocity, with what forces are not in matrices."""
+    run = run_of(Case.from_table(table))
+    a = run["points/acceleration"].values
+    v = run["points/velocity"].values
+    dt = float(run["time"][1])
+
+    change = dt / 3 * (a[:-2] + 4 * a[1:-1] + a[2:])
+    assert np.abs(a).max(axis=0).min() > 0
+    assert np.abs(v[2:] - v[:-2] - change).max() < 1e-6 * np.abs(v).max()
+
+
+def test_records_of_points_do_not_depend_on_what_else_is_kept(tmp_path, monkeypatch):
+    """A window and strides leave the points' bits; points leave those of all else; a stopped run has the same."""
+    time = {"end": 0.03, "engine": "propagator"}
+    whole = small_case(time=time, output=IMPACTS["output"])
+    thin = small_case(time=time, output=IMPACTS["output"] | {"window": [3, 15], "every": 3, "stride": 4})
+    plain = small_case(time=time)
+    for name, case in (("whole", whole), ("thin", thin), ("plain", plain)):
+        assert simulate(case, tmp_path / name).complete
+    runs = {name: datasets(tmp_path / name / "run.h5") for name in ("whole", "thin", "plain")}
+
+    points = {name for name in runs["whole"] if name.startswith("points/")} | {"sites/force"}
+    assert {"points/displacement", "points/velocity", "points/acceleration"} < points
+    assert_same_bits({name: runs["whole"][name] for name in points}, {name: runs["thin"][name] for name in points})
+    assert {name: values.tobytes() for name, values in runs["plain"].items()}.items() <= {
+        name: values.tobytes() for name, values in runs["whole"].items()
+    }.items()
+
+    assert np.count_nonzero(runs["whole"]["sites/force"]) > 0
+    monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 40)
+    assert simulate(whole, tmp_path / "stopped", stop=StopAt(2)).resumable
+    assert simulate(whole, tmp_path / "stopped").complete
+    assert_same_bits(runs["whole"], datasets(tmp_path / "stopped" / "run.h5"))
+
+
+def test_export_writes_histories_forces_and_numbers(tmp_path):
+    """CSV with a column for each point and site, every digit, and a table of all numbers of the run."""
+    case = small_case(
+        time={"end": 0.02, "engine": "propagator"}, output=IMPACTS["output"] | {"transmission": [["c1m1", "c6m2"]]}
+    )
+    simulate(case, tmp_path)
+    measure_run(tmp_path)
+    export.write_curves(tmp_path)
+
+    def read(name: str) -> pd.DataFrame:
+        return pd.read_csv(tmp_path / "curves" / name, float_precision="round_trip")
+
+    with open_run(tmp_path / "run.h5") as run:
+        velocity = run["points/velocity"].sel(point="c6m2").values
+        assert read("run-points.csv")["c6m2 velocity (m/s)"].values.tobytes() == velocity.tobytes()
+        force = run["sites/force"].values
+        assert read("run-forces.csv")["force of site 2 (N)"].values.tobytes() == force[:, 1].tobytes()
+
+    numbers = read("analysis-measures.csv").set_index("measure")
+    assert numbers.loc["peak_velocity/c6m2", "value"] == np.abs(velocity).max()
+    assert numbers.loc["peak_velocity/c6m2", "unit"] == "m/s"
+    assert "band_transmission/c1m1-c6m2 band 2" in numbers.index
+    summary = json.loads((tmp_path / "summary.json").read_text())["measures"]
+    assert summary["peak_velocity/c6m2"] == np.abs(velocity).max()
+
+
+@pytest.mark.parametrize(
+    ("output", "sentence"),
+    [
+        ({"points": [{"name": "a", "cell": 25}]}, "output.points[1].cell = 25: the lattice has the cells 1 to 24"),
+        ({"points": [{"name": "a", "cell": 2, "mass": 5}]}, "output.points[1].mass = 5: a cell has the masses 1 to 4"),
+        ({"points": [{"name": "a", "cell": 2}] * 2}, "output.points[2].name = 'a': names another point"),
+        ({"points": [{"name": "a b", "cell": 2}]}, "output.points[1].name"),
+        ({"points": [{"name": "a", "cell": 2}], "transmission": [["a", "b"]]}, "b: no point of that name"),
+        ({"transmission": [["a", "b"]]}, "a, b: no point of that name in output.points; there are none"),
+        ({"points": [{"name": "a", "cell": 2}], "transmission": [["a", "a"]]}, "names one point twice"),
+    ],
+)
+def test_points_that_are_not_there_are_one_problem(output, sentence):
+    with pytest.raises(CaseError) as raised:
+        small_case(output=output)
+    (problem,) = raised.value.problems
+    assert sentence in str(problem)

@@ -1,0 +1,158 @@
+"""What a search for a design measures: its objectives, its constraints, and what is wrong with them."""
+
+import difflib
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from vipetsc.case.case import Case
+from vipetsc.case.case_file import Problem, Section
+from vipetsc.case.schema import Finite, Positive
+from vipetsc.lattice import pass_bands
+from vipetsc.spectra.measures import PART, RunMeasure, measures_of
+
+# Measures of searches alone; all others are those of every run, by their names.
+OF_SEARCHES = ("upper_share_at_end", "ibtet", "band_share", "entropy", "transmitted")
+# Of a run's analysis, but no number about the lattice's motion.
+NO_GOAL = ("ledger_error", "entropy/start", "bands/modal_energy")
+Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+
+
+class MeasuredTable(Section):
+    """A measure of a design: of a band or a part of one, at some amplitudes.
+
+    ``measure``: at the run's end over the drive's work, the energy in the pass bands above the driven one
+    (``upper_share_at_end``), in the pass band ``band`` or in ``part`` of it in rad/s (``band_share``), beyond the last
+    site (``transmitted``); or ``ibtet``, or the energy-weighted ``entropy`` in bit; or any other number of a run by its
+    name, ``peak_velocity/tip`` of a point, ``band_transmission/base-tip`` with the ``band``. Of the ``amplitudes`` in
+    N, by default the case's, the ``worst`` or the ``mean`` counts.
+    """
+
+    measure: Literal[OF_SEARCHES] | str = "upper_share_at_end"  # type: ignore[valid-type]  # the names above
+    band: int | None = Field(None, ge=1)
+    part: Pair | None = None
+    amplitudes: list[Positive] = Field([])
+    over: Literal["worst", "mean"] = "worst"
+
+    @property
+    def name(self) -> str:
+        """The measure, with its band and part."""
+        name = str(self.measure)
+        if self.band:
+            name += f" {self.band}"
+        if self.part:
+            name += f" {self.part[0]:g}-{self.part[1]:g}"
+        return name
+
+    @property
+    def is_of_runs(self) -> bool:
+        """Whether it is a number of every run, not one that searches alone measure."""
+        return self.measure not in OF_SEARCHES
+
+    def at_amplitudes(self) -> str:
+        """Which amplitudes count, in words."""
+        if not self.amplitudes:
+            return ""
+        amplitudes = ", ".join(f"{amplitude:g}" for amplitude in self.amplitudes)
+        return f", the {self.over} at {amplitudes} N"
+
+
+class ObjectiveTable(MeasuredTable):
+    """What is to become large or small: a measure, and the ``goal``."""
+
+    goal: Literal["maximise", "minimise"] = "maximise"
+
+    def describe(self) -> str:
+        """The objective in words."""
+        return f"{self.goal} {self.name}{self.at_amplitudes()}"
+
+
+class ConstraintTable(MeasuredTable):
+    """Bounds of a measure, in its unit: it is to be ``at_least`` or ``at_most`` so much, or both."""
+
+    at_least: Finite | None = None
+    at_most: Finite | None = None
+
+    def describe(self) -> str:
+        """The constraint in words."""
+        bounds = [f"at least {self.at_least:g}" if self.at_least is not None else ""]
+        bounds.append(f"at most {self.at_most:g}" if self.at_most is not None else "")
+        return f"{self.name} {' and '.join(filter(None, bounds))}{self.at_amplitudes()}"
+
+    def excess(self, value: float) -> float:
+        """By how much a ``value`` is outside the bounds, over the bound's size (or 1 for a bound of 0); 0 inside."""
+        below = 0.0 if self.at_least is None else (self.at_least - value) / (abs(self.at_least) or 1.0)
+        above = 0.0 if self.at_most is None else (value - self.at_most) / (abs(self.at_most) or 1.0)
+        return max(below, above, 0.0)
+
+
+def measured_problems(objective: MeasuredTable, at: str, base: Case, varied: bool) -> Iterator[Problem]:
+    """Problems with an objective or a constraint, of a cell that stays as it is unless ``varied``."""
+    if objective.is_of_runs:
+        yield from _problems_of_runs(objective, at, base)
+        return
+
+    bands = pass_bands(base.lattice.unit_cell())
+    band = objective.band
+    part = objective.part
+
+    # The top of the driven band and of those that overlap it.
+    top = base.drive.frequency or 0.0
+    for other in sorted(bands, key=lambda band: band.low):
+        if other.low <= top:
+            top = max(top, other.high)
+
+    if objective.measure == "transmitted" and base.lattice.ends == "periodic":
+        remedy = "nothing lies beyond the last site of a ring; lattice.ends = fixed or free, or another measure"
+        yield Problem(f"{at}.measure", objective.measure, remedy)
+    elif objective.measure in ("upper_share_at_end", "ibtet") and top >= max(b.high for b in bands):
+        remedy = f"the driven band is the highest of {len(bands)}; band_share of another, or a drive on a lower one"
+        yield Problem(f"{at}.measure", objective.measure, remedy)
+    elif (objective.measure == "band_share") != (band is not None):
+        remedy = "only band_share has a band" if band else f"missing; band_share needs a band, 1 to {len(bands)}"
+        yield Problem(f"{at}.band", band, remedy)
+    elif band and band > len(bands):
+        yield Problem(f"{at}.band", band, f"the cell has {len(bands)} bands")
+    elif part and not band:
+        yield Problem(f"{at}.part", part, "only band_share has a part of a band")
+    elif part and band:
+        low, high = bands[band - 1].low, bands[band - 1].high
+        if not part[0] < part[1] or (not varied and (part[1] <= low or part[0] >= high)):
+            yield Problem(
+                f"{at}.part", part, f"must be [low, high] in rad/s and meet band {band}, {low:.5g}-{high:.5g}"
+            )
+
+
+def measures_of_runs(base: Case) -> dict[str, RunMeasure]:
+    """The measures, by name, that every run of a case like ``base`` has, and that may be an objective."""
+    points = [point.name for point in base.output.points or []]
+    measures = measures_of(points, base.output.transmission or [])
+    return {name: m for name, m in measures.items() if name not in NO_GOAL and m.dimension in ("", PART)}
+
+
+def _problems_of_runs(objective: MeasuredTable, at: str, base: Case) -> Iterator[Problem]:
+    """Problems with a measure of every run."""
+    bands = len(pass_bands(base.lattice.unit_cell()))
+    measures = measures_of_runs(base)
+    name = str(objective.measure)
+    if name not in measures:
+        valid = [*OF_SEARCHES, *(name for name in measures if name not in OF_SEARCHES)]
+        near = difflib.get_close_matches(name, valid, n=1, cutoff=0.6)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        points = "" if base.output.points else "; those of points need output.points"
+        yield Problem(f"{at}.measure", name, f"is no measure of this case; {hint}There are {', '.join(valid)}{points}")
+        return
+
+    is_of_bands = measures[name].dimension == PART
+    if name.startswith("steady") and base.drive.kind != "harmonic":
+        remedy = f"a {base.drive.kind} becomes no steady vibration; drive.waveform = harmonic, or peak and rms"
+        yield Problem(f"{at}.measure", name, remedy)
+    elif objective.part:
+        yield Problem(f"{at}.part", objective.part, "only band_share has a part of a band")
+    elif is_of_bands and not objective.band:
+        yield Problem(f"{at}.band", None, f"missing; {name} needs a band, 1 to {bands}")
+    elif objective.band and not is_of_bands:
+        yield Problem(f"{at}.band", objective.band, f"{name} has no bands; leave it out")
+    elif objective.band and objective.band > bands:
+        yield Problem(f"{at}.band", objective.band, f"the cell has {bands} bands")

@@ -1,0 +1,50 @@
+"""Named masses whose motion is recorded at every sample: the keys ``output.points`` and ``output.transmission``."""
+
+from collections.abc import Iterator
+from typing import Annotated
+
+from pydantic import Field
+
+from vipetsc.case.case_file import Problem, Section
+
+NAME = "^[A-Za-z][A-Za-z0-9_]*$"  # of a point: it is a part of names in files
+MOST_POINTS = 1000
+
+
+class PointTable(Section):
+    """A ``mass`` of a ``cell``, both counted from 1, whose motion is recorded under its ``name``."""
+
+    name: Annotated[str, Field(pattern=NAME, max_length=40)]
+    cell: int = Field(ge=1)
+    mass: int = Field(1, ge=1)
+
+
+def check_points(
+    points: list[PointTable], transmission: list[list[str]], cells: int | None, dofs: int | None
+) -> Iterator[Problem]:
+    """Problems of ``points`` in a lattice of ``cells`` with ``dofs`` masses each (None: invalid), and of their pairs.
+
+    ``transmission`` are pairs of their names.
+    """
+    names = [point.name for point in points]
+    for number, point in enumerate(points, 1):
+        at = f"output.points[{number}]"
+        if cells is not None and point.cell > cells:
+            yield Problem(f"{at}.cell", point.cell, f"the lattice has the cells 1 to {cells}")
+        if dofs is not None and point.mass > dofs:
+            has = "the one mass 1" if dofs == 1 else f"the masses 1 to {dofs}"
+            yield Problem(f"{at}.mass", point.mass, f"a cell has {has}")
+        if point.name in names[: number - 1]:
+            yield Problem(f"{at}.name", point.name, "names another point too; every point needs a name that differs")
+
+    for number, pair in enumerate(transmission, 1):
+        at = f"output.transmission[{number}]"
+        missing = [name for name in pair if name not in names]
+        if missing:
+            listed = f"there are {', '.join(names)}" if names else "there are none"
+            remedy = f"{', '.join(missing)}: no point of that name in output.points; {listed}"
+            yield Problem(at, pair, remedy)
+        elif pair[0] == pair[1]:
+            yield Problem(at, pair, 'names one point twice; give [from, to], as in ["base", "tip"]')
+        elif pair in transmission[: number - 1]:
+            yield Problem(at, pair, "is listed twice")

@@ -1,0 +1,323 @@
+"""The registry of measures: numbers that a run leaves, each with its name, its unit and what gives it.
+
+``run``, ``sweep``, ``optimise`` and ``export`` all take them from here. A measure of a point or of a pair of points
+has a value for each of these, under a name of its own: ``peak_velocity/tip``, ``transmission/base-tip``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from vipetsc.spectra import histories
+from vipetsc.spectra.histories import History, SteadyAmplitude, SteadyDrive
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+PERIODS = 10  # of the drive in a window of the steady amplitude, where the case gives none
+TOLERANCE = 0.01  # of its drift
+QUANTITIES = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s2"}
+PART = "part"  # the dimension of parts of the frequency axis: pass bands, gaps, what is above
+UNSETTLED = "steady amplitude"  # how sentences begin about one that is not
+JOINT = "-"  # between the names of a pair
+
+Group = Literal["statistics", "entropy", "transfer", "motion"]
+Over = Literal["run", "point", "pair"]
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """A run as measures see it.
+
+    ``run`` is the dataset of ``run.h5``, ``points`` are the histories of its named points, ``pairs`` the pairs of them
+    between which transmission is measured, ``drive`` is the steady part of its first drive, if that has one. ``edges``
+    (part + 1) in rad/s and ``parts`` are those of the frequency axis. A steady amplitude needs windows of so many
+    ``periods`` and a drift within the ``tolerance``. Measures add sentences to ``warnings``.
+    """
+
+    run: xr.Dataset
+    points: Mapping[str, History]
+    pairs: Sequence[Sequence[str]]
+    edges: np.ndarray
+    parts: tuple[str, ...]
+    drive: SteadyDrive | None = None
+    periods: int = PERIODS
+    tolerance: float = TOLERANCE
+    warnings: list[str] = field(default_factory=list)
+    _steady: dict[str, dict[str, SteadyAmplitude]] = field(default_factory=dict)
+
+    def steady(self, point: str) -> dict[str, SteadyAmplitude] | None:
+        """The steady amplitude of each quantity at a ``point``; None where the first drive is no lasting sine."""
+        if self.drive is None:
+            return None
+        if point not in self._steady:
+            history = self.points[point]
+            amplitudes = {}
+            for quantity in QUANTITIES:
+                values = getattr(history, quantity)
+                amplitudes[quantity] = histories.steady_amplitude(history.time, values, self.drive, self.periods)
+            self._steady[point] = amplitudes
+        return self._steady[point]
+
+    def drift(self, point: str) -> float | None:
+        """The largest drift of the steady amplitudes at a ``point``."""
+        steady = self.steady(point)
+        return None if steady is None else float(np.max([amplitude.drift for amplitude in steady.values()]))
+
+    def settled(self, point: str, quantity: str) -> float | None:
+        """The steady amplitude of a ``quantity`` at a ``point``, NaN and a warning where it has not settled."""
+        steady = self.steady(point)
+        drift = self.drift(point)
+        if steady is None or drift is None:
+            return None
+        if drift <= self.tolerance:
+            return steady[quantity].amplitude
+
+        sentence = self._unsettled(point, drift)
+        if sentence not in self.warnings:
+            self.warnings.append(sentence)
+        return np.nan
+
+    def _unsettled(self, point: str, drift: float) -> str:
+        """The sentence about a ``point`` whose amplitude is not steady."""
+        about = f"{UNSETTLED} at {point}: three windows of {self.periods} periods of the drive"
+        if not np.isnan(drift):
+            return (
+                f"{about} differ by {drift:.2g} of it, more than {self.tolerance:g}; a later time.end, or more damping"
+            )
+        return f"{about} do not lie in its steady part, or samples do not resolve it; a later time.end"
+
+
+class RunMeasure(NamedTuple):
+    """A number that a run leaves, or one for each of its points or pairs of points (``over``).
+
+    ``of(record)``, ``of(record, point)`` or ``of(record, source, receiver)`` gives it, in ``unit``, from a
+    ``RunRecord``; None where the run has no such thing, NaN where it has but no value. Measures without ``of`` are
+    variables of that name of the run's analysis or its statistics. ``dimension``: "" for a number, ``PART`` for one of
+    each part of the frequency axis, "snapshot". Until something touches it goes with the amplitude to the ``power``.
+    ``group`` says what a run must be measured for.
+    """
+
+    name: str
+    unit: str
+    text: str
+    of: Callable[..., Any] | None = None
+    over: Over = "run"
+    dimension: str = ""
+    power: float = 0.0
+    group: Group = "motion"
+
+    @property
+    def row(self) -> tuple[str, str, str]:
+        """Dimension, unit and text, as tables of variables have them."""
+        return self.dimension, self.unit, self.text
+
+    def at(self, *points: str) -> RunMeasure:
+        """The measure of these ``points``: its name, text and function without them."""
+        if self.over == "run":
+            return self
+        place = f"at {points[0]}" if self.over == "point" else f"of {points[1]} over that of {points[0]}"
+        of = self.of
+        assert of is not None
+        return self._replace(
+            name=f"{self.name}/{JOINT.join(points)}",
+            text=f"{self.text} {place}",
+            of=lambda record: of(record, *points),
+            over="run",
+        )
+
+
+MEASURES: dict[str, RunMeasure] = {}
+"""All measures by name, in the order in which files hold them."""
+
+
+def register(measure: RunMeasure) -> RunMeasure:
+    """Add a ``measure`` to the registry and return it; raises ValueError if its name is taken."""
+    if measure.name in MEASURES:
+        raise ValueError(f"measure {measure.name}: there is one of that name")
+    MEASURES[measure.name] = measure
+    return measure
+
+
+def measures_of(points: Sequence[str], pairs: Sequence[Sequence[str]]) -> dict[str, RunMeasure]:
+    """The measures, by name, of a run with these ``points`` and ``pairs`` of them."""
+    expanded: dict[str, RunMeasure] = {}
+    for measure in MEASURES.values():
+        for one in _expanded(measure, points, pairs):
+            expanded[one.name] = one
+    return expanded
+
+
+def _expanded(measure: RunMeasure, points: Sequence[str], pairs: Sequence[Sequence[str]]) -> Iterator[RunMeasure]:
+    """A ``measure`` for each of the things that it is of."""
+    if measure.over == "run":
+        yield measure
+    elif measure.over == "point":
+        for point in points:
+            yield measure.at(point)
+    else:
+        for source, receiver in pairs:
+            yield measure.at(source, receiver)
+
+
+def row_of(name: str) -> tuple[str, str, str]:
+    """Dimension, unit and text of the measure ``name``, perhaps of points; raises KeyError if there is none."""
+    if name in MEASURES:
+        return MEASURES[name].row
+    base, _, points = name.partition("/")
+    return MEASURES[base].at(*points.split(JOINT)).row
+
+
+def is_measure(name: str) -> bool:
+    """Whether ``name`` is a measure, perhaps of points."""
+    base, _, points = name.partition("/")
+    return name in MEASURES or (bool(points) and base in MEASURES and MEASURES[base].over != "run")
+
+
+def _of_name(name: str) -> RunMeasure:
+    """The measure ``name``, perhaps of points, for all of them."""
+    return MEASURES.get(name) or MEASURES[name.partition("/")[0]]
+
+
+def power_of(name: str) -> float:
+    """The power of the amplitude with which the measure ``name`` goes until something touches."""
+    return _of_name(name).power
+
+
+def group_of(name: str) -> Group:
+    """The group of the measure ``name``."""
+    return _of_name(name).group
+
+
+def take(record: RunRecord, groups: Collection[str]) -> dict[str, Any]:
+    """The values by name of the measures of these ``groups`` that the run of ``record`` has."""
+    values = {}
+    for name, measure in measures_of([*record.points], record.pairs).items():
+        if measure.of is None or measure.group not in groups:
+            continue
+        value = measure.of(record)
+        if value is not None:
+            values[name] = value
+    return values
+
+
+def _contact_episodes(record: RunRecord) -> int | None:
+    return record.run.sizes.get("episode")
+
+
+def _work(record: RunRecord) -> float | None:
+    return float(record.run["energy/work"][-1]) if "energy/work" in record.run else None
+
+
+def _dissipated_fraction(record: RunRecord) -> float | None:
+    work = _work(record)
+    if work is None or "energy/dissipated" not in record.run:
+        return None
+    return float(record.run["energy/dissipated"][-1]) / work if work else np.nan
+
+
+def _largest_force(record: RunRecord) -> float | None:
+    if not record.run.sizes.get("site") or "impacts/force" not in record.run:
+        return None
+    return float(record.run["impacts/force"].max()) if record.run.sizes["episode"] else 0.0
+
+
+def _velocities(record: RunRecord, source: str, receiver: str) -> tuple[np.ndarray, np.ndarray]:
+    return record.points[source].velocity, record.points[receiver].velocity
+
+
+def _transmission(record: RunRecord, source: str, receiver: str) -> float:
+    return histories.transmission(*_velocities(record, source, receiver))
+
+
+def _band_transmission(record: RunRecord, source: str, receiver: str) -> np.ndarray | None:
+    time = record.points[source].time
+    if len(time) < 2:
+        return None
+    velocities = _velocities(record, source, receiver)
+    return histories.transmission_by_part(*velocities, float(time[1] - time[0]), record.edges)
+
+
+def _steady_transmission(record: RunRecord, source: str, receiver: str) -> float | None:
+    below = record.settled(source, "velocity")
+    above = record.settled(receiver, "velocity")
+    if below is None or above is None:
+        return None
+    return above / below if below else np.nan
+
+
+def _of_points(kind: str, quantity: str) -> RunMeasure:
+    """The measure of a ``kind`` (peak, rms, steady) of a ``quantity`` at a point."""
+    unit = QUANTITIES[quantity]
+    name = f"{kind}_{quantity}"
+    if kind == "steady":
+        text = f"steady amplitude of the {quantity}"
+        return RunMeasure(
+            name, unit, text, lambda record, point: record.settled(point, quantity), over="point", power=1.0
+        )
+
+    function = {"peak": histories.peak, "rms": histories.rms}[kind]
+    text = {"peak": f"largest {quantity}", "rms": f"root mean square of the {quantity}"}[kind]
+
+    def of(record: RunRecord, point: str) -> float:
+        return function(getattr(record.points[point], quantity))
+
+    return RunMeasure(name, unit, text, of, over="point", power=1.0)
+
+
+IBTET_WHOLE = "inter-band energy transfer as the paper's: the record's last samples are in the mean"
+UPPER_SHARE = "energy of the bands above the driven one at the end, over the drive's work"
+MEAN_SHARE = "mean share of a pass band or gap after the wave's arrival"
+STANDARD = (
+    RunMeasure("contact_episodes", "1", "contact episodes", _contact_episodes, group="statistics"),
+    RunMeasure(
+        "dissipated_fraction", "1", "dissipated energy over the drive's work", _dissipated_fraction, group="statistics"
+    ),
+    RunMeasure("work", "J", "work done by the drive", _work, power=2.0, group="statistics"),
+    RunMeasure("ledger_error", "1", "largest error of the energy ledger over the work", group="statistics"),
+    RunMeasure("ibtet", "1", "inter-band energy transfer", group="transfer"),
+    RunMeasure("entropy/energy_weighted", "bit", "mean over time of the energy-weighted entropy", group="entropy"),
+    RunMeasure(
+        "entropy/masked", "bit", "mean entropy where the wave is louder than 1 % of its loudest", group="entropy"
+    ),
+    RunMeasure(
+        "entropy/joint", "bit", "mean over time of the entropy over cells and wavenumbers together", group="entropy"
+    ),
+    RunMeasure("ibtet_whole", "1", IBTET_WHOLE, group="transfer"),
+    RunMeasure("entropy/error", "bit", "deviation over the cells of the masked time mean", group="entropy"),
+    RunMeasure("entropy/start", "s", "time at which averages of the entropy begin", group="entropy"),
+    RunMeasure("entropy/history", "bit", "entropy of a snapshot", dimension="snapshot", group="entropy"),
+    RunMeasure("entropy/snapshot", "s", "time of a snapshot", dimension="snapshot", group="entropy"),
+    RunMeasure("upper_share_at_end", "1", UPPER_SHARE, group="transfer"),
+    RunMeasure(
+        "bands/modal_energy", "J", "energy of the linear modes in a part at the end", dimension=PART, group="transfer"
+    ),
+    RunMeasure(
+        "bands/share",
+        "1",
+        "mean share of a pass band or gap after the wave's arrival",
+        dimension=PART,
+        group="transfer",
+    ),
+    RunMeasure("largest_force", "N", "largest contact force of all impacts", _largest_force),
+    *(_of_points(kind, quantity) for kind in ("peak", "rms", "steady") for quantity in QUANTITIES),
+    RunMeasure(
+        "steady_drift", "1", "drift of the steady amplitude", lambda record, point: record.drift(point), over="point"
+    ),
+    RunMeasure("transmission", "1", "transmission, rms velocity", _transmission, over="pair"),
+    RunMeasure("steady_transmission", "1", "transmission, steady velocity", _steady_transmission, over="pair"),
+    RunMeasure(
+        "band_transmission",
+        "1",
+        "transmission in a part of the frequency axis, rms velocity",
+        _band_transmission,
+        over="pair",
+        dimension=PART,
+    ),
+)
+for standard in STANDARD:
+    register(standard)

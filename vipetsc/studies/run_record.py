@@ -1,0 +1,48 @@
+"""A run as its measures see it: the record from which ``vipetsc.spectra.measures`` takes them."""
+
+import numpy as np
+import xarray as xr
+
+from vipetsc.case import Case
+from vipetsc.case.schema import AnalysisTable
+from vipetsc.lattice import pass_bands
+from vipetsc.spectra import Parts
+from vipetsc.spectra.histories import History, SteadyDrive
+from vipetsc.spectra.measures import PERIODS, QUANTITIES, TOLERANCE, RunRecord
+
+
+def record_of(run: xr.Dataset, options: AnalysisTable) -> RunRecord:
+    """The record of a ``run``, open or in memory, measured with ``options``."""
+    case = Case.of(run)
+    output = case.output
+    cell = case.lattice.unit_cell()
+    # Masses without springs have no bands.
+    parts = Parts.of(pass_bands(cell)) if cell.springs else Parts(np.array([0.0, np.inf]), ("above",), ((),))
+
+    points: dict[str, History] = {}
+    if "points/velocity" in run:
+        time = run["time"].values
+        motion = {quantity: run[f"points/{quantity}"].values for quantity in QUANTITIES}
+        for number, point in enumerate(output.points or []):
+            columns = {quantity: values[:, number] for quantity, values in motion.items()}
+            points[point.name] = History(time=time, **columns)
+    return RunRecord(
+        run=run,
+        points=points,
+        pairs=(output.transmission or []) if points else [],
+        edges=np.asarray(parts.edges),
+        parts=parts.names,
+        drive=steady_drive(case),
+        periods=options.steady_periods or PERIODS,
+        tolerance=options.steady_tolerance or TOLERANCE,
+    )
+
+
+def steady_drive(case: Case) -> SteadyDrive | None:
+    """The steady part of the first drive of ``case``: between its ramps; None for one that is no harmonic drive."""
+    drive = case.drive
+    if drive.kind != "harmonic" or not drive.amplitude or not drive.frequency:
+        return None
+    ramp = drive.ramp or 0.0
+    stop = np.inf if drive.duration is None else drive.duration - ramp
+    return SteadyDrive(frequency=drive.frequency, start=ramp, stop=stop)
