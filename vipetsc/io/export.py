@@ -1,6 +1,6 @@
 """Export of results to other programs: XDMF for ParaView, which reads ``run.h5`` itself, and curves as CSV."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as Xml
@@ -117,7 +117,7 @@ def write_curves(path: Path) -> list[Path]:
         with open_results(measured) as analysis:
             numbers = _numbers(analysis)
         if numbers["measure"]:
-            written.append(_write_frame(measured.parent / "curves" / f"{measured.stem}-measures.csv", numbers))
+            written.append(_write_columns(measured.parent / "curves" / f"{measured.stem}-measures.csv", numbers))
     return written
 
 
@@ -137,7 +137,7 @@ def _write_wide(run: xr.Dataset, source: Path) -> list[Path]:
     for kind, table in columns.items():
         if table and len(table) * run.sizes["time"] <= MOST_NUMBERS:
             path = source.parent / "curves" / f"{source.stem}-{kind}.csv"
-            written.append(_write_frame(path, {"time (s)": run["time"].values} | table))
+            written.append(_write_columns(path, {"time (s)": run["time"].values} | table))
     return written
 
 
@@ -167,11 +167,15 @@ def _write_table(path: Path, table: xr.Dataset) -> Path:
     return _write_frame(path, frame)
 
 
-def _write_frame(path: Path, columns: Any) -> Path:
-    """Write a table of named ``columns`` as CSV."""
-    import pandas as pd
+def _write_columns(path: Path, columns: Mapping[str, Any]) -> Path:
+    """Write a table of ``columns`` of one length, by what stands at their heads, as CSV."""
+    rows = xr.Dataset({head: ("row", np.asarray(values)) for head, values in columns.items()})
+    return _write_frame(path, rows.to_dataframe())
 
+
+def _write_frame(path: Path, frame: Any) -> Path:
+    """Write a pandas ``frame`` as CSV."""
     path.parent.mkdir(exist_ok=True)
     with atomic_write(path) as aside:
-        pd.DataFrame(columns).to_csv(aside, index=False, float_format="%.17g")
+        frame.to_csv(aside, index=False, float_format="%.17g")
     return path

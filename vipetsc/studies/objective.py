@@ -86,12 +86,15 @@ class ObjectiveRuns:
         """The judgement of a ``design`` whose runs are recorded."""
         options = self.plan.options
         constraints = options.constraint or []
-        missing = [[np.nan] * len(options.objective), [np.nan] * len(constraints)]
         records = {key: self.recorded.records[case_id(run)] for key, run in self.runs(design).items()}
         for (amplitude, _), record in records.items():
             reason = self._failure(record)
             if reason:
-                return Judgement(*missing, reason=f"{amplitude:g} N: {reason}")
+                return Judgement(
+                    losses=[np.nan] * len(options.objective),
+                    constraints=[np.nan] * len(constraints),
+                    reason=f"{amplitude:g} N: {reason}",
+                )
 
         losses = []
         for objective in options.objective:
