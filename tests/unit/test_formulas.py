@@ -20,6 +20,7 @@ MANUAL = Path(vipetsc.__file__).parent / "manual"
         (r"M \ddot u + K u = \sum_i b_i F_i", "M ü + K u = ∑ᵢ bᵢ Fᵢ"),
         (r"\frac{a + b}{2 N}", "(a + b)/(2 N)"),
         (r"\tfrac12 m v^2", "1/2 m v²"),
+        (r"\log\frac{1 + c}{2}", "log((1 + c)/2)"),
         (r"\frac{\mathrm d\omega}{\mathrm d\kappa}", "dω/dκ"),
         (r"\sqrt{\kappa_c/\kappa}", "√(κ_c/κ)"),
         (r"\sqrt{m_j(x)}\, v", "√(mⱼ(x)) v"),

@@ -19,7 +19,8 @@ SYMBOLS = {
     "quad": WIDE, "qquad": WIDE, ",": " ", ";": " ", ":": " ", "!": "", " ": " ",
     "{": "{", "}": "}", "%": "%", "_": "_", "|": "‖",
 }  # fmt: skip
-FUNCTIONS = ("sin", "cos", "exp", "log", "det", "min", "max", "arg", "Re", "Im", "mean", "sgn", "tan")
+FUNCTIONS = ("sin", "cos", "exp", "log", "det", "min", "max", "arg", "Re", "Im", "mean", "sgn", "tan", "ln", "lim", "sup", "inf", "cosh",
+             "sinh", "tanh")  # fmt: skip
 ACCENTS = {
     "dot": "\N{COMBINING DOT ABOVE}",
     "ddot": "\N{COMBINING DIAERESIS}",
@@ -102,6 +103,8 @@ def _command(name: str, tokens: list[str]) -> str:
     if name in SIZES:
         return ""
     if name in FUNCTIONS:
+        if tokens and tokens[0].removeprefix("\\") in FRACTIONS:
+            return f"{name}({_next(tokens)})"
         # A blank before letters, none before brackets and scripts.
         is_followed = bool(tokens) and (tokens[0].isalnum() or tokens[0].startswith("\\"))
         return name + " " * is_followed
