@@ -19,8 +19,7 @@ SYMBOLS = {
     "quad": WIDE, "qquad": WIDE, ",": " ", ";": " ", ":": " ", "!": "", " ": " ",
     "{": "{", "}": "}", "%": "%", "_": "_", "|": "‖",
 }  # fmt: skip
-FUNCTIONS = ("sin", "cos", "exp", "log", "det", "min", "max", "arg", "Re", "Im", "mean", "sgn", "tan", "ln", "lim", "sup", "inf", "cosh",
-             "sinh", "tanh")  # fmt: skip
+FUNCTIONS = ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "ln", "det", "min", "max", "arg", "lim")
 ACCENTS = {
     "dot": "\N{COMBINING DOT ABOVE}",
     "ddot": "\N{COMBINING DIAERESIS}",
