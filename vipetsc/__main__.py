@@ -28,8 +28,8 @@ def main(arguments: list[str] | None = None) -> int:
     # Looked for rather than imported: PETSc takes its options from the first import that starts it.
     if missing := [name for name in BUILT_FOR_MPI if find_spec(name) is None]:
         remedy = (
-            "on Debian: apt install python3-petsc4py python3-h5py-mpi, and an environment with --system-site-packages;"
-            " without root or Debian: scripts/recipes/pip of a clone makes an environment"
+            "on Debian: apt install python3-petsc4py python3-h5py-mpi, in an environment with --system-site-packages;"
+            " without root or Debian: scripts/recipes/pip in a clone creates an environment"
         )
         logging.getLogger("vipetsc").critical("vipetsc: %s not installed; %s", " and ".join(missing), remedy)
         return 1
@@ -56,7 +56,7 @@ def main(arguments: list[str] | None = None) -> int:
         # One of the package's own modules that cannot be imported is a defect, and wants its traceback.
         if (error.name or "").startswith("vipetsc"):
             raise
-        remedy = "it is missing, or does not go with the others: the chapter install of the manual says what is needed"
+        remedy = "it is missing or incompatible with the others; the chapter install of the manual lists what is needed"
         logging.getLogger("vipetsc").critical("vipetsc: %s; %s", error, remedy)
         return 2
 

@@ -200,7 +200,7 @@ class StopRequest:
     def check(self, comm: MPI.Comm) -> None:
         """Raise StoppedError on all ranks of ``comm`` if any got a request; all must call it."""
         if self.agreed(comm):
-            raise StoppedError("stopped on request; the same command goes on")
+            raise StoppedError("stopped on request; the same command continues")
 
     @contextmanager
     def at_once(self) -> Iterator[None]:

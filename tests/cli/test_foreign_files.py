@@ -37,7 +37,7 @@ def test_pictures_of_a_foreign_file_are_refused(in_process, tmp_path, name, cont
     put_foreign(tmp_path / "out" / f"{name}.h5", contents)
     ended = in_process("plot", tmp_path / "out")
     assert ended.returncode == 2
-    assert "of vipetsc" in ended.stderr or "cannot be opened" in ended.stderr or "holds no run.h5" in ended.stderr
+    assert "of vipetsc" in ended.stderr or "cannot be opened" in ended.stderr or "contains no run.h5" in ended.stderr
     exported = in_process("export", tmp_path / "out")
     assert exported.returncode in (0, 2)
 
@@ -66,4 +66,4 @@ def test_a_study_that_cannot_read_earlier_results_says_what_to_do(in_process, mo
     case = prepare(SCENARIOS["law"], tmp_path)
     ended = in_process("law", case, "--out", tmp_path / "out")
     assert ended.returncode == 2
-    assert ended.stderr.endswith("law.h5 is of another program; move it away, or --force begins anew\n")
+    assert ended.stderr.endswith("law.h5 is of another program; move it away, or start again with --force\n")

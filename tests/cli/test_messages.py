@@ -53,9 +53,9 @@ def test_quiet_tells_nothing_but_warnings(in_process, tmp_path):
 
     other = in_process("run", *TINY, "--out", tmp_path / "run", "--quiet", "--set", "drive.amplitude=3")
     assert other.returncode == 2
-    assert "holds another run" in other.stderr
+    assert "contains another run" in other.stderr
 
-    assert "GB on a rank" in in_process("validate", "--quiet").stdout
+    assert "GB per rank" in in_process("validate", "--quiet").stdout
 
 
 def test_the_log_holds_all_that_is_told_with_its_time(in_process, tmp_path):
@@ -69,7 +69,7 @@ def test_the_log_holds_all_that_is_told_with_its_time(in_process, tmp_path):
     second = in_process("run", *TINY, "--out", tmp_path / "run", "--set", "drive.amplitude=3", "--log", log)
     assert second.returncode == 2
     assert log.read_text().startswith(text)
-    assert re.search(rf"^{STAMP} WARNING vipetsc: .*holds another run", log.read_text(), flags=re.M)
+    assert re.search(rf"^{STAMP} WARNING vipetsc: .*contains another run", log.read_text(), flags=re.M)
     assert not logging.getLogger("vipetsc").handlers
 
 

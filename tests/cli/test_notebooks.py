@@ -77,6 +77,6 @@ def test_its_cells_run(path, monkeypatch, tmp_path, capsys):
     elif path.stem == "breather":
         assert float(abs(names["u"][-1] - names["u"][0]).max() / abs(names["u"][0]).max()) < 1e-3
     else:
-        assert "in s? In ms they would be largest at 10" in printed
+        assert "in s? In ms, their spectrum would be largest at 10" in printed
         assert printed.splitlines()[-2] == "[]"
         assert names["result"].statistics["episodes"] > 0

@@ -126,7 +126,7 @@ def test_a_request_to_stop_ends_with_75_and_the_same_command_goes_on(in_process,
     _, message = process.communicate(timeout=120)
 
     assert process.returncode == 75, message
-    assert "the same command goes on" in message
+    assert "the same command continues" in message
     assert not (out / "optimum.h5").exists()
     assert (out / "optimum-runs-0.jsonl").exists()
 

@@ -75,7 +75,7 @@ def test_bands_of_beads_are_none(in_process, tmp_path):
     """A cell without springs has no band: a sentence and an empty list say so, and there is no picture."""
     answer = in_process("bands", "runs/examples/beads.toml", "--out", tmp_path)
     assert answer.returncode == 0
-    assert answer.stdout == "no pass bands: contacts alone join the masses, and no wave is linear\n"
+    assert answer.stdout == "no pass bands: only contacts join the masses, so that there are no linear waves\n"
     assert [path.name for path in tmp_path.iterdir()] == ["bands.json"]
     numbers = json.loads(in_process("bands", "runs/examples/beads.toml", "--out", tmp_path, "--json").stdout)
     assert numbers["bands"] == numbers["gaps"] == []

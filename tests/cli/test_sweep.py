@@ -78,7 +78,7 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
     assert re.search(r"made now +0 in", second.stdout)
     changed = in_process("sweep", case, "--out", out, "--set", "drive.cycles=6")
     assert changed.returncode == 2
-    assert "holds another sweep: drive.cycles = 5 there, 6 here; --force replaces it" in changed.stderr
+    assert "contains another sweep: drive.cycles = 5 there, 6 here; replace it with --force" in changed.stderr
 
 
 def test_a_member_is_made_again_whole_by_its_name_or_number(in_process, case, tmp_path):
@@ -115,8 +115,8 @@ def test_a_member_that_is_not_there_is_refused(in_process, case, tmp_path):
     assert in_process("sweep", case, "--out", out, *changes).returncode == 0
 
     for path, name, message in (
-        (out, "2", "--member = '2': is no member"),
-        (case, "x", "is no member"),
+        (out, "2", "--member = '2': is not a member"),
+        (case, "x", "is not a member"),
         (tmp_path, "0", "case"),
     ):
         bad = in_process("run", path, "--member", name, "--out", tmp_path / "bad")
@@ -135,7 +135,7 @@ def test_a_sweep_of_an_earlier_version_is_named(in_process, case, tmp_path):
     for words in (("sweep", case, "--out", out, *changes), ("analyse", out)):
         ended = in_process(*words)
         assert ended.returncode == 2
-        assert "holds a sweep of an earlier version" in ended.stderr
+        assert "contains a sweep of an earlier version" in ended.stderr
 
     assert in_process("sweep", case, "--out", out, *changes, "--force").returncode == 0
     assert not (out / "linear").exists()
@@ -147,7 +147,7 @@ def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
     out = tmp_path / "out"
     ended = vipetsc(2, "sweep", case, "--out", out, "--set", "sweep.contacts.sites=[[20], [41], [30]]")
     assert ended.returncode == 1
-    assert "contacts.sites = [41]: outside the lattice; cells count from 1 to 40" in ended.stdout
+    assert "contacts.sites = [41]: outside the lattice; cells are numbered from 1 to 40" in ended.stdout
 
     # One for each of the six amplitudes.
     rows = json.loads((out / "index.json").read_text())["failed"]
@@ -227,7 +227,7 @@ def test_measures_again_from_files(vipetsc, in_process, case, tmp_path):
 
     nothing = in_process("analyse", tmp_path)
     assert nothing.returncode == 2
-    assert "holds no run.h5" in nothing.stderr
+    assert "contains no run.h5" in nothing.stderr
 
 
 def test_validate_counts_the_members(in_process, case):

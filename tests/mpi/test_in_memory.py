@@ -47,5 +47,5 @@ def test_rank_0_has_the_ensemble():
 @pytest.mark.parallel(2)
 def test_all_ranks_refuse_fields_without_a_folder():
     """The refusal is raised on every rank."""
-    with pytest.raises(CaseError, match="name a folder"):
+    with pytest.raises(CaseError, match="give a folder"):
         run_sweep(Sweep(**TABLE, sweep={"drive": {"amplitude": [1.0]}, "fields": True}))

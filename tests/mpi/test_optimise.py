@@ -55,7 +55,7 @@ def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder,
     comm = MPI.COMM_WORLD
     stop = StopAt(looks) if comm.rank == comm.size - 1 else StopRequest()
 
-    with pytest.raises(StoppedError, match="the same command goes on"):
+    with pytest.raises(StoppedError, match="the same command continues"):
         run_search(plan(), folder, comm, stop=stop)
     assert not (folder / "optimum.h5").exists()
 

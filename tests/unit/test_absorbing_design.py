@@ -41,6 +41,6 @@ def test_an_end_is_designed_once_for_all_amplitudes(tried):
 
 def test_that_no_end_will_do_is_found_once(tried):
     for amplitude in (1.0, 2.0):
-        with pytest.raises(CaseError, match="comes back, mostly slow waves"):
+        with pytest.raises(CaseError, match="is reflected, mostly slow waves"):
             case(amplitude, reflection=1e-9)
     assert len(tried) == len(set(tried))

@@ -168,7 +168,10 @@ def test_on_a_ring_the_first_site_is_the_nearest_in_either_direction(run):
 
     assert "cell 22" in measured["ibtet"].attrs["starts_when"]
     assert not {"dispersion_before", "dispersion_after"} & set(measured.variables)
-    assert "dispersion_before, dispersion_after: on a ring the wave goes both ways" in measured.attrs["left_out"]
+    assert (
+        "dispersion_before, dispersion_after: on a ring the wave travels in both directions"
+        in measured.attrs["left_out"]
+    )
     model = ring.model()
     estimate = 0.5 * model.drive.duration + 5 / model.speed
     assert estimate <= measured.attrs["entropy/start"] < estimate + 2 * INTERVAL

@@ -302,5 +302,5 @@ def test_multipliers_of_the_whole_of_a_long_lattice_are_refused():
     NnmCase.from_table(table)
 
     table["nnm"] |= {"multipliers": 2}
-    with pytest.raises(CaseError, match=r"nnm\.multipliers.*multiplier_max needs the sites alone"):
+    with pytest.raises(CaseError, match=r"nnm\.multipliers.*multiplier_max needs only the motion of the sites"):
         NnmCase.from_table(table)

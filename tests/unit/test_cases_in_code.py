@@ -57,7 +57,7 @@ def test_bad_input_is_refused_as_in_a_file():
     assert str(of_keywords.value) == str(of_table.value)
     assert "lattice.cels = 3: unknown key; did you mean lattice.cells?" in str(of_keywords.value)
 
-    with pytest.raises(CaseError, match="sweep: missing; list what varies"):
+    with pytest.raises(CaseError, match="sweep: missing; give the keys that vary"):
         Sweep(**TABLE)
 
 

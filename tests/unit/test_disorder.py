@@ -118,15 +118,15 @@ def test_samples_of_contacts_alone_have_one_linear_run():
 @pytest.mark.parametrize(
     ("disorder", "message"),
     [
-        ({}, "names nothing that scatters"),
-        ({"seed": 3}, "names nothing that scatters"),
+        ({}, "contains no quantity that scatters"),
+        ({"seed": 3}, "contains no quantity that scatters"),
         ({"clearance": {"relative": -0.1}}, "disorder.clearance.relative = -0.1: must be greater than or equal to 0"),
         ({"clearanc": {"relative": 0.1}}, "did you mean disorder.clearance?"),
-        ({"clearance": {"relative": 0.1, "absolute": 1e-4}}, "give one of relative and absolute"),
-        ({"clearance": {}}, "give one of relative and absolute"),
-        ({"clearance": {"relative": 0.9}}, "a sign cannot change: take a smaller deviation, or lognormal"),
+        ({"clearance": {"relative": 0.1, "absolute": 1e-4}}, "give either relative or absolute"),
+        ({"clearance": {}}, "give either relative or absolute"),
+        ({"clearance": {"relative": 0.9}}, "its sign must not change: use a smaller deviation, or lognormal"),
         ({"clearance": {"relative": 0.1, "distribution": "norml"}}, "did you mean 'normal'?"),
-        ({"sites": {"relative": 0.1}}, "give absolute, in cells"),
+        ({"sites": {"relative": 0.1}}, "give `absolute`, in cells"),
         ({"sites": {"absolute": 3.0}}, "draws contacts.sites = "),
         ({"restitution": {"absolute": 0.25, "distribution": "uniform"}}, "draws contacts.each.restitution[1] = "),
         ({"seed": -1, "clearance": {"relative": 0.1}}, "disorder.seed = -1"),
@@ -226,7 +226,7 @@ def test_one_sample_that_cannot_be_drawn_refuses_the_sweep():
     possible = [plan.member(number).case is not None for number in range(0, plan.count, 7)]
     assert any(possible)
     assert not all(possible)
-    with pytest.raises(CaseError, match="but a sign cannot change"):
+    with pytest.raises(CaseError, match="but its sign must not change"):
         plan.members()
 
 

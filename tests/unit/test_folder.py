@@ -91,12 +91,12 @@ def test_the_same_case_is_resumed_and_nothing_is_touched(run):
 
 @pytest.mark.parametrize("resume", [False, True])
 def test_another_case_is_refused_with_the_difference(run, resume):
-    message = "holds another run: a = 1 there, 2 here; --force replaces it, --out chooses another folder"
+    message = "contains another run: a = 1 there, 2 here; replace it with --force, or choose another folder with --out"
     assert_refused(message, run, RUN, NEW, resume=resume)
 
 
 def test_a_folder_that_is_not_there_is_not_resumed(tmp_path):
-    message = "holds no run to resume; leave out --resume"
+    message = "contains no run to resume; omit --resume"
     assert_refused(message, tmp_path / "deep" / "none", RUN, OLD, resume=True)
     assert not names_in(tmp_path)
 

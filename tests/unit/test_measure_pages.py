@@ -197,7 +197,7 @@ def test_a_study_of_too_many_pages_is_cut_through_its_largest_value():
     )
     assert MOST_PAGES < 4**3
     (figure,) = figures.values()
-    assert "through the largest value of all: " in title(figure)
+    assert "through the largest value: " in title(figure)
 
 
 def test_bands_are_curves_of_their_own_and_other_parts_stay_out():
@@ -218,7 +218,7 @@ def test_samples_are_a_mean_and_a_band():
     edges = band.get_paths()[0].vertices
     assert edges[:, 1].min() == pytest.approx(low.min())
     assert edges[:, 1].max() == pytest.approx(high.max())
-    assert "means over 8 samples; bands: 5 to 95 % of them" in title(figure)
+    assert "means over 8 samples; bands: 5 to 95 % of the samples" in title(figure)
     assert "disorder.seed" not in title(figure)
 
 

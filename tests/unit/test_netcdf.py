@@ -105,7 +105,7 @@ def test_files_of_another_kind_are_refused(tmp_path):
 
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["values"] = np.zeros((2, 2))
-    with pytest.raises(ValueError, match=r"foreign\.h5 is not a run of vipetsc: it has no time, energy/kinetic, case"):
+    with pytest.raises(ValueError, match=r"foreign\.h5 is not a run of vipetsc: it lacks time, energy/kinetic, case"):
         open_netcdf(tmp_path / "foreign.h5", "run", ("time", "energy/kinetic", "values", "case"))
 
 

@@ -93,7 +93,9 @@ def test_a_cell_of_ones_own_needs_clearances_and_a_stiffness():
 def test_a_restitution_is_warned_of():
     """Normal modes are conservative: a restitution below 1 is ignored with a warning, one of 1 without."""
     lossy = NnmCase.from_table({"contacts": {"restitution": 0.7}})
-    assert lossy.warnings() == ["contacts.restitution = 0.7 counts as 1: normal modes lose nothing"]
+    assert lossy.warnings() == [
+        "contacts.restitution = 0.7 is treated as 1: normal modes are computed without dissipation"
+    ]
     assert NnmCase.from_table({"contacts": {"restitution": 1.0}}).warnings() == []
 
 
@@ -102,7 +104,7 @@ def test_a_restitution_is_warned_of():
     ("table", "key"),
     [
         ({"contacts": {"law": "power"}}, r"contacts\.exponent: missing"),
-        ({"contacts": {"exponent": 3.0}}, r"contacts\.exponent = 3.0: is for law"),
+        ({"contacts": {"exponent": 3.0}}, r"contacts\.exponent = 3.0: applies only to law"),
         ({"contacts": {"side": "plus"}}, r"contacts\.side"),
         ({"contacts": {"clearance_minus": 2e-3}}, r"contacts\.clearance_minus"),
         ({"contacts": {"each": {"law": ["bilinear"]}}}, r"contacts\.each"),

@@ -106,17 +106,17 @@ def test_other_files_are_refused(tmp_path, folder):
     with pytest.raises(OSError):
         open_run(tmp_path / "absent.h5")
 
-    with pytest.raises(ValueError, match=r"ensemble\.h5 is not a run of vipetsc: it has no time, cell, energy"):
+    with pytest.raises(ValueError, match=r"ensemble\.h5 is not a run of vipetsc: it lacks time, cell, energy"):
         open_run(folder / "ensemble.h5")
 
     with h5py.File(tmp_path / "ensemble.h5", "w") as file:
         file["time"] = 1.0
-    with pytest.raises(ValueError, match="is not a sweep's ensemble of vipetsc: it has no status, case"):
+    with pytest.raises(ValueError, match="is not a sweep's ensemble of vipetsc: it lacks status, case"):
         open_ensemble(tmp_path)
 
     # Sweeps once kept their contact-free runs in a folder of this name.
     (folder / "linear").mkdir()
-    with pytest.raises(ValueError, match="holds a sweep of an earlier version"):
+    with pytest.raises(ValueError, match="contains a sweep of an earlier version"):
         open_ensemble(folder)
 
 
@@ -135,11 +135,11 @@ def test_members_are_selected_by_the_values_of_swept_keys(folder):
     assert select(ensemble["ibtet"], law="hertz", amplitude=0.1 + 0.2).values.tolist() == [1, 3, 5]
     assert select(ensemble, law="bilinear")["fits/ibtet/exponent"].values.tolist() == [6, 8, 10]
 
-    with pytest.raises(KeyError, match="no member has cycles = 15 beside sites"):
+    with pytest.raises(KeyError, match="no member has cycles = 15 at the given sites"):
         select(ensemble, sites=1, cycles=15)
     with pytest.raises(KeyError, match=r"amplitude = 0\.2"):
         select(ensemble, amplitude=0.2)
-    with pytest.raises(KeyError, match="ibtet is no coordinate"):
+    with pytest.raises(KeyError, match="ibtet is not a coordinate"):
         select(ensemble, ibtet=3.0)
 
 

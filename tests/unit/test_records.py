@@ -51,7 +51,7 @@ def test_a_line_that_was_cut_off_costs_no_other(tmp_path, cut):
     append_all(path, ROWS[3:])
     rows, damaged = read_all(path)
     assert rows == [*ROWS[:2], *ROWS[3:]]
-    assert damaged == [f"{path}, line 3: cut off or damaged; what it told is made again"]
+    assert damaged == [f"{path}, line 3: truncated or damaged; its results are computed again"]
 
 
 def test_a_damaged_line_is_left_out(tmp_path):

@@ -91,7 +91,7 @@ def test_a_lattice_without_springs_begins_with_no_mode_and_no_packet(motion):
 
 def test_stops_are_described_by_what_they_are():
     gaps = ((float("inf"), 0.0), (-2e-6, float("inf")), (2e-4, 3e-4))
-    expected = ["touches on side -", "pressed by 0.002 mm on side +", "+0.2 mm -0.3 mm"]
+    expected = ["touches on side -", "precompressed by 0.002 mm on side +", "+0.2 mm -0.3 mm"]
     assert describe_stops(gaps, (0.0, 0.0, 2e-4)) == expected
     assert describe_stops((), (2e-4,)) == ["0.2 mm"]
 
@@ -99,7 +99,7 @@ def test_stops_are_described_by_what_they_are():
 def test_a_drive_without_an_end_is_said_to_go_on():
     case = small_case(drive={"waveform": "harmonic", "cycles": 30})
     rows = dict(run_rows(case, 1))
-    assert rows["drive, end"] == "it goes on, 0.05 s"
+    assert rows["drive, end"] == "no end, 0.05 s"
     assert "burst, end" in dict(run_rows(small_case(), 1))
 
 

@@ -32,14 +32,15 @@ def file(tmp_path: Path) -> Path:
 
 def test_a_data_set_is_not_read_before_its_size_is_known(file):
     """Sixteen terabytes of samples are refused by their number, which no memory could hold."""
-    assert f"holds (1000000000000, 2) numbers; time and value in two columns, {MOST_SAMPLES} rows" in refusal(
-        file=str(file), dataset="endless"
+    assert (
+        f"holds (1000000000000, 2) numbers; give time and value in two columns, with at most {MOST_SAMPLES} rows"
+        in refusal(file=str(file), dataset="endless")
     )
 
 
 def test_what_is_no_table_of_two_columns_is_refused(file):
     """A group and a table of three columns are named as such."""
-    assert "group is no data set" in refusal(file=str(file), dataset="group")
+    assert "group is not a dataset" in refusal(file=str(file), dataset="group")
     assert "holds (4, 3) numbers" in refusal(file=str(file), dataset="three")
 
 
@@ -48,7 +49,7 @@ def test_a_table_of_text_is_read_up_to_the_line_that_is_too_much(tmp_path, heade
     """A table of text with one sample more than allowed is refused, with a line of names or without."""
     path = tmp_path / "samples.csv"
     path.write_text(header + "0.5,1.0\n" * (MOST_SAMPLES + 1), encoding="utf-8")
-    assert f"{MOST_SAMPLES} rows at most" in refusal(file=str(path))
+    assert f"at most {MOST_SAMPLES} rows" in refusal(file=str(path))
 
     path.write_text(header + "# a comment\n\n" + "0.5,1.0\n" * MOST_SAMPLES, encoding="utf-8")
     table, problems = with_samples({"drive": {"waveform": "samples", "samples": {"file": str(path)}}})

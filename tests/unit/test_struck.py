@@ -69,19 +69,19 @@ def test_on_springs_the_frequency_is_that_of_the_mass_while_others_are_held():
     [
         ({"cell": 1}, r"initial\.velocity: missing; kind = 'velocity' needs cell, velocity"),
         ({"cell": 1, "velocity": 0.0}, r"initial\.velocity = 0\.0: must not be zero; give it in m/s"),
-        ({"cell": 9, "velocity": 1.0}, r"initial\.cell = 9: outside the lattice; cells count from 1 to 5"),
+        ({"cell": 9, "velocity": 1.0}, r"initial\.cell = 9: outside the lattice; cells are numbered from 1 to 5"),
         ({"cell": 1, "mass": 2, "velocity": 1.0}, r"initial\.mass = 2: the cell has 1 masses"),
-        ({"cell": 1, "velocity": 1.0, "number": 2}, r"initial\.number = 2: belongs to another kind than 'velocity'"),
+        ({"cell": 1, "velocity": 1.0, "number": 2}, r"initial\.number = 2: does not apply to the kind 'velocity'"),
         (
             {"cell": 1, "velocity": 1.0, "more": [{"cell": 1, "velocity": 2.0}]},
-            r"initial\.more\[1\]\.cell = 1: mass 1 of this cell is struck already",
+            r"initial\.more\[1\]\.cell = 1: mass 1 of this cell is given twice",
         ),
         (
             {"cell": 1, "velocity": 1.0, "more": [{"cell": 6, "velocity": 2.0}]},
             r"initial\.more\[1\]\.cell = 6: outside the lattice",
         ),
         ({"cell": 1, "velocity": 1.0, "more": [{"cell": 2, "speed": 2.0}]}, r"initial\.more\[1\]\.speed"),
-        ({"kind": "zero", "velocity": 1.0}, r"initial\.velocity = 1\.0: belongs to another kind than 'zero'"),
+        ({"kind": "zero", "velocity": 1.0}, r"initial\.velocity = 1\.0: does not apply to the kind 'zero'"),
     ],
 )
 def test_what_is_refused(initial, message):
@@ -93,9 +93,7 @@ def test_what_is_refused(initial, message):
 def test_two_frequencies_are_refused():
     """The frequency of a drive is the reference where there is one."""
     initial = {"cell": 1, "velocity": 1.0, "frequency": 1e4}
-    with pytest.raises(
-        CaseError, match=r"initial\.frequency = 10000\.0: the drive has a frequency; leave this one out"
-    ):
+    with pytest.raises(CaseError, match=r"initial\.frequency = 10000\.0: the drive has a frequency; omit this key"):
         beads(initial, drive={"amplitude": 1.0, "frequency": 2e4})
     assert beads(initial).model().drive.frequency == 1e4
 
@@ -110,5 +108,7 @@ def test_lossy_sites_at_rest_are_refused_next_to_struck_ones():
 
 def test_verbs_about_waves_refuse_it():
     """A law is about a wave in a lattice at rest."""
-    with pytest.raises(CaseError, match=r"initial\.kind = 'velocity': this verb is about a wave in a lattice at rest"):
+    with pytest.raises(
+        CaseError, match=r"initial\.kind = 'velocity': this verb treats a wave in a lattice that starts at rest"
+    ):
         LawCase.from_table({"initial": {"kind": "velocity", "cell": 1, "velocity": 1.0}, "law": {}})

@@ -107,7 +107,7 @@ def test_written_out_and_read_back_it_has_the_same_members():
     ("text", "message"),
     [
         ("", "sweep: missing"),
-        ("[sweep]\nfields = true", "names no key that varies"),
+        ("[sweep]\nfields = true", "contains no key that varies"),
         ("[sweep]\nfeilds = true\n[sweep.drive]\namplitude = [1.0]", "did you mean sweep.fields?"),
         ("[sweep.drive]\namplitude = 3.0", "sweep.drive.amplitude = 3.0: give a list"),
         ("[sweep.drive]\namplitude = []", "give a list"),
@@ -115,7 +115,10 @@ def test_written_out_and_read_back_it_has_the_same_members():
         ("[sweep.drive]\namplitude = { log = [1, 2] }", "give a list"),
         ("[sweep.drive]\namplitud = [1.0]", "did you mean drive.amplitude?"),
         ('[sweep]\nzip = [["drive.cycles"]]\n[sweep.drive]\namplitude = [1.0]', "not among the keys that vary"),
-        ('[sweep]\nzip=[["drive.cycles","drive.amplitude"]]\n[sweep.drive]\namplitude=[1.0]\ncycles=[3,4]', "as many"),
+        (
+            '[sweep]\nzip=[["drive.cycles","drive.amplitude"]]\n[sweep.drive]\namplitude=[1.0]\ncycles=[3,4]',
+            "the same number of values",
+        ),
         ('[sweep]\nzip=[["drive.cycles"],["drive.cycles"]]\n[sweep.drive]\ncycles=[3,4]', "in one group only"),
     ],
 )
@@ -158,7 +161,7 @@ def test_a_number_or_a_name_finds_its_member():
     assert plan.case(3).drive.amplitude == 2.0
     # Beyond the last one, before the first one, and no name of any.
     for name in ("6", "-1", "0123456789abcdef"):
-        with pytest.raises(CaseError, match="is no member; ensemble"):
+        with pytest.raises(CaseError, match="is not a member; ensemble"):
             plan.number(name)
 
 

@@ -132,7 +132,7 @@ def test_the_end_that_is_chosen_keeps_its_bound():
     (back,) = returning(source, sections[0], [0])
     assert of.lattice.absorbing.cells > 160
     assert back < 1.01e-3
-    assert f"{reflected([source], sections):.1e} of all that the drive sends" in describe_ends(of)
+    assert f"{reflected([source], sections):.1e} of all waves that the drive sends" in describe_ends(of)
 
 
 @pytest.mark.slow

@@ -185,5 +185,5 @@ def test_a_sweep_is_one_table_of_members(tmp_path):
 def test_what_holds_no_results_is_refused(in_process, tmp_path):
     ended = in_process("export", tmp_path)
     assert ended.returncode == 2
-    assert "holds no results" in ended.stderr
+    assert "contains no results" in ended.stderr
     assert not any(tmp_path.iterdir())

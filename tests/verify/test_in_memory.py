@@ -89,7 +89,7 @@ def test_a_sweep_that_is_stopped_stays_where_it_is(tmp_path, monkeypatch):
 
 def test_fields_of_members_need_a_folder():
     """A sweep that keeps the runs of its members is refused without a folder, before anything is simulated."""
-    with pytest.raises(CaseError, match=r"sweep\.fields = True: keeps files of every member: name a folder"):
+    with pytest.raises(CaseError, match=r"sweep\.fields = True: stores files of every member: give a folder"):
         run_sweep(small_sweep(fields=True))
 
 

@@ -122,10 +122,10 @@ def test_an_absorbing_end_is_that_of_all_drives():
 
     description = describe_ends(small_case(lattice=ends, drive=TWO_DRIVES))
     assert "at 1500 rad/s" in description
-    assert description.count("comes back") == 2
+    assert description.count("reflects") == 2
 
     in_a_gap = describe_ends(small_case(lattice=ends, drive={"frequency": 650.0, "cycles": 200}))
-    assert "no wave comes to it at 650 rad/s" in in_a_gap
+    assert "no wave reaches it at 650 rad/s" in in_a_gap
 
     # An end that absorbs both bursts is another one than that for the first alone.
     one = small_case(lattice={"cells": 90, "absorbing": {}})

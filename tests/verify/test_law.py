@@ -254,7 +254,7 @@ def test_matched_clearances_meet_each_site_at_the_best_z():
     np.testing.assert_allclose(20 * linear.envelope[[9, 19, 29]] * left / clearances, z)
 
     law.mean.upper[:] = 0
-    with pytest.raises(ValueError, match="no band above"):
+    with pytest.raises(ValueError, match="no energy to bands above"):
         law.matched()
 
 
@@ -267,7 +267,7 @@ def test_matched_clearances_meet_each_site_at_the_best_z():
         ({"law": {"jitter": 0.7}}, "law.jitter"),
         ({"drive": {"frequency": 1800.0}}, "lies in no pass band"),
         ({"law": {"settle": 1000.0}}, "too slow to wait for"),
-        ({"law": {"distance": 20}}, "law.distance = 20: the burst must be over before"),
+        ({"law": {"distance": 20}}, "law.distance = 20: the burst must end before"),
         (
             {"lattice": {"cell": THREE_MASS_CELL}, "contacts": {"stiffness": 1e6, "clearance": None}},
             "law.clearance: missing",

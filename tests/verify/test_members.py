@@ -104,8 +104,10 @@ def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
 
         assert again.complete
         assert again.newly_made == missing
-        (warning,) = (text for text in again.warnings if "meets the right end" not in text)
-        assert warning == f"{out}/members.jsonl, line {number + 1}: cut off or damaged; what it told is made again"
+        (warning,) = (text for text in again.warnings if "reaches the right end" not in text)
+        assert (
+            warning == f"{out}/members.jsonl, line {number + 1}: truncated or damaged; its results are computed again"
+        )
         assert_same_bits(before, datasets(out / "ensemble.h5"))
         assert (out / "members.jsonl").read_bytes().count(b"\n") == 7
 

@@ -99,7 +99,7 @@ def test_what_only_looks_is_no_part_of_a_case():
 
 def test_verbs_without_time_stepping_take_no_options(capsys):
     assert main(["bands"], {"ts_rk_type": "5dp"}) == 2
-    assert "-ts_rk_type: bands takes no PETSc options" in capsys.readouterr().err
+    assert "-ts_rk_type: bands does not accept PETSc options" in capsys.readouterr().err
 
 
 def test_a_case_with_options_is_stepped():

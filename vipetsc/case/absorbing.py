@@ -78,15 +78,16 @@ def designed_end(
     """
     waves = [wave for drive in drives for wave in waves_at(cell, drive.waveform.frequency)]
     if not waves:
-        raise ValueError("the drive is in a gap: no wave comes to the end")
+        raise ValueError("the drive frequency is in a gap: no wave reaches the end")
 
     speed = max(wave[2] for wave in waves)
     end = _first_end(table, cell, ends, with_unit_amplitude(drives), cells, speed)
     if end.cells:
         return table.model_copy(update={"cells": end.cells, "strength": end.strength})
     raise ValueError(
-        f"no end of up to {cells // 3} cells has it, {end.back:.2g} comes back, mostly slow waves at band edges;"
-        " allow more, lengthen the lattice, or drive more cycles or a frequency farther from the edges"
+        f"no end of up to {cells // 3} cells satisfies it: {end.back:.2g} is reflected, mostly slow waves at band"
+        f" edges;"
+        " allow more reflection, lengthen the lattice, increase the cycles, or drive farther from the band edges"
     )
 
 

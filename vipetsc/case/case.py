@@ -289,7 +289,7 @@ def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[
     time = resolved["time"]
     count = time.end / time.sample_interval
     if count > MOST_SAMPLES:
-        remedy = f"makes {count:.3g} samples; at most {MOST_SAMPLES:.3g} can be taken, and the bands need so many"
+        remedy = f"makes {count:.3g} samples; at most {MOST_SAMPLES:.3g} are possible, and the bands need that many"
         return [Problem("time.end", given["time"].end, remedy)]
     samples = given["time"].samples
     if samples is None:
@@ -317,14 +317,18 @@ def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]
     initial = sections.get("initial")
     has_wave = drive.amplitude != 0 or bool(drive.wave_choices)
     if initial is not None and initial.frequency and has_wave and valid("initial", "drive"):
-        yield Problem("initial.frequency", initial.frequency, "the drive has a frequency; leave this one out")
+        yield Problem("initial.frequency", initial.frequency, "the drive has a frequency; omit this key")
     if drive.amplitude != 0:
         return
     moves = initial is not None and initial.moves
     if not moves and valid("initial") and drive.kind == DEFAULT:
-        yield Problem("drive.amplitude", 0.0, "must not be zero in a lattice at rest; see [initial]")
+        yield Problem("drive.amplitude", 0.0, "must not be zero if the lattice starts at rest; see [initial]")
     if sections["time"].atol == "paper":
-        yield Problem("time.atol", "paper", 'is 1e-9 of the drive, and there is none; give "scaled" or a number')
+        yield Problem(
+            "time.atol",
+            "paper",
+            'is 1e-9 times the amplitude of a drive, but there is no drive; give "scaled" or a number',
+        )
 
 
 def _check_output(output: OutputTable, cells: int | None, cell: UnitCell | None) -> Iterator[Problem]:

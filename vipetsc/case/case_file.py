@@ -240,7 +240,9 @@ def _check_name(name: Any) -> Iterator[Problem]:
     if not isinstance(name, str) or not name:
         yield Problem("name", name, "must be a non-empty string")
     elif not (name.isprintable() and FOLDER.fullmatch(name) and len(name.encode()) <= LONGEST_NAME):
-        remedy = f"names the output folder: {LONGEST_NAME} bytes at most, without / or \\, no dot or dash first"
+        remedy = (
+            f"names the output folder: use at most {LONGEST_NAME} bytes, no / or \\, and no dot or dash at the start"
+        )
         yield Problem("name", name, remedy)
 
 
@@ -288,7 +290,9 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
         if not equals or not all(keys):
             problems.append(Problem("--set", override, "write section.key=value"))
         elif has_more_keys(text):
-            problems.append(Problem("--set", override, "gives one key: what follows in other lines needs a --set each"))
+            problems.append(
+                Problem("--set", override, "gives a single key; give the keys in further lines with a --set each")
+            )
         elif len(keys) > DEEPEST or is_deeper(value, DEEPEST - len(keys)):
             problems.append(Problem("--set", override, TOO_DEEP))
         else:
@@ -305,7 +309,7 @@ def put(table: Table, path: str, value: Any) -> list[Problem]:
     if not isinstance(section, dict):
         return [Problem(path, value, f"{'.'.join(parents)} is a value, not a section")]
     if value is None and key not in section:
-        return [Problem(path, None, "is not in the case, so there is nothing to take out")]
+        return [Problem(path, None, "is not in the case, so that it cannot be removed")]
 
     if value is None:
         del section[key]
@@ -348,7 +352,7 @@ def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
             yield from _out_of_range(item, f"{path}[{i}]")
     # ``type`` rather than ``isinstance``: a boolean is an ``int`` for the latter.
     elif type(value) in (int, float) and (0 < abs(value) < 1 / LARGEST or LARGEST < abs(value) < math.inf):
-        yield Problem(path, value, f"must be of a magnitude between {1 / LARGEST:g} and {LARGEST:g}, in SI units")
+        yield Problem(path, value, f"must have a magnitude between {1 / LARGEST:g} and {LARGEST:g}, in SI units")
 
 
 def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:

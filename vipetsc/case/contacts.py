@@ -37,7 +37,7 @@ def check_per_site(
     per_site = lists_of(contacts)
     for key, values in per_site.items():
         if len(values) != count:
-            yield Problem(f"contacts.each.{key}", values, f"one value for each of the {count} sites is needed")
+            yield Problem(f"contacts.each.{key}", values, f"give one value for each of the {count} sites")
             return
 
     # A stiffness would contradict a material; the lists over sites may give either.
@@ -50,7 +50,7 @@ def check_per_site(
 
     lacking = [key for key in MATERIAL if None in values_of_sites(contacts, key, count)]
     if has_material and lacking:
-        yield Problem(f"contacts.{lacking[0]}", None, "missing; the stiffness of each site needs it")
+        yield Problem(f"contacts.{lacking[0]}", None, "missing; needed for the stiffness of each site")
     yield from _check_laws(contacts, count)
     yield from _check_sides(contacts, count)
     wrong = list(_check_stops(contacts, gaps))
@@ -66,9 +66,9 @@ def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
         path = _path_of(contacts, key)
         if is_given and parameter.law not in laws:
             value = lists_of(contacts).get(key, getattr(contacts, key))
-            yield Problem(path, value, f'is for law = "{parameter.law}"')
+            yield Problem(path, value, f'applies only to law = "{parameter.law}"')
         if parameter.law in laws and not is_given:
-            yield Problem(path, None, f'missing; the law "{parameter.law}" needs it')
+            yield Problem(path, None, f'missing; needed for the law "{parameter.law}"')
 
     # Without sites the values for all are checked: normal modes need no list of sites.
     names = values_of_sites(contacts, "damping", count) or [contacts.damping]
@@ -76,7 +76,7 @@ def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
     # None, the default damping, cannot be compared with a name: text orders both.
     for name, restitution in sorted(set(zip(names, restitutions, strict=True)), key=str):
         if name in ("exact", "flores") and restitution < LEAST_RESTITUTION:
-            remedy = f"the {name} damping grows without bound towards 0; at least {LEAST_RESTITUTION}"
+            remedy = f"the {name} damping increases without bound towards 0; give at least {LEAST_RESTITUTION}"
             yield Problem(_path_of(contacts, "restitution"), restitution, remedy)
 
 
@@ -84,7 +84,7 @@ def _check_sides(contacts: ContactsTable, count: int) -> Iterator[Problem]:
     """The problem of a clearance on a side on which none of ``count`` sites has a stop."""
     is_given = contacts.clearance_minus is not None or "clearance_minus" in lists_of(contacts)
     if is_given and count and set(values_of_sites(contacts, "side", count)) == {"plus"}:
-        remedy = 'with side = "plus" no site has a stop on the side -; leave it out'
+        remedy = 'with side = "plus" no site has a stop on the side -; omit it'
         yield Problem(_path_of(contacts, "clearance_minus"), contacts.clearance_minus, remedy)
 
 
@@ -110,15 +110,15 @@ def _check_stops(contacts: ContactsTable, gaps: list[float]) -> Iterator[Problem
     stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
     for number, (plus, minus) in enumerate(stops, 1):
         if min(plus, minus) <= 0 and max(plus, minus) < np.inf:
-            remedy = "contacts that touch or are pressed have a stop on one side alone: contacts.side"
+            remedy = "contacts that touch at rest or are precompressed have a stop on one side only; set contacts.side"
             yield Problem("contacts.clearance", min(plus, minus), f"site {number}: {remedy}")
             return
         if precompressions[number - 1] and max(plus, minus) < np.inf:
-            remedy = f"site {number} has stops on both sides, and one alone can be pressed: contacts.side"
+            remedy = f"site {number} has stops on both sides; a precompressed contact has one: set contacts.side"
             yield Problem(_path_of(contacts, "precompression"), precompressions[number - 1], remedy)
             return
         if min(plus, minus) < 0 and restitutions[number - 1] < 1:
-            remedy = "a contact that is pressed together has no approach velocity: its restitution must be 1"
+            remedy = "a precompressed contact has no approach velocity: its restitution must be 1"
             yield Problem(_path_of(contacts, "precompression"), -min(plus, minus), f"site {number}: {remedy}")
             return
 
@@ -185,10 +185,10 @@ def describe_stops(gaps: Gaps, clearances: tuple[float, ...]) -> list[str]:
 
 
 def _describe_stop(side: str, gap: float) -> str:
-    """The stop of one ``side`` in words: at how many mm, touching, or pressed by so many."""
+    """The stop of one ``side`` in words: at how many mm, touching, or precompressed by so many."""
     if gap > 0:
         return f"{side}{1e3 * gap:.4g} mm"
-    return f"touches on side {side}" if gap == 0 else f"pressed by {-1e3 * gap:.4g} mm on side {side}"
+    return f"touches on side {side}" if gap == 0 else f"precompressed by {-1e3 * gap:.4g} mm on side {side}"
 
 
 def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple[Pair, ...]:
@@ -214,7 +214,7 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
     for number, (at, pair) in enumerate(zip(cells, pairs, strict=True), 1):
         what = f"site {number} joins masses {pair.host + 1} and {pair.resonator + 1}"
         if max(pair.host, pair.resonator) >= cell.dofs or pair.resonator < 0:
-            remedy = f"{what}; the cell's count from 1 to {cell.dofs}, and 0 as the first one is the ground"
+            remedy = f"{what}; the masses of the cell are numbered from 1 to {cell.dofs}, and host 0 is the ground"
             yield Problem("contacts.pair", [pair.host + 1, pair.resonator + 1], remedy)
             return
         if pair.host == pair.resonator and not pair.next_cell:
@@ -229,9 +229,11 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
     times = Counter(zip(cells, pairs, strict=True))
     twice = [at for (at, _), count in times.items() if count > 1]
     if has_pair and twice:
-        yield Problem("contacts.sites", twice, "named twice with the same contact pair")
+        yield Problem("contacts.sites", twice, "given twice with the same contact pair")
     if not cell.springs and cells and not any(pair.next_cell for pair in pairs):
-        yield Problem("lattice.cell.springs", None, "neither springs nor contacts (contacts.next_cell) join the cells")
+        yield Problem(
+            "lattice.cell.springs", None, "neither springs nor contacts (contacts.next_cell) connect the cells"
+        )
 
 
 def gaps_of_sites(contacts: ContactsTable, gaps: list[float]) -> Gaps:

@@ -62,7 +62,7 @@ class DesignCase(CaseFile):
         lattice = table.get("lattice", {})
         if isinstance(lattice, dict) and ("cell" in lattice or lattice.get("preset", "four-band") != "four-band"):
             remedy = "only the four-band preset has a lambda and an eta to search"
-            problems.append(Problem("lattice", lattice.get("preset", "a cell of one's own"), remedy))
+            problems.append(Problem("lattice", lattice.get("preset", "a user-defined cell"), remedy))
         return fields, problems
 
     @property
@@ -80,7 +80,7 @@ class DesignCase(CaseFile):
             if not grid.first < grid.last:
                 yield Problem(f"design.{key}.last", grid.last, f"must be above design.{key}.first = {grid.first}")
         if len(set(design.readings)) < len(design.readings):
-            yield Problem("design.readings", design.readings, "name each reading once")
+            yield Problem("design.readings", design.readings, "give each reading once")
         size = design.lam.count * design.eta.count * design.wavenumbers
         if size > LARGEST:
             remedy = f"times design.eta.count and design.wavenumbers it is {size}; at most {LARGEST} fit"

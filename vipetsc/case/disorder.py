@@ -81,7 +81,7 @@ def scatter(
     lattice = sections["lattice"]
     contacts = sections["contacts"]
     if not (disorder.quantities() or disorder.cells):
-        remedy = "names nothing that scatters, as in: clearance = { relative = 0.01 }"
+        remedy = "contains no quantity that scatters; give one, as in: clearance = { relative = 0.01 }"
         return {}, [Problem("disorder", disorder.seed, remedy)]
 
     # A resolved case has no modulus: what is drawn scales the stiffness, which is proportional to it.
@@ -119,7 +119,7 @@ def _draw(
         key = f"disorder.{name}"
         about = np.asarray(values[name], float)
         if name == "sites" and deviation.relative:
-            problems.append(Problem(key, deviation.model_dump(exclude_none=True), "give absolute, in cells"))
+            problems.append(Problem(key, deviation.model_dump(exclude_none=True), "give `absolute`, in cells"))
         elif not about.size:
             problems.append(Problem(key, None, "the case has none that could scatter"))
         elif deviation.relative or deviation.absolute:  # none leaves the case as it is, to the last bit
@@ -128,7 +128,7 @@ def _draw(
             changes_sign = ~(new * about > 0) & (new != about)
             if changes_sign.any():
                 numbers = [float(f"{x:.4g}") for x in new[changes_sign]]
-                remedy = "but a sign cannot change: take a smaller deviation, or lognormal"
+                remedy = "but its sign must not change: use a smaller deviation, or lognormal"
                 problems.append(Problem(key, numbers, f"drawn with seed {disorder.seed}, {remedy}"))
             drawn[name] = new.tolist()
     return drawn, problems

@@ -57,10 +57,10 @@ def _check_keys(drive: OneDrive, path: str) -> Iterator[Problem]:
     """Problems with keys of other waveforms, keys that are missing, and a ramp that is too long."""
     given = drive.model_dump(exclude_none=True, exclude_defaults=True)
     for key in sorted(drive.foreign & given.keys()):
-        yield Problem(f"{path}.{key}", None, f"belongs to another waveform than {drive.kind!r}")
+        yield Problem(f"{path}.{key}", None, f"does not apply to the waveform {drive.kind!r}")
     for key in drive.record.needs:
         if key not in given:
-            yield Problem(f"{path}.{key}", None, f"missing; the waveform {drive.kind!r} needs it")
+            yield Problem(f"{path}.{key}", None, f"missing; needed for the waveform {drive.kind!r}")
 
     if drive.duration and drive.ramp and drive.ramp > drive.duration / 2 and "ramp" in drive.record.keys:
         yield Problem(f"{path}.ramp", drive.ramp, f"at most half the duration of {drive.duration:g} s")
@@ -83,14 +83,14 @@ def _check_samples(drive: OneDrive, samples: SamplesTable, path: str) -> Iterato
     times = np.array(samples.time)
     values = np.array(samples.value)
     if len(times) != len(values) or len(times) < 2:
-        remedy = f"two or more are needed, and as many values ({len(values)})"
+        remedy = f"give two or more, and as many values ({len(values)})"
         yield Problem(f"{path}.samples.time", len(times), remedy)
     elif times[0] < 0 or not (np.diff(times) > 0).all():
-        yield Problem(f"{path}.samples.time", None, "must grow from sample to sample, from 0 s or later on")
+        yield Problem(f"{path}.samples.time", None, "must increase from sample to sample and start at 0 s or later")
     elif not values.any():
         yield Problem(f"{path}.samples.value", None, "are all zero")
     elif drive.end and values[0] != 0:
-        yield Problem(f"{path}.samples.value", float(values[0]), "an end begins at rest: the first value must be 0")
+        yield Problem(f"{path}.samples.value", float(values[0]), "an end starts at rest: the first value must be 0")
 
 
 def _check_place(
@@ -99,23 +99,25 @@ def _check_place(
     """Problems with a driven mass outside the lattice, and with a wall that is missing or not on a linear spring."""
     if drive.end is None:
         if length is not None and drive.cell > length:
-            yield Problem(f"{path}.cell", drive.cell, f"outside the lattice; cells count from 1 to {length}")
+            yield Problem(f"{path}.cell", drive.cell, f"outside the lattice; cells are numbered from 1 to {length}")
         if cell and drive.mass > cell.dofs:
             yield Problem(f"{path}.mass", drive.mass, f"the cell has {cell.dofs} masses")
         return
 
     if lattice.ends != "fixed":
-        remedy = f'only a wall can be moved, and lattice.ends = "{lattice.ends}" has none'
+        remedy = f'only a fixed end has a wall that can be moved, and lattice.ends = "{lattice.ends}" has none'
         yield Problem(f"{path}.end", drive.end, remedy)
     if cell and any(spring.damping or not spring.is_linear for spring in cell.springs if spring.next_cell):
-        yield Problem(f"{path}.end", drive.end, "a wall moves a linear spring alone: no damping, quadratic, cubic")
+        yield Problem(
+            f"{path}.end", drive.end, "a wall can only move a linear spring: omit damping, quadratic and cubic"
+        )
     if cell and not cell.springs:
-        yield Problem(f"{path}.end", drive.end, "a wall moves the springs to it, and the cell has none")
+        yield Problem(f"{path}.end", drive.end, "a wall moves the springs attached to it, but the cell has none")
     elif cell and length:
         place = _beside_wall(cell, drive.end, length)
         for key in sorted(place.keys() & drive.model_fields_set):
             if getattr(drive, key) != place[key]:
-                remedy = f"leave it out: the wall acts on mass {place['mass']} of cell {place['cell']}"
+                remedy = f"omit it: the wall acts on mass {place['mass']} of cell {place['cell']}"
                 yield Problem(f"{path}.{key}", getattr(drive, key), remedy)
 
 
@@ -174,9 +176,11 @@ def check_wave(cell: UnitCell, drive: OneDrive, time: TimeTable) -> Iterator[Pro
     frequency, speed = driven_wave(cell, drive)
     key = "frequency" if drive.frequency else "wavenumber" if drive.wavenumber else "band"
     if not frequency > 0:
-        yield Problem(f"drive.{key}", getattr(drive, key), "the frequency there is 0; drive another wavenumber or band")
+        yield Problem(
+            f"drive.{key}", getattr(drive, key), "the frequency there is 0; choose another wavenumber or band"
+        )
     elif time.end == "traverse" and not speed > STANDING * wave_speed(cell, np.inf):
-        remedy = f"the wave at {frequency:.6g} rad/s stands (group velocity 0) and never crosses the lattice"
+        remedy = f"the wave at {frequency:.6g} rad/s has group velocity 0 and never crosses the lattice"
         yield Problem(f"drive.{key}", getattr(drive, key), f"{remedy}; give time.end in s, or another wavenumber")
 
 

@@ -32,7 +32,7 @@ UNLIKE_CELLS = {"profiles": "inhomogeneity", "scatter": "inhomogeneity", "absorb
 def refuse_disorder(kind: type[CaseFile], table: Table) -> list[Problem]:
     """The problem of a section ``[disorder]`` in a ``table`` whose verb does not take it."""
     if "disorder" in table and "disorder" not in kind.takes:
-        return [Problem("disorder", None, "this verb does not take it")]
+        return [Problem("disorder", None, "this verb does not accept it")]
     return []
 
 
@@ -43,7 +43,7 @@ def refusals(kind: type[CaseFile], sections: Mapping[str, Any], valid: Valid) ->
 
     initial = sections.get("initial")
     if initial and initial.moves and "initial motion" not in kind.takes:
-        yield Problem("initial.kind", initial.kind, "this verb is about a wave in a lattice at rest; leave it out")
+        yield Problem("initial.kind", initial.kind, "this verb treats a wave in a lattice that starts at rest; omit it")
 
     if "drive" in sections:
         yield from _other_drives(kind, sections["drive"])
@@ -55,7 +55,7 @@ def _unlike_sites(contacts: ContactsTable) -> Iterator[Problem]:
     for key in ("each", *SIDES, *JOINS):
         value = getattr(contacts, key)
         if value is not None:
-            remedy = "this verb knows one law for all sites, and equal stops on both sides; leave it out"
+            remedy = "this verb accepts only one law for all sites and equal stops on both sides; omit it"
             yield Problem(f"contacts.{key}", None if key == "each" else value, remedy)
 
     clearance = contacts.clearance
@@ -66,23 +66,25 @@ def _unlike_sites(contacts: ContactsTable) -> Iterator[Problem]:
 def _other_drives(kind: type[CaseFile], drive: DriveTable) -> Iterator[Problem]:
     many = bool(drive.end or drive.more) and "many drives" not in kind.takes
     if many or (kind.waveforms and drive.kind not in kind.waveforms):
-        remedy = f"this verb is about one {' or '.join(kind.waveforms)} on a mass; run takes all others"
+        remedy = f"this verb accepts only one {' or '.join(kind.waveforms)} on a mass; run accepts all others"
         yield Problem("drive.waveform", drive.kind, remedy)
 
 
 def _other_lattices(kind: type[CaseFile], lattice: LatticeTable) -> Iterator[Problem]:
     for key, feature in UNLIKE_CELLS.items():
         if getattr(lattice, key) and feature not in kind.takes:
-            yield Problem(f"lattice.{key}", None, f"{kind.premise} whose cells are alike; leave [lattice.{key}] out")
+            yield Problem(f"lattice.{key}", None, f"{kind.premise} with identical cells; omit [lattice.{key}]")
 
     cell, wrong = check_cell(lattice)
     if cell and not wrong:
         if not cell.is_linear and "nonlinear springs" not in kind.takes:
-            remedy = f"{kind.premise} of linear springs; leave quadratic and cubic out"
+            remedy = f"{kind.premise} with linear springs; omit quadratic and cubic"
             yield Problem("lattice.cell.springs", None, remedy)
         if cell.is_damped and "damping" not in kind.takes:
-            remedy = f"{kind.premise} without dashpots; leave [lattice.damping] and those of the cell out"
+            remedy = f"{kind.premise} without dashpots; omit [lattice.damping] and the dashpots of the cell"
             yield Problem("lattice", "damped", remedy)
 
     if lattice.ends == "periodic" and "rings" not in kind.takes:
-        yield Problem("lattice.ends", "periodic", "waves around a ring are not composed; fixed or free")
+        yield Problem(
+            "lattice.ends", "periodic", "the prediction does not apply to waves around a ring; use fixed or free ends"
+        )

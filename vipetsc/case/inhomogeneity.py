@@ -45,14 +45,14 @@ def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
         return np.linspace(given.first, given.last, len(values)), ""
     if isinstance(given, list):
         if len(given) != len(values):
-            return values, f"one value for each of the {len(values)} cells is needed"
+            return values, f"give one value for each of the {len(values)} cells"
         return np.array(given), ""
 
     outside = [cell for cell in given.cells if not 1 <= cell <= len(values)]
     if outside:
-        return values, f"cells {outside} are outside the lattice; cells count from 1 to {len(values)}"
+        return values, f"cells {outside} are outside the lattice; cells are numbered from 1 to {len(values)}"
     if (given.value is None) == (given.factor is None):
-        return values, "give one of value and factor"
+        return values, "give either value or factor"
     at = np.array(given.cells) - 1
     new = values.copy()
     if given.factor is None:
@@ -60,14 +60,14 @@ def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
         return new, ""
     new[at] = given.factor * values[at]
     if not values[at].any():
-        return new, "is 0, and so is any factor of it: give value"
+        return new, "is 0, so that a factor has no effect: give value"
     return new, ""
 
 
 def _drawn(deviation: Deviation, seed: int, key: str, values: np.ndarray) -> tuple[np.ndarray, str]:
     drawn = deviation.draw(values, seed, key)
     if deviation.relative and not values.any():
-        return drawn, "is 0 in all cells, and so is what is relative to it"
+        return drawn, "is 0 in all cells, so that a relative deviation has no effect"
     return drawn, ""
 
 
@@ -104,10 +104,11 @@ def _wrong_values(name: str, column: np.ndarray) -> str:
     """Problems with the values (cells,) of a quantity called ``name`` in ``Coefficients``; "" if nothing."""
     size = np.abs(column)
     if not np.all((size < LARGEST) & ((size > 1 / LARGEST) | (column == 0))):
-        return f"is no number, or not between {1 / LARGEST:g} and {LARGEST:g}, in some cells"
+        return f"is not a number, or not between {1 / LARGEST:g} and {LARGEST:g}, in some cells"
     least = column.min()
     if least < 0 or (least == 0 and name in ("masses", "stiffness")):
-        return f"is {least:.4g} in cell {int(column.argmin()) + 1}: no smaller than 0, and a mass or spring above it"
+        where = f"cell {int(column.argmin()) + 1}"
+        return f"is {least:.4g} in {where}: it must not be negative, and a mass or stiffness must be positive"
     return ""
 
 
@@ -146,7 +147,9 @@ def cell_variation(lattice: LatticeTable) -> Variation | None:
 def check_inhomogeneity(lattice: LatticeTable, driven: Sequence[int]) -> Iterator[Problem]:
     """Problems with what differs from a valid cell; ``driven`` are the cells (from 1) of the drives."""
     if (lattice.profiles or lattice.scatter or lattice.absorbing) and lattice.cells > MOST_VARIED:
-        yield Problem("lattice.cells", lattice.cells, f"at most {MOST_VARIED} cells may differ: every rank holds them")
+        yield Problem(
+            "lattice.cells", lattice.cells, f"at most {MOST_VARIED} cells may differ, because every rank stores them"
+        )
         return
     if lattice.profiles or lattice.scatter:
         yield from vary(lattice, lattice.undamped_cell())[1]
@@ -157,9 +160,9 @@ def check_inhomogeneity(lattice: LatticeTable, driven: Sequence[int]) -> Iterato
 def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: Sequence[int]) -> Iterator[Problem]:
     """Problems with an absorbing end that no wave reaches, or that covers half the lattice or a driven cell."""
     if not lattice.undamped_cell().springs:
-        yield Problem("lattice.absorbing", None, "no waves come to an end of a lattice without springs; leave it out")
+        yield Problem("lattice.absorbing", None, "in a lattice without springs no waves reach an end; omit it")
     if lattice.ends == "periodic":
-        yield Problem("lattice.absorbing", None, 'a ring has no end; ends = "fixed" or "free"')
+        yield Problem("lattice.absorbing", None, 'a ring has no end; use ends = "fixed" or "free"')
     n = absorbing.cells or 0
     if 2 * n >= lattice.cells:
         yield Problem("lattice.absorbing.cells", n, f"half of the {lattice.cells} cells, or more")

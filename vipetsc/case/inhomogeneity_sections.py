@@ -24,7 +24,7 @@ class Deviation(Section):
     @model_validator(mode="after")
     def _one_size(self) -> Self:
         if (self.relative is None) == (self.absolute is None):
-            raise ValueError("give one of relative and absolute")
+            raise ValueError("give either relative or absolute")
         return self
 
     def draw(self, values: np.ndarray, seed: int, name: str) -> np.ndarray:

@@ -163,7 +163,7 @@ def check_initial(
     given = initial.model_dump(exclude_none=True, exclude={"kind"})
     taken = {*keys.needs, *keys.others, *itertools.chain(*keys.choices)}
     for key in given.keys() - taken:
-        yield Problem(f"initial.{key}", given[key], f"belongs to another kind than {initial.kind!r}")
+        yield Problem(f"initial.{key}", given[key], f"does not apply to the kind {initial.kind!r}")
     for key in keys.needs:
         if key not in given and valid(f"initial.{key}"):
             yield Problem(f"initial.{key}", None, f"missing; kind = {initial.kind!r} needs {', '.join(keys.needs)}")
@@ -175,7 +175,7 @@ def check_initial(
     others = [(path, strike.cell) for path, strike in initial.strikes[1:]]
     for path, at in [("initial", initial.cell), *others]:
         if at and valid("lattice.cells") and at > lattice.cells:
-            remedy = f"outside the lattice; cells count from 1 to {lattice.cells}"
+            remedy = f"outside the lattice; cells are numbered from 1 to {lattice.cells}"
             yield Problem(f"{path}.cell", at, remedy)
     if cell and initial.band and initial.band > cell.dofs:
         yield Problem("initial.band", initial.band, f"the cell has {cell.dofs} bands")
@@ -184,10 +184,10 @@ def check_initial(
     if dofs and initial.number and initial.number > dofs:
         yield Problem("initial.number", initial.number, f"the lattice has {dofs} modes")
     elif initial.kind in ("mode", "packet") and cell and not cell.springs:
-        remedy = 'a lattice without springs has no modes and no waves; kind = "velocity" strikes masses of it'
+        remedy = 'a lattice without springs has no modes and no waves; kind = "velocity" gives velocities to masses'
         yield Problem("initial.kind", initial.kind, remedy)
     elif initial.kind == "mode" and (lattice.profiles or lattice.scatter):
-        remedy = "the mode of a lattice whose cells differ; a packet, or a state in a file"
+        remedy = "modes are not available for lattices with different cells; use a packet, or a state in a file"
         yield Problem("initial.kind", "mode", remedy)
 
 
@@ -198,7 +198,7 @@ def _check_strikes(initial: InitialTable, cell: UnitCell | None) -> Iterator[Pro
         if cell and strike.mass > cell.dofs:
             yield Problem(f"{path}.mass", strike.mass, f"the cell has {cell.dofs} masses")
         if (strike.cell, strike.mass) in places:
-            yield Problem(f"{path}.cell", strike.cell, f"mass {strike.mass} of this cell is struck already")
+            yield Problem(f"{path}.cell", strike.cell, f"mass {strike.mass} of this cell is given twice")
         if strike.velocity == 0:
             yield Problem(f"{path}.velocity", 0.0, "must not be zero; give it in m/s")
         places.add((strike.cell, strike.mass))
@@ -229,7 +229,7 @@ def _mode(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
     number = initial.number or number_near(chain, initial.near or 0.0)
     omega = mode_frequency(chain, number)
     if omega == 0:
-        raise CaseError([Problem("initial.number", number, "the frequency of this mode is 0; another one moves")])
+        raise CaseError([Problem("initial.number", number, "the frequency of this mode is 0; choose another mode")])
 
     update: dict[str, Any] = {"number": number, "near": None}
     if initial.energy:
@@ -278,7 +278,7 @@ def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
     _check_state(state, path, initial, chain)
     frequency = frequency or state.frequency()
     if not frequency:
-        remedy = "tells no frequency; give initial.frequency, that of the motion in rad/s"
+        remedy = "contains no frequency; give initial.frequency, the frequency of the motion in rad/s"
         raise CaseError([Problem("initial.path", initial.path, remedy)])
 
     amplitude, cell = state.largest(frequency)
@@ -310,7 +310,7 @@ def _check_state(state: State, path: Path, initial: InitialTable, chain: Chain) 
         raise CaseError([Problem("initial.path", initial.path, f"the state has {held}, the lattice {here}")])
     for key, value in (("time", initial.time), ("orbit", initial.orbit)):
         if value is not None and getattr(state, key) is None:
-            raise CaseError([Problem(f"initial.{key}", value, f"{path.name} has no such thing")])
+            raise CaseError([Problem(f"initial.{key}", value, f"{path.name} has no such sample or orbit")])
 
 
 def file_hash(path: str | Path) -> str:

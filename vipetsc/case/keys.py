@@ -103,8 +103,8 @@ def chapter() -> str:
     lines = [
         "# Every key of a case file",
         "",
-        "As files are checked, and as `vipetsc schema` tells editors. Keys without a",
-        "default may be left out, but for those marked as needed. Masses, cells, sites and bands count from 1.",
+        "The program checks case files by this list, and `vipetsc schema` passes it to editors. Keys without a",
+        "default are optional, except those marked as required. Masses, cells, sites and bands are numbered from 1.",
         "",
     ]
 
@@ -128,7 +128,7 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
         yield from ("| key | value | unit | default | |", "|---|---|---|---|---|")
     for key, item in rows:
         unit, text = unit_and_text(name, key)
-        needed = "needed" if key in schema.get("required", ()) else ""
+        needed = "required" if key in schema.get("required", ()) else ""
         default = item.get("default")
         is_table = "{" in str(default)  # which is shown by itself
         shown_default = needed if default is None or is_table else f"`{_toml(default)}`"

@@ -70,7 +70,7 @@ class LawCase(Case):
     verb = section = "law"
     takes = frozenset({"disorder", "rings"})
     waveforms = ("burst",)
-    premise = "a law of scattering is that of a lattice"
+    premise = "a scattering law is computed only for lattices"
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -178,10 +178,10 @@ class LawCase(Case):
         """Problems with the wave of a resolved case and with the distance that it gives."""
         frequency = self.drive.frequency or 0.0
         if not waves_at(self.lattice.unit_cell(), frequency):
-            return [Problem("drive.frequency", frequency, "lies in no pass band, so that nothing arrives at a site")]
+            return [Problem("drive.frequency", frequency, "lies in no pass band, so that no wave reaches the site")]
         least = self._least_distance()
         if self.law.distance is not None and self.law.distance < least:
-            remedy = f"the burst must be over before a wave from the site is back at the drive; at least {least} cells"
+            remedy = f"the burst must end before a wave from the site returns to the drive; give at least {least} cells"
             return [Problem("law.distance", self.law.distance, remedy)]
         return []
 
@@ -192,7 +192,7 @@ class LawCase(Case):
             return []
         remedy = (
             f"the burst has waves of {setting.slow:.3g} cells/s, too slow to wait for: {setting.cells} cells and"
-            f" {setting.samples} samples; more cycles, another frequency or a shorter law.distance need less"
+            f" {setting.samples} samples; more cycles, another frequency or a shorter law.distance reduce these numbers"
         )
         return [Problem("drive.frequency", self.drive.frequency, remedy)]
 

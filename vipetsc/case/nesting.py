@@ -3,7 +3,7 @@
 from typing import Any
 
 DEEPEST = 50
-TOO_DEEP = f"tables and lists stand more than {DEEPEST} deep in one another; no key of a case does"
+TOO_DEEP = f"tables and lists are nested more than {DEEPEST} levels deep; no key of a case needs this"
 
 
 def is_deeper(value: Any, levels: int = DEEPEST) -> bool:

@@ -58,10 +58,10 @@ class NfrcCase(Case):
     nfrc: NfrcTable
 
     verb = section = "nfrc"
-    kept_by_resume: ClassVar[str] = "the case its curves were begun with, but for nfrc.points"
+    kept_by_resume: ClassVar[str] = "the case with which its curves were started, except nfrc.points"
     takes = frozenset({"disorder", "rings"})
     waveforms = ("burst", "harmonic")
-    premise = "steady states are those of a lattice"
+    premise = "steady states are computed only for lattices"
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -94,7 +94,7 @@ class NfrcCase(Case):
         if not nfrc.range[0] < nfrc.range[1]:
             yield Problem("nfrc.range", nfrc.range, "must be [low, high]")
         if nfrc.source == "wave" and not nfrc.infinite:
-            yield Problem("nfrc.infinite", False, "a wave comes in where the lattice does not end; leave it out")
+            yield Problem("nfrc.infinite", False, "an incident wave needs an infinite lattice; omit it")
         if nfrc.over == "frequency" and not nfrc.fixed:
             yield Problem("nfrc.fixed", [], "give the amplitudes of the curves over frequency")
         if not nfrc.smallest_step < nfrc.largest_step:
@@ -105,9 +105,11 @@ class NfrcCase(Case):
             yield from check_stiffness(sections["contacts"], True, valid)
             bounded = sections["contacts"].damping in ("exact", "flores")
             if bounded and (small := [r for r in nfrc.restitutions if r < LEAST_RESTITUTION]):
-                yield Problem("nfrc.restitutions", small, f"below {LEAST_RESTITUTION} this damping grows without bound")
+                yield Problem(
+                    "nfrc.restitutions", small, f"below {LEAST_RESTITUTION} this damping increases without bound"
+                )
             if sections["contacts"].sites in (0, []):
-                yield Problem("contacts.sites", sections["contacts"].sites, "name a cell with a contact")
+                yield Problem("contacts.sites", sections["contacts"].sites, "give a cell with a contact")
 
     def warnings(self) -> list[str]:
         """No sentences: the warnings about runs in time do not concern steady states."""
@@ -146,4 +148,4 @@ def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:
     for frequency in frequencies:
         if nfrc.band not in [band for band, *_ in waves_at(cell, frequency)]:
             where = "in no pass band" if nfrc.band is None else f"not in band {nfrc.band}"
-            yield Problem(key, frequency, f"lies {where}, so that no such wave comes in (rad/s)")
+            yield Problem(key, frequency, f"lies {where}, so that no such wave is incident (rad/s)")

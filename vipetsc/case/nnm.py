@@ -152,9 +152,9 @@ class NnmCase(CaseFile):
     output: Annotated[OutputTable, Field(exclude=True)]
 
     verb = section = "nnm"
-    kept_by_resume: ClassVar[str] = "the system, map and flow that its branches were begun with"
+    kept_by_resume: ClassVar[str] = "the system, map and flow with which its branches were started"
     takes = frozenset({"rings"})
-    premise = "normal modes are those of a lattice"
+    premise = "normal modes are computed only for lattices"
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -186,7 +186,9 @@ class NnmCase(CaseFile):
         restitution = self.contacts.restitution
         if restitution == 1:
             return []
-        return [f"contacts.restitution = {restitution:g} counts as 1: normal modes lose nothing"]
+        return [
+            f"contacts.restitution = {restitution:g} is treated as 1: normal modes are computed without dissipation"
+        ]
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> list[Problem]:
@@ -219,7 +221,7 @@ class NnmCase(CaseFile):
         if nnm.system in ("chain", "condensed"):
             problems += check_sites(lattice, contacts)
             if not site_cells(lattice, contacts):
-                problems.append(Problem("contacts.sites", [], f"name cells from 1 to {lattice.cells}"))
+                problems.append(Problem("contacts.sites", [], f"give cells from 1 to {lattice.cells}"))
         if nnm.system == "chain":
             dofs = cell.dofs * lattice.cells if cell else 2
             rigid = int(lattice.ends != "fixed")  # nothing holds it
@@ -239,7 +241,7 @@ class NnmCase(CaseFile):
 
         still = [mode for mode in nnm.modes if mode <= rigid]
         if still:
-            problems.append(Problem("nnm.modes", still, "the system is free to move as a whole, which has no period"))
+            problems.append(Problem("nnm.modes", still, "the system can move as a rigid body, which has no period"))
         # A number of masses that is wrong itself says nothing about modes.
         beyond = [mode for mode in nnm.modes if mode > dofs]
         if beyond and not problems:
@@ -280,7 +282,7 @@ def _check_options(nnm: NnmTable) -> Iterator[Problem]:
         if not low < high:
             yield Problem(f"nnm.{key}", [low, high], "must be [low, high]")
     if nnm.direction != "up" and not nnm.energy[0] > 0:
-        yield Problem("nnm.energy", nnm.energy, "going down needs a lowest energy above 0 (J)")
+        yield Problem("nnm.energy", nnm.energy, "the direction down needs a lowest energy above 0 (J)")
 
     yield from _check_method(nnm)
     if not nnm.smallest_step < nnm.largest_step:
@@ -335,19 +337,19 @@ def _check_method(nnm: NnmTable) -> Iterator[Problem]:
     for key in foreign:
         given = getattr(nnm, key)
         if given:
-            yield Problem(f"nnm.{key}", given, f"goes with motions that are {method}")
+            yield Problem(f"nnm.{key}", given, f"applies to motions that are {method}")
 
 
 def _check_condensed(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTable, valid: Valid) -> Iterator[Problem]:
     """Problems with the start of a lattice's motions."""
     yield from check_stiffness(contacts, True, valid)
     if not nnm.start_frequency:
-        yield Problem("nnm.start_frequency", [], "name frequencies in rad/s, between the pass bands or above them")
+        yield Problem("nnm.start_frequency", [], "give frequencies in rad/s, between the pass bands or above them")
 
     count = len(site_cells(lattice, contacts))
     outside = [number for number in nnm.start_sites if not 1 <= abs(number) <= count]
     if outside:
-        yield Problem("nnm.start_sites", outside, f"number the sites from 1 to {count}, with a sign")
+        yield Problem("nnm.start_sites", outside, f"give site numbers from 1 to {count}, with a sign")
     if check_cell(lattice)[1]:
         return
 
@@ -355,7 +357,9 @@ def _check_condensed(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTab
     masses = cell.dofs * lattice.cells
     if nnm.multipliers and masses > MOST_OF_LATTICE:
         remedy = f"need the motion of all {masses} masses, and are found up to {MOST_OF_LATTICE}"
-        yield Problem("nnm.multipliers", nnm.multipliers, f"{remedy}; multiplier_max needs the sites alone")
+        yield Problem(
+            "nnm.multipliers", nnm.multipliers, f"{remedy}; multiplier_max needs only the motion of the sites"
+        )
     # A motion whose frequency is in a band sends waves away: it is not localised, and nothing is periodic.
     bands = pass_bands(cell)
     inside = [omega for omega in nnm.start_frequency if any(band.low <= omega <= band.high for band in bands)]

@@ -102,7 +102,7 @@ class OptimiseCase(CaseFile):
         table = dict(table)
         section = table.pop("optimise", None)
         if not isinstance(section, dict):
-            remedy = "missing; say what varies, as in: [optimise.variables] clearance = [1e-4, 1e-2]"
+            remedy = "missing; give the quantities that vary, as in: [optimise.variables] clearance = [1e-4, 1e-2]"
             return {}, [Problem("optimise", section, remedy)]
         # Many runs want the fastest engine that a case allows.
         if isinstance(table.get("time", {}), dict):
@@ -246,16 +246,18 @@ def _problems(options: OptimiseTable, base: Case, disorder: bool) -> Iterator[Pr
     bounds = options.variables
     sites = base.model().chain.sites
     if not sites:
-        yield Problem("contacts.sites", base.contacts.sites, "no sites: without contacts a design has nothing to do")
+        yield Problem("contacts.sites", base.contacts.sites, "no sites: without contacts there is nothing to optimise")
     if not any(bounds.model_dump(exclude_none=True).values()):
         valid = ", ".join(VariablesTable.model_fields)
-        yield Problem("optimise.variables", None, f"names nothing that varies; give [low, high] for any of {valid}")
+        yield Problem(
+            "optimise.variables", None, f"contains no quantity that varies; give [low, high] for any of {valid}"
+        )
     yield from _bounds_problems(bounds, base, len(sites))
 
     if options.samples > 1 and not disorder:
-        yield Problem("optimise.samples", options.samples, "there is no [disorder] to draw them from")
+        yield Problem("optimise.samples", options.samples, "there is no [disorder] from which to draw samples")
     if options.start == "matched" and not (bounds.clearance or bounds.profile):
-        yield Problem("optimise.start", options.start, "clearances are matched: let clearance or profile vary")
+        yield Problem("optimise.start", options.start, "the start matches clearances: let clearance or profile vary")
     varied = bool(bounds.masses or bounds.springs)
     for number, objective in enumerate(options.objective, 1):
         yield from measured_problems(objective, f"optimise.objective[{number}]", base, varied)
@@ -282,7 +284,7 @@ def _bounds_problems(bounds: VariablesTable, base: Case, sites: int) -> Iterator
         for number, pair in given[kind].items():
             pairs[f"{kind}.{number}"] = pair
             if not (number.isdecimal() and 1 <= int(number) <= count):
-                yield Problem(f"{at}.{kind}.{number}", pair, f"the cell's {kind} count from 1 to {count}")
+                yield Problem(f"{at}.{kind}.{number}", pair, f"the cell's {kind} are numbered from 1 to {count}")
 
     for key, (low, high) in pairs.items():
         if key != "sites" and not low < high:
@@ -290,5 +292,5 @@ def _bounds_problems(bounds: VariablesTable, base: Case, sites: int) -> Iterator
     if bounds.sites:
         low, high = bounds.sites
         if not 1 <= low < high <= base.lattice.cells or high - low + 1 < sites:
-            remedy = f"must lie within cells 1 to {base.lattice.cells} and hold all {sites} sites"
+            remedy = f"must lie within cells 1 to {base.lattice.cells} and have room for all {sites} sites"
             yield Problem(f"{at}.sites", bounds.sites, remedy)

@@ -44,4 +44,4 @@ class PredictCase(LawCase):
         """Problems between keys."""
         yield from super().check(sections, valid)
         if valid("contacts.sites") and sections["contacts"].sites in (0, []):
-            yield Problem("contacts.sites", [], "there is no site to predict; list cells or give a count")
+            yield Problem("contacts.sites", [], "there are no sites; list their cells or give a count")

@@ -153,7 +153,7 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
     group = connected_groups(cell.dofs + 1, (*to_next_cell, *within))
     loose = [str(mass) for mass, number in enumerate(group) if number != group[0]]
     if loose:
-        remedy = f"nothing ties mass {', '.join(loose)} to the next cell: add springs, or a spring with next_cell"
+        remedy = f"mass {', '.join(loose)} is not connected to the next cell: add springs, or a spring with next_cell"
         problems.append(Problem("lattice.cell.springs", None, remedy))
     return cell, problems
 
@@ -170,7 +170,7 @@ def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
     elif loss is not None and (damping.mass or damping.stiffness):
         yield Problem("lattice.damping.loss", loss, "give it, or mass and stiffness, not both")
     elif fitted != (None, None) and (loss is None or [len(values or ()) for values in fitted] != expected):
-        yield Problem("lattice.damping.grounding", fitted[0], "it and springs are fitted to loss; leave them out")
+        yield Problem("lattice.damping.grounding", fitted[0], "grounding and springs are fitted to loss; omit both")
 
 
 def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Problem]:
@@ -185,18 +185,18 @@ def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Prob
     cells = site_cells(lattice, contacts)
     outside = [cell for cell in cells if not 1 <= cell <= lattice.cells]
     if outside:
-        yield Problem("contacts.sites", outside, f"outside the lattice; cells count from 1 to {lattice.cells}")
+        yield Problem("contacts.sites", outside, f"outside the lattice; cells are numbered from 1 to {lattice.cells}")
     if isinstance(sites, Span) and None not in (sites.last, sites.spacing):
         yield Problem("contacts.sites.spacing", None, "give last or spacing, not both")
     has_pair = contacts.pair is not None or (contacts.each is not None and contacts.each.pair is not None)
     twice = sorted(cell for cell, times in Counter(cells).items() if times > 1)
     if twice and not has_pair:
-        yield Problem("contacts.sites", twice, "named twice; a cell carries one contact pair")
+        yield Problem("contacts.sites", twice, "given twice; a cell has one contact pair")
     if isinstance(sites, int) and sites > 0 and lattice.preset is None:
         yield Problem("contacts.sites", sites, "a count needs a preset; list the cells or give {first, last, count}")
 
     if isinstance(clearance, list) and len(clearance) != len(cells):
-        yield Problem("contacts.clearance", clearance, f"one clearance for each of the {len(cells)} sites is needed")
+        yield Problem("contacts.clearance", clearance, f"give one clearance for each of the {len(cells)} sites")
     if clearance is None and lattice.preset is None and cells:
         yield Problem("contacts.clearance", None, "missing; give the clearance in m")
 
@@ -338,7 +338,7 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
 
 def check_unsprung(drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
     """A lattice that contacts alone join has no bands from which times could follow."""
-    remedy = "missing; without springs there are no bands that it follows from"
+    remedy = "missing; without springs there are no bands from which it would follow"
     # The frequency of other waveforms follows from their own keys, that of a struck lattice from what is struck.
     if drive.frequency is None and drive.is_sine and drive.amplitude != 0:
         yield Problem("drive.frequency", None, remedy)

@@ -78,7 +78,7 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
         with h5py.File(path, "r") as file:
             values = file[str(dataset)]
             if not isinstance(values, h5py.Dataset):
-                raise ValueError(f"{dataset} is no data set")
+                raise ValueError(f"{dataset} is not a dataset")
             # Before it is read: a file may hold more than the memory.
             _check_shape(values.shape)
             rows = np.asarray(values, float)
@@ -89,7 +89,7 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
         try:
             rows = np.array(lines[1:] if has_header else lines, float)
         except ValueError:
-            raise ValueError("is no table of numbers: time and value in two columns are needed") from None
+            raise ValueError("is not a table of numbers; give time and value in two columns") from None
     _check_shape(rows.shape)
     return rows
 
@@ -112,4 +112,4 @@ def _table_lines(path: Path) -> list[list[str]]:
 def _check_shape(shape: tuple[int, ...]) -> None:
     """Raise ValueError for numbers of another ``shape`` than two columns of samples, no more than are allowed."""
     if len(shape) != 2 or shape[1] != 2 or shape[0] > MOST_SAMPLES:
-        raise ValueError(f"holds {shape} numbers; time and value in two columns, {MOST_SAMPLES} rows at most")
+        raise ValueError(f"holds {shape} numbers; give time and value in two columns, with at most {MOST_SAMPLES} rows")

@@ -74,7 +74,9 @@ class Sweep(CaseFile):
         table = dict(table)
         section = table.pop("sweep", None)
         if not isinstance(section, dict):
-            remedy = "missing; list what varies, as in: [sweep.drive] amplitude = { log = [1.0, 100.0], count = 9 }"
+            remedy = (
+                "missing; give the keys that vary, as in: [sweep.drive] amplitude = { log = [1.0, 100.0], count = 9 }"
+            )
             return {}, [Problem("sweep", section, remedy)]
         # Many runs want the fastest engine that a case allows.
         if isinstance(table.get("time", {}), dict):
@@ -91,13 +93,13 @@ class Sweep(CaseFile):
             except ValueError as error:
                 problems.append(Problem(f"sweep.{key}", value, str(error)))
         if not varying:
-            remedy = "names no key that varies, as in [sweep.drive] amplitude = [1.0, 2.0]"
+            remedy = "contains no key that varies; give one, as in [sweep.drive] amplitude = [1.0, 2.0]"
             problems.append(Problem("sweep", None, remedy))
 
         axes, wrong = _axes(values, options.zip)
         count = math.prod(len(next(iter(axis.values()))) for axis in axes)
         if count > MOST_MEMBERS:
-            wrong.append(Problem("sweep", None, f"makes {count} members; at most {MOST_MEMBERS}, so divide it"))
+            wrong.append(Problem("sweep", None, f"makes {count} members; at most {MOST_MEMBERS}, so split it"))
         return {"table": table, "options": options, "axes": axes}, problems + wrong
 
     @property
@@ -181,7 +183,7 @@ class Sweep(CaseFile):
         ids = self.ids()
         if name in ids or (name.isdecimal() and int(name) < self.count):
             return ids.index(name) if name in ids else int(name)
-        remedy = f"is no member; ensemble.h5 has their names (member), their numbers go from 0 to {self.count - 1}"
+        remedy = f"is not a member; ensemble.h5 lists the names (member), and the numbers go from 0 to {self.count - 1}"
         raise CaseError([Problem("--member", name, remedy)], self.name)
 
     def case(self, number: int) -> Case:
@@ -307,7 +309,7 @@ def _axes(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], 
         if missing:
             problems.append(Problem("sweep.zip", missing, f"not among the keys that vary: {', '.join(values)}"))
         elif len(set(lengths.values())) > 1:
-            problems.append(Problem("sweep.zip", lengths, "keys that vary together need as many values each"))
+            problems.append(Problem("sweep.zip", lengths, "keys that vary together need the same number of values"))
         elif group_of.keys() & set(group):
             problems.append(Problem("sweep.zip", group, "a key can be in one group only"))
         group_of |= dict.fromkeys(group, tuple(group))

@@ -56,11 +56,11 @@ def loss_warnings(lattice: LatticeTable) -> Iterator[str]:
         is_off_in_mean = abs(mean - asked) > MISSED * asked + TINY
         is_off_somewhere = most > 2 * asked + TINY or least < asked / 2
         if is_off_in_mean or is_off_somewhere:
-            off.append(f"band {band} {least:.3g} to {most:.3g} (mean {mean:.3g}, asked {asked:.3g})")
+            off.append(f"band {band} {least:.3g} to {most:.3g} (mean {mean:.3g}, requested {asked:.3g})")
     if off:
         yield (
-            f"lattice.damping.loss: dashpots of the cell's masses and springs can give no more like it than"
-            f" {', '.join(off)}; fewer bands, and those that matter, come nearer"
+            f"lattice.damping.loss: the closest fit with dashpots at the cell's masses and springs is"
+            f" {', '.join(off)}; prescribe only the important bands for a closer fit"
         )
 
 
@@ -74,14 +74,15 @@ def wave_warnings(model: Model) -> Iterator[str]:
     waves = waves_at(cell, drive.frequency)
     frequency = f"drive.frequency = {drive.frequency:.6g} rad/s"
     if not waves:
-        yield f"{frequency} lies in no pass band, so the wave is evanescent; see the verb `bands`"
+        yield f"{frequency} lies in no pass band, so that the wave is evanescent; see the verb `bands`"
         return
     band, _, speed = max(waves, key=lambda wave: wave[2])
     _, best, fastest = max_group_velocity(cell, band)
     if speed < SLOW * fastest:
         yield (
-            f"{frequency} lies at an edge of band {band}: its waves make {speed:.3g} of {fastest:.3g} cells/s"
-            f" and spread; the fastest are at {best:.6g} rad/s"
+            f"{frequency} lies near an edge of band {band}: its waves have a group velocity of {speed:.3g} cells/s"
+            f" and spread;"
+            f" the largest one is {fastest:.3g} cells/s, at {best:.6g} rad/s"
         )
 
 
@@ -109,10 +110,10 @@ def unit_warnings(drives: DriveTable, chain: Chain) -> Iterator[str]:
         waves = f"the waves of this lattice ({lowest:.4g} to {highest:.4g} rad/s)"
         if FAR * most < lowest:
             hint = _fitting_unit(main_frequency(samples.time, samples.value), span, lowest, highest)
-            yield f"{about} below {most:.3g} rad/s, far under {waves}; are the times, to {span:.4g} s, in s?{hint}"
+            yield f"{about} below {most:.3g} rad/s, far below {waves}; are the times, up to {span:.4g} s, in s?{hint}"
         elif least > FAR * highest:
             yield (
-                f"{about} above {least:.3g} rad/s, far over {waves}; are the times, to {span:.4g} s, in s, and the"
+                f"{about} above {least:.3g} rad/s, far above {waves}; are the times, up to {span:.4g} s, in s, and the"
                 " lattice in kg and N/m?"
             )
 
@@ -121,7 +122,8 @@ def _fitting_unit(frequency: float, span: float, lowest: float, highest: float) 
     """The unit of times in which samples that are largest at ``frequency`` would be waves; empty if there is none."""
     for unit, factor in (("ms", 1e-3), ("us", 1e-6)):
         if lowest <= frequency / factor <= highest:
-            return f" In {unit} they would be largest at {frequency / factor:.4g} rad/s and last {span * factor:.4g} s"
+            largest = f"their spectrum would be largest at {frequency / factor:.4g} rad/s"
+            return f" In {unit}, {largest} and they would last {span * factor:.4g} s"
     return ""
 
 
@@ -140,12 +142,12 @@ def length_warnings(model: Model) -> Iterator[str]:
         wavelength = 2 * pi / max(min(kappa, 2 * pi - kappa), 1e-300)
         if wavelength * WAVELENGTHS > cells:
             yield (
-                f"lattice.cells = {cells} hold {cells / wavelength:.3g} wavelengths of {wavelength:.4g} cells, and"
-                f" wavenumbers are told apart by {2 * pi / cells:.3g} rad/cell; {WAVELENGTHS * wavelength:.0f} cells or"
-                " more resolve the wave"
+                f"lattice.cells = {cells} contain only {cells / wavelength:.3g} wavelengths of {wavelength:.4g}"
+                f" cells, and resolve wavenumbers to {2 * pi / cells:.3g} rad/cell;"
+                f" {WAVELENGTHS * wavelength:.0f} cells or more resolve the wave"
             )
     if model.end <= drive.settled:
-        yield f"time.end = {model.end:.6g} s comes before the burst is over"
+        yield f"time.end = {model.end:.6g} s is before the end of the burst"
 
 
 def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
@@ -168,9 +170,9 @@ def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
         back = arrival + abs(nearest - cell) / model.speed
         if back < model.end:
             yield (
-                f"the wave ({model.speed:.4g} cells/s) meets the {end} end at {arrival:.4g} s and is back at the {name}"
-                f" {nearest + 1} at {back:.4g} s, before time.end = {model.end:.4g} s: more lattice.cells or an earlier"
-                " end keep the reflection out of what is measured"
+                f"the wave ({model.speed:.4g} cells/s) reaches the {end} end at {arrival:.4g} s and returns to the"
+                f" {name} {nearest + 1} at {back:.4g} s, before time.end = {model.end:.4g} s: more lattice.cells or an"
+                " earlier end exclude the reflection from the measures"
             )
 
 
@@ -180,7 +182,7 @@ def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     top = pass_bands(chain.cell)[-1].high
     interval = output.stride * model.sample_interval
     if output.fields and interval * top >= np.pi:
-        coarse = f"fields kept every {interval:.4g} s resolve {np.pi / interval:.5g} of {top:.5g} rad/s"
+        coarse = f"fields stored every {interval:.4g} s resolve {np.pi / interval:.5g} of {top:.5g} rad/s"
         yield f"{coarse}: dispersion, bands and ibtet are not measured"
     if output.fields and output.every > 1:
         sparse = f"fields of one cell in {output.every} do not resolve waves shorter than {2 * output.every} cells"
@@ -188,15 +190,15 @@ def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
 
     first, last = output.window or (1, chain.cells)
     if output.fields and chain.sites and not any(first <= site + 1 <= last for site in chain.sites):
-        yield f"output.window = [{first}, {last}] holds none of the contact sites"
+        yield f"output.window = [{first}, {last}] contains none of the contact sites"
 
     highest = max(drive.waveform.highest for drive in model.drives)
     if model.is_driven and highest > np.pi / model.sample_interval:
         interval = np.pi / highest
         yield (
-            f"the drive's {highest:.5g} rad/s are beyond the {np.pi / model.sample_interval:.5g} rad/s of samples every"
-            f" {model.sample_interval:.3g} s: fields and energies alias it; time.sample_interval below {interval:.3g} s"
-            " does not"
+            f"the drive contains up to {highest:.5g} rad/s, beyond the {np.pi / model.sample_interval:.5g} rad/s of"
+            f" samples every {model.sample_interval:.3g} s: fields and energies are aliased; use a time.sample_interval"
+            f" below {interval:.3g} s"
         )
 
 
@@ -213,11 +215,11 @@ def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
     if petsc.get("ts_adapt_type") == "none" and step > time / STEPS:
         yield (
             f"ts takes fixed steps of {step:.3g} s, and a contact at {speed:.3g} m/s lasts {time:.3g} s: ts_dt ="
-            f" {time / STEPS:.2g} or less, steps of varied length or the propagator follow it"
+            f" {time / STEPS:.2g} or less, adaptive steps or the propagator resolve it"
         )
     elif time < BRIEF * model.sample_interval:
         yield (
-            f"a contact at {speed:.3g} m/s lasts {time:.3g} s, {time / model.sample_interval:.2g} of a sample interval:"
-            " both engines step through it, but samples show it as a jump; its force stands in the log of impacts,"
-            f" and a time.sample_interval of {time:.1g} s shows it"
+            f"a contact at {speed:.3g} m/s lasts {time:.3g} s, {time / model.sample_interval:.2g} of a sample"
+            " interval: both engines resolve it, but the samples show it as a jump; the log of impacts contains its"
+            f" largest force, and a time.sample_interval of {time:.1g} s resolves it"
         )

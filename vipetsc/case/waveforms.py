@@ -1,4 +1,4 @@
-"""The waveforms of a drive, one record each: its keys, its frequency, its words, and the waveform that is built.
+"""The waveforms of a drive, one record each: its keys, its frequency, its description, and the waveform that is built.
 
 A new waveform is one more record in ``WAVEFORMS``, and a field of ``OneDrive`` for each key that no other one has: the
 choices of ``drive.waveform``, the checks of its keys and the schema follow from these.
@@ -113,7 +113,7 @@ def _describe_chirp(drive: "OneDrive") -> str:
 
 def _describe_samples(drive: "OneDrive") -> str:
     count = len(drive.samples.time) if drive.samples else 0
-    return f"{count} samples, joined by a cubic spline"
+    return f"{count} samples, interpolated by a cubic spline"
 
 
 WAVEFORMS = {

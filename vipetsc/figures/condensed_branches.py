@@ -112,7 +112,7 @@ def _draw_over_cells(axes: Axes, branch: xr.Dataset) -> None:
     """Draw the largest displacement in every cell at phase 0, over the largest of all."""
     largest = np.abs(branch["states/displacement"].values).max(axis=2)
     _draw_shapes(axes, branch["states/cell"].values, largest, branch)
-    axes.set(xlabel="cell", ylabel="displacement / largest", ylim=(SMALLEST, 3))
+    axes.set(xlabel="cell", ylabel="displacement / maximum", ylim=(SMALLEST, 3))
     axes.legend(fontsize=5.5)
 
 
@@ -120,7 +120,7 @@ def _draw_over_masses(axes: Axes, branch: xr.Dataset) -> None:
     """Draw the displacement of every mass at phase 0, over the largest of all."""
     displacement = np.abs(branch["states/displacement"].values)[:, 0]
     _draw_shapes(axes, branch["states/dof"].values, displacement, branch)
-    axes.set(xlabel="mass", ylabel="displacement / largest", ylim=(SMALLEST, 3))
+    axes.set(xlabel="mass", ylabel="displacement / maximum", ylim=(SMALLEST, 3))
     axes.legend(fontsize=5.5)
 
 

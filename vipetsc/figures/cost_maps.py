@@ -14,7 +14,7 @@ WEIGHTED = 2  # index of the weighted cost
 TITLES = {"deflection": "Deflection", "group_velocity": "Group velocity", "weighted": "Weighted"}
 LABELS = {"deflection": "max w (1)", "group_velocity": "Σ max |v$_g$| (cells/s)", "weighted": "cost (cells/s)"}
 SYMBOLS = {"lambda": "λ", "eta": "η"}
-MASSES = ("$u_1$", "$u_2$", "$u_3$, negative where against $u_2$", "$u_4$")
+MASSES = ("$u_1$", "$u_2$", "$u_3$, negative if out of phase with $u_2$", "$u_4$")
 LINES = 10  # values of the parameter that is followed
 HEADROOM = 1.9  # frequencies are shown up to this many times the best cell's highest
 
@@ -50,7 +50,7 @@ def cost_maps(search: xr.Dataset) -> Figure:
 
     Cells whose host and resonator are not out of phase all along the second band are veiled.
     """
-    xlabel = "λ  (pale: $u_2$ and $u_3$ are not out of phase all along band 2)"
+    xlabel = "λ  (pale: $u_2$ and $u_3$ are not out of phase throughout band 2)"
     figure, grid = _grid(search, columns=search.sizes["cost"], margin=0.6, height=2.1, xlabel=xlabel)
     for (i, j), axes in np.ndenumerate(grid):
         result = search.isel(reading=i, cost=j)

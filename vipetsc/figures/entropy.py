@@ -260,7 +260,7 @@ def _draw_log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float) 
     doubts = doubt(fit["points"], fit["r2_log_log"])
     if not doubts:
         x = amplitude[amplitude >= fit["peak_amplitude"] * (1 - 1e-9)]
-        label = "power law, adjusted R² (of nonlinear fit)"
+        label = "power law, adjusted R² (nonlinear fit)"
         axes.plot(x, fit["factor"] * x ** fit["exponent"], color=style.BLACK, lw=2.0, zorder=4, label=label)
         text = f"$A^{{{fit['exponent']:.2f}}}$\n$R^2$ {fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})"
         axes.text(0.04, 0.97, text, transform=axes.transAxes, va="top", fontsize=6)
@@ -276,7 +276,7 @@ def _history(facet: Facet) -> Figure:
     columns = min(len(facet.rows), MOST_COLUMNS)
     rows = -(-len(facet.rows) // columns)
     width = max(style.PAGE * columns / MOST_COLUMNS, style.COLUMN)
-    figure = style.new_figure(width, 0.7 + 1.9 * rows, facet.heading("entropy H(t) of every amplitude"))
+    figure = style.new_figure(width, 0.7 + 1.9 * rows, facet.heading("entropy H(t) at each amplitude"))
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
 
     # One scale for all, of the times that are averaged: from the wave's arrival at the first site on.

@@ -204,8 +204,8 @@ def slope(axes: Axes, branch: xr.Dataset) -> None:
 
     label = None
     if not is_lowest.all():
-        axes.loglog(energy, steepness, lw=0.4, color=style.SKY, label="other states at their energies")
-        label = "lowest frequency at its energy"
+        axes.loglog(energy, steepness, lw=0.4, color=style.SKY, label="other states at the same energy")
+        label = "lowest frequency at this energy"
     axes.loglog(energy, np.where(is_lowest, steepness, np.nan), lw=1.1, color=style.BLUE, label=label)
     if label:
         axes.legend(loc="lower left", fontsize=5.5)

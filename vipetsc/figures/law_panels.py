@@ -49,7 +49,7 @@ def law(data: xr.Dataset) -> Figure:
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if z[-1] > FEW_DECADES else (1.0, 2.0, 5.0)))
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
-    all_energies.set(ylim=(0, 1.02), ylabel="share of the energy that arrives")
+    all_energies.set(ylim=(0, 1.02), ylabel="fraction of the incident energy")
     by_band.set(yscale="log", ylim=(FLOOR / 10, 1.5))
     onset.set(xscale="log", xlabel="z - 1", xlim=(max((z[1] - 1) / 2, 1e-4), 3), ylim=(0, 1.02))
 

@@ -207,7 +207,7 @@ def reason_without_page(ensemble: xr.Dataset, name: str, by_name: bool) -> str:
     if not by_name and not np.nan_to_num(values).any():
         return "0 for every member"
     if not SweptAxis.all_of(over_samples(ensemble)) and _seeds(ensemble).size < 2:
-        return "the sweep has one member, so nothing varies; its pictures are those of `run CASE --member 0`"
+        return "the sweep has one member, so that no key varies; `run CASE --member 0` draws its pictures"
     return ""
 
 
@@ -237,7 +237,7 @@ def _pages_over_keys(measure: Measure, heading: str, stem: str) -> Iterator[Draw
     if len(places) > MOST_PAGES:
         best = measure.largest()
         places = [{dimension: best[dimension] for dimension in dimensions}]
-        cut = "through the largest value of all: "
+        cut = "through the largest value: "
 
     for number, place in enumerate(places, 1):
         page = measure.at(place)
@@ -281,10 +281,10 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str]) -> Figure:
         largest = f"{float(measure.values.isel(best)):.4g} {measure.unit}".strip()
         lines.append(f"largest (ring): {largest} at {measure.place_text(best)}")
     if measure.samples:
-        lines.append(f"means over {measure.samples} samples" + ("" if roles.y else "; bands: 5 to 95 % of them"))
+        lines.append(f"means over {measure.samples} samples" + ("" if roles.y else "; bands: 5 to 95 % of the samples"))
     failed = int(measure.failed.sum())
     if failed:
-        lines.append(f"{failed} of {measure.failed.size} members failed, and are left out")
+        lines.append(f"{failed} of {measure.failed.size} members failed and are left out")
 
     panels = _by_place(measure, roles.panels)
     page = MeasurePage(measure.label, lines, list(_by_place(measure, roles.curves)) if roles.curves else [])

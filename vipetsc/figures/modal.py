@@ -58,7 +58,7 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     energy = analysis["bands/modal_energy"]
     largest = float(energy.sum("bands/part").max())
     if largest == 0:
-        return panels.empty_figure("Modal energies: the drive has done no work")
+        return panels.empty_figure("Modal energies: the drive did no work")
 
     # Bands are always drawn, gaps where they have or had any energy to speak of.
     names = list(energy.attrs["parts"])
@@ -93,7 +93,7 @@ def _draw_steps(axes: Axes, run: xr.Dataset, analysis: xr.Dataset, parts: list[i
         fraction = float(energy[p, -1] / at_end)
         axes.plot(analysis["bands/instant"], energy[p], color=colour, lw=0.9, label=f"{names[p]}: {fraction:.1%}")
     axes.set(ylabel="Energy of the linear modes (J)", xlim=run["time"][[0, -1]], ylim=(0, None))
-    axes.legend(loc="best", ncols=2 if len(parts) > 5 else 1, title="share at the end", title_fontsize=7)
+    axes.legend(loc="best", ncols=2 if len(parts) > 5 else 1, title="fraction at the end", title_fontsize=7)
 
 
 def _colours(names: list[str], parts: list[int]) -> list[str]:
@@ -128,7 +128,7 @@ def _draw_matrix(axes: Axes, rows: list[str], columns: list[str], percent: np.nd
     axes.set_yticks(range(len(rows)), rows, fontsize=6 if is_long else 8)
     axes.tick_params(length=0)
     axes.grid(visible=False)
-    axes.set(title="(b) Moved by each site (% of the work)", ylabel="Contact site (cell)")
+    axes.set(title="(b) Transferred by each site (% of the work)", ylabel="Contact site (cell)")
 
 
 def _in_cell(value: float, is_wide: bool) -> str:

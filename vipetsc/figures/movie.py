@@ -115,7 +115,7 @@ class MovieFigure:
         content = self.content
         self._waves = None
         if not content.wavenumber.size:
-            reason = "Waves are told apart where displacement and velocity\nof cells side by side were recorded"
+            reason = "The waves need displacements and velocities\nof contiguous cells"
             panels.annotate_empty(axes, reason)
             return
 

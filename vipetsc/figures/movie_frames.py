@@ -87,7 +87,7 @@ def check(run: xr.Dataset, shot: Shot) -> CheckedShot:
     are_side_by_side = len(cells) > 1 and bool(np.all(np.diff(cells) == 1))
     has_waves = "displacement" in run and are_side_by_side
     if shot.quantity == "energy" and not has_waves:
-        raise ValueError("--movie energy: needs displacement and velocity of cells side by side; --movie velocity")
+        raise ValueError("--movie energy: needs displacements and velocities of contiguous cells; use --movie velocity")
     return CheckedShot(window=window, time=_check_times(run, shot), has_waves=has_waves)
 
 
@@ -100,7 +100,7 @@ def _check_cells(run: xr.Dataset, shot: Shot) -> slice:
 
     begin, end = np.searchsorted(recorded, (first, last + 1)).tolist()
     if end - begin > MOST_CELLS:
-        raise ValueError(f"--movie: {end - begin} cells are more than {MOST_CELLS}; name some with --cells A:B")
+        raise ValueError(f"--movie: {end - begin} cells are more than {MOST_CELLS}; select some with --cells A:B")
     return slice(begin, end)
 
 

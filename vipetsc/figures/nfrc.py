@@ -16,7 +16,7 @@ ENERGIES = {
     "transmitted": ("T, transmitted", style.BLUE),
     "reflected": ("R, reflected", style.SKY),
     "upper": ("U, other harmonics", style.VERMILION),
-    "lost": ("L, lost in contacts", style.ORANGE),
+    "lost": ("L, dissipated in contacts", style.ORANGE),
 }
 FOLD = 1  # of the variable ``kind``
 
@@ -104,6 +104,6 @@ def _draw_energies(axes: Axes, branch: xr.Dataset) -> None:
             axes.plot(parameter, fraction, color=colour, lw=0.6, ls="--")
             axes.plot(parameter, np.where(stable, fraction, np.nan), color=colour, lw=1.4, label=label)
 
-    axes.set(ylabel="share of the energy", ylim=(-0.02, 1.04))
+    axes.set(ylabel="fraction of the energy", ylim=(-0.02, 1.04))
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=6, loc="best")

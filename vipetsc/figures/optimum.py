@@ -73,7 +73,7 @@ def convergence(optimum: xr.Dataset) -> Figure:
     number = optimum["design"].values
     for name, colour in (("upper_share_at_end", style.PURPLE), ("dissipated", style.ORANGE)):
         others.plot(number, optimum[name].values, ".", color=colour, ms=3, label=name.replace("_", " "))
-    others.set(xlabel="Design", ylabel="share of the work, mean", ylim=(0, None), title="All designs")
+    others.set(xlabel="Design", ylabel="fraction of the work, mean", ylim=(0, None), title="All designs")
     others.legend(loc="best")
     return figure
 
@@ -186,7 +186,7 @@ def _draw_measure(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: in
             searched.update(other.amplitudes or [plan.base.drive.amplitude])
     for amplitude in searched:
         axes.axvline(amplitude, color=style.GREY, lw=0.5, ls=style.DOTTED)
-    axes.set(xscale="log", xlabel="Amplitude (N)", ylabel=_label(objective), title="dotted: amplitudes searched")
+    axes.set(xscale="log", xlabel="Amplitude (N)", ylabel=_label(objective), title="dotted: amplitudes of the search")
 
 
 def _draw_energies(axes: Axes, optimum: xr.Dataset, amplitude: float) -> None:
@@ -203,4 +203,4 @@ def _draw_energies(axes: Axes, optimum: xr.Dataset, amplitude: float) -> None:
         x = np.arange(len(energies)) + (i - (len(designs) - 1) / 2) * width
         axes.bar(x, energies, width, color=COLOURS[design.name])
     axes.set_xticks(np.arange(len(labels)), labels)
-    axes.set(ylabel="share of the work at the end", title=f"At {amplitudes[nearest]:.4g} N")
+    axes.set(ylabel="fraction of the work at the end", title=f"At {amplitudes[nearest]:.4g} N")

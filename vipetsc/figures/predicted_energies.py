@@ -19,7 +19,7 @@ def prediction(data: xr.Dataset) -> Figure:
     """Draw energies at the end over the drive's work against amplitude, predicted (lines) and simulated (points)."""
     bands = data["band"].values
     name = "upper" if int(data.attrs["drive_band"]) < len(bands) else "other"
-    title = "Bands above the driven one" if name == "upper" else "All bands but the driven one"
+    title = "Bands above the driven one" if name == "upper" else "All bands except the driven one"
     figure = style.new_figure(style.PAGE, 4.9)
     grid = figure.subplots(2, 2, sharex=True)
     (transferred, dissipated), (every_band, sites) = grid
@@ -37,7 +37,7 @@ def prediction(data: xr.Dataset) -> Figure:
     for site, z in zip(data["sites/cell"].values, data["predicted/z"].values.T, strict=True):
         label = f"cell {site}" if data.sizes["site"] <= MOST_SITES else None
         sites.plot(data["amplitude"].values, z, lw=0.9, label=label)
-    sites.set(title="What arrives at the sites", ylabel="Displacement / clearance", yscale="log")
+    sites.set(title="Wave that arrives at the sites", ylabel="Displacement / clearance", yscale="log")
 
     for axes in grid.flat:
         axes.axvline(float(data.attrs["onset_amplitude"]), color=style.GREY, lw=0.7, ls=style.DOTTED)
@@ -51,7 +51,7 @@ def prediction(data: xr.Dataset) -> Figure:
     rms = data.attrs.get(f"rms_{name}")
     if rms is not None:
         transferred.set_title(f"{title}: rms {rms:.3f} decades")
-        dissipated.set_title(f"Dissipated: off by {data.attrs['worst_dissipated']:.3f} at most")
+        dissipated.set_title(f"Dissipated: error at most {data.attrs['worst_dissipated']:.3f} at most")
     return figure
 
 

@@ -109,7 +109,7 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw energies over time, and below them the residual relative to the work done, on a log scale."""
     largest = float(np.abs(run["energy/work"]).max())
     if len(run["time"]) < 2 or largest == 0:
-        return empty_figure("Energy ledger: the drive has done no work")
+        return empty_figure("Energy balance: the drive did no work")
 
     figure = style.new_figure(style.COLUMN, 3.3)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1))
@@ -159,7 +159,7 @@ def _draw_residual(axes: Axes, run: xr.Dataset, largest: float) -> None:
     # A run whose dashpots were given what the balance leaves has no error of its own.
     if _statistics(run).get("ledger_error", 0.0) is None:
         residual *= np.nan
-        text = "none: dashpots have what the balance leaves"
+        text = "none: the dissipation of dashpots is the remainder of the balance"
         panels.note(axes, text, (0.5, 0.3), (0, 0), xycoords="axes fraction", ha="center")
 
     axes.semilogy(run["time"].values, np.maximum(residual, 1e-18), color=style.BLACK, lw=0.5)
@@ -197,10 +197,10 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     if cell not in run["cell"].values:
         return empty_figure(f"Phase portraits: cell {cell}, the first site, was not recorded")
     if "displacement" not in run or "velocity" not in run:
-        return empty_figure("Phase portraits: they need displacement and velocity, and one was not recorded")
+        return empty_figure("Phase portraits: displacement and velocity were not both recorded")
     chain = Case.of(run).model().chain
     if chain.pairs:
-        return empty_figure("Phase portraits are of the cell's pair, and the contacts join others")
+        return empty_figure("Phase portraits show the cell's contact pair, but the contacts join other masses")
 
     recorded = run.sel(cell=cell)
     u, v, time = refined(recorded["displacement"].values, recorded["velocity"].values, field_time(run))

@@ -262,7 +262,7 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
     grid[0, 0].legend(loc="upper left")
     grid[1, 0].set(ylabel="Relative error")
     panels.note(grid[1, 0], "1 %", (1, 0.01), (-2, -2), xycoords=("axes fraction", "data"), ha="right", va="top")
-    grid[2, 0].set(ylabel="Share of KE between bins")
+    grid[2, 0].set(ylabel="Fraction of KE between bins")
     return figure
 
 

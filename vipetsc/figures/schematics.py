@@ -29,7 +29,7 @@ GAP = 0.17  # clearance as drawn
 SIDE = 0.5  # half the side of a mass of the reduced model
 
 STRIP = 0.52  # height in inches of a lattice drawn as a strip of cells
-LEGEND = "cell above, clearance in mm below; driven at the arrow"
+LEGEND = "above: cell; below: clearance in mm; arrow: drive"
 ROD = {"color": style.BLACK, "lw": 0.7}
 
 Point = tuple[float, float]
@@ -46,9 +46,9 @@ def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     title = "(a) Unit cell"
     differing = int(model.chain.differs.sum())
     if differing:
-        title += f" of the case, from which {counted(differing, 'cell')} differ"
+        title += f" of the case; {counted(differing, 'cell')} differ"
     upper.set_title(title)
-    legend = LEGEND if model.drive.amplitude else LEGEND.replace("driven", "begins")
+    legend = LEGEND if model.drive.amplitude else LEGEND.replace("arrow: drive", "arrow: initial motion")
     lower.set_title(f"(b) Lattice of {model.chain.cells} cells, {model.chain.ends} ends; sites: {legend}")
     return figure
 

@@ -193,7 +193,7 @@ def _dispersion_table(members: Sequence[CaseFolder], files: Files) -> Figure:
         axes.set_title(f"({'abcdef'[i]}.{j + 1}) {law.capitalize()}, {amplitude:.4g} N")
         transferred = f"IBTET {float(member.analysis['ibtet']):.2g}"
         axes.text(0.03, 0.41, transferred, color="white", transform=axes.transAxes)
-    panels.colour_bar(image, grid, "Energy per bin over its largest", aspect=35)
+    panels.colour_bar(image, grid, "Energy per bin / maximum", aspect=35)
     return figure
 
 
@@ -208,7 +208,7 @@ def band_shares(sweeps: Sweeps) -> Iterator[Drawing]:
     """Offer mean fractions of all parts over the amplitude, a page a configuration and reading."""
     with_fractions = (curve for curve in transfer_curves(sweeps) if "bands/share" in curve.data)
     for name, curves in grouped(with_fractions, lambda curve: Labels.of(curve.case).page_stem).items():
-        page = partial(columns_of_laws, curves, "Mean share of the energy (1)", _draw_fractions)
+        page = partial(columns_of_laws, curves, "Mean fraction of the energy (1)", _draw_fractions)
         yield Drawing(name, page)
 
 
@@ -254,7 +254,7 @@ def energies_over_time(member: MemberRun) -> Figure:
     text = f"whole record: {100 * whole_record:.2g} %; at most 1 % for {100 * below:.3g} % of the time"
     lower.text(0.5, 0.93, text, ha="center", va="top", transform=lower.transAxes)
     lower.set(yscale="log", ylim=(1e-4, 1e3), xlim=time[[0, -1]], xlabel="Time (s)", ylabel="Error (%)")
-    lower.set_title("(b) Sum of the parts against the total")
+    lower.set_title("(b) Sum of the parts compared with the total")
     return figure
 
 

@@ -43,7 +43,9 @@ def unwritten(path: Path, error: Exception) -> OSError:
     if not number:
         number = int(in_text[1]) if in_text else 0
     reason = os.strerror(number) if number else str(error)
-    return OSError(number, f"{path} could not be written: {reason}; the same command goes on when that is mended")
+    return OSError(
+        number, f"{path} could not be written: {reason}; after the cause is removed, the same command continues"
+    )
 
 
 def discard(folder: Path) -> None:

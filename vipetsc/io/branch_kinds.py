@@ -27,7 +27,7 @@ def branch_kind(branch: xr.Dataset) -> str:
     if kind is None:
         return _kind_by_variables(branch)
     if kind not in BRANCH_KINDS:
-        raise ValueError(f"branch_kind = {kind!r} is none of {', '.join(BRANCH_KINDS)}: written by a later version?")
+        raise ValueError(f"branch_kind = {kind!r} is not one of {', '.join(BRANCH_KINDS)}: written by a later version?")
     return str(kind)
 
 

@@ -139,9 +139,9 @@ def _claim(
         _finish_swap(path, kind)
     filled = any(not entry.is_dir() or _results(entry) for entry in _results(path))
     if foreign or (filled and not (path / kind.marker).exists()):
-        raise FolderError(f"{path}: holds files that are not a {kind.noun}'s of this kind; choose another --out")
+        raise FolderError(f"{path}: contains files that are not a {kind.noun}'s of this kind; choose another --out")
     if resume and not filled:
-        raise FolderError(f"{path}: holds no {kind.noun} to resume; leave out --resume")
+        raise FolderError(f"{path}: contains no {kind.noun} to resume; omit --resume")
 
     aside = path / NEW
     going_on = filled and not force
@@ -191,7 +191,7 @@ def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference |
         return difference(earlier)
     if earlier == text:
         return None
-    remedy = "--force replaces it, --out chooses another folder"
+    remedy = "replace it with --force, or choose another folder with --out"
     try:
         then = dict(_keys(tomllib.loads(earlier)))
         now = dict(_keys(tomllib.loads(text)))
@@ -206,7 +206,7 @@ def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference |
     if not differing:
         return None
     more = f"; and {len(differing) - MOST_NAMED} more" if len(differing) > MOST_NAMED else ""
-    return f"holds another {kind.noun}: {'; '.join(differing[:MOST_NAMED])}{more}; {remedy}"
+    return f"contains another {kind.noun}: {'; '.join(differing[:MOST_NAMED])}{more}; {remedy}"
 
 
 def _text_of(path: Path) -> str:

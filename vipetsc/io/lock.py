@@ -87,7 +87,7 @@ def _acquire(path: Path, created: list[Path]) -> int | None:
         now = time.monotonic()
         if deadline is None:
             deadline = now + PATIENCE
-            logger.info("vipetsc: %s: %s is working in it; waiting up to %g s for its end", path, holder, PATIENCE)
+            logger.info("vipetsc: %s: %s is working in it; waiting up to %g s for it to end", path, holder, PATIENCE)
         elif now >= deadline:
             remedy = "wait until it has ended, or choose another --out"
             raise FolderError(f"{path}: {holder} is working in it; {remedy}")

@@ -135,7 +135,7 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     missing = [name for name in needs if name not in present and name not in data.attrs]
     if missing:
         data.close()  # nobody else would
-        raise ResultFileError(f"{path} is not a {kind} of vipetsc: it has no {', '.join(missing)}")
+        raise ResultFileError(f"{path} is not a {kind} of vipetsc: it lacks {', '.join(missing)}")
     return data
 
 

@@ -61,7 +61,7 @@ def open_results(path: str | Path) -> xr.Dataset:
         present = [path / name for name in FIRST if (path / name).exists()]
         files = present[:1] or sorted(path.glob("branch-*.h5"))
     if len(files) != 1:
-        raise ValueError(f"{path}: holds {', '.join(file.name for file in files) or 'no results'}; name a file")
+        raise ValueError(f"{path}: contains {', '.join(file.name for file in files) or 'no results'}; name a file")
     data = open_netcdf(files[0], "result")
     data = with_point_names(data)
     data.encoding["source"] = str(files[0])
@@ -113,7 +113,7 @@ def open_ensemble(folder: str | Path) -> xr.Dataset:
     further = [name for name, variable in data.data_vars.items() if variable.attrs.get("long_name") in zipped]
     data = data.set_coords(further)
     number = np.arange(data["status"].size).reshape(data["status"].shape)
-    return data.assign(number=(data["status"].dims, number, {"long_name": "number of the member, from 0"}))
+    return data.assign(number=(data["status"].dims, number, {"long_name": "number of the member, counted from 0"}))
 
 
 def over_samples(ensemble: xr.Dataset) -> xr.Dataset:
@@ -135,8 +135,8 @@ def over_samples(ensemble: xr.Dataset) -> xr.Dataset:
 
 def outdated(folder: Path) -> str:
     """Message about a sweep of an earlier version, which has a folder for every member; empty for one of this."""
-    remedy = "the verb sweep makes it again with --force, or elsewhere with --out"
-    text = f"{folder}: holds a sweep of an earlier version, a folder for every member; {remedy}"
+    remedy = "repeat the sweep with --force, or in another folder with --out"
+    text = f"{folder}: contains a sweep of an earlier version, with a folder for each member; {remedy}"
     return text if (folder / "linear").is_dir() else ""
 
 
@@ -150,7 +150,7 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
     matches: dict[str, np.ndarray] = {}
     for name, value in wanted.items():
         if name not in data.coords or data[name].ndim != 1:
-            raise KeyError(f"{name} is no coordinate; there are {', '.join(map(str, data.coords))}")
+            raise KeyError(f"{name} is not a coordinate; the coordinates are {', '.join(map(str, data.coords))}")
 
         coordinate = data[name].values
         if np.issubdtype(coordinate.dtype, np.number):
@@ -161,8 +161,8 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
         matches[dimension] = matches.get(dimension, np.array(True)) & match
         if not matches[dimension].any():
             others = [n for n in wanted if n != name and n in data.coords and data[n].dims == data[name].dims]
-            with_others = f" beside {', '.join(others)}" if others else ""
-            raise KeyError(f"no member has {name} = {value!r}{with_others}; there are {list(coordinate)}")
+            with_others = f" at the given {', '.join(others)}" if others else ""
+            raise KeyError(f"no member has {name} = {value!r}{with_others}; the values are {list(coordinate)}")
 
     return data.isel({dimension: int(np.argmax(match)) for dimension, match in matches.items()})
 

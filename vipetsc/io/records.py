@@ -85,7 +85,7 @@ def read_records(path: Path, damaged: Callable[[str], None]) -> Iterator[tuple[R
             if line.endswith(CHECK % zlib.crc32(line[:-CHECK_LENGTH] + b"}")):
                 yield _parsed(line), Line(path=path, start=start, length=len(line))
             else:
-                damaged(f"{path}, line {number}: cut off or damaged; what it told is made again")
+                damaged(f"{path}, line {number}: truncated or damaged; its results are computed again")
             start += len(line)
 
 

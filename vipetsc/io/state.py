@@ -35,7 +35,7 @@ class State(NamedTuple):
             names = [prefix + name for name in ("displacement", "velocity", "cell")]
             missing = [name for name in names if name not in file]
             if missing:
-                raise ValueError(f"{path} holds no state: it has no {', '.join(missing)}")
+                raise ValueError(f"{path} contains no state: it lacks {', '.join(missing)}")
             u, v, cell = (file[name] for name in names)
 
             origin: dict[str, Any] = {}  # which state of the file it is
@@ -58,7 +58,7 @@ class State(NamedTuple):
             )
 
         if not (np.isfinite(state.displacement).all() and np.isfinite(state.velocity).all()):
-            raise ValueError(f"{path} holds a state that is not finite")
+            raise ValueError(f"{path} contains a state with values that are not finite")
         return state
 
     def on(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
@@ -96,7 +96,7 @@ class State(NamedTuple):
 def _row(values: np.ndarray, wanted: float | None, reach: float, text: str) -> int:
     """The row of the value ``wanted``, within ``reach``, or the last one; raises ValueError, which ``text`` begins."""
     if not len(values):
-        raise ValueError(f"{text.split(' has ')[0]} holds no state: it is empty")
+        raise ValueError(f"{text.split(' has ')[0]} contains no state: it is empty")
     if wanted is None:
         return len(values) - 1
     row = int(np.argmin(np.abs(values - wanted)))

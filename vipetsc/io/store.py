@@ -85,7 +85,7 @@ class RunFolder:
             with open_run(path) as run:
                 attributes = {key: np.asarray(value).item() for key, value in run.attrs.items()}
         except (OSError, ValueError) as error:
-            raise FolderError(f"{error}; --force makes the run again") from error
+            raise FolderError(f"{error}; --force repeats the run") from error
 
         for key in ("statistics", "warnings"):
             if key in attributes:

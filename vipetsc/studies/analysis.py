@@ -72,9 +72,9 @@ LAYOUT = (
         "partition/bounds": ("partition/bound", "rad/cell", "bounds of the bins"),
         "partition/energy": ("partition/bin partition/snapshot", "J", "kinetic energy of a bin"),
         "partition/kinetic": ("partition/snapshot", "J", "kinetic energy"),
-        "partition/reconstructed": ("partition/snapshot", "J", "kinetic energy of the bins' sum"),
+        "partition/reconstructed": ("partition/snapshot", "J", "kinetic energy of the sum of all bins"),
         "partition/error": ("partition/snapshot", "1", "relative error of the reconstructed kinetic energy"),
-        "partition/cross_share": ("partition/snapshot", "1", "share of the energy between bins"),
+        "partition/cross_share": ("partition/snapshot", "1", "fraction of the energy in products of different bins"),
         "partition/kinetic_energy": ("partition/bin partition/snapshot cell", "J", "kinetic energy of a bin in a cell"),
     }
     | BANDS
@@ -266,7 +266,7 @@ def _windows(record: VelocityRecord) -> dict[str, slice]:
     if record.site is None:
         record.left_out.append("dispersion_before, dispersion_after: the lattice has no sites")
     elif record.model.chain.ends == "periodic":
-        record.left_out.append("dispersion_before, dispersion_after: on a ring the wave goes both ways")
+        record.left_out.append("dispersion_before, dispersion_after: on a ring the wave travels in both directions")
     else:
         low, high = map(int, np.searchsorted(record.cells, [record.site, record.site + 1]))
         lower = slice(0, low)
@@ -302,7 +302,7 @@ def _entropies(record: VelocityRecord, stride: int, arrival: float | None, maps:
     reason = "the largest host velocity at the first site in the linear run"
     if arrival is None:
         arrival = _estimated_arrival(record)
-        reason = "half the burst and the way to the first site at the group velocity"
+        reason = "half the burst plus the travel time to the first site at the group velocity"
     # A record that ends before keeps its last snapshot.
     start = min(int(np.searchsorted(time, arrival)), len(time) - 1)
 

@@ -31,7 +31,7 @@ FEWEST = 3  # points of a fit; which fits are called power laws `vipetsc.spectra
 LAYOUT = {
     "energy": ("energy", "J", "work of the drive, normalised to the branch"),
     "ibtet": ("energy", "1", "inter-band energy transfer"),
-    "fitted": ("energy", "1", "1 in region III at or behind the peak"),
+    "fitted": ("energy", "1", "1 in region III at or beyond the peak"),
     "point": ("point", "1", "regular point of the branch"),
     "branch/energy": ("point", "J", "energy of the branch"),
     "branch/slope": ("point", "Hz/J", "slope df/dE"),
@@ -107,7 +107,7 @@ def initiation_of(folder: Path, case: Case) -> Initiation:
     """
     linear = read_linear(folder, case)
     if linear is None:
-        raise OSError(f"{folder}: its records hold no linear run of this lattice and drive")
+        raise OSError(f"{folder}: its records contain no linear run of this lattice and drive")
     sites = np.asarray(case.contacts.sites)
     touching = np.asarray(case.contacts.clearance) / linear.envelope[sites - 1]
     amplitude = float(touching[np.argmax(sites == leading_cell(case))])
@@ -216,7 +216,7 @@ def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], f
     floor = float(untouched.mean())
     aligned = align(curve["work"].values, curve["ibtet"].values, initiation.energy, floor, slope)
     if "exponent" not in aligned.attrs:
-        return f"{int(aligned['fitted'].sum())} points in region III behind the peak"
+        return f"{int(aligned['fitted'].sum())} points in region III beyond the peak"
     return aligned.assign_attrs(
         case=case.to_toml(),
         branch_reading=slope.attrs["reading"],
@@ -253,7 +253,7 @@ def relate_folders(folders: Sequence[Path]) -> list[Path]:
     branches = [folder for folder in folders if folder not in sweeps]
     for folder in branches:
         if not (folder / BRANCH).exists():
-            raise FolderError(f"{folder}: holds no {BRANCH}; the verb nnm makes it, with [nnm] modes = [2]")
+            raise FolderError(f"{folder}: contains no {BRANCH}; compute it with the verb nnm and [nnm] modes = [2]")
     if not branches:
         return []
 
@@ -263,7 +263,7 @@ def relate_folders(folders: Sequence[Path]) -> list[Path]:
         try:
             path = _relate(open_ensemble(folder), branches)
         except (KeyError, OSError, ValueError) as error:
-            raise FolderError(f"{folder} beside {', '.join(map(str, branches))}: {error}") from None
+            raise FolderError(f"{folder} with {', '.join(map(str, branches))}: {error}") from None
         if path:
             written.append(path)
     return written

@@ -21,11 +21,11 @@ BANDS = {
     "bands/edges": ("bands/edge", "rad/s", "edges of the pass bands and gaps"),
     "bands/sample": ("bands/sample", "s", "time of a sample"),
     "bands/energy": ("bands/part bands/sample", "J", "kinetic energy of a part"),
-    "bands/band": ("bands/band", "1", "part that holds pass bands"),
+    "bands/band": ("bands/band", "1", "part that contains pass bands"),
     "bands/kinetic_energy": ("bands/band time cell", "J", "kinetic energy of a part in a cell"),
     "bands/above": ("bands/part", "1", "1 for a pass band above the driven one"),
     "bands/total": ("bands/sample", "J", "kinetic energy"),
-    "bands/share": ("bands/part", "1", "mean share of a part after the wave's arrival"),
+    "bands/share": ("bands/part", "1", "mean fraction of the energy in a part after the wave's arrival"),
 }
 
 

@@ -34,19 +34,16 @@ STATISTICS = {name: REGISTRY[name].row for name in ("contact_episodes", "dissipa
 FIT = {
     "peak_amplitude": ("N", "amplitude of the largest value"),
     "peak": ("1", "largest value, not normalised"),
-    "points": ("1", "points from the peak on"),
-    "exponent": ("1", "exponent of the log-log line"),
+    "points": ("1", "number of points from the peak on"),
+    "exponent": ("1", "exponent of the log-log fit"),
     "exponent_low": ("1", "lower end of its 95 % confidence interval"),
     "exponent_high": ("1", "upper end of its 95 % confidence interval"),
-    "factor": ("1", "factor of the log-log line at 1 N"),
-    "r2_log_log": ("1", "adjusted R^2 of the log-log line"),
+    "factor": ("1", "factor of the log-log fit at 1 N"),
+    "r2_log_log": ("1", "adjusted R^2 of the log-log fit"),
     "exponent_nonlinear": ("1", "exponent of the nonlinear fit"),
     "factor_nonlinear": ("1", "factor of the nonlinear fit at 1 N"),
     "r2_nonlinear": ("1", "adjusted R^2 of the nonlinear fit"),
-    "is_power_law": (
-        "1",
-        f"1 where the log-log line is a power law: {FEWEST} points or more, adjusted R^2 not below 0",
-    ),
+    "is_power_law": ("1", f"1 where the log-log fit is a power law: {FEWEST} points or more, adjusted R^2 not below 0"),
 }
 
 

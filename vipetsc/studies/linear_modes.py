@@ -27,13 +27,17 @@ LAYOUT = {
     "dof": ("dof", "1", "mass of the cell"),
     "frequency": ("mode", "rad/s", "angular frequency"),
     "band": ("mode", "1", "pass band that the frequency lies in; 0 for a gap"),
-    "participation": ("mode", "1", "cells that take part: 1 over the sum of the squares of their shares of the energy"),
-    "left": ("mode", "1", "share of the kinetic energy in the first tenth of the cells"),
-    "right": ("mode", "1", "share of the kinetic energy in the last tenth of the cells"),
+    "participation": (
+        "mode",
+        "1",
+        "number of participating cells: 1 over the sum of the squares of their energy fractions",
+    ),
+    "left": ("mode", "1", "fraction of the kinetic energy in the first tenth of the cells"),
+    "right": ("mode", "1", "fraction of the kinetic energy in the last tenth of the cells"),
     "peak": ("mode", "1", "cell with most kinetic energy"),
     "kind": ("mode", "1", "bulk, edge, at a site, or in a cell"),
-    "residual": ("mode", "1", "norm of K x - Om^2 M x over that of the largest Om^2 times M x"),
-    "shape": ("mode cell dof", "1/sqrt(kg)", "displacement, its square times the masses sums to 1"),
+    "residual": ("mode", "1", "norm of K x - Om^2 M x over the norm of M x times the largest Om^2"),
+    "shape": ("mode cell dof", "1/sqrt(kg)", "displacement, normalised to unit modal mass"),
 }
 
 
@@ -82,11 +86,13 @@ def _check(case: Case, count: int, near: float) -> None:
     if not 1 <= count <= masses:
         raise CaseError([Problem("--modes", count, f"the lattice has {masses} modes")])
     if gaps and np.min(gaps) <= 0:
-        raise CaseError([Problem("contacts.clearance", None, "contacts that touch at rest are in no linear mode")])
+        raise CaseError(
+            [Problem("contacts.clearance", None, "linear modes do not include contacts that touch at rest")]
+        )
     if not 0 <= near < 1e50:
-        raise CaseError([Problem("--near", near, "give a frequency in rad/s, from 0 on")])
+        raise CaseError([Problem("--near", near, "give a frequency in rad/s that is not negative")])
     if 8 * count * masses > GATHER_LIMIT:
-        raise CaseError([Problem("--modes", count, "their shapes are more than one rank gathers; ask for fewer")])
+        raise CaseError([Problem("--modes", count, "one rank cannot gather all shapes; request fewer modes")])
 
 
 def classify(chain: Chain, frequency: np.ndarray, shape: np.ndarray) -> dict[str, Any]:

@@ -43,9 +43,13 @@ LAYOUT = {
     "sites/cell": ("site", "1", "cell (1-based) of a site"),
     "predicted/bands": ("amplitude band", "1", "energy of a pass band at the end over the work"),
     "predicted/upper": ("amplitude", "1", "energy of the bands above the driven one at the end over the work"),
-    "predicted/other": ("amplitude", "1", "energy of all bands but the driven one at the end over the work"),
+    "predicted/other": ("amplitude", "1", "energy of all bands except the driven one at the end over the work"),
     "predicted/dissipated": ("amplitude", "1", "dissipated energy over the work"),
-    "predicted/z": ("amplitude site", "1", "largest relative displacement that arrives at a site over its clearance"),
+    "predicted/z": (
+        "amplitude site",
+        "1",
+        "largest relative displacement of the wave that arrives at a site, over its clearance",
+    ),
     "predicted/change": ("amplitude", "1", "change by the last iteration over the linear wave"),
 }
 MEASURED = ("bands", "upper", "other", "dissipated")

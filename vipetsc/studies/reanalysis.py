@@ -51,7 +51,7 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str
         sweeps = [path for path in paths if (path / "index.json").exists()]
         for override in overrides:
             if sweeps or not override.startswith("analysis."):
-                raise FolderError(f"{override}: of a run that is there only [analysis] can change, of a sweep nothing")
+                raise FolderError(f"{override}: for an existing run only [analysis] can change, for a sweep nothing")
         # All are checked before any is measured: nothing is written if a path cannot be used.
         return [run for path in paths for run in _measurable(path)], sweeps
 
@@ -70,7 +70,7 @@ def _reassemble(folder: Path) -> Path:
     """Put the ensemble of the sweep in ``folder`` together anew; returns its path."""
     results = Results(Sweep.load(folder / "case.toml"), folder)
     if (results.status == MISSING).any():
-        raise FolderError(f"{folder}: the sweep is not finished; the verb sweep goes on with it")
+        raise FolderError(f"{folder}: the sweep is not finished; continue it with the verb sweep")
 
     # New records behind the old ones: the latest of a member counts.
     file = RecordFile(results.paths.for_rank(0))
@@ -92,7 +92,7 @@ def _measurable(path: Path) -> Iterator[MeasurableRun]:
     if reason:
         raise FolderError(reason)
     if not sweep and not (folder / "run.h5").exists():
-        raise FolderError(f"{path}: holds no run.h5; the folder of a finished run or sweep is needed")
+        raise FolderError(f"{path}: contains no run.h5; give the folder of a finished run or sweep")
 
     files = [folder / "run.h5"]
     measures: Collection[str] = FULL

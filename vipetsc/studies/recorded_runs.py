@@ -126,14 +126,14 @@ class RecordedRuns:
         for records in self.comm.allgather(recorded):
             self.records |= records
         if self.pool.stopped:
-            raise StoppedError(f"stopped on request with {len(self.records)} runs; the same command goes on")
+            raise StoppedError(f"stopped on request with {len(self.records)} runs; the same command continues")
 
         # Every rank has to raise: one that went on alone would wait for the others for ever.
         reasons = [reason for from_rank in self.comm.allgather(failed) for reason in from_rank]
 
         def check() -> None:
             if reasons:
-                raise RuntimeError(f"one of the {what} did not come out, {reasons[0]}")
+                raise RuntimeError(f"one of the {what} failed: {reasons[0]}")
 
         on_root(self.comm, check)
 

@@ -14,15 +14,14 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 def over_samples(data: Variables, seed: str, names: Iterable[str]) -> Variables:
     """``statistics/<name>/mean``, ``deviation`` and ``quantiles`` of the ``names`` over the dimension ``seed``.
 
-    They are taken of the samples that came out, whose number is ``statistics/samples``. The deviation is divided by
-    n - 1.
+    They refer to the successful samples, whose number is ``statistics/samples``. The variance is divided by n - 1.
     """
     episodes = data["contact_episodes"]
     valid = np.isfinite(episodes.values).sum(axis=episodes.dims.index(seed))
     other_dims = [str(dim) for dim in episodes.dims if dim != seed]
     summary = {
-        "quantile": variable("quantile", QUANTILES, "1", "share of the samples that lie below"),
-        "statistics/samples": variable(other_dims, valid, "1", "samples that came out"),
+        "quantile": variable("quantile", QUANTILES, "1", "fraction of the samples below the quantile"),
+        "statistics/samples": variable(other_dims, valid, "1", "number of successful samples"),
     }
     for name in names:
         summary |= _statistics(f"statistics/{name}", data[name].transpose(seed, ...))

@@ -20,27 +20,35 @@ BROAD = 0.05  # half the width in log z over which it is averaged: a design has 
 LISTED = (1.01, 1.1, 1.5, 3.0, 10.0, 30.0, 100.0)  # values of z in the printed table
 
 POINT_LAYOUT = {
-    "transmitted": ("z", "1", "share that goes on in the drive's band"),
-    "reflected": ("z", "1", "share that goes back in the drive's band"),
-    "upper": ("z", "1", "share that bands above the drive's get"),
-    "share": ("z band direction", "1", "share that leaves by band and direction"),
-    "dissipated": ("z", "1", "share that is dissipated"),
-    "contact": ("z", "1", "share that a closed contact holds at the end"),
+    "transmitted": ("z", "1", "transmitted fraction in the driven band"),
+    "reflected": ("z", "1", "reflected fraction in the driven band"),
+    "upper": ("z", "1", "fraction transferred to the bands above the driven one"),
+    "share": ("z band direction", "1", "outgoing fraction by band and direction"),
+    "dissipated": ("z", "1", "dissipated fraction"),
+    "contact": ("z", "1", "fraction stored in a closed contact at the end"),
     "onset": ("z", "s", "time of the first contact"),
     "separation": ("z", "s", "time at which the last contact ends"),
-    "release": ("z", "1", "linear envelope over the clearance when the last contact ends"),
+    "release": ("z", "1", "linear envelope over the clearance at the end of the last contact"),
 }
 LAYOUT = {
-    "z": ("z", "1", "largest relative displacement of the linear wave at the site over the clearance"),
+    "z": ("z", "1", "largest relative displacement of the linear wave at the site, over the clearance"),
     "band": ("band", "1", "band, from 1"),
-    "direction": ("direction", "1", "forward: from the drive to the site and on; backward"),
+    "direction": ("direction", "1", "forward: from the drive to the site and beyond; backward"),
     "time": ("time", "s", "time"),
     "envelope": ("time", "m/N", "sqrt(w^2 + (w'/Om)^2) of the linear wave at the site under 1 N"),
     "amplitude": ("z", "N", "amplitude of the drive"),
     "episodes": ("z", "1", "contact episodes"),
-    "near": ("z", "1", f"twice the kinetic energy within {NEAR} cells of the site at the end, contained in the shares"),
-    "interpolation_error": ("z", "1", "largest distance of a share from the line between the neighbours before it"),
-    "efficiency": ("z", "1", "U/(1-T), both averaged over 5 % of z either way; 0 where little leaves the drive's wave"),
+    "near": (
+        "z",
+        "1",
+        f"twice the kinetic energy within {NEAR} cells of the site at the end, included in the fractions",
+    ),
+    "interpolation_error": ("z", "1", "largest deviation of a fraction from the line between its previous neighbours"),
+    "efficiency": (
+        "z",
+        "1",
+        "U/(1-T), both averaged over 5 % of z on either side; 0 where the driven wave loses little",
+    ),
     **POINT_LAYOUT,
     **{f"{name}_scatter": (dims, unit, f"deviation: {text}") for name, (dims, unit, text) in POINT_LAYOUT.items()},
 }
@@ -68,7 +76,7 @@ class ScatteringOutcome(NamedTuple):
 
 @dataclass(frozen=True)
 class ScatteringLaw:
-    """The law at points ``z``: largest relative displacement of the linear wave at the site over the clearance.
+    """The law at points ``z``: largest relative displacement of the linear wave at the site, over the clearance.
 
     ``mean`` and ``scatter`` (standard deviation of runs with amplitudes a little apart) hold arrays over the points.
     ``drive_band`` counts from 0; ``clearance`` in m. ``peak`` is the largest |w| of the linear wave at the site in m
@@ -148,7 +156,7 @@ class ScatteringLaw:
         """
         efficiency = self.efficiency()
         if not efficiency.any():
-            raise ValueError("no band above the drive's gets energy from it")
+            raise ValueError("it transfers no energy to bands above the driven one")
 
         near_best = efficiency >= (1 - FLAT) * efficiency.max()
         best = int(np.argmax(np.where(near_best, self.mean.transmitted, -np.inf)))
@@ -161,12 +169,15 @@ class ScatteringLaw:
         arrives = f"at {about['arrival']:.4g} s, {about['spread']:.4g} times as long as the burst"
         rows = [
             ("ring", f"{about['cells']} cells, site at {about['distance']}, clearance {self.clearance:.5g} m"),
-            ("packet", f"{arrives}; {about['under_way']:.1e} of its energy had not passed at the end"),
-            ("points", f"{len(self.z)} from z = 1 to {self.z[-1]:g}; shares sum to 1 within {abs(sums - 1).max():.0e}"),
+            ("packet", f"{arrives}; {about['under_way']:.1e} of its energy has not passed the site at the end"),
+            (
+                "points",
+                f"{len(self.z)} from z = 1 to {self.z[-1]:g}; fractions sum to 1 within {abs(sums - 1).max():.0e}",
+            ),
         ]
         rows += [(f"z = {z:g}", self._fractions_at(z)) for z in LISTED if z < self.z[-1]]
 
-        best = "no band above the drive's gets energy"
+        best = "no energy is transferred to bands above the driven one"
         if self.efficiency().any():
             best = f"z* = {about['matched_z']:.4g}, T = {about['matched_transmitted']:.3g}"
         return [*rows, ("matched", best)]

@@ -61,7 +61,7 @@ class SweepResult:
     def _repr_html_(self) -> str:
         """The numbers of members by their ending, and warnings, as a notebook shows them."""
         rows: list[tuple[str, object]] = [(name, self.count(code) or None) for code, name in enumerate(STATUS)]
-        rows += [("time in s", round(self.seconds, 1)), ("ensemble", self.folder or "in memory, as dataset")]
+        rows += [("time in s", round(self.seconds, 1)), ("ensemble", self.folder or "in memory, as `dataset`")]
         rows += [("warning", warning) for warning in self.warnings]
         return html_table(f"sweep of {self.status.size} members", rows)
 
@@ -121,7 +121,7 @@ def run_sweep(
 def _in_memory(plan: Sweep, comm: MPI.Comm, stop: StopRequest | None, progress: bool) -> SweepResult:
     """The sweep in a temporary folder, which goes once rank 0 has read the ensemble."""
     if plan.options.fields:
-        remedy = "keeps files of every member: name a folder for them, as in sweep(plan, 'my-sweep')"
+        remedy = "stores files of every member: give a folder for them, as in sweep(plan, 'my-sweep')"
         raise CaseError([Problem("sweep.fields", True, remedy)], plan.name)
     if not on_one_machine(comm):
         raise ValueError("ranks on several machines need a folder that all of them see, as in sweep(plan, 'my-sweep')")
@@ -130,7 +130,7 @@ def _in_memory(plan: Sweep, comm: MPI.Comm, stop: StopRequest | None, progress: 
         result = run_sweep(plan, folder, comm, stop=stop, progress=progress)
     except BaseException:
         if comm.rank == 0:
-            say(f"vipetsc: members that are complete stay in {folder}; sweep(plan, {str(folder)!r}) goes on")
+            say(f"vipetsc: complete members remain in {folder}; sweep(plan, {str(folder)!r}) goes on")
         raise
     if result.resumable:
         return result
@@ -282,7 +282,7 @@ def is_whole(path: Path, lost: list[str]) -> bool:
         h5py.File(path).close()
     except OSError as error:
         if path.exists():
-            lost.append(f"{path} cannot be read: {error}; made again")
+            lost.append(f"{path} cannot be read: {error}; computed again")
         return False
     return True
 

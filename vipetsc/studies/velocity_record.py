@@ -78,7 +78,7 @@ class VelocityRecord:
             names |= {"dispersion", "bands"}
         # The Nyquist limit: the top band would appear at lower frequencies.
         if self.interval * top >= np.pi:
-            text = f"fields kept every {self.interval:.4g} s resolve {np.pi / self.interval:.5g} of {top:.5g} rad/s"
+            text = f"fields stored every {self.interval:.4g} s resolve {np.pi / self.interval:.5g} of {top:.5g} rad/s"
             self.warnings.append(f"{text}: dispersion, bands and ibtet are not measured")
             names |= {"dispersion", "bands"}
         if every > 1:

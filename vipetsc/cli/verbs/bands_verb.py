@@ -25,9 +25,9 @@ MODES = argument(
     "--modes",
     type=int,
     metavar="N",
-    help="also the N linear modes of the finite lattice that are nearest to a frequency, and their shapes",
+    help="also compute the N linear modes of the finite lattice nearest to a frequency, and their shapes",
 )
-NEAR = argument("--near", type=float, metavar="OMEGA", help="that frequency in rad/s; 0 if left out")
+NEAR = argument("--near", type=float, metavar="OMEGA", help="this frequency in rad/s; default: 0")
 JSON = argument("--json", action="store_true", help="print JSON instead of a table")
 
 
@@ -63,7 +63,7 @@ def write_bands(case: Case, folder: Path, as_json: bool) -> str:
     if as_json:
         return text
     if not cell.springs:
-        return "no pass bands: contacts alone join the masses, and no wave is linear"
+        return "no pass bands: only contacts join the masses, so that there are no linear waves"
     return f"{bands_report(numbers)}{damping_report(numbers)}\n  {picture['picture']}"
 
 
@@ -121,14 +121,14 @@ def damping_report(numbers: dict[str, Any]) -> str:
     if "damping" not in numbers:
         return ""
 
-    lines = ["\nband  damping ratio  decays by 1/e in (s)   at: kappa/pi   rad/s"]
+    lines = ["\nband  damping ratio  decays to 1/e in (s)   at: kappa/pi   rad/s"]
     for row in numbers["damping"]:
         lines.append(
             f"{row['band']:4d} {row['damping_ratio']:14.4g} {row['decay_time']:21.4g} "
             f"{row['wavenumber'] / np.pi:14.4f} {row['frequency']:8.2f}"
         )
     length = numbers["decay_length"]
-    lines.append(f"at {length['frequency']:.6g} rad/s waves decay by 1/e in {length['cells']:.4g} cells")
+    lines.append(f"at {length['frequency']:.6g} rad/s waves decay to 1/e in {length['cells']:.4g} cells")
     return "\n".join(lines)
 
 
@@ -136,7 +136,7 @@ def modes_report(case: Case, options: argparse.Namespace, folder: Path, comm: MP
     """The linear modes of ``--modes`` as text on rank 0, which writes them; empty if none are asked for."""
     if options.modes is None:
         if options.near is not None:
-            raise CaseError([Problem("--near", options.near, "says near which frequency --modes are; give both")])
+            raise CaseError([Problem("--near", options.near, "gives the frequency for --modes; give both options")])
         return ""
 
     from vipetsc.studies import linear_modes

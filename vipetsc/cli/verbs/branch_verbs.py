@@ -87,7 +87,7 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
     """Lattice and contacts; how many curves there are, over what, at which values, and how they are computed."""
     options = case.nfrc
     if options.source == "wave":
-        excitation = f"a wave of band {options.band} that comes in, {options.direction}"
+        excitation = f"an incident wave of band {options.band}, {options.direction}"
         amplitude_unit = "of the clearance"
     else:
         excitation = f"a force on mass {case.drive.mass} of cell {case.drive.cell}"
@@ -104,18 +104,18 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
 
     low, high = options.range
     count = len(case.curves())
-    parity = "odd ones alone" if options.symmetric else "even ones too"
+    parity = "odd only" if options.symmetric else "even and odd"
 
     lattice = dict(lattice_rows(case))
     if options.infinite:
-        lattice["lattice"] = f"infinite, sites by their cells of {case.lattice.cells}"
+        lattice["lattice"] = f"infinite, with sites in the cells of a segment of {case.lattice.cells}"
     return [
         *lattice.items(),
         ("nfrc", f"{count} curve{'s' if count > 1 else ''} over the {options.over}, {low:g} to {high:g} {over_unit}"),
         ("driven by", excitation),
         (f"at {fixed}", f"{first_few([f'{value:.6g}' for value in options.fixed])} {fixed_unit}"),
         ("restitution", first_few([f"{restitution:g}" for restitution in options.restitutions])),
-        ("harmonics", f"up to {options.harmonics}, {parity}; {options.points} points a curve at most"),
+        ("harmonics", f"up to {options.harmonics}, {parity}; at most {options.points} points per curve"),
     ]
 
 
@@ -212,7 +212,7 @@ PICTURES = Pictures(source="branches", file="branch-*.h5", noun=BRANCHES.noun, r
 
 NNM = StudyVerb(
     name="nnm",
-    text="nonlinear normal modes: frequency-energy branches",
+    text="compute nonlinear normal modes as frequency-energy branches",
     example="nnm runs/examples/nnm-hertz.toml --quiet --log nnm.log",
     arguments=(case_with("nnm"), *OF_STUDIES),
     case=NnmCase,
@@ -224,7 +224,7 @@ NNM = StudyVerb(
 
 NFRC = StudyVerb(
     name="nfrc",
-    text="steady states under a wave or a force, with stability",
+    text="compute steady states under a wave or a force, and their stability",
     example="nfrc runs/examples/nfrc.toml",
     arguments=(CASE, *OF_STUDIES),
     case=NfrcCase,

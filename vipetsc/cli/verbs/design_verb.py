@@ -1,4 +1,4 @@
-"""The verb ``design``: the (lambda, eta) search of the four-band cell."""
+"""The verb ``design``: repeat the paper's (lambda, eta) search for the four-band cell."""
 
 from vipetsc.case import DesignCase
 from vipetsc.cli.arguments import CASE, OF_STUDIES
@@ -24,7 +24,7 @@ def design_rows(case: DesignCase, ranks: int) -> Rows:
 
 VERB = StudyVerb(
     name="design",
-    text="the (lambda, eta) search of the four-band cell",
+    text="repeat the paper's (lambda, eta) search for the four-band cell",
     example="design runs/examples/design.toml --set design.lambda.count=10",
     arguments=(CASE, *OF_STUDIES),
     case=DesignCase,

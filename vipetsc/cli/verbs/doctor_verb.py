@@ -32,7 +32,7 @@ def compile_now(comm: MPI.Comm) -> None:
     from vipetsc.studies.first_calls import compile_kernels
 
     seconds = compile_kernels(comm)
-    outcome = f"compiled in {duration(seconds)}" if seconds > LOADING else "all there"
+    outcome = f"compiled in {duration(seconds)}" if seconds > LOADING else "already compiled"
     echo(comm, f"kernels of runs, modes and measures: {outcome}")
 
 
@@ -52,17 +52,19 @@ def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
     faults = sorted(set().union(*by_rank))
     if faults:
         ranks = [str(rank) for rank, names_of_rank in enumerate(by_rank) if names_of_rank]
-        verdict = f"the program cannot work here: {', '.join(faults)} on rank {', '.join(ranks)}"
+        verdict = f"the program cannot run here: {', '.join(faults)} on rank {', '.join(ranks)}"
     else:
-        verdict = "all is well"
+        verdict = "no problems"
     return f"{table(rows)}\n{verdict}", not faults
 
 
-COMPILE = argument("--compile", action="store_true", help="compile the kernels now, not in the first run; mpirun helps")
+COMPILE = argument(
+    "--compile", action="store_true", help="compile the kernels now instead of in the first run; faster under mpirun"
+)
 
 VERB = PlainVerb(
     name="doctor",
-    text="versions and what is missing",
+    text="print versions, and report missing or unsuitable packages",
     example="doctor --compile",
     arguments=(COMPILE,),
     function=doctor,

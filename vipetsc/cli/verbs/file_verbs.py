@@ -59,7 +59,7 @@ def write_exports(path: Path) -> list[Path]:
 
 ANALYSE = PlainVerb(
     name="analyse",
-    text="measures of runs already made, from their files",
+    text="measure finished runs again, from their files",
     example="analyse runs/four-band --set analysis.band_stride=1",
     arguments=(
         argument("path", type=Path, nargs="+", metavar="PATH", help="folder of a run or of a sweep, or a run.h5"),
@@ -70,7 +70,7 @@ ANALYSE = PlainVerb(
 
 EXPORT = PlainVerb(
     name="export",
-    text="XDMF (ParaView) beside a run, and curves of any results as CSV",
+    text="write the curves of any results as CSV, and XDMF for ParaView next to a run",
     example="export runs/four-band",
     arguments=(argument("path", type=Path, nargs="+", metavar="PATH", help="folder or file of results"),),
     function=export,

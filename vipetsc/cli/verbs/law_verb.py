@@ -26,7 +26,7 @@ def law_rows(case: LawCase, ranks: int) -> Rows:
 
 VERB = StudyVerb(
     name="law",
-    text="the scattering law of one site, refined; goes on where it was",
+    text="compute the scattering law of one site with adaptive refinement",
     example="law runs/examples/law.toml --set law.tolerance=0.02",
     arguments=(CASE, *OF_STUDIES),
     case=LawCase,

@@ -28,7 +28,7 @@ def optimise_rows(plan: OptimiseCase, ranks: int) -> Rows:
 
 VERB = StudyVerb(
     name="optimise",
-    text="the best design for an objective; goes on where it was",
+    text="search for the best design for an objective",
     example="optimise runs/examples/optimise-clearances.toml --set optimise.budget=40",
     arguments=(case_with("optimise"), *OF_STUDIES),
     case=OptimiseCase,

@@ -37,14 +37,20 @@ def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
 
 VERB = PlainVerb(
     name="paper",
-    text="every figure and claim of the paper, and a report",
+    text="reproduce every figure and claim of the paper, with a report",
     example="paper --quick --only fig09 C7",
     arguments=(
         argument(
-            "--only", nargs="+", default=[], metavar="ID", help="only what these figures (fig05) and claims (C7) need"
+            "--only",
+            nargs="+",
+            default=[],
+            metavar="ID",
+            help="only the steps that these figures (fig05) and claims (C7) need",
         ),
-        argument("--quick", action="store_true", help="coarse grids: minutes, marked on every picture"),
-        argument("--list", action="store_true", help="what is done, what is left and how long it takes"),
+        argument(
+            "--quick", action="store_true", help="coarse grids, which take minutes and are marked in every picture"
+        ),
+        argument("--list", action="store_true", help="list completed and remaining steps with their duration"),
         OUT,
     ),
     function=paper,

@@ -35,7 +35,7 @@ def window(text: str) -> tuple[int, int]:
     """First and last of ``A:B``."""
     first, separator, last = text.partition(":")
     if not (separator and first.isdigit() and last.isdigit()):
-        raise argparse.ArgumentTypeError(f"{text} is not A:B, the first and the last cell, from 1")
+        raise argparse.ArgumentTypeError(f"{text} is not of the form A:B, the first and the last cell, from 1")
     return int(first), int(last)
 
 
@@ -45,13 +45,13 @@ OF_MOVIES: dict[str, Argument] = {
         "--speed",
         type=positive,
         metavar="X",
-        help="of a movie: seconds of the run in a second; 10 s for all if left out",
+        help="movie: simulated seconds per second; by default the movie lasts 10 s",
     ),
-    "start": argument("--from", type=float, metavar="T", dest="start", help="of a movie: its first instant in s"),
-    "stop": argument("--to", type=float, metavar="T", dest="stop", help="of a movie: its last instant in s"),
-    "cells": argument("--cells", type=window, metavar="A:B", help="of a movie: the first and the last cell"),
-    "rate": argument("--rate", type=positive, metavar="N", help="of a movie: frames a second, 15 if left out"),
-    "width": argument("--width", type=int, metavar="PIXELS", help="of a movie: 960 if left out"),
+    "start": argument("--from", type=float, metavar="T", dest="start", help="movie: first time in s"),
+    "stop": argument("--to", type=float, metavar="T", dest="stop", help="movie: last time in s"),
+    "cells": argument("--cells", type=window, metavar="A:B", help="movie: first and last cell"),
+    "rate": argument("--rate", type=positive, metavar="N", help="movie: frames per second; default: 15"),
+    "width": argument("--width", type=int, metavar="PIXELS", help="movie: width in pixels; default: 960"),
 }
 
 
@@ -64,7 +64,7 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     if options.movie:
         wrong = formats - {*MOVIE_FORMATS} or (options.fig and {"--fig"})
         if wrong:
-            raise FolderError(f"--movie: is a gif or an mp4 of its own, without {min(wrong)}")
+            raise FolderError(f"--movie: writes a GIF or MP4 file and cannot be combined with {min(wrong)}")
         # On rank 0: the frames go into one file in their order.
         paths, missing = on_root(comm, lambda: film(pictures, folders[0], options.movie, of_movie, formats))
         echo_paths(comm, paths)
@@ -75,7 +75,7 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     misplaced = [OF_MOVIES[name].flag for name in of_movie]
     misplaced += [f"--format {name}" for name in MOVIE_FORMATS if name in formats]
     if misplaced:
-        raise FolderError(f"{misplaced[0]}: is of a movie; add --movie")
+        raise FolderError(f"{misplaced[0]}: applies only to movies; add --movie")
     echo_paths(comm, draw_pictures(pictures, folders, comm, options.fig, tuple(options.format or ("png",))))
     return DONE
 
@@ -97,7 +97,7 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
             return pictures, folders
 
     if len(folders) > 1:
-        raise FolderError(f"{' '.join(map(str, paths))}: only sweeps and folders of branches can share a page")
+        raise FolderError(f"{' '.join(map(str, paths))}: only sweeps and folders of branches can be drawn on one page")
     return known["run"], folders
 
 
@@ -114,13 +114,16 @@ def film(
     from vipetsc.io.read import open_run
 
     if pictures.source != "run":
-        raise FolderError(f"--movie: {folder} holds no run; of a sweep: run CASE --member ID, then plot that")
+        raise FolderError(
+            f"--movie: {folder} contains no run; for a sweep, repeat a member with run CASE --member ID and plot"
+            f" that run"
+        )
     if not (folder / "run.h5").exists():
-        raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
+        raise FolderError(f"{folder}: contains no run.h5; give the folder of a finished run")
     shot = movie_frames.Shot(quantity, **options)
     if shot.rate > FASTEST or not NARROWEST <= shot.width <= WIDEST:
         raise FolderError(
-            f"--rate {shot.rate:g} --width {shot.width}: at most {FASTEST:g} a second, {NARROWEST} to {WIDEST} pixels"
+            f"--rate {shot.rate:g} --width {shot.width}: at most {FASTEST:g} frames/s, {NARROWEST} to {WIDEST} pixels"
         )
 
     # A format asked for by name is refused where it cannot be written; a default one is left out, with a message.
@@ -149,7 +152,7 @@ def film(
 
 VERB = PlainVerb(
     name="plot",
-    text="pictures of a finished run again, from its files; movies",
+    text="draw pictures again from result files; make movies",
     example="plot runs/four-band --fig dispersion --format pdf",
     arguments=(
         argument(
@@ -160,19 +163,19 @@ VERB = PlainVerb(
             help="folder of a run, a search or a law, or its run.h5, design.h5, law.h5; or folders of branches, whose"
             " branches of one name share a page",
         ),
-        argument("--fig", action="append", metavar="NAME", help="only this figure; may be repeated"),
+        argument("--fig", action="append", metavar="NAME", help="draw only this figure; may be repeated"),
         argument(
             "--format",
             action="append",
             choices=("png", "pdf", "gif", "mp4"),
-            help="png if left out, of movies gif, and mp4 with ffmpeg; may be repeated",
+            help="default: png, for movies gif, and mp4 with ffmpeg; may be repeated",
         ),
         argument(
             "--movie",
             nargs="?",
             choices=("energy", "velocity"),
             const="energy",
-            help="a movie of a run: energy of the bands by cell, or velocity of the hosts",
+            help="make a movie of a run: energy of the bands by cell, or velocity of the host masses",
         ),
         *OF_MOVIES.values(),
     ),

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 SUMMARY = {
     "onset_amplitude": "first contact (N)",
-    "rms_upper": "rms of the upper bands (decades)",
-    "rms_other": "rms of all bands but the driven one (decades)",
-    "worst_dissipated": "largest difference of what is dissipated",
+    "rms_upper": "rms error of the upper bands (decades)",
+    "rms_other": "rms error of all bands except the driven one (decades)",
+    "worst_dissipated": "largest error of the dissipated fraction",
     "cpu_seconds": "CPU time without the simulations (s)",
 }
 
@@ -40,7 +40,7 @@ def predict_rows(case: PredictCase, ranks: int) -> Rows:
         high = max(options.amplitudes)
         amplitudes = f"{len(options.amplitudes)} amplitudes, {low:g} to {high:g} N"
     else:
-        amplitudes = f"{options.count} amplitudes, from that of the first contact to {options.span:g} times it"
+        amplitudes = f"{options.count} amplitudes, from the first contact to {options.span:g} times its amplitude"
 
     site = case.one_site()
     where = f"a clearance of {site.clearance:.5g} m {site.distance} cells from the drive"
@@ -77,7 +77,7 @@ def prediction_table(data: xr.Dataset) -> str:
 
 VERB = StudyVerb(
     name="predict",
-    text="several sites from the answer of one, beside simulations",
+    text="predict several sites from the response of one, and compare with simulations",
     example="predict runs/examples/predict.toml",
     arguments=(CASE, *OF_STUDIES),
     case=PredictCase,

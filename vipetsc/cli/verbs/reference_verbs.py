@@ -18,13 +18,13 @@ def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
     """Print a chapter of the manual as plain text, or a list of them."""
     if options.topic is None:
         echo(comm, on_root(comm, contents))
-        echo(comm, "vipetsc manual TOPIC shows one")
+        echo(comm, "vipetsc manual TOPIC prints one")
         return DONE
 
     names = on_root(comm, lambda: [*itertools.chain(*parts().values()), *studies()])
     if options.topic not in names:
         listed = ", ".join(sorted(names))
-        raise CaseError([Problem("TOPIC", options.topic, f"no chapter; there are {listed}")], "manual")
+        raise CaseError([Problem("TOPIC", options.topic, f"no such chapter; the chapters are {listed}")], "manual")
     echo(comm, on_root(comm, lambda: plain(chapter(options.topic))))
     return DONE
 
@@ -49,16 +49,16 @@ def completion(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -
 
 MANUAL = PlainVerb(
     name="manual",
-    text="a chapter of the manual, as plain text",
+    text="print a chapter of the manual as plain text",
     example="manual case-file",
-    arguments=(argument("topic", nargs="?", metavar="TOPIC", help="a chapter; a list of them if left out"),),
+    arguments=(argument("topic", nargs="?", metavar="TOPIC", help="a chapter; default: list the chapters"),),
     function=manual,
     is_answer=True,
 )
 
 SCHEMA = PlainVerb(
     name="schema",
-    text="the JSON schema of case files, for editors",
+    text="print the JSON schema of case files, for editors",
     example="schema > vipetsc.schema.json",
     function=schema,
     is_answer=True,
@@ -66,9 +66,9 @@ SCHEMA = PlainVerb(
 
 COMPLETION = PlainVerb(
     name="completion",
-    text="what a shell needs to complete verbs, options and files",
+    text="print a script with which a shell completes verbs, options and files",
     example="completion bash > ~/.local/share/bash-completion/completions/vipetsc",
-    arguments=(argument("shell", choices=("bash", "zsh"), help="the shell whose completions are printed"),),
+    arguments=(argument("shell", choices=("bash", "zsh"), help="the shell"),),
     function=completion,
     is_answer=True,
 )

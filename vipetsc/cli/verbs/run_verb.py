@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MEMBER = argument(
     "--member",
     metavar="ID",
-    help="make a member of a sweep (CASE is its file or folder) again, whole: its name, or its number from 0",
+    help="repeat a member of a sweep with all its fields: its name or number; CASE is the sweep's file or folder",
 )
 
 
@@ -36,7 +36,7 @@ def load(options: argparse.Namespace) -> Case:
     if options.member is None:
         return Case.load(options.case, options.set)
 
-    path = Path(options.case or "a sweep's case")
+    path = Path(options.case or "the case of a sweep")
     plan = Sweep.load(path / "case.toml" if path.is_dir() else path)
     number = plan.number(options.member)
     return plan.case(number).varied(name=f"{plan.name}-{plan.ids()[number]}", overrides=options.set)
@@ -91,7 +91,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
         for band, kappa, speed in waves_at(chain.cell, omega or 0.0)
     ]
     drive_end = max(drive.waveform.duration for drive in model.drives)
-    drive_words = f"{drive_end:.6g} s" if drive_end < np.inf else "it goes on"
+    drive_words = f"{drive_end:.6g} s" if drive_end < np.inf else "no end"
     noun = "burst" if all(drive.kind == DEFAULT for _, drive in case.drive.every) else "drive"
 
     # Doubles: fields at every stride-th sample, and what each site has dissipated at all samples. The rest is small.
@@ -103,28 +103,24 @@ def run_rows(case: Case, ranks: int) -> Rows:
     # Ranks on one machine divide its memory among them.
     needed = sum(memory_needed(model, case.output, cost.engine, ranks).values())
     available = memory_available() / ranks
-    memory = f"{needed / 1e9:.3g} GB on a rank"
+    memory = f"{needed / 1e9:.3g} GB per rank"
     if needed > available:
-        memory += f", and here are {available / 1e9:.3g} GB"
+        memory += f", but only {available / 1e9:.3g} GB are available"
 
     time = f"about {duration(cost.seconds)} on {ranks} rank{'s' if ranks > 1 else ''}"
     if cost.episodes:
-        time += f", {duration(cost.contacts)} of it for about {float(f'{cost.episodes:.1g}'):g} contacts"
+        time += f", {duration(cost.contacts)} of this for about {float(f'{cost.episodes:.1g}'):g} contacts"
 
     return [
         *lattice_rows(case),
         ("begins with", case.initial.describe() if case.initial else ""),
         *(("drive", drive.describe() if drive.amplitude else "none") for _, drive in case.drive.every),
-        ("waves at Om", ("; ".join(waves) or "none: in a gap") if omega else ""),
+        ("waves at Om", ("; ".join(waves) or "none: the frequency is in a gap") if omega else ""),
         (f"{noun}, end", f"{drive_words}, {model.end:.6g} s") if model.is_driven else ("end", f"{model.end:.6g} s"),
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
         ("engine", f"{cost.engine}: {cost.note}" if cost.note else cost.engine),
-        (
-            "disk",
-            f"{size / 2**20:.4g} MiB ({writer}), twice that until the run has ended;"
-            f" {free / 2**30:.4g} GiB are free here",
-        ),
+        ("disk", f"{size / 2**20:.4g} MiB ({writer}), twice that during the run; {free / 2**30:.4g} GiB free here"),
         ("memory", memory),
         ("time", time),
         ("faster", cost.faster),
@@ -155,7 +151,7 @@ def run_table(result: "Result", faster: str = "") -> str:
     note = numbers.get("engine_note")
     time = f"{numbers['wall_seconds']:.2f} s wall, {numbers['cpu_seconds']:.2f} s CPU of all ranks"
     if compiled := numbers.get("compile_seconds"):
-        time += f"; {compiled:.1f} s of it compiled kernels, once"
+        time += f"; {compiled:.1f} s of this for compiling kernels, once"
 
     rows = [
         ("energy", energy),
@@ -203,7 +199,7 @@ def measure_where_missing(folders: Sequence[Path]) -> None:
     (folder,) = folders
     run = folder / "run.h5"
     if not run.exists():
-        raise FolderError(f"{folder}: holds no run.h5; a finished run's folder is needed")
+        raise FolderError(f"{folder}: contains no run.h5; give the folder of a finished run")
     try:
         measured = is_measured(folder)
     except FolderError:
@@ -218,7 +214,7 @@ def measure_where_missing(folders: Sequence[Path]) -> None:
 
 VERB = StudyVerb(
     name="run",
-    text="one simulation, its analysis and pictures",
+    text="simulate a case, analyse it and draw pictures",
     example="run runs/examples/diatomic.toml --set drive.amplitude=0.8 --out runs/soft",
     arguments=(CASE, MEMBER, *OF_STUDIES),
     case=Case,

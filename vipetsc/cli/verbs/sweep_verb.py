@@ -50,7 +50,7 @@ def sweep_table(result: "SweepResult") -> str:
         ("ranks busy", ", ".join(f"{100 * busy:.0f} %" for busy in result.busy)),
     ]
     if missing:
-        rows.append(("missing", f"{missing}; stopped on request, the same command goes on"))
+        rows.append(("missing", f"{missing}; stopped on request; the same command continues"))
     else:
         rows.append(("leaves", str(result.folder / "ensemble.h5")))
 
@@ -69,7 +69,7 @@ def relate_to_branches(folders: Sequence[Path]) -> None:
         if reason := outdated(folder):
             raise FolderError(reason)
         if not (folder / "ensemble.h5").exists() and not any(folder.glob("branch-*.h5")):
-            raise FolderError(f"{folder}: holds neither a finished sweep nor branches")
+            raise FolderError(f"{folder}: contains neither a finished sweep nor branches")
     relate_folders(folders)
 
 
@@ -84,7 +84,7 @@ PICTURES = Pictures(
 
 VERB = StudyVerb(
     name="sweep",
-    text="every combination in [sweep]; goes on where it was",
+    text="simulate every combination of the values in [sweep]",
     example="sweep runs/examples/interband-amplitudes.toml --set sweep.ranks=1",
     arguments=(case_with("sweep"), *OF_STUDIES),
     case=Sweep,

@@ -61,7 +61,7 @@ def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> Rows:
 
 VERB = PlainVerb(
     name="validate",
-    text="check a case; print band edges, frequency, end time, size and cost",
+    text="check a case, and print its band edges, frequency, end time, size and cost",
     example="validate runs/examples/three-mass.toml",
     arguments=(CASE, SET),
     function=validate,
