@@ -46,7 +46,7 @@ def version_of(monkeypatch):
         ("mpi4py", "3.0.3", "scripts/recipes/pip"),
         ("numpy", "1.23.5", "pip install 'numpy>=1.24'"),
         ("scipy", "1.9.3", "pip install 'scipy>=1.10'"),
-        ("xarray", "2024.11.0", "pip install 'xarray>=2025.6'"),
+        ("xarray", "2024.9.0", "pip install 'xarray>=2024.10'"),
         ("tomli-w", "0.4.0", "pip install 'tomli-w>=1.0'"),
     ],
 )
@@ -59,11 +59,11 @@ def test_a_package_that_is_too_old(version_of, name, version, remedy):
 
 
 def test_doctor_ends_with_2_where_the_program_cannot_work(in_process, version_of):
-    version_of("xarray", "2024.11.0")
+    version_of("xarray", "2024.9.0")
     version_of("cma", None)
     ended = in_process("doctor")
     assert ended.returncode == 2
-    assert "2024.11.0; FAULT: too old" in ended.stdout
+    assert "2024.9.0; FAULT: too old" in ended.stdout
     assert "FAULT: missing" in ended.stdout
     assert ended.stdout.endswith("the program cannot run here: cma, xarray on rank 0\n")
 

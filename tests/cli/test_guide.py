@@ -13,9 +13,11 @@ from pathlib import Path
 from mpi4py import MPI
 
 import h5py
+import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.figure import Figure
+from PIL import Image
 
 import vipetsc as package
 from tests.conftest import clean_environment
@@ -123,6 +125,21 @@ def test_what_the_guide_says_of_its_lattice_is_so(desk):
         assert ibtet[quiet] == pytest.approx(ibtet[0], rel=1e-12)
         assert ibtet.max() > 10 * ibtet[0]
     assert (desk / "runs/my-sweep/figures/ibtet-over-drive.amplitude.png").exists()
+
+
+@pytest.mark.mpirun
+def test_the_picture_of_the_readme_is_the_one_that_the_program_draws(desk):
+    """The dispersion of the built-in run that the session drew is that of the README, but for versions of fonts."""
+
+    def seen(path: Path) -> np.ndarray:
+        """Return the picture as a reader at a distance sees it: brightness on a coarse grid."""
+        return np.asarray(Image.open(path).convert("L").resize((140, 64)), float)
+
+    drawn = desk / "runs/four-band/figures/dispersion.png"
+    shown = MANUAL / "pictures/four-band.png"
+    assert Image.open(drawn).size == Image.open(shown).size
+    # Of 255: a picture of the same run in an earlier layout differed by 8.
+    assert np.abs(seen(drawn) - seen(shown)).mean() < 1
 
 
 def commands() -> dict[str, list[str]]:

@@ -133,6 +133,10 @@ def test_the_wheel_runs_away_from_the_source(site, tmp_path):
     call(program, "plot", "runs/four-band", "--fig", "ledger", cwd=tmp_path, site=site)
     assert (tmp_path / "runs/four-band/figures/ledger.png").stat().st_size > 5000
     assert "scattering" in call(program, "paper", "--list", cwd=tmp_path, site=site).stdout
+    # As the manual says: its commands name case files in this folder.
+    call(program, "examples", "--all", "--out", "runs/examples", cwd=tmp_path, site=site)
+    read = call(program, "validate", "runs/examples/waveform.toml", cwd=tmp_path, site=site).stdout
+    assert "308 samples, joined by a cubic spline" in read
     shutil.copy2(ROOT / "tests/cli/tiny_paper.py", tmp_path)
     call(sys.executable, "tiny_paper.py", "paper", "fig01", "C8", "C10", cwd=tmp_path, site=site)
     for path in ("design/design.h5", "scattering/ensemble.h5", "report.html"):
@@ -163,6 +167,8 @@ def test_recipes_and_citation_say_what_the_package_says():
     assert re.search(r"^## (\S+)", changes, flags=re.M)[1] == package.__version__
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    (authors,) = re.findall(r"^authors:\n((?: +.*\n)+)", citation, flags=re.M)
+    assert [author["name"] for author in project["authors"]] == re.findall(r"- name: (.*)", authors)
     needed = {re.match(r"[\w-]+", line)[0] for line in [*project["dependencies"], "h5py"]}
 
     # Conda calls some packages by the name of their smaller variant; what it brings besides is not pip's.

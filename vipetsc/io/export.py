@@ -177,5 +177,6 @@ def _write_frame(path: Path, frame: Any) -> Path:
     """Write a pandas ``frame`` as CSV."""
     path.parent.mkdir(exist_ok=True)
     with atomic_write(path) as aside:
-        frame.to_csv(aside, index=False, float_format="%.17g")
+        # The shortest text that reads back as the same number.
+        frame.to_csv(aside, index=False)
     return path
