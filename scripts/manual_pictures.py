@@ -15,7 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from PIL import Image
 
 ROOT = Path(__file__).parents[1]
@@ -115,6 +118,31 @@ def contact_law(case: Case) -> Figure:
     return figure
 
 
+def named_cell(run: xr.Dataset) -> Figure:
+    """Draw the cell and the lattice of a run, with the words of the chapter at host, resonator and stop."""
+    figure = schematics.unit_cell(run, None)
+    axes = figure.axes[0]
+    by_colour: dict[str, list[Rectangle]] = {style.SKY: [], style.ORANGE: []}
+    for patch in axes.patches:
+        colour = to_hex(patch.get_facecolor()).upper()
+        if isinstance(patch, Rectangle) and colour in by_colour:
+            by_colour[colour].append(patch)
+
+    # The largest of the host's boxes is its frame; the others are stops.
+    frame, *stops = sorted(by_colour[style.SKY], key=lambda box: -box.get_width())
+    (resonator,) = by_colour[style.ORANGE]
+    left_stop = min(stops, key=lambda box: (box.get_x(), -box.get_y()))
+    top = frame.get_y() + frame.get_height()
+    for box, word, shift in ((frame, "host", -1.35), (left_stop, "stop", -0.75), (resonator, "resonator", -0.1)):
+        x, y = box.get_x() + box.get_width() / 2, box.get_y() + 0.8 * box.get_height()
+        if box is frame:
+            x, y = box.get_x() + 0.1, top
+        arrow = {"arrowstyle": "-", "color": style.GREY, "lw": 0.6, "shrinkA": 0, "shrinkB": 0}
+        place = (frame.get_x() + frame.get_width() / 2 + shift, top + 0.42)
+        axes.annotate(word, (x, y), place, arrowprops=arrow, ha="center", fontsize=7, color=style.BLACK, zorder=8)
+    return figure
+
+
 def save_small(image: Image.Image, target: Path) -> None:
     """Save a picture as a PNG of few colours, at most ``WIDTH`` wide; raises ValueError for one too large."""
     image = image.convert("RGB")
@@ -150,7 +178,7 @@ def main(arguments: list[str] | None = None) -> int:
         for name, path in DRAWN.items():
             save_small(Image.open(folder / path), PICTURES / f"{name}.png")
         with open_run(folder / "four-band/run.h5") as run:
-            save_small(drawn(folder, lambda: schematics.unit_cell(run, None)), PICTURES / "cell.png")
+            save_small(drawn(folder, lambda: named_cell(run)), PICTURES / "cell.png")
             save_small(drawn(folder, lambda: contact_law(Case.of(run))), PICTURES / "contact-law.png")
     return 0
 

@@ -25,6 +25,7 @@ MANUAL = Path(vipetsc.__file__).parent / "manual"
         (r"\sqrt{\kappa_c/\kappa}", "√(κ_c/κ)"),
         (r"\sqrt{m_j(x)}\, v", "√(mⱼ(x)) v"),
         (r"e^{i \kappa j}", "e^(i κ j)"),
+        (r"e^{i\kappa} z", "e^(iκ) z"),
         (r"k_c x^{n+1}", "k_c xⁿ⁺¹"),
         (r"\dot w/\dot w_-", "ẇ/ẇ₋"),
         (r"w = u_\text{host} - 1", "w = u_host − 1"),

@@ -117,7 +117,8 @@ def _script(mark: str, text: str, is_word: bool) -> str:
     letters = RAISED if mark == "^" else LOWERED
     if text and not is_word and all(character in letters for character in text):
         return "".join(letters[character] for character in text)
-    return mark + (text if FACTOR.fullmatch(text) else f"({text})")
+    is_clear = is_word or len(text) == 1 or (mark == "_" and FACTOR.fullmatch(text))
+    return mark + (text if is_clear else f"({text})")
 
 
 def _factor(text: str) -> str:
