@@ -1,14 +1,15 @@
-"""Waves in phononic lattices whose cells carry vibro-impacts, on PETSc and MPI.
+"""Waves in phononic lattices with local vibro-impacts, on PETSc and MPI.
 
-    Case      what to simulate: ``Case(lattice=..., contacts=..., drive=..., time=...)``, ``Case.load("file.toml")``
-    Sweep     many cases in one: the same tables, and ``sweep=...`` with the values that keys take
+    Case      a case to simulate: ``Case(lattice=..., contacts=..., drive=..., time=...)``, ``Case.load("file.toml")``
+    Sweep     many cases in one: the same tables, and ``sweep=...`` with the values of the swept keys
     simulate  one run of a case, in memory or in a folder
     sweep     every member of a sweep, in memory or in a folder
     analyse   the measures of a run: spectra, energies of the pass bands, entropy
-    open      files of results as xarray datasets
-    CaseError what is wrong with a case: key, value and remedy of every problem
+    open      result files as xarray datasets
+    CaseError raised for an invalid case: key, value and remedy of every problem
 
-A run of the built-in lattice with a weaker burst, and its largest speed by cell and mass:
+This example simulates a shorter version of the built-in lattice, and prints the largest speed of each mass in each
+cell:
 
     from vipetsc import Case, simulate
 
@@ -45,5 +46,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """The names that are loaded late among the others: completion and ``help`` ask for them."""
+    """All names, including those that are loaded late, for completion and ``help``."""
     return sorted({*globals(), *__all__})

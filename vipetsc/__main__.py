@@ -1,4 +1,4 @@
-"""Front door: ``python -m vipetsc VERB``, alone or under ``mpirun -n N``; PETSc options after ``--``."""
+"""Entry point: ``python -m vipetsc VERB``, on one process or under ``mpirun -n N``; PETSc options follow ``--``."""
 
 import logging
 import os
@@ -17,7 +17,7 @@ def main(arguments: list[str] | None = None) -> int:
     end_on_request()
     check_standard_streams()
 
-    # One thread a rank: the ranks are the parallelism, and threads would fight over the cores.
+    # One thread per rank: further threads would compete with the other ranks for the cores.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     # Pictures go into files: the backend that a notebook names for its windows need not even be there.

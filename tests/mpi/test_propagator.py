@@ -24,7 +24,7 @@ def test_same_bits_with_clusters_across_borders(folder, ends, law):
 
 @pytest.mark.parallel([2, 4])
 def test_same_bits_where_the_band_is_wider_than_a_rank(folder):
-    """Samples .8 ms apart: the band reaches over several ranks of a few cells."""
+    """Samples 0.8 ms apart: the band reaches over several ranks of a few cells."""
     case = small_case(
         lattice={"cells": 11},
         contacts={"sites": [3, 8]},

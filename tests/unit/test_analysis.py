@@ -119,7 +119,7 @@ def test_cells_before_and_after_the_first_site_are_measured_apart(run):
 
 
 def test_samples_too_rare_for_the_bands_are_named_and_spectra_left_out(run):
-    # The top band ends at 3645 rad/s: a sample every .8 ms resolves it, one every 1 ms does not.
+    # The top band ends at 3645 rad/s: a sample every 0.8 ms resolves it, one every 1 ms does not.
     resolved = analyse(run.isel(time=slice(None, None, 4)))
     aliased = analyse(run.isel(time=slice(None, None, 5)))
 

@@ -38,11 +38,11 @@ def test_a_criterion_is_met_within_its_bounds_alone(low, width, value):
 
 
 def test_a_criterion_of_counts_is_met_from_its_number_on():
-    criterion = Criterion("share of curves", "of", (4, 6), "", "")
+    criterion = Criterion("fraction of curves", "of", (4, 6), "", "")
     assert criterion.met(4 / 6)
     assert criterion.met(2 / 3)
     assert not criterion.met(0.5)
-    assert str(criterion) == "share of curves: at least 4 of 6"
+    assert str(criterion) == "fraction of curves: at least 4 of 6"
 
 
 @pytest.mark.parametrize(
@@ -94,25 +94,25 @@ SPECIFIED = """
 C1 | ridge's largest distance from the optical branch | <= | 1
 C1 | loudest wavenumber's distance from 5 pi/9 | <= | 1
 C2 | contact episodes at low amplitude | <= | 0
-C2 | largest share of the energy that changes its wavenumber | <= | 0.01
-C3 | share at new wavenumbers, medium amplitude | >= | 0.1
-C3 | share at new wavenumbers, medium over low amplitude | >= | 10
-C3 | share within 2 % of the top edge from the Bloch branches | >= | 0.95
+C2 | largest fraction of the energy that changes its wavenumber | <= | 0.01
+C3 | fraction at new wavenumbers, medium amplitude | >= | 0.1
+C3 | fraction at new wavenumbers, medium over low amplitude | >= | 10
+C3 | fraction within 2 % of the top edge from the Bloch branches | >= | 0.95
 C4 | new wavenumbers, high over medium amplitude | <= | 1
-C4 | share of the incident energy reflected, high amplitude | >= | 0.5
-C5 | smallest share in bins 7 and 8, Fourier | >= | 0.99
-C5 | smallest share in bins 7 and 8, wavelet | >= | 0.85
+C4 | fraction of the incident energy reflected, high amplitude | >= | 0.5
+C5 | smallest fraction in bins 7 and 8, Fourier | >= | 0.99
+C5 | smallest fraction in bins 7 and 8, wavelet | >= | 0.85
 C6 | largest error of the reconstructed kinetic energy after the drive | <= | 0.01
 C7 | floor of the normalised entropy | <= | 0.1
-C7 | share of configurations with an abrupt rise | of | 4 6
-C7 | share of configurations with the peak at 0.9 to 1.8 N | of | 4 6
+C7 | fraction of configurations with an abrupt rise | of | 4 6
+C7 | fraction of configurations with the peak at 0.9 to 1.8 N | of | 4 6
 C7 | normalised entropy at 10 N behind the peak, 3 sites or more | <= | 0.17
-C7 | share of configurations of spread sites with adjusted R^2 >= 0.95 over 4 points or more | of | 4 6
-C7 | share of configurations of neighbouring sites with adjusted R^2 >= 0.95 over 4 points or more | of | 4 6
-C8 | share of curves that rise, peak and fall by half | of | 30 36
-C8 | share of curves with adjusted R^2 >= 0.9 over 4 points or more | of | 30 36
-C9 | share of configurations with larger error bars from 10 N on than at the peak | of | 4 6
-C9 | share of configurations with larger error bars from 10 N on than without contact | of | 4 6
+C7 | fraction of configurations of spread sites with adjusted R^2 >= 0.95 over 4 points or more | of | 4 6
+C7 | fraction of configurations of neighbouring sites with adjusted R^2 >= 0.95 over 4 points or more | of | 4 6
+C8 | fraction of curves that rise, peak and fall by half | of | 30 36
+C8 | fraction of curves with adjusted R^2 >= 0.9 over 4 points or more | of | 30 36
+C9 | fraction of configurations with larger error bars from 10 N on than at the peak | of | 4 6
+C9 | fraction of configurations with larger error bars from 10 N on than without contact | of | 4 6
 C10 | lambda at the optimum of a grid of 0.1 | within | 0.05 0.15
 C10 | eta at the optimum of a grid of 0.1 | within | 0.45 0.55
 C10 | u2 and u3 out of phase on band 2 at the paper's cell (1 = yes) | >= | 1
@@ -123,8 +123,8 @@ C12 | medium over low amplitude* | >= | 1
 C12 | medium over high amplitude* | >= | 1
 C13 | largest error of the mean over the record | <= | 0.01
 C13 | mean error over a period of the drive, largest of the runs | <= | 0.01
-C13 | largest share outside the paper's bands and gaps | <= | 0.01
-C13 | largest difference of a part's share from that in the space-time spectrum | <= | 0.01
+C13 | largest fraction outside the paper's bands and gaps | <= | 0.01
+C13 | largest difference of a part's fraction from that in the space-time spectrum | <= | 0.01
 C13 | bound on the relative error of the modal energies' sum at any sample | <= | 1e-6
 C14 | maximum with one site* | within | 0.05 0.15
 C14 | maximum with one site over that with five* | <= | 1
@@ -142,11 +142,11 @@ C16 | difference of the exponents* | <= | 0.2
 C16 | mean factor between transfer and slope* | <= | 2
 C17 | I: correlation of host and resonator* | <= | -0.9
 C17 | II: correlation with the motion without contact* | >= | 0.9
-C17 | III: largest share of energy above the driven band* | >= | 0.1
+C17 | III: largest fraction of energy above the driven band* | >= | 0.1
 C17 | IV: correlation of host and resonator* | >= | 0.99
-C17 | IV: share of energy above the driven band* | <= | 0.01
+C17 | IV: fraction of energy above the driven band* | <= | 0.01
 C18 | rms of the upper bands' energy at the end, in decades* | <= | 0.06
-C18 | largest error of the dissipated share* | <= | 0.04
+C18 | largest error of the dissipated fraction* | <= | 0.04
 C18 | amplitudes with contact on one side alone* | <= | 0
 """
 

@@ -23,8 +23,8 @@ from vipetsc.spectra import Parts, dispersion, part_energies
 
 OF_RECORD = "largest error of the mean over the record"
 OF_PERIOD = "mean error over a period of the drive"
-OUTSIDE = "largest share outside the paper's bands and gaps"
-IN_SPECTRUM = "largest difference of a part's share from that in the space-time spectrum"
+OUTSIDE = "largest fraction outside the paper's bands and gaps"
+IN_SPECTRUM = "largest difference of a part's fraction from that in the space-time spectrum"
 # Samples of the fields: 2000 Hz resolve the top band, which ends at 580 Hz.
 TIME = np.arange(1500) * 2.5e-4
 

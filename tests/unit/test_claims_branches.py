@@ -34,7 +34,7 @@ def put_branch(
     energy = 0.03 * np.concatenate([np.geomspace(0.1, 1, 5), np.geomspace(1.01, 1e10, 100)])
     region = np.select([energy <= 0.03, energy < 0.05, energy < 3e3], [1, 2, 3], 4)
 
-    # Hertz's law has no highest frequency but a slope of .1 far up.
+    # Hertz's law has no highest frequency but a slope of 0.1 far up.
     last = {"bilinear": BILINEAR_LIMIT * limit, "hertz": 21000.0}[law]
     last_slope = {"bilinear": 0.0, "hertz": 0.1 * limit}[law]
     frequency = np.where(region == 1, 474.25, last * (energy / energy[-1]) ** 0.1)

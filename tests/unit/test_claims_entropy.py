@@ -19,9 +19,9 @@ SITES = [1, 2, 3, 5, 10, 20]
 ONSET = 0.7
 SPREAD = "scattering"
 NEIGHBOURS = "scattering-neighbours"
-SPREAD_FIT = "share of configurations of spread sites with adjusted R^2 >= 0.95 over 4 points or more"
-CURVES_FIT = "share of curves with adjusted R^2 >= 0.9 over 4 points or more"
-LARGER_ERRORS = "share of configurations with larger error bars from 10 N on than at the peak"
+SPREAD_FIT = "fraction of configurations of spread sites with adjusted R^2 >= 0.95 over 4 points or more"
+CURVES_FIT = "fraction of curves with adjusted R^2 >= 0.9 over 4 points or more"
+LARGER_ERRORS = "fraction of configurations with larger error bars from 10 N on than at the peak"
 
 EntropyOf = Callable[[Case], float]
 

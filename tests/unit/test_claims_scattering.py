@@ -106,7 +106,7 @@ def test_scattering_as_the_paper_has_it_holds(tmp_path):
     for found in claims.values():
         assert found.verdict == HOLDS, found
 
-    high = claims["C4"].value["share of the incident energy reflected, high amplitude"]
+    high = claims["C4"].value["fraction of the incident energy reflected, high amplitude"]
     assert high == pytest.approx(PAPER_REFLECTED[2], rel=1e-3)
     assert "67 %" in claims["C6"].reason
     wavenumber = claims["C1"].value["wavenumber of the drive on the optical branch (rad/cell)"]

@@ -261,7 +261,7 @@ def pull(tracker: ImpactTracker, start: float) -> None:
     """Let the second site of a tracker go from ``start`` m back to its clearance, so fast that the contact pulls."""
     tracker.end[1] = start, 0.0, 0.0
     tracker.accept_step(STEP)
-    # g = 1 + .45 (-.2/.05) < 0.
+    # g = 1 + 0.45 (-0.2/0.05) < 0.
     tracker.end[1] = -CLEARANCE, 0.2, 0.0
     tracker.accept_step(STEP)
 

@@ -157,7 +157,7 @@ def test_a_power_law_is_fitted_from_the_largest_value_on():
 
 
 def linear_wave(case: Case, peak: np.ndarray) -> xr.Dataset:
-    """A run in which the hosts' velocities peak at the times ``peak`` (cell,), those of the resonators .1 s later."""
+    """A run in which the hosts' velocities peak at the times ``peak`` (cell,), those of the resonators 0.1 s later."""
     cell = four_band()
     time = np.linspace(0, 1, 201)
     velocity = np.zeros((201, 30, 4))

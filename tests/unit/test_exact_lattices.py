@@ -133,7 +133,7 @@ def test_free_motion_and_impulses_are_the_exponential(ends, differing, damped, p
     for cluster in range(len(groups.first) - 1):
         expand_free_motion(tables, cluster, records.columns, taylor)
 
-    # At .7 of the step.
+    # At 0.7 of the step.
     step = exponential(model.chain, 0.7 * series.interval)
     exact = (step @ state.ravel()).reshape(2 * d, n)
     forms = displacement_forms(model, groups.numbers)
@@ -145,7 +145,7 @@ def test_free_motion_and_impulses_are_the_exponential(ends, differing, damped, p
     masses = model.chain.masses().reshape(n, d)
     powers = 0.7 ** (1 + np.arange(response.shape[2]) * (1 if damped else 2))
     for i, form in enumerate(forms):
-        # An impulse on the DoF at .3 of the step.
+        # An impulse on the DoF at 0.3 of the step.
         moments = 0.7 ** np.arange(2 * series.terms)[None]
         out = np.zeros((2 * d, n))
         apply_impulses(tables, i, moments, out)

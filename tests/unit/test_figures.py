@@ -278,7 +278,7 @@ def test_warnings_about_a_run_stand_below_its_pictures_each_once(tmp_path):
     write_run(tmp_path / "run.h5")
     plain = height_with_warnings(tmp_path, [])
     wide = "a sentence that is wider than the picture " * 4
-    # Lines are about .16 inches high: three at least, and not more than four where there are many.
+    # Lines are about 0.16 inches high: three at least, and not more than four where there are many.
     assert height_with_warnings(tmp_path, ["one", wide, "one"]) >= plain + 3 * 0.15 * SCREEN
     many = [f"warning {number}" for number in range(300)]
     assert height_with_warnings(tmp_path, many) <= plain + 4 * 0.17 * SCREEN

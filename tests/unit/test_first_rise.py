@@ -74,7 +74,7 @@ def test_a_hump_next_to_a_dip_in_one_quarter_of_a_step_is_found():
 
 
 def test_a_hump_within_the_interpolants_error_comes_before_the_root_behind_it():
-    """Slope (x - .05)(x - .15), so that .05 is a largest value and the gap rises again within the same quarter."""
+    """Slope (x - 0.05)(x - 0.15), so that 0.05 is a largest value and the gap rises again within the same quarter."""
     rise = Polynomial.fromroots([0.05, 0.15]).integ().coef
     # The coefficient of order 5 makes the error 1e-5, ten times the gap's largest value.
     coefficients = np.append(rise, [0.0, 1e-3])
@@ -87,7 +87,7 @@ def test_a_hump_within_the_interpolants_error_comes_before_the_root_behind_it():
 
 
 def test_the_second_hump_of_a_gap_is_found():
-    """Slope -(x - .1)(x - .45)(x - .9): the first largest value is 2e-3 below zero, the second 2.3e-3 above."""
+    """Slope -(x - 0.1)(x - 0.45)(x - 0.9): the first largest value is 2e-3 below zero, the second 2.3e-3 above."""
     slope = -Polynomial.fromroots([0.1, 0.45, 0.9])
     coefficients = np.append(slope.integ().coef, 0.0)
     coefficients[0] = -2e-3 - slope.integ()(0.1)
@@ -103,7 +103,7 @@ def test_the_second_hump_of_a_gap_is_found():
     ("largest_in_errors", "expected"), [(0.5, EXTREMUM), (-0.5, EXTREMUM), (-2, NONE), (2, CROSSING)]
 )
 def test_a_gap_that_nearly_closes_is_left_to_the_flow(largest_in_errors, expected):
-    """A largest value at .4, within the interpolant's error of zero, is an extremum; beyond it, a change or none."""
+    """A largest value at 0.4, within the interpolant's error of zero, is an extremum; beyond it, a change or none."""
     coefficients = np.array([0.0, 0.8, -1.0, 0.0, 0.0, -0.02])
     turns = Polynomial(coefficients).deriv().roots()
     inside = (turns.imag == 0) & (turns.real > 0) & (turns.real < 1)

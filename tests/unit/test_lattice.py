@@ -81,7 +81,7 @@ def test_published_drive_frequencies_and_speeds():
 
 
 def test_the_stiffness_of_a_contact_is_hertzs():
-    """Two spheres of 100 MPa and 5 mm have 2 E sqrt(r)/(3 (1 - nu^2)): 3 * .91 = 2.73."""
+    """Two spheres of 100 MPa and 5 mm have 2 E sqrt(r)/(3 (1 - nu^2)): 3 * 0.91 = 2.73."""
     assert contact_stiffness(1e8, 0.005, 0.3) == pytest.approx(2e8 * np.sqrt(0.005) / 2.73)
 
 

@@ -74,7 +74,7 @@ def test_a_pair_of_crossings_inside_one_step_is_found():
 
 
 def test_a_start_that_has_just_landed_is_no_crossing():
-    """s (s - .4), raised by the rounding of a landing: on zero and falling at first."""
+    """s (s - 0.4), raised by the rounding of a landing: on zero and falling at first."""
     coefficients = np.array([0.0, -0.2, 0.6]) + 1e-12
 
     assert first_upcrossing(coefficients) == 0.0

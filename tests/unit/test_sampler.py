@@ -9,7 +9,7 @@ from vipetsc.studies.sampler import CmaEs, Nsga2, front, knee, smooth
 
 
 def bowl(points):
-    """Return losses that are least at (.3, .4, ...), each direction ten times as steep as the one before."""
+    """Return losses that are least at (0.3, 0.4, ...), each direction ten times as steep as the one before."""
     number = np.arange(points.shape[1])
     return ((points - (0.3 + 0.1 * number)) ** 2 * 10.0**number).sum(axis=1, keepdims=True)
 

@@ -98,7 +98,7 @@ def test_best_velocities_where_bands_three_and_four_touch(found, reading):
 
 
 def test_paper_choice(found):
-    """C10: (.1, .5) is what a grid of spacing .1 gives; finer, .45 as printed and .475 calibrated."""
+    """C10: (0.1, 0.5) is what a grid of spacing 0.1 gives; finer, 0.45 as printed and 0.475 calibrated."""
     tenths = np.round(np.linspace(0.1, 0.9, 9), 12)
     for reading, eta in (("printed", 0.45), ("calibrated", 0.475)):
         row, column = search_cells(reading, tenths, tenths, KAPPA).optimum("weighted")

@@ -126,7 +126,7 @@ def test_what_comes_back_in_a_run_is_what_is_stated(strength):
 
 @pytest.mark.slow
 def test_the_end_that_is_chosen_keeps_its_bound():
-    """Where an end was chosen by the spectrum's main lobe alone, .8 % came back from it."""
+    """Where an end was chosen by the spectrum's main lobe alone, 0.8 % came back from it."""
     of = case({"cells": 1200, "absorbing": {}}, BURST | {"cell": 400})
     source, sections = source_and_sections(of)
     (back,) = returning(source, sections[0], [0])

@@ -142,7 +142,7 @@ def test_a_picture_is_drawn_from_the_file(branch, tmp_path):
 
 
 def test_orbits_have_the_energies_that_are_asked_for(tmp_path):
-    """Between its two folds, .0264 and .02934 J, the branch passes an energy three times."""
+    """Between its two folds, 0.0264 and 0.02934 J, the branch passes an energy three times."""
     branch = follow(tmp_path / "a", energy=[0.0, 0.05], orbits_at=[0.028, 0.0316, 9.0], locate=False)
 
     # Those asked for are appended to the orbits that every branch samples.

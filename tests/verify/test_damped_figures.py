@@ -37,7 +37,7 @@ def test_bands_of_a_damped_cell_show_its_decay():
     rates = np.asarray(decay.lines[0].get_xdata())
     omega = np.asarray(decay.lines[0].get_ydata())
 
-    # A loss of .02 is twice the damping ratio.
+    # A loss of 0.02 is twice the damping ratio.
     _, frequency, speed = max_group_velocity(cell, 2)
     in_band = np.interp(frequency / 1e3, omega, rates)
     assert in_band == pytest.approx(0.01 * frequency / speed, rel=1e-2)

@@ -105,7 +105,7 @@ class ForcedCell:
 @pytest.mark.slow
 @pytest.mark.parametrize(("force", "last"), [(19.5, 61), (25.0, 119)])
 def test_stability_of_a_dissipative_state_is_that_of_its_period_map(force, last):
-    """r = .7, two cells: an unstable and a stable state, after a state without contact at the same frequency."""
+    """r = 0.7, two cells: an unstable and a stable state, after a state without contact at the same frequency."""
     omega = 1700.0
     of = nfrc_case({"cells": 2}, {"sites": [1], "restitution": 0.7}, source="force", infinite=False, harmonics=last,
               range=[force, 26.0], fixed=[omega], largest_step=0.5)  # fmt: skip

@@ -107,8 +107,8 @@ def peak_time(time: np.ndarray, values: np.ndarray) -> float:
 def test_a_struck_chain_sends_a_solitary_wave(tmp_path):
     """The wave is 1.2 % faster than Nesterenko's long wave, at any force, and five beads move in it.
 
-    His V = .6802 a (2E/(a rho^(3/2) (1 - nu^2)))^(1/3) F^(1/6) is that of ``theory``. SciPy's DOP853 on 40 beads, in
-    units of A = m = 1, gives V = .90552 F^(1/6), and speeds of .0087, .326, 1, .326, .0087 of the largest.
+    His V = 0.6802 a (2E/(a rho^(3/2) (1 - nu^2)))^(1/3) F^(1/6) is that of ``theory``. SciPy's DOP853 on 40 beads, in
+    units of A = m = 1, gives V = 0.90552 F^(1/6), and speeds of 0.0087, 0.326, 1, 0.326, 0.0087 of the largest.
     """
     n = 40
     ratios = []

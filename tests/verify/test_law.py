@@ -244,7 +244,7 @@ def test_matched_clearances_meet_each_site_at_the_best_z():
     """D_k = A env(s_k) sqrt(T^k)/z* (SPEC section 13), where z* has the largest U/(1 - T)."""
     law = law_by_hand()
     z, transmitted = law.matched()
-    # U/(1 - T) is .5 there and .4 at the onset.
+    # U/(1 - T) is 0.5 there and 0.4 at the onset.
     assert z == 1.2
     assert transmitted == 0.7
 
@@ -311,7 +311,7 @@ def test_a_case_without_sites_gives_the_clearance_and_the_bursts_length(tmp_path
 
 @pytest.mark.slow
 def test_matched_sites_outdo_the_papers(tmp_path):
-    """Ten matched sites with r = .9 send more than .45 of the work at 24.33 N to upper bands; the paper's five .34."""
+    """Ten matched sites with r = 0.9 send more than 0.45 of the work at 24.33 N to upper bands, the paper's 0.34."""
     amplitude = 24.33
     contacts = {"restitution": 0.9, "sites": 10}
     table = {"contacts": contacts, "law": {"largest": 1.4, "samples": 1, "tolerance": 0.05, "finest": 0.02}}

@@ -30,7 +30,7 @@ TABLE = {
 
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory):
-    """Amplitudes at which the linear wave reaches .6, .85, 1.02, 1.1, 1.25 and 3 times the nearest clearance."""
+    """Amplitudes at which the linear wave reaches 0.6, 0.85, 1.02, 1.1, 1.25 and 3 times the nearest clearance."""
     folder = tmp_path_factory.mktemp("members")
 
     # How near the wave of 1 N comes is measured by the run that the sweep itself makes.

@@ -60,7 +60,7 @@ def test_modal_energies_of_the_built_in_run(builtin):
     assert parts.modes.frequency[at_ends] == pytest.approx([2034.825] * 2, abs=1e-3)
 
 
-# At .25 s, in the midst of the first contacts, one sample changes the share by a tenth: SPEC's value there is left out.
+# At 0.25 s, amid the first contacts, one sample changes the share by a tenth: SPEC's value there is left out.
 @pytest.mark.slow
 @pytest.mark.parametrize(("time", "share"), [(0.3, 0.1113), (0.4, 0.2351), (0.5, 0.3365), (0.6, 0.3385)])
 def test_upper_bands_of_the_built_in_run_over_its_work(builtin, time, share):

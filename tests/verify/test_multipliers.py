@@ -126,7 +126,7 @@ def test_hills_multipliers_of_a_breather_are_those_of_floquet(tmp_path):
     """The largest pair is off the real axis and agrees to 1e-6 with that of the whole lattice's motion.
 
     What the harmonics left out change is 1e-7, and what Hill's eliminated unknowns change is less than 1e-6. In the 14
-    cells other pairs of 1.05 and less lie near the circle, whose zeros and poles are .01 of a strip apart.
+    cells other pairs of 1.05 and less lie near the circle, whose zeros and poles are 0.01 of a strip apart.
     """
     case = breather_case(system="condensed", points=1, truncation=1e-7, multipliers=2)
     (branch,) = follow_all(case, tmp_path, MPI.COMM_SELF)

@@ -1,7 +1,7 @@
 """Two masses of which one meets a stop, forced and damped: the third example of NLvib (Krack and Gross 2019).
 
-Masses 1 kg, springs 1 N/m from one to the other and from the second to the ground, dampers .03 of the springs, a stop
-of 100 N/m for the first mass beyond 1 m on one side, .1 N cos(Om t) on the second. No case file has dampers of a
+Masses 1 kg, springs 1 N/m from one to the other and from the second to the ground, dampers 0.03 of the springs, a stop
+of 100 N/m for the first mass beyond 1 m on one side, 0.1 N cos(Om t) on the second. No case file has dampers of a
 system of one's own, or a force on it, so that the equations of ``nfrc`` are given the compliance here; stops act on
 both sides, of which an offset takes one out of reach.
 M. Krack, J. Gross, Harmonic Balance for Nonlinear Vibration Problems, Springer 2019; github.com/maltekrack/NLvib.
@@ -129,7 +129,7 @@ def periodic_orbit(omega: float, state: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 @pytest.fixture(scope="module")
 def attractor() -> np.ndarray:
-    """State of the orbit at .635 rad/s to which motions settle."""
+    """State of the orbit at 0.635 rad/s to which motions settle."""
     state = np.array([-1.0, -1.0, 0.0, 0.0])
     # As many periods as damping needs to bring Newton's method near it.
     for _ in range(80):
@@ -142,7 +142,7 @@ def attractor() -> np.ndarray:
     ("omega", "steps", "stability"), [(0.635, 1, "stable"), (0.6, 5, "a pair grows"), (0.74, 15, "flips")]
 )
 def test_shooting_and_harmonic_balance_find_the_published_stability(attractor, omega, steps, stability):
-    """Past the folds orbits are stable at .635 rad/s; at .6 a pair grows, at .74 one turns over (-mu > 1)."""
+    """Past the folds orbits are stable at 0.635 rad/s; at 0.6 a pair grows, at 0.74 one turns over (-mu > 1)."""
     state = attractor
     for frequency in np.linspace(0.635, omega, steps):
         state, multipliers = periodic_orbit(frequency, state)

@@ -114,7 +114,7 @@ def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, mo
     requests = []
 
     class Law:
-        """A law whose best z is 1.25, where .64 of the energy is transmitted."""
+        """A law whose best z is 1.25, where 0.64 of the energy is transmitted."""
 
         def matched(self):
             return 1.25, 0.64
@@ -137,7 +137,7 @@ def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, mo
 
     run, result = simulated(linear_case(small_case()))
     envelope = LinearRun.of(run, result.statistics, (), ()).envelope
-    # The square roots of .64 to the powers 0, 1 and 2.
+    # The square roots of 0.64 to the powers 0, 1 and 2.
     matched = 24.33 * envelope[np.array([6, 12, 13]) - 1] / 1.25 * [1, 0.8, 0.64]
     first, second = datasets(tmp_path / "optimum.h5")["parameter"]
     assert first == pytest.approx(2e-4)

@@ -76,7 +76,7 @@ def test_what_has_not_settled_has_a_drift_and_no_amplitude(steady_run):
     assert 1e-14 < measured["steady_drift/tip"] < 1e-5
     assert "more than 1e-14" in json.loads(measured.attrs["warnings"])[-1]
 
-    # The ramp takes 10 periods, and three windows of 10 follow: 40 periods are .279 s.
+    # The ramp takes 10 periods, and three windows of 10 follow: 40 periods are 0.279 s.
     short = analyse(steady_run.isel(time=slice(0, 1350)), ["motion"])
     assert np.isnan(short["steady_velocity/tip"])
     assert np.isnan(short["steady_drift/tip"])
@@ -98,7 +98,7 @@ def test_peak_and_rms_are_those_of_the_samples(steady_run):
 
     assert float(measured["peak_velocity/tip"]) == np.abs(velocity).max()
     assert float(measured["rms_velocity/tip"]) == pytest.approx(np.sqrt((velocity**2).mean()), rel=1e-14)
-    last = velocity[-1396:]  # 40 periods of .00698 s
+    last = velocity[-1396:]  # 40 periods of 0.00698 s
     assert np.sqrt((last**2).mean()) == pytest.approx(float(measured["steady_velocity/tip"]) / np.sqrt(2), rel=2e-3)
 
 

@@ -74,7 +74,7 @@ def test_below_the_onset_the_run_is_linear(prediction):
 
 
 def test_the_small_prediction_is_near_the_simulation(prediction):
-    """Nothing is fitted: upper bands are met within .15 decades, what is dissipated within .05 of the energy."""
+    """Nothing is fitted: upper bands are met within 0.15 decades, what is dissipated within 0.05 of the energy."""
     data = prediction.data
 
     assert data.attrs["rms_upper"] < 0.15

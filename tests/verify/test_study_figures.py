@@ -277,7 +277,7 @@ CALIBRATED = {"reading": "calibrated", "wavenumber": 5 * np.pi / 9}
 @pytest.mark.parametrize("average", AVERAGES)
 @pytest.mark.parametrize(("column", "sites"), [(0, 2), (1, 3)])
 def test_entropy_curves_and_error_bars_are_the_ensembles(curves, entropy_figures, average, column, sites):
-    """Curves are normalised to [.01, 1], their error bars with them; the reading that is not meant is grey."""
+    """Curves are normalised to [0.01, 1], their error bars with them; the reading that is not meant is grey."""
     assert len(entropy_figures) == 2 * 2 * len(AVERAGES)
     grid = np.reshape(entropy_figures[f"calibrated-5pi-9-{average}"].axes, (2, 2))
     upper, lower = grid[:, column]

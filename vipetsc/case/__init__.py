@@ -1,9 +1,9 @@
-"""Cases, which say what to simulate: strict TOML in, a typed, frozen and fully resolved case out.
+"""Cases, which define simulations: strict TOML is read into a typed, immutable and fully resolved case.
 
 ``case_file`` turns a TOML file into a case, with all problems at once (``CaseFile`` is the base of every verb's case);
 ``schema`` holds the sections of a lattice run, ``resolve`` how their choices become numbers; ``case``, ``sweep``,
-``nnm``, ``law`` and ``design`` are the cases of the verbs, with what must hold between their keys. For keys and units
-see the manual.
+``nnm``, ``law`` and ``design`` are the cases of the verbs, with the conditions between their keys. The manual lists
+keys and units.
 """
 
 from vipetsc.case.case import Case, Model, case_id

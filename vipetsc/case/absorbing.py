@@ -1,4 +1,4 @@
-"""Ends that absorb: what of a drive's energy comes back from them, and the first of a few ends that keep a bound."""
+"""Absorbing ends: the fraction of a drive's energy that they reflect, and the first end that satisfies a bound."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,13 +13,13 @@ from vipetsc.lattice.chain import Ends
 from vipetsc.lattice.ends import EndSection, absorbing_section, reflection
 from vipetsc.lattice.sent import Source
 
-# Cells of an absorbing end that are tried, and logarithms of the energy that is left of a wave on both of its passes.
+# Numbers of cells of an absorbing end that are tried, and logarithmic losses of a wave over both of its passes.
 LENGTHS = (10, 20, 40, 80, 160, 320, 640)
 LOSSES = (8.0, 10.0, 13.0, 17.0)
 
 
 def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) -> list[Source]:
-    """The ``drives`` of a lattice as sources of waves: a wall that several springs are tied to is one."""
+    """The ``drives`` of a lattice as sources of waves; a wall attached to several springs is a single source."""
     loads: dict[tuple[Waveform, int], np.ndarray] = {}
     for drive in with_unit_amplitude(drives):
         load = loads.setdefault((drive.waveform, drive.cell), np.zeros(cell.dofs))
@@ -28,7 +28,7 @@ def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) 
 
 
 def with_unit_amplitude(drives: Sequence[Drive]) -> tuple[Drive, ...]:
-    """The ``drives`` as far as fractions of energies depend on them: the amplitude of a single burst cancels."""
+    """The ``drives`` normalised for fractions of energies, from which the amplitude of a single burst cancels."""
     unit = []
     for drive in drives:
         waveform = drive.waveform
@@ -50,12 +50,12 @@ def sections_of(table: AbsorbingTable, cell: UnitCell, ends: Ends, cells: int, s
 
 
 def reflected_at(omega: float, sections: Sequence[EndSection]) -> float:
-    """Largest fraction of a wave's energy at ``omega`` (rad/s) that comes back from a section; NaN in a gap."""
+    """Largest fraction of a wave's energy at ``omega`` (rad/s) that a section reflects; NaN in a gap."""
     return max(reflection(chain, omega, cells, end) for chain, cells, end in sections)
 
 
 def reflected(sources: Sequence[Source], sections: Sequence[EndSection]) -> float:
-    """Fraction of what ``sources`` send to the ``sections`` that comes back, largest with that of each endless sine.
+    """Fraction of the energy from ``sources`` that the ``sections`` reflect; each endless sine counts at its frequency.
 
     NaN if nothing arrives.
     """
@@ -74,7 +74,7 @@ def designed_end(
 ) -> AbsorbingTable:
     """``table`` with a length, up to a third of ``cells``, and a strength; raises ValueError if none will do.
 
-    What comes back is counted over all ``drives`` together.
+    The reflected fraction counts all ``drives`` together.
     """
     waves = [wave for drive in drives for wave in waves_at(cell, drive.waveform.frequency)]
     if not waves:
@@ -92,9 +92,9 @@ def designed_end(
 
 
 class TriedEnd(NamedTuple):
-    """An end of some ``cells`` and a ``strength``, from which the fraction ``back`` comes back.
+    """An end with ``cells`` cells and a ``strength``, which reflects the fraction ``back``.
 
-    Where none of those that were tried keeps the bound, ``cells`` is 0 and ``back`` the least of them.
+    If no tried end satisfies the bound, ``cells`` is 0 and ``back`` is the smallest reflected fraction.
     """
 
     cells: int
@@ -108,7 +108,7 @@ class TriedEnd(NamedTuple):
 def _first_end(
     table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: tuple[Drive, ...], cells: int, speed: float
 ) -> TriedEnd:
-    """The first end that keeps the bound of ``table`` where waves have a ``speed`` in cells/s."""
+    """The first end that satisfies the bound of ``table``, for waves with a ``speed`` in cells/s."""
     sources = sources_of(drives, cell, ends, cells)
     lengths = [table.cells] if table.cells else [length for length in LENGTHS if length <= cells // 3]
     best = np.inf

@@ -1,4 +1,4 @@
-"""A lattice run: a strict case file in, a typed and fully resolved case out.
+"""A lattice run: a strict case file is read into a typed and fully resolved case.
 
 A case is TOML with the sections of ``vipetsc.case.schema``, in SI units; masses and cells count from 1.
 """
@@ -100,7 +100,7 @@ class Case(CaseFile):
     def _scattered(
         cls, resolved: dict[str, Any], disorder: DisorderTable, contacts: ContactsTable
     ) -> tuple[dict[str, Any], list[Problem]]:
-        """The ``resolved`` sections with what is drawn; ``contacts`` are those that the file has."""
+        """The ``resolved`` sections with the drawn values; ``contacts`` are those of the file."""
         drawn, problems = scatter(resolved, disorder, contacts)
         if problems or not drawn:
             return resolved, problems
@@ -217,11 +217,11 @@ class Case(CaseFile):
         overrides: Iterable[str] = (),
         **changes: Mapping[str, Any],
     ) -> "Case":
-        """A lattice run like this case but for some values; a case of another verb loses that verb's own section.
+        """A lattice run like this case, with some values changed; the section of another verb is dropped.
 
-        ``changes`` are keys by section, as in ``drive={"amplitude": 2.0}``; the value None takes a key out. Sections
+        ``changes`` are keys by section, as in ``drive={"amplitude": 2.0}``; the value None removes a key. Sections
         named in ``without`` begin with their defaults instead of the values of this case. ``overrides`` are as those of
-        ``load``. The new case is checked and resolved as any other; raises CaseError.
+        ``load``. The new case is checked and resolved like any other; raises CaseError.
         """
         table = self.model_dump(by_alias=True, exclude_none=True, include={*Case.model_fields})
         # First what is left out, then what changes: a section may be begun anew with some keys.
@@ -234,7 +234,7 @@ class Case(CaseFile):
 
     @property
     def contact_radius(self) -> float | None:
-        """Radius in m of the spheres in contact, the preset's where another one is not given; None if it is unknown."""
+        """Radius in m of the spheres in contact, by default the preset's; None if it is unknown."""
         return self.contacts.radius or (CONTACTS["radius"] if self.lattice.preset else None)
 
     def runs(self) -> list[CaseFile]:
@@ -251,7 +251,7 @@ class Case(CaseFile):
         return case_html(self.name, self.model(), self.lattice.ends, [one.describe() for _, one in self.drive.every])
 
     def warnings(self) -> list[str]:
-        """Sentences about what is allowed but likely not meant."""
+        """Warnings of settings that are allowed but probably unintended."""
         options = (self.petsc.model_extra if self.petsc else None) or {}
         return [
             *unit_warnings(self.drive, self.model().chain),
@@ -261,7 +261,7 @@ class Case(CaseFile):
 
 
 def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem]]:
-    """Motion at t = 0, None for a lattice at rest, and the problems with it."""
+    """Motion at t = 0 (None for a lattice at rest), and the problems with it."""
     initial = sections.get("initial")
     drive = sections["drive"]
     if initial is None or not initial.moves:
@@ -312,7 +312,7 @@ def _touching_problems(sections: dict[str, Any], beginning: Beginning | None) ->
 
 
 def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-    """A lattice without a force needs a motion to begin with, and a tolerance that is no part of the force."""
+    """A lattice without a force needs an initial motion, and a tolerance that does not refer to the force."""
     drive = sections["drive"]
     initial = sections.get("initial")
     has_wave = drive.amplitude != 0 or bool(drive.wave_choices)

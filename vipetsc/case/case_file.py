@@ -41,7 +41,7 @@ Valid = Callable[..., bool]  # whether neither any of the keys given nor a key i
 
 @dataclass(frozen=True)
 class Problem:
-    """Problem of a case: the key's path, its value, and what to do."""
+    """Problem of a case: the path of the key, its value, and the remedy."""
 
     key: str
     value: Any
@@ -57,7 +57,7 @@ class Problem:
 
 
 class CaseError(ValueError):
-    """A case that cannot be used; ``problems`` holds all reasons."""
+    """An invalid case; ``problems`` contains all reasons."""
 
     def __init__(self, problems: Iterable[Problem], source: str = "case") -> None:
         self.problems = list(problems)
@@ -81,9 +81,9 @@ AnySection = TypeVar("AnySection", bound=Section)
 class CaseFile(Section):
     """Case of a verb as its file gives it: a ``name`` and the sections that a subclass declares as its fields.
 
-    A subclass names its ``verb`` and the ``section`` that this verb alone reads ("" for ``run``), and which features of
+    A subclass names its ``verb`` and the ``section`` that only this verb reads ("" for ``run``), and the features of
     a lattice run it ``takes`` (``vipetsc.case.features``); ``waveforms`` are the drives that it takes, () for all, and
-    ``premise`` begins the sentence that refuses another lattice. Its hooks: ``check`` finds what is wrong between valid
+    ``premise`` begins the message that refuses another lattice. Its hooks: ``check`` finds problems between valid
     keys; ``read`` may fill in the table before its sections are read, and resolve them afterwards. ``builtin_table`` is
     the case without a file, if there is one.
     """
@@ -102,7 +102,7 @@ class CaseFile(Section):
 
         ``Case(lattice={"cells": 60}, drive={"amplitude": 8.0})`` is the case of a file with these sections. Values are
         as in a file; arrays, tuples and sections of another case are taken too, and None is a key that is not given.
-        Raises CaseError with everything that is wrong.
+        Raises CaseError with all problems.
         """
         super().__init__(**self.fields_of(plain_table(sections)))
 
@@ -147,7 +147,7 @@ class CaseFile(Section):
 
     @classmethod
     def from_table(cls, table: Table, overrides: Iterable[str] = (), source: str = "case") -> Self:
-        """The resolved case of a parsed table; raises CaseError with everything that is wrong."""
+        """The resolved case of a parsed table; raises CaseError with all problems."""
         return cls.resolved(cls.fields_of(table, overrides, source))
 
     @classmethod
@@ -198,7 +198,7 @@ class CaseFile(Section):
         return ()
 
     def warnings(self) -> list[str]:
-        """Sentences about what is allowed but likely not meant."""
+        """Warnings of settings that are allowed but probably unintended."""
         return []
 
     def runs(self) -> list["CaseFile"]:
@@ -276,9 +276,9 @@ def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
 
 
 def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[Problem]]:
-    """A copy of ``table`` with each ``section.key=value`` set (TOML value or bare word), and what cannot be.
+    """A copy of ``table`` with each ``section.key=value`` set (TOML value or bare word), and the problems.
 
-    ``section.key=`` takes the key out.
+    ``section.key=`` removes the key.
     """
     # The table may be the built-in one, which later cases read too.
     table = copy.deepcopy(table)
@@ -301,7 +301,7 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
 
 
 def put(table: Table, path: str, value: Any) -> list[Problem]:
-    """Set the key ``path`` ("a.b.c") of ``table`` in place, or take it out (None); the problem if that cannot be."""
+    """Set the key ``path`` ("a.b.c") of ``table`` in place, or remove it (None); returns the problem if this fails."""
     *parents, key = path.split(".")
     section: Any = table
     for parent in parents:
@@ -343,7 +343,7 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
 
 
 def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
-    """Numbers anywhere in ``value`` that are so large or small that products of a few are no numbers any more."""
+    """Numbers anywhere in ``value`` that are so large or small that products of a few of them overflow."""
     if isinstance(value, dict):
         for key, item in value.items():
             yield from _out_of_range(item, f"{path}.{key}")

@@ -1,4 +1,4 @@
-"""The laws and stops of the sites of a case: one for all, with lists over the sites where they differ."""
+"""The contact laws and stops of the sites: one for all sites, or lists over the sites."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -58,7 +58,7 @@ def check_per_site(
 
 
 def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
-    """Problems with parameters of laws that no site has, missing ones, and a damping that grows without bound."""
+    """Problems with parameters of unused laws, missing parameters, and an unbounded damping."""
     laws = values_of_sites(contacts, "law", count) if count else [contacts.law]
     for key, parameter in PARAMETERS.items():
         values = values_of_sites(contacts, key, max(count, 1))
@@ -104,7 +104,7 @@ def check_touching(contacts: ContactsTable, gaps: list[float], at_rest: Sequence
 
 
 def _check_stops(contacts: ContactsTable, gaps: list[float]) -> Iterator[Problem]:
-    """Problems with contacts that are closed at rest: a second stop, or a dissipation that has no limit."""
+    """Problems with contacts that are closed at rest: a second stop, or an unbounded dissipation."""
     restitutions = values_of_sites(contacts, "restitution", len(gaps))
     precompressions = values_of_sites(contacts, "precompression", len(gaps))
     stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
@@ -157,14 +157,14 @@ def parameters_of(contacts: ContactsTable) -> dict[str, Any]:
 
 
 def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
-    """The law of each site of a resolved case; () if they are alike."""
+    """The law of each site of a resolved case; () if all are equal."""
     per_site = lists_of(contacts)
     # Sides and pairs are no part of a law: the gaps and the pairs of the chain hold them.
     keys = [key for key in per_site if key not in SIDES + JOINS]
     if not keys:
         return ()
 
-    # Each site has the law of all, but for what its lists say.
+    # Each site has the common law, with the changes of the lists.
     laws = []
     for values in zip(*(per_site[key] for key in keys), strict=True):
         site = contacts.model_copy(update=dict(zip(keys, values, strict=True)))
@@ -173,7 +173,7 @@ def laws_of_sites(contacts: ContactsTable, count: int) -> tuple[Contact, ...]:
 
 
 def describe_stops(gaps: Gaps, clearances: tuple[float, ...]) -> list[str]:
-    """The stops of each site in words: by their side where ``gaps`` differ, else the ``clearances``."""
+    """Description of the stops of each site: by side if ``gaps`` differ, otherwise the ``clearances``."""
     if not gaps:
         return [f"{1e3 * gap:.4g} mm" for gap in clearances]
 
@@ -185,7 +185,7 @@ def describe_stops(gaps: Gaps, clearances: tuple[float, ...]) -> list[str]:
 
 
 def _describe_stop(side: str, gap: float) -> str:
-    """The stop of one ``side`` in words: at how many mm, touching, or precompressed by so many."""
+    """Description of the stop on one ``side``: its clearance in mm, touching, or precompressed."""
     if gap > 0:
         return f"{side}{1e3 * gap:.4g} mm"
     return f"touches on side {side}" if gap == 0 else f"precompressed by {-1e3 * gap:.4g} mm on side {side}"

@@ -1,4 +1,4 @@
-"""The case of the verb ``design``: which (lambda, eta) are searched, in which readings."""
+"""The case of the verb ``design``: the grid of (lambda, eta) and the readings of the parameters."""
 
 from collections.abc import Iterator
 from typing import Annotated, Any, ClassVar, Literal
@@ -20,12 +20,12 @@ class GridTable(Section):
     count: Annotated[int, Field(ge=2)] = 37
 
     def values(self) -> np.ndarray:
-        """The values (count,), free of the last digits' noise."""
+        """The values (count,), rounded to remove errors in the last digits."""
         return np.round(np.linspace(self.first, self.last, self.count), 12)
 
 
 class EtaTable(GridTable):
-    """The grid of eta; a value of 1 in it is left out, since the host mass m (1 - eta) vanishes there."""
+    """The grid of eta; the value 1 is left out, because the host mass m (1 - eta) vanishes there."""
 
     first: Annotated[float, Field(gt=0, lt=1)] = 0.1
     last: Annotated[float, Field(gt=0, le=1)] = 1.0

@@ -1,4 +1,4 @@
-"""Scatter of a case's numbers: the section ``[disorder]``, from which values are drawn that the resolved case holds.
+"""Random scatter of a case: the section ``[disorder]``, whose drawn values the resolved case contains.
 
 A resolved case has these values in place of the section, so it states what was simulated, and no later step needs the
 draw. Each quantity has its own generator (Philox), keyed by the seed and its name: the numbers do not depend on the
@@ -25,12 +25,12 @@ SPRING_PARAMETERS = tuple(field.name for field in fields(Spring) if isinstance(f
 
 
 class DisorderTable(Section):
-    """What scatters about the values of the case, and the ``seed`` of what is drawn.
+    """Quantities that scatter about the values of the case, and the ``seed`` of the random numbers.
 
-    Of every site: ``clearance`` (m), ``restitution``, ``sites`` (the cell, rounded), ``stiffness`` (N/m^n) if it is a
-    list, which else is that of all sites, as ``modulus`` (Pa) is. Of the cell, the same in all cells: ``masses`` (kg),
+    For each site: ``clearance`` (m), ``restitution``, ``sites`` (the cell, rounded), ``stiffness`` (N/m^n) if it is a
+    list; otherwise it is common to all sites, as ``modulus`` (Pa) is. The same in all cells: ``masses`` (kg),
     ``springs`` (N/m).
-    Of every cell by itself: ``cells``, by quantity; the resolved case keeps these as they are said.
+    For each cell: ``cells``, by quantity; the resolved case contains the request instead of the values.
     """
 
     seed: Annotated[int, Field(ge=0)] = 0

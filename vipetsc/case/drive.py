@@ -1,4 +1,4 @@
-"""The section ``[drive]``: where waveforms act, what is wrong with them, and the drives that are built from it."""
+"""The section ``[drive]``: waveforms and the places where they act, their checks, and the resulting drives."""
 
 from collections.abc import Iterator
 from functools import lru_cache
@@ -12,12 +12,12 @@ from vipetsc.case.schema import LatticeTable, TimeTable
 from vipetsc.case.waveforms import DEFAULT, OneDrive, waveform_of
 from vipetsc.lattice import Chain, Drive, UnitCell, bloch, fastest_speed, max_group_velocity, pass_bands, waves_at
 
-STANDING = 1e-6  # of the cell's fastest group velocity, below which a wave stands
+STANDING = 1e-6  # of the cell's largest group velocity, below which a wave counts as standing
 WAVE_REMEDY = 'give one of: frequency; wavenumber and band; band and at = "max-group-velocity"'
 
 
 class DriveTable(OneDrive):
-    """A drive, and ``more`` of them. With an initial state ``amplitude`` may be 0.
+    """A drive, and ``more`` drives. With an initial state, ``amplitude`` may be 0.
 
     Then ``frequency`` and ``cell`` are by default those of its motion.
     """
@@ -134,7 +134,7 @@ def _beside_wall(cell: UnitCell, end: str, cells: int) -> Table:
 
 
 def frequency_of(cell: UnitCell, drive: OneDrive) -> float:
-    """The frequency in rad/s that a valid ``drive`` is about: as given, else that of its samples or its half-sine.
+    """The frequency in rad/s of a valid ``drive``: as given, otherwise that of its samples or its half sine.
 
     For half a sine that is shorter than the lattice can follow, it is the top band's edge, if the cell has bands.
     """
@@ -159,7 +159,7 @@ def _wave(cell: UnitCell, frequency: float | None, wavenumber: float | None, ban
 
 
 def packet_speed(cell: UnitCell, drive: OneDrive) -> float:
-    """Speed in cells/s of what a resolved ``drive`` sends out: of its wave, without a sine that of the fastest one."""
+    """Speed in cells/s of the wave of a resolved ``drive``; without a sine, the speed of the fastest wave."""
     if drive.is_sine and drive.frequency:
         return wave_speed(cell, drive.frequency)
     return wave_speed(cell, np.inf)

@@ -1,6 +1,6 @@
-"""Features of a case that not every verb takes, and the sentences that refuse them.
+"""Features of a case that not every verb accepts, and the messages that refuse them.
 
-A case class lists what it ``takes``; everything else is refused here, for all verbs alike. A lattice run takes all.
+A case class lists the features that it ``takes``; this module refuses all others. A lattice run accepts all.
 """
 
 from collections.abc import Iterator, Mapping

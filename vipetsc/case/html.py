@@ -1,4 +1,4 @@
-"""Cases and results as a notebook shows them: a table, and a drawing of the unit cell."""
+"""Display of cases and results in a notebook: a table, and a drawing of the unit cell."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape

@@ -1,4 +1,4 @@
-"""The sections of a case about cells that differ: profiles and defects, scatter cell by cell, ends that absorb."""
+"""The sections of a case for inhomogeneous lattices: profiles and defects, scatter cell by cell, absorbing ends."""
 
 from typing import Annotated, Literal, Self
 
@@ -49,14 +49,14 @@ class Deviation(Section):
 
 
 class Profile(Section):
-    """A quantity that grows linearly from the ``first`` cell to the ``last``."""
+    """A quantity that varies linearly from the ``first`` cell to the ``last``."""
 
     first: Finite
     last: Finite
 
 
 class Defects(Section):
-    """A quantity that has another ``value``, or ``factor`` times its own, in some ``cells`` (from 1)."""
+    """A quantity that has another ``value``, or ``factor`` times its value, in some ``cells`` (from 1)."""
 
     cells: list[int] = Field(min_length=1)
     value: Finite | None = None
@@ -64,16 +64,16 @@ class Defects(Section):
 
 
 class ScatterTable(Section):
-    """What ``[disorder.cells]`` asks for, in a resolved case: the ``seed`` and the deviation of each quantity."""
+    """The request of ``[disorder.cells]`` in a resolved case: the ``seed`` and the deviation of each quantity."""
 
     seed: Annotated[int, Field(ge=0)]
     quantities: dict[str, Deviation]
 
 
 class AbsorbingTable(Section):
-    """An end that absorbs: dashpots to ground, strength x^3 times the mass, over the last ``cells``, x from 0 to 1.
+    """An absorbing end: dashpots to ground, strength x^3 times the mass, over the last ``cells``, with x from 0 to 1.
 
-    ``cells`` and ``strength`` are by default the first that keep what comes back of the burst's energy below
+    By default, ``cells`` and ``strength`` are the first tried values whose reflected fraction of the energy is below
     ``reflection``.
     """
 

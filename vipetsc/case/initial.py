@@ -1,4 +1,4 @@
-"""The section ``[initial]`` of a run: the motion that it begins with, and the numbers that follow from it."""
+"""The section ``[initial]`` of a run: the motion at t = 0, and the numbers that follow from it."""
 
 import hashlib
 import itertools
@@ -57,17 +57,17 @@ class StrikeTable(Section):
 
 
 class InitialTable(Section):
-    """What a run begins with at t = 0.
+    """The state of the lattice at t = 0.
 
     ``zero``: at rest. ``mode``: mode ``number`` of the lattice without contacts, from 1, lowest first, or the one
     ``near`` a frequency in rad/s, at its turning point. ``packet``: Gaussian, of the waves of a ``band`` about a
-    ``wavenumber``, ``width`` cells its standard deviation, in the middle of the ``cell``, that goes up the cells
-    (``direction`` 1) or down (-1). Both have an ``amplitude``, the largest displacement of the packet's envelope or of
-    the mode in m, or an ``energy`` in J. ``velocity``: the ``mass`` of a ``cell`` is struck, and so are ``more`` of
-    them: they have a ``velocity`` in m/s, and all else is at rest. ``file``: the state in the file ``path``: of a run
-    at ``time`` in s, of a branch's ``orbit`` (from 1), the last if not given, or a state alone; cells that are not in
-    it are at rest; its ``sha256`` is filled in. So is the ``frequency`` in rad/s of the motion, by which tolerances and
-    measures are judged where nothing is driven, and the ``amplitude`` of a state or of what is struck.
+    ``wavenumber``, centred at the ``cell``, with a standard deviation of ``width`` cells, which travels to higher cells
+    (``direction`` 1) or lower cells (-1). Both have an ``amplitude``, the largest displacement of the packet's envelope
+    or of the mode in m, or an ``energy`` in J. ``velocity``: the ``mass`` of a ``cell``, and the masses in ``more``,
+    have a ``velocity`` in m/s, and all other masses are at rest. ``file``: the state in the file ``path``: of a run at
+    ``time`` in s, of a branch's ``orbit`` (from 1), the last if not given, or a state alone; cells that are not in it
+    are at rest; its ``sha256`` is filled in. The ``frequency`` in rad/s of the motion, to which tolerances and measures
+    refer if nothing is driven, and the ``amplitude`` of a state or of struck masses are filled in, too.
     """
 
     kind: Literal["zero", "mode", "packet", "velocity", "file"] = "zero"
@@ -116,7 +116,7 @@ class InitialTable(Section):
         return not self.moves
 
     def describe(self) -> str:
-        """The motion in words; empty for a lattice at rest."""
+        """Description of the motion; empty for a lattice at rest."""
         if self.kind == "velocity":
             struck = [f"{one.velocity:g} m/s of mass {one.mass} of cell {one.cell}" for _, one in self.strikes]
             more = f", ... ({len(struck)})" if len(struck) > MOST_SHOWN else ""

@@ -36,7 +36,7 @@ def texts() -> dict[str, dict[str, list[str]]]:
 
 
 def unit_and_text(name: str, key: str) -> tuple[str, str]:
-    """Unit and text of a key of the class ``name``, empty where nothing is said."""
+    """Unit and text of a key of the class ``name``; empty if there is none."""
     unit, text = texts().get(name, {}).get(key, ("", ""))
     return unit, text
 

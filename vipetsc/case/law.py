@@ -1,4 +1,4 @@
-"""The case of the verb ``law``: a lattice run, of which cell, contact law and burst are taken, and ``[law]``."""
+"""The case of the verb ``law``: cell, contact law and burst of a lattice run, and the section ``[law]``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,19 +18,19 @@ from vipetsc.lattice.packet import packet_speeds
 
 LARGEST = 1e9  # cells times samples of a run
 SHORTEST = 64  # cells of the ring: more than the propagator's band
-SLOWEST = 1e-9  # cells/s, so that a wave that stands asks for a run that is too large, and is refused for that
+SLOWEST = 1e-9  # cells/s, so that a standing wave needs a run that is too large, and is refused for this reason
 
 
 class LawTable(Section):
-    """How the scattering law of one site is taken.
+    """How the scattering law of one site is computed.
 
     ``clearance`` in m (by default the geometric mean of the sites'), ``distance`` in cells from the driven cell to the
-    site (that of the leading site, without sites the burst's length, but so many that the burst is over before a wave
-    is back from the site). The law reaches up to ``largest`` relative
-    displacement over clearance; between neighbouring points it is refined until no fraction is further than
-    ``tolerance`` from a straight line over log z, or than the scatter, or the points are closer than ``finest``. At
-    each, ``samples`` runs with amplitudes up to ``jitter`` apart from it give mean and scatter. A run ends ``settle``
-    lengths of the burst after the first of the slow waves reaches the site.
+    site (by default that of the leading site, or the length of the burst; at least so large that the burst ends before
+    a wave returns from the site). The law reaches up to ``largest`` relative displacement over clearance; between
+    neighbouring points it is refined until no fraction is further than ``tolerance`` from a straight line over log z,
+    or than the scatter, or the points are closer than ``finest``. At each, ``samples`` runs with amplitudes up to
+    ``jitter`` apart from it give mean and scatter. A run ends ``settle`` lengths of the burst after the first of the
+    slow waves reaches the site.
     """
 
     clearance: Positive | None = None

@@ -1,4 +1,4 @@
-"""A case in the terms of ``vipetsc.lattice``: what engines simulate."""
+"""A case in terms of ``vipetsc.lattice``, as the engines simulate it."""
 
 from dataclasses import dataclass
 
@@ -45,7 +45,7 @@ class Model:
 
     @property
     def is_driven(self) -> bool:
-        """Whether the first drive drives."""
+        """Whether the first drive has an amplitude."""
         return self.drive.amplitude != 0
 
     @property

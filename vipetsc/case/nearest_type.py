@@ -1,4 +1,4 @@
-"""Errors of pydantic in a value that may be of several types: those of the type that it is nearest to."""
+"""Errors of pydantic in a value of several possible types, reduced to those of the nearest type."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""How deep tables and lists of a case file may stand in one another: copying and sending them descends by recursion."""
+"""Largest depth of nested tables and lists in a case file, because copying and sending them is recursive."""
 
 from typing import Any
 

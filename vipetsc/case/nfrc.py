@@ -19,7 +19,7 @@ Restitution = Annotated[float, Field(ge=0, le=1)]
 
 
 class NfrcTable(Section):
-    """Steady answers of the sites to a ``wave`` of a ``band`` that comes in, or to a ``force`` on the driven mass.
+    """Steady responses of the sites to an incident ``wave`` of a ``band``, or to a ``force`` on the driven mass.
 
     ``over`` the amplitude (of a wave: the relative displacement that it alone would make at the first site, over the
     clearance there; of a force: N) or the frequency (rad/s), within the ``range`` [low, high]: a curve for each of
@@ -112,11 +112,11 @@ class NfrcCase(Case):
                 yield Problem("contacts.sites", sections["contacts"].sites, "give a cell with a contact")
 
     def warnings(self) -> list[str]:
-        """No sentences: the warnings about runs in time do not concern steady states."""
+        """No warnings: those about runs in time do not concern steady states."""
         return []
 
     def physics(self) -> "NfrcCase":
-        """Case that a resumed curve must keep: all but the number of its points."""
+        """The part of the case that a resumed curve must keep: all except the number of points."""
         nfrc = self.nfrc.model_copy(update={"points": 1})
         return self.model_copy(update={"nfrc": nfrc})
 

@@ -1,4 +1,4 @@
-"""The case of the verb ``nnm``: which system, which branches, how they are followed.
+"""The case of the verb ``nnm``: the system, its branches, and how they are followed.
 
 The system itself is built by ``vipetsc.modes.system.System.from_case``.
 """
@@ -198,7 +198,7 @@ class NnmCase(CaseFile):
         lattice = sections["lattice"]
         contacts = sections["contacts"]
         nnm = sections["nnm"]
-        # A system of one's own ignores the section [lattice].
+        # A user-defined system ignores the section [lattice].
         refusable = {"contacts": contacts} if nnm.system == "own" else {"contacts": contacts, "lattice": lattice}
         problems = [*_check_options(nnm), *refusals(cls, refusable, valid)]
         # Lists over sites are refused above; checking their values too would report them twice.
@@ -275,7 +275,7 @@ class NnmCase(CaseFile):
 
 
 def _check_options(nnm: NnmTable) -> Iterator[Problem]:
-    """Problems with a system of one's own, and with the bounds of a branch and its steps."""
+    """Problems with a user-defined system, and with the bounds of a branch and its steps."""
     if (nnm.system == "own") != (nnm.custom is not None):
         yield Problem("nnm.system", nnm.system, 'a system of one\'s own needs "own" and [nnm.own]')
     for key, (low, high) in (("energy", nnm.energy), ("frequency", nnm.frequency)):
@@ -369,7 +369,7 @@ def _check_condensed(lattice: LatticeTable, contacts: ContactsTable, nnm: NnmTab
 
 
 def _check_shooting(nnm: NnmTable, dofs: int) -> Iterator[Problem]:
-    """Keys of [nnm] that do not go with how a lattice of ``dofs`` masses is shot."""
+    """Keys of [nnm] that do not fit the shooting method of a lattice with ``dofs`` masses."""
     krylov = nnm.is_krylov(dofs)
     if krylov:
         for key in ("compare", "switch", "orbits_at", "flow", "jacobian"):

@@ -1,4 +1,4 @@
-"""What a search for a design measures: its objectives, its constraints, and what is wrong with them."""
+"""Objectives and constraints of a search for a design, and their checks."""
 
 import difflib
 from collections.abc import Iterator
@@ -59,7 +59,7 @@ class MeasuredTable(Section):
 
 
 class ObjectiveTable(MeasuredTable):
-    """What is to become large or small: a measure, and the ``goal``."""
+    """An objective: a measure, and the ``goal`` to maximise or minimise it."""
 
     goal: Literal["maximise", "minimise"] = "maximise"
 

@@ -1,4 +1,4 @@
-"""The case of the verb ``optimise``: what varies within which bounds, and what is to become large or small."""
+"""The case of the verb ``optimise``: the variables with their bounds, the objectives and the constraints."""
 
 import copy
 from collections.abc import Iterator, Sequence
@@ -22,11 +22,11 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class VariablesTable(Section):
-    """What varies, each as [low, high]; all but sites and restitution are searched by their logarithm.
+    """The variables, each with bounds [low, high]; all except sites and restitution are searched by their logarithm.
 
-    ``clearance`` in m of each site by itself, or ``profile``, those of the first and of the last site with the others
-    log-spaced between; ``sites``: the cells (1-based), whole numbers that differ; ``restitution``; ``masses`` in kg and
-    ``springs`` in N/m of the cell by their number in it (from 1).
+    ``clearance`` in m of each site independently, or ``profile``, those of the first and of the last site with the
+    others log-spaced between; ``sites``: the cells (1-based), whole numbers that differ; ``restitution``; ``masses`` in
+    kg and ``springs`` in N/m of the cell by their number in it (from 1).
     """
 
     clearance: Pair | None = None
@@ -123,7 +123,7 @@ class OptimiseCase(CaseFile):
         return {"table": table, "options": options, "base": base}, problems
 
     def warnings(self) -> list[str]:
-        """Sentences about what is likely not meant in the case to begin with."""
+        """Warnings of settings in the initial case that are probably unintended."""
         return self.base.warnings()
 
     def to_toml(self) -> str:

@@ -1,4 +1,4 @@
-"""Tables that a program builds, as a TOML file would hold them."""
+"""Tables built in a program, converted to the types of a TOML file."""
 
 from collections.abc import Mapping
 from pathlib import PurePath

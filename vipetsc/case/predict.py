@@ -16,7 +16,7 @@ MOST = 10_000  # amplitudes
 class PredictTable(Section):
     """``amplitudes`` in N; by default ``count``, log-spaced from that of the first contact to ``span`` times it.
 
-    ``points``: runs of the one site whose answer is composed. ``simulate``: run the same amplitudes, to compare.
+    ``points``: number of runs with a single site. ``simulate``: also simulate the same amplitudes, for comparison.
     """
 
     amplitudes: list[Positive] = Field([], max_length=MOST)
@@ -35,7 +35,7 @@ class PredictCase(LawCase):
     takes = LawCase.takes - {"rings"}
 
     def warnings(self) -> list[str]:
-        """Sentences about what is likely not meant in the waves that are composed; fields are not kept of the runs."""
+        """Warnings about the waves of the prediction; its runs do not store fields."""
         model = self.model()
         return [*wave_warnings(model), *length_warnings(model), *end_warnings(model, self.output)]
 

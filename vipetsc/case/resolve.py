@@ -232,7 +232,7 @@ def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> I
 def resolve(sections: Mapping[str, Any], beginning: Beginning | None) -> dict[str, Any]:
     """The ``sections`` of a valid lattice run in which every choice is resolved, and its initial motion.
 
-    Raises ValueError if no end absorbs as much as is asked of it.
+    Raises ValueError if no absorbing end satisfies the bound.
     """
     lattice = sections["lattice"]
     cell = lattice.unit_cell()
@@ -286,7 +286,7 @@ def contact_frequency(lattice: LatticeTable, contacts: ContactsTable, speed: flo
 
 
 def _resolved_lattice(lattice: LatticeTable, cell: UnitCell, drive: DriveTable) -> LatticeTable:
-    """The lattice with an absorbing end that does for the ``drive``, and with fitted dashpots."""
+    """The lattice with an absorbing end that suits the ``drive``, and with fitted dashpots."""
     update: dict[str, Any] = {}
     absorbing = lattice.absorbing
     if absorbing and not (absorbing.cells and absorbing.strength):

@@ -56,7 +56,7 @@ Wavenumber = Annotated[float, Field(gt=0, le=np.pi), BeforeValidator(number)]
 
 @dataclass(frozen=True)
 class Preset:
-    """Lattice of the paper; the tables hold what a case file would say, in SI units.
+    """Lattice of the paper; the tables contain the sections of a case file, in SI units.
 
     ``site_span(cells, count)`` gives the 1-based positions (first, last) between which sites are spread,
     ``clearance_span(count)`` the clearances in m of the leading and of the last site.
@@ -135,10 +135,10 @@ class CellTable(Section):
 
 
 class DampingTable(Section):
-    """Dashpots everywhere: to ground ``mass`` times each mass, along each spring ``stiffness`` times its stiffness.
+    """Proportional dashpots: ``mass`` times each mass to ground, ``stiffness`` times the stiffness of each spring.
 
-    A mode of frequency w then has the damping ratio (mass/w + stiffness w)/2. In their place ``loss``, twice the ratio
-    asked of bands, by number; ``grounding`` (dof) and ``springs`` (spring) are the dashpots in N s/m fitted to it.
+    A mode of frequency w then has the damping ratio (mass/w + stiffness w)/2. Instead, ``loss`` prescribes twice
+    the ratio of bands, by number; ``grounding`` (dof) and ``springs`` (spring) are the dashpots in N s/m fitted to it.
     """
 
     mass: NotNegative = 0.0
@@ -155,7 +155,7 @@ class DampingTable(Section):
 
 
 class LatticeTable(Section):
-    """``preset`` or ``cell``; length in cells; ends; which reading of the paper's parameters."""
+    """The lattice: a ``preset`` or a ``cell``, the number of cells, the ends, the reading of the parameters."""
 
     preset: Literal["four-band", "diatomic"] | None = None
     cell: CellTable | None = None
@@ -199,12 +199,12 @@ class LatticeTable(Section):
 
 
 class TimeTable(Section):
-    """End in s or ``traverse`` (burst + cells / group velocity), engine, method, tolerances, sampling.
+    """Time: end in s or ``traverse`` (burst + cells / group velocity), engine, method, tolerances, sampling.
 
-    ``samples`` is their number from 0 to the end, in place of an interval.
+    ``samples`` is the number of samples from 0 to the end, instead of an interval.
 
     ``engine``: ``ts`` steps with PETSc's Runge-Kutta ``method``; ``propagator`` takes exact linear steps, with
-    contact forces collocated; ``auto`` is the propagator where it suits. ``atol``: ``scaled`` is .1 rtol times the
+    contact forces collocated; ``auto`` is the propagator where it applies. ``atol``: ``scaled`` is 0.1 rtol times the
     displacement and the velocity of the drive's linear wave, ``paper`` is 1e-9 times the amplitude, a number is
     used for displacements (m) and velocities (m/s).
     """
@@ -219,7 +219,7 @@ class TimeTable(Section):
 
 
 class OutputTable(Section):
-    """Which part of the fields is kept: cells ``window``, every n-th cell, every n-th sample; who writes.
+    """Stored part of the fields (cells of the ``window``, every n-th cell, every n-th sample), and who writes it.
 
     ``writer``: ``gather`` sends samples to rank 0, ``parallel`` has every rank write its own cells,
     ``auto`` takes ``parallel`` when a run's fields exceed 2 GiB. Besides the fields, the motion of named ``points`` and
@@ -244,7 +244,7 @@ class OutputTable(Section):
 
 
 class AnalysisTable(Section):
-    """How finely a run is measured; the strides at 1 leave nothing out, what others change stands in ``analysis.h5``.
+    """Resolution of the measures. Strides of 1 leave nothing out; ``analysis.h5`` states the error of larger strides.
 
     ``band_stride``: samples between those at which energies above the pass bands are taken; ``snapshot_stride`` and
     ``cell_stride``: of the snapshots (500 at most) and of the cells whose entropy is taken. ``modal_stride``: samples
@@ -269,7 +269,7 @@ RENAMED_OPTIONS = {"ts_time_step": "ts_dt", "ts_max_step_rejections": "ts_max_re
 
 
 class PetscTable(Section):
-    """PETSc options by name, without the leading dash, as they stand behind ``--`` on the command line.
+    """PETSc options by name, without the leading dash, as they follow ``--`` on the command line.
 
     Those of time stepping (``ts_...``) are for ``ts``; a case that has some is not simulated by the propagator.
     An option that PETSc has renamed may have either name under any version, and is stored by the earlier one.
@@ -299,5 +299,5 @@ _LOOKS = re.compile(
 
 
 def only_looks(name: str) -> bool:
-    """Whether the PETSc option ``name`` changes no result, so that it is no part of a case."""
+    """Whether the PETSc option ``name`` changes no result, and is therefore not part of a case."""
     return bool(_LOOKS.fullmatch(name))

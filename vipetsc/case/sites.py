@@ -1,4 +1,4 @@
-"""The section of a case about its contact sites: where they are, their laws and their stops."""
+"""The section of a case about its contact sites: their cells, laws and stops."""
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -64,7 +64,7 @@ else:
 
 
 class PerSiteTable(ElasticLaws):
-    """What differs from site to site: lists, one value a site, in place of the values of ``[contacts]``."""
+    """Quantities that differ from site to site: lists with one value per site."""
 
     modulus: list[Positive] | None = None
     radius: list[Positive] | None = None

@@ -1,4 +1,4 @@
-"""Sweeps, which are many cases in one file: the section ``[sweep]`` of a case file, and the members it stands for."""
+"""Sweeps, which are many cases in one file: the section ``[sweep]`` of a case file, and its members."""
 
 import copy
 import hashlib
@@ -26,11 +26,11 @@ MOST_TRIED = 1_000
 MOST_TRIED_SITES = 200_000
 DIGITS = 12  # of numbers that a range is meant to meet
 ROUNDINGS = 8  # by which a value of a range may miss such a number
-Values = dict[str, tuple[Any, ...]]  # what each key takes in turn; an axis has those of keys that vary together
+Values = dict[str, tuple[Any, ...]]  # the values of each key; an axis has those of keys that vary together
 
 
 class SweepTable(Section):
-    """What is done with the members of a sweep, besides the keys that vary.
+    """Measures, stored fields and ranks of the members of a sweep, in addition to the keys that vary.
 
     ``measures``: what is measured of every run: ``entropy`` over wavenumbers (the paper's section II), ``transfer``
     between bands (section III); ``motion`` asks for neither, but for what every run is measured for: the largest force

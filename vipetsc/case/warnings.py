@@ -50,7 +50,7 @@ def losses(lattice: LatticeTable) -> np.ndarray:
 
 
 def loss_warnings(lattice: LatticeTable) -> Iterator[str]:
-    """Warnings of bands whose loss is not the one asked: by more than ``MISSED``, or by a factor of 2 somewhere."""
+    """Warnings of bands whose loss deviates from the request by more than ``MISSED``, or by a factor of 2 somewhere."""
     off: list[str] = []
     for band, (asked, least, mean, most) in enumerate(losses(lattice), 1):
         is_off_in_mean = abs(mean - asked) > MISSED * asked + TINY

@@ -1,4 +1,4 @@
-"""Numbers that follow from a case, in words: the lattice with its ends, losses, contacts, sites and initial motion."""
+"""Description of a case as text: the lattice with its ends, losses, contacts, sites and initial motion."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     bands = pass_bands(cell)
     band_list = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)
     gap_list = ", ".join(f"{low:.2f}-{high:.2f}" for low, high in gaps(bands))
-    # Every one of a million sites may have a law: as many are named as a list shows.
+    # Each of a million sites may have its own law: a list shows only the first ones.
     laws = model.used_laws[:8]
     clearances = first_few(describe_stops(model.gaps, chain.clearances))
 
@@ -39,7 +39,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
 
 
 def describe_ends(case: Case) -> str:
-    """Ends in words; for an absorbing end, the energy that comes back at each drive's frequency and of all."""
+    """Description of the ends; for an absorbing end, with the energy reflected at each drive and in total."""
     lattice = case.lattice
     absorbing = lattice.absorbing
     if absorbing is None or not (absorbing.cells and absorbing.strength):
@@ -64,7 +64,7 @@ def describe_ends(case: Case) -> str:
 
 
 def describe_losses(case: Case) -> str:
-    """The loss ratio of each band: least, largest and mean over its wavenumbers; empty where none is asked for."""
+    """The smallest, largest and mean loss ratio of each band over its wavenumbers; empty if no loss is prescribed."""
     sentences = []
     for band, (asked, least, mean, most) in enumerate(losses(case.lattice), 1):
         sentence = f"band {band} {least:.3g}-{most:.3g}, mean {mean:.3g}"

@@ -1,4 +1,4 @@
-"""Pictures of what a folder holds, drawn from its files over all ranks."""
+"""Pictures of the results in a folder, drawn from its files on all ranks."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -18,9 +18,9 @@ SWEEP_FIGURES = "sweep"  # the source of pictures whose measures are those of th
 class Pictures:
     """Pictures that a verb draws of its results.
 
-    ``source`` is the name of these pictures in the registry of figures, ``file`` the one that shows that a folder holds
-    results to draw (a pattern as of ``Path.glob``), ``noun`` what that file is. ``prepare`` checks folders, and
-    measures what is missing in them or older than its run; without it, a file that cannot be read is found out by
+    ``source`` is the name of these pictures in the registry of figures, ``file`` the file that shows that a folder
+    contains results to draw (a pattern as of ``Path.glob``), ``noun`` what that file is. ``prepare`` checks folders,
+    and measures what is missing in them or older than its run; without it, a file that cannot be read is found out by
     drawing it. ``recognise`` says whether folders hold such results where one ``file`` in one folder does not decide.
     """
 
@@ -31,7 +31,7 @@ class Pictures:
     recognise: Callable[[Sequence[Path]], bool] | None = None
 
     def are_of(self, folders: Sequence[Path]) -> bool:
-        """Whether these pictures show what ``folders`` hold."""
+        """Whether these pictures show the results in ``folders``."""
         if self.recognise:
             return self.recognise(folders)
         return len(folders) == 1 and any(folders[0].glob(self.file))
@@ -60,7 +60,7 @@ def draw_pictures(
             # The message says which file, and why.
             raise
         except (OSError, KeyError, ValueError) as error:
-            # What `prepare` has checked is no matter of the folder: an error then is one of the program.
+            # `prepare` has checked the folder: an error after that is an error of the program.
             if pictures.prepare:
                 raise
             article = "an" if pictures.noun[0] in "aeiou" else "a"
@@ -70,7 +70,7 @@ def draw_pictures(
     on_root(comm, lambda: prepare(pictures, folders, names))
     for sentence in on_root(comm, lambda: left_out(pictures, folders, names)):
         echo(comm, f"vipetsc: {sentence}", sys.stderr)
-    # Rank 0 looks, so that all ranks judge by one time, whatever their file systems show them.
+    # Rank 0 reads the time, so that all ranks use the same one even if their file systems differ.
     newest = None if afresh else on_root(comm, lambda: newest_result(folders))
     drawn = on_every_rank(comm, draw_part)
     # ``gather`` gives None on all ranks but the first.
@@ -78,7 +78,7 @@ def draw_pictures(
 
 
 def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None = None) -> None:
-    """Check what is to be drawn, and measure what is missing or older than its run; on one rank."""
+    """Check the requested pictures, and compute measures that are missing or older than their run; on one rank."""
     from vipetsc.figures.registry import figure_names
 
     try:
@@ -91,7 +91,7 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
 
 
 def left_out(pictures: Pictures, folders: Sequence[Path], names: list[str] | None) -> list[str]:
-    """Sentences about what is not drawn of sweeps; on one rank. Raises FolderError for a figure asked for by name."""
+    """Messages about pictures of sweeps that are not drawn; on one rank. Raises FolderError for a requested figure."""
     from vipetsc.figures.registry import OVER_BRANCHES, reasons_without_pages
     from vipetsc.figures.transfer_curves import curves_left_out
 
@@ -106,7 +106,7 @@ def left_out(pictures: Pictures, folders: Sequence[Path], names: list[str] | Non
         by_reason.setdefault(reason, []).append(name)
     sentences = [f"no picture of {', '.join(named)}: {reason}" for reason, named in by_reason.items()]
 
-    # Branches stand on one page alone, and of the sweep's curves perhaps not all.
+    # Only one page shows branches, and perhaps not all curves of the sweep.
     branches = [str(folder) for folder in folders if not (folder / "ensemble.h5").exists()]
     if branches and names and OVER_BRANCHES not in names:
         drawn = ", ".join(names)

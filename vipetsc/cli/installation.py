@@ -1,4 +1,4 @@
-"""What the program needs of the machine: versions of packages, PETSc's scalars, and one MPI for all of them."""
+"""Requirements of the program: versions of packages, PETSc's scalar type, and a single MPI for all packages."""
 
 import importlib
 import os
@@ -16,13 +16,13 @@ import numpy as np
 from vipetsc.case import CaseError
 
 BUILT_FOR_MPI = "mpi4py", "petsc4py"
-# Where a launcher writes how many processes it has started: Open MPI, MPICH and its kin.
+# Environment variables in which Open MPI, MPICH and their relatives write the number of processes.
 LAUNCHED = "OMPI_COMM_WORLD_SIZE", "PMI_SIZE"
 MPI_LIBRARY = re.compile(r"\S*/lib(?:mpi|mpich|mpi_abi)\.so[.\d]*$", re.MULTILINE)
 
 
 class Package(NamedTuple):
-    """Package of Python: its name for pip, the ``oldest`` version that works and the newest ``tried``."""
+    """Python package: its name for pip, the ``oldest`` version that works and the newest version that was ``tried``."""
 
     name: str
     oldest: str
@@ -52,7 +52,7 @@ PACKAGES = (
 
 
 class Check(NamedTuple):
-    """One check of the machine: its ``value``, the ``fault`` with which the program cannot work, or a ``note``."""
+    """One check of the machine: its ``value``, a ``fault`` that prevents the program from working, or a ``note``."""
 
     name: str
     value: str = ""
@@ -159,7 +159,7 @@ def check_mpi(libraries: list[str], size: int, environment: Mapping[str, str]) -
 
 
 def check_mpirun() -> Check:
-    """Where mpirun stands; a cluster's own launcher, or one rank, needs none."""
+    """The path of mpirun; the launcher of a cluster, or a single rank, does not need it."""
     value = shutil.which("mpirun")
     note = (
         ""
@@ -195,7 +195,7 @@ def check_native_calls() -> Check:
 
 
 def check_slepc() -> Check:
-    """The version of SLEPc, or how to get it: only some verbs need it, so that none is no fault of an installation."""
+    """The version of SLEPc, or how to install it; only some verbs need it, so that its absence is not a fault."""
     from vipetsc.dynamics.eigen import load_slepc
 
     try:

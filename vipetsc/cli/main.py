@@ -18,12 +18,12 @@ from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.io.errors import FolderError, ResultFileError
 from vipetsc.parallel import EndedError, StoppedError, StopRequest, all_meet, on_root
 
-PATIENCE = 5.0  # s in which ranks that stopped have to meet; a launcher kills those that are left sooner
+PATIENCE = 5.0  # s within which stopped ranks must meet; a launcher kills the remaining ranks sooner
 ABOUT_THE_PROGRAM = "-h", "--help", "--version"
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that prints on rank 0 only and lets all ranks leave together."""
+    """An argument parser that prints on rank 0 only and ends all ranks together."""
 
     def _print_message(self, message: str, file: Any = None) -> None:
         if message and MPI.COMM_WORLD.rank == 0:
@@ -58,7 +58,7 @@ def main(arguments: list[str], petsc: Mapping[str, str] | None = None) -> int:
 
 
 def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
-    """Call the verb with a request to stop at hand, and report bad input; returns the exit code."""
+    """Call the verb, listen for requests to stop, and report invalid input; returns the exit code."""
     verb = VERBS[options.verb]
     try:
         # Refused rather than ignored: a result is that of its case file, which would not name these options.

@@ -38,14 +38,14 @@ def echo_paths(comm: MPI.Comm, paths: Iterable[Path]) -> None:
 
 
 def echo_warnings(comm: MPI.Comm, warnings: Iterable[str]) -> None:
-    """Print on rank 0 what a user should know about a case or a result."""
+    """Print warnings about a case or a result on rank 0."""
     for warning in warnings:
         echo(comm, f"vipetsc: warning: {warning}", sys.stderr)
 
 
 @contextmanager
 def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> Iterator[list[TextIO]]:
-    """Print within the block what ``options`` (quiet, verbose, log) want; an answer that was asked for even when quiet.
+    """Print within the block according to ``options`` (quiet, verbose, log); answers are printed even with --quiet.
 
     Gives the streams that have to take all of it, for ``report_unwritten``. All ranks must call it. Raises FolderError
     if the file of ``--log`` cannot be opened.
@@ -53,7 +53,7 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
     handlers = _stream_handlers(quiet=options.quiet, is_answer=is_answer)
     streams = [sys.stdout]
     if options.log:
-        # All ranks must learn of it: those that went on would wait for rank 0 in the first collective.
+        # All ranks must raise the error: otherwise they would wait for rank 0 in the first collective call.
         on_root(comm, lambda: streams.append(_open_log(options.log)))
         handlers += [_log_handler(stream) for stream in streams[1:]]
 
@@ -72,7 +72,7 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
     try:
         yield streams
     except Exception as error:
-        # In the file alone: on stderr the process's own hook reports it.
+        # Only in the file: the exception hook of the process reports it on stderr.
         for handler in handlers:
             if handler.stream in streams[1:]:
                 handler.handle(logger.makeRecord(logger.name, logging.CRITICAL, "", 0, f"vipetsc: {error}", (), None))

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterable
 from typing import Any
 
-CUT_OFF = 128 + signal.SIGPIPE  # what a shell reports of a program that wrote into a pipe nobody reads any more
+CUT_OFF = 128 + signal.SIGPIPE  # exit code that a shell reports for a program that wrote into a closed pipe
 
 
 class CheckedStream(io.TextIOWrapper):
@@ -88,9 +88,9 @@ def check_standard_streams() -> None:
 
 
 def report_unwritten(streams: Iterable[Any]) -> int:
-    """Say on stderr to which of the checked ``streams`` not all could be written; returns an exit code, 0 if none."""
+    """Report on stderr which of the checked ``streams`` lost output; returns an exit code, 0 if none."""
     errors = {stream.title: stream.error for stream in streams if isinstance(stream, CheckedStream) and stream.error}
-    # A reader that has seen enough, as `head`, is nobody to complain to.
+    # A reader that closes the pipe, as `head` does, needs no message.
     complaints = {title: error for title, error in errors.items() if error.errno != errno.EPIPE}
     for title, error in complaints.items():
         note = "some output was lost; the result files are complete"

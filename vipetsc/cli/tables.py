@@ -12,7 +12,7 @@ def table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def first_few(items: Sequence[object]) -> str:
-    """The first ``items``, and how many there are if these are not all."""
+    """The first ``items``, followed by the number of all items if there are more."""
     if not items:
         return "none"
     shown = ", ".join(map(str, items[:MOST_SHOWN]))

@@ -37,9 +37,9 @@ class Verb(ABC):
     """Verb of the command line.
 
     ``text`` is its line in the help, ``example`` a call that the help shows, without the program's name. ``results``
-    is what its folder holds, for verbs that leave results of their own and go on with them. One that ``is_stoppable``
-    looks at requests to stop, and saves first; others end where they are. What one that ``is_answer`` prints was asked
-    for, and is printed with ``--quiet`` too. One that ``takes_petsc_options`` makes those of time stepping part of its
+    is the kind of its folder, for verbs that write results and can continue them. A verb that ``is_stoppable``
+    saves its state on a request to stop; other verbs end at once. The output of a verb that ``is_answer`` was requested
+    and is printed even with ``--quiet``. A verb that ``takes_petsc_options`` adds options of time stepping to its
     case.
     """
 
@@ -99,8 +99,8 @@ class Work:
 class Outcome:
     """Ending of a study, the same on all ranks.
 
-    ``complete``: all that was asked for is there; ``failures`` say what is not, and why, and are printed last;
-    ``drawable``: the folder holds what pictures show.
+    ``complete``: all requested results exist; ``failures`` name missing results with the reason, and are printed last;
+    ``drawable``: the folder contains results that can be drawn.
     """
 
     complete: bool = True

@@ -36,7 +36,7 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
     grid = figure.subplots(len(branches), 3, squeeze=False)
     for (frequency, elongation, motions), branch in zip(grid, branches, strict=True):
         case = NnmCase.from_toml(branch.attrs["case"])
-        # A system of one's own has neither cells nor pass bands.
+        # A user-defined system has neither cells nor pass bands.
         is_lattice = case.nnm.system == "condensed"
         _draw_frequency(frequency, branch)
         if is_lattice:

@@ -30,7 +30,7 @@ FIT_VALUES = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r
 
 
 class EntropyCurve(NamedTuple):
-    """Mean entropy over the amplitude (N), normalised to [.01, 1], its deviation over the cells, its power law.
+    """Mean entropy over the amplitude (N), normalised to [0.01, 1], its deviation over the cells, its power law.
 
     ``band`` has the lowest and the highest quantile over the samples, on the same scale.
     """

@@ -1,6 +1,6 @@
 """A figure as numbers: positions, scales and labels of its axes, their curves, the values of a map's colours.
 
-A page lays this over the picture, so that values can be read off and curves drawn again, larger or without some.
+A page places these data over the picture, so that values can be read and curves drawn again.
 """
 
 import re

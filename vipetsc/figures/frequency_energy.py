@@ -122,7 +122,7 @@ def _heading(branch: xr.Dataset, with_law: bool) -> str:
     if with_law:
         parts.append(table.get("contacts", {}).get("law", ""))
 
-    # The reading is one of the paper's parameters only, not of a cell or system of one's own.
+    # Only the paper's parameters have a reading, not a user-defined cell or system.
     is_custom = "cell" in lattice or table.get("nnm", {}).get("system") == "own"
     if not is_custom:
         parts.append(lattice.get("reading", ""))

@@ -29,7 +29,7 @@ PART = "part"  # the dimension of parts of the frequency axis
 BAND = "band"  # how those begin that are pass bands
 LONGEST_STEM = 150  # letters: file systems take 255, and figures of a report have prefixes
 
-# Not about the lattice's motion, but about the members and how well they were computed.
+# About the members and their accuracy, not about the lattice's motion.
 ABOUT_MEMBERS = {"status", "number"}
 ON_REQUEST = {
     "ledger_error",
@@ -195,7 +195,7 @@ def measures_of(ensemble: xr.Dataset) -> list[str]:
 
 
 def reason_without_page(ensemble: xr.Dataset, name: str, by_name: bool) -> str:
-    """Return why the measure ``name`` of an ensemble has no page; empty where it has one.
+    """Return the reason why the measure ``name`` of an ensemble has no page; empty if it has one.
 
     One that vanishes everywhere has a page only where it is asked for ``by_name``.
     """

@@ -1,4 +1,4 @@
-"""The energies of a run's linear modes: their steps at impacts, and what each site moved between the bands."""
+"""The energies of a run's linear modes: their steps at impacts, and the energy that each site transferred."""
 
 from typing import NamedTuple, Self
 
@@ -12,13 +12,13 @@ from vipetsc.figures import panels, style
 
 COLOURS = style.GREY, style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.YELLOW
 LEAST = 1e-4  # of the largest energy, at the end or in transfers, below which a gap is not drawn
-MOST_ROWS = 24  # sites of a matrix; of more, the ones that moved most
+MOST_ROWS = 24  # sites of a matrix; of more, those with the largest transfers
 MOST_TICKS = 6  # of sites next to the raster of impacts
 SEVERAL = "several"  # sites in contact between the same samples
 
 
 class MovedEnergies(NamedTuple):
-    """Energies (row, part) in J that each site moved into the parts of the spectrum; in the last column what it lost.
+    """Energies (row, part) in J that each site transferred to the parts of the spectrum; the last column is its loss.
 
     ``labels`` (row) are cells, or ``SEVERAL`` for episodes that cannot be separated by site.
     """
@@ -28,7 +28,7 @@ class MovedEnergies(NamedTuple):
 
     @classmethod
     def of(cls, run: xr.Dataset, analysis: xr.Dataset, parts: list[int]) -> Self:
-        """Return what the sites of ``run`` moved into ``parts``, of at most ``MOST_ROWS`` of them, in their order."""
+        """Return the energies that at most ``MOST_ROWS`` sites of ``run`` transferred to ``parts``."""
         transfer = analysis["bands/transfer"].values  # (cluster, part)
         cluster = analysis["bands/cluster_of_episode"].values - 1
         site = run["impacts/site"].values.astype(int) - 1

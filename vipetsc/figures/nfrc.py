@@ -1,4 +1,4 @@
-"""Nonlinear frequency-response curves: displacement, stability, folds, slow sweeps, and where the energy goes."""
+"""Nonlinear frequency-response curves: displacement, stability, folds, slow sweeps, and fractions of the energy."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ FOLD = 1  # of the variable ``kind``
 
 
 def frequency_response(paths: Sequence[Path]) -> Figure:
-    """Draw displacement over amplitude or frequency, and below it where the energy goes; a column for each file."""
+    """Draw displacement over amplitude or frequency, and below it fractions of the energy; a column for each file."""
     branches = []
     for path in paths:
         with open_netcdf(path, "branch", ("share", "unstable", "over")) as file:

@@ -1,4 +1,4 @@
-"""A search for the best design: how it went, the designs it compares, what they do over the amplitude."""
+"""A search for the best design: its progress, the compared designs, and their performance over the amplitude."""
 
 from typing import NamedTuple
 

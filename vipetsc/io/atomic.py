@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written under a temporary name, renamed when complete."""
+"""Files that are complete or absent: written under a temporary name, and renamed when complete."""
 
 import os
 import platform

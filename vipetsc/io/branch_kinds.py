@@ -1,7 +1,7 @@
 """The kinds of branch files: orbits, condensed motions, responses; the attribute ``branch_kind`` of a file names it.
 
-Readers of all rooms ask `branch_kind`; the branch format of ``vipetsc.modes.branches`` writes the attribute. The module
-stands here because figures, which read branches, do not load PETSc.
+All readers use `branch_kind`; the branch format of ``vipetsc.modes.branches`` writes the attribute. The module
+is in this folder because figures, which read branches, do not load PETSc.
 """
 
 import xarray as xr

@@ -1,12 +1,12 @@
-"""What a user has asked of a folder or a file of results that it cannot do."""
+"""Errors about folders and files of results."""
 
 
 class FolderError(ValueError):
-    """An output folder that cannot be used as asked."""
+    """An output folder that cannot be used as requested."""
 
 
 class ResultFileError(FolderError):
-    """A file that is not of the kind of results that its name says."""
+    """A file whose content is not of the kind that its name indicates."""
 
 
 class UnreadableFileError(OSError, ResultFileError):

@@ -1,7 +1,7 @@
 """Output folders: their claim by one command, and the provenance that every output carries.
 
-Names that begin with a dot are no results: ``.lock`` while a command works in the folder, ``.new`` for results that
-are to replace those that are there, ``.ready``, ``.moving`` and ``.*.old`` while they do, ``.*.part`` for a file being
+Names that begin with a dot are not results: ``.lock`` while a command works in the folder, ``.new`` for results that
+will replace the present ones, ``.ready``, ``.moving`` and ``.*.old`` while they do, ``.*.part`` for a file being
 written.
 """
 
@@ -111,12 +111,12 @@ def claimed(
     resume: bool = False,
     difference: Difference | None = None,
 ) -> Iterator[Claim]:
-    """Claim the folder ``path`` for results of ``kind``: begin them, or go on with results of the same case.
+    """Claim the folder ``path`` for results of ``kind``: start new results, or continue those of the same case.
 
     All ranks must call it. A missing folder is created; leftovers of a killed command are removed, and a swap that it
-    began is finished. ``text``, a resolved case, is stored in the folder. ``force`` begins anew: earlier results stay
-    until new ones are published; the next call without ``force`` goes on with the new ones. ``resume`` only goes on
-    with results that exist. ``difference`` takes an earlier text and returns the reason why its results are not the
+    began is finished. ``text``, a resolved case, is stored in the folder. ``force`` starts again: earlier results stay
+    until new ones are published; the next call without ``force`` continues the new ones. ``resume`` only continues
+    existing results. ``difference`` takes an earlier text and returns the reason why its results are not the
     wanted ones, or None if they are; by default any change is a reason.
 
     Raises FolderError if the path is a file, another process works in it, it holds anything but results of ``kind`` and

@@ -1,4 +1,4 @@
-"""Locks on folders, in which one command at a time works."""
+"""Locks on folders, so that one command at a time works in a folder."""
 
 import fcntl
 import logging
@@ -30,7 +30,7 @@ LOOK_EVERY = 0.05  # s between two attempts while a holder may be ending
 def locked(comm: MPI.Comm, *paths: Path) -> Iterator[None]:
     """Keep other commands out of the folders ``paths`` within the block; those that are missing are created.
 
-    A lock lies on ``.lock`` in the folder, held by rank 0, and ends with its process, so that none is left behind;
+    Rank 0 holds the lock on the file ``.lock`` in the folder. It ends with its process, so that none is left behind;
     it may be taken again within the block by the same process. Folders that stay empty are removed again. Rank 0 waits
     up to ``PATIENCE`` s for another process that has the lock, and says so. All ranks must call it. Raises FolderError
     on all of them if the other process keeps the lock, and names it.

@@ -20,7 +20,7 @@ from vipetsc.lattice.chain import cells_between
 if TYPE_CHECKING:
     import xarray as xr
 
-# Files that are opened where a folder is named: the first of them that it holds.
+# Files that are opened if a folder is given: the first one that exists.
 FIRST = "run.h5", "optimum.h5", "prediction.h5", "law.h5", "design.h5", "analysis.h5"
 Selectable = TypeVar("Selectable", "xr.Dataset", "xr.DataArray")
 
@@ -96,7 +96,7 @@ def nearest_cell(run: xr.Dataset, cell: int) -> int:
 
 
 def open_ensemble(folder: str | Path) -> xr.Dataset:
-    """The ensemble of the sweep in ``folder``, read whole: measures over one dimension a swept axis.
+    """The ensemble of the sweep in ``folder``, read completely: measures with one dimension per swept axis.
 
     A dimension is named after its axis' first key; further keys of a zipped axis are coordinates on it. ``number`` is
     each member's, from 0; the attribute ``folder`` is the sweep's. Raises OSError if ``ensemble.h5`` cannot be read,
@@ -117,7 +117,7 @@ def open_ensemble(folder: str | Path) -> xr.Dataset:
 
 
 def over_samples(ensemble: xr.Dataset) -> xr.Dataset:
-    """The ensemble without the axis of its samples, if it has one: means stand in the place of single measures.
+    """The ensemble without its axis of samples, if it has one: means replace the measures of single samples.
 
     A measure without a mean is that of the first sample; ``statistics/<name>/quantiles`` stay.
     """

@@ -1,4 +1,4 @@
-"""Records of a long task: lines of JSON, appended as they come, each with a checksum.
+"""Records of a long task: lines of JSON, appended one by one, each with a checksum.
 
 A kill loses at most the line that is being written. A line with a wrong checksum counts as if it had not been written.
 """

@@ -13,7 +13,7 @@ class State(NamedTuple):
     """Displacement (cell, dof) in m and velocity in m/s of some cells, which count from 1; others are at rest.
 
     ``time`` in s is that of a run's sample, ``orbit`` the number of a branch's orbit, ``period`` in s that of an orbit;
-    ``case`` is the resolved case of a run. Each is None where the file has no such thing.
+    ``case`` is the resolved case of a run. Each is None if the file does not contain it.
     """
 
     cell: np.ndarray

@@ -1,4 +1,4 @@
-"""Output of a run: a folder, which ends with ``run.h5`` and ``summary.json``, or memory.
+"""Output of a run: a folder, which contains ``run.h5`` and ``summary.json`` at the end, or memory.
 
 During a run its samples are stored as chunks: chunk k holds the samples between the checkpoints k - 1 and k. A chunk
 and a checkpoint are named arrays; a rank writes its part of each into a file of its own, so that nothing is sent during
@@ -64,7 +64,7 @@ class RunFolder:
         self._parts = self.folder / "parts"
 
     def begin(self, case: str) -> None:
-        """Make ready for a run of ``case`` (TOML), or for one that goes on; all ranks must call it."""
+        """Prepare the output of a new or continued run of ``case`` (TOML); all ranks must call it."""
         self.case = case
         on_root(self.comm, lambda: self._parts.mkdir(parents=True, exist_ok=True))
 

@@ -1,4 +1,4 @@
-"""The paper this package comes from, and nothing else: its plan, claims, figures and report.
+"""Reproduction of the paper: its plan, claims, figures and report.
 
 Tempelman, Vakakis and Matlack, on wavenumber scattering and inter-band targeted energy transfer in phononic lattices
 with local vibro-impacts. ``plan`` gathers the steps (``plan.toml``, case files in ``cases/``), ``figures`` draws the

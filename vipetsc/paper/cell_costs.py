@@ -1,4 +1,4 @@
-"""The search of the supplement for the four-band cell: which (lambda, eta) suit inter-band transfer best."""
+"""The search of the supplement for the values of (lambda, eta) that best suit inter-band transfer."""
 
 import itertools
 import sys
@@ -17,7 +17,7 @@ AT_REST = 1e-12  # of the product of two unit-norm displacements, which then hav
 
 @dataclass(frozen=True)
 class CellSearch:
-    """Bloch bands over a grid of four-band cells, and what makes a cell good.
+    """Bloch bands over a grid of four-band cells, and the costs of the cells.
 
     Over the grid ``lam`` (lambda), ``eta`` (eta) and wavenumbers (kappa, rad per cell) of the irreducible Brillouin
     zone: ``frequency`` (lambda, eta, kappa, band) in rad/s; ``signed_deflection`` (lambda, eta, kappa), which is
@@ -95,7 +95,7 @@ def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:
     """|u3 - u2| sign(-u2 u3) (..., band) of the contact pair: positive where it moves out of phase.
 
     The paper leaves the length of the Bloch vectors open. They have unit norm here, which puts the optimum near the
-    paper's eta = .5 in both readings; with unit modal mass a resonator wins by being light (calibrated: eta = .16).
+    paper's eta = 0.5 in both readings; unit modal mass would favour a light resonator (calibrated: eta = 0.16).
     """
     u = unit_vectors(point)
     host, resonator = u[..., cell.host, :], u[..., cell.resonator, :]

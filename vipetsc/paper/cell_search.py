@@ -32,7 +32,7 @@ OPTIMUM = "reading cost"
 LAYOUT = {
     "reading": ("reading", "1", "reading of the paper's parameters"),
     "lambda": ("lambda", "1", "stiffness of the resonator's spring over k (printed) or k2 (calibrated)"),
-    "eta": ("eta", "1", "resonator's share of the mass m2 + m3"),
+    "eta": ("eta", "1", "resonator's fraction of the mass m2 + m3"),
     "wavenumber": ("wavenumber", "rad/cell", "wavenumber"),
     "band": ("band", "1", "band, from 1"),
     "dof": ("dof", "1", "mass within the cell, from 1"),
@@ -162,7 +162,7 @@ def _optima(grids: Mapping[Reading, CellSearch], values: Mapping[str, Any]) -> d
 
 
 def _table(data: xr.Dataset) -> str:
-    """The optima in words and numbers, one line a reading and cost."""
+    """The optima as text, with one line for each reading and cost."""
     sizes = data.sizes
     lines = [
         f"four-band cell, {sizes['lambda']} x {sizes['eta']} cells, {sizes['wavenumber']} wavenumbers;"

@@ -54,8 +54,8 @@ def make_paper(
 ) -> PaperResult:
     """Compute what is missing or stale of ``plan`` in ``root``, on all ranks of ``comm``.
 
-    Leaves ``<step>/`` for every step, ``figures/`` (PNG and PDF), ``claims.json`` and ``report.html``. A call that
-    was stopped or killed is gone on with by the next one; one with nothing to do takes seconds.
+    Leaves ``<step>/`` for every step, ``figures/`` (PNG and PDF), ``claims.json`` and ``report.html``. The next
+    call continues an interrupted one; a call with nothing to do takes seconds.
 
     ``only``, ids of figures and claims, restricts the steps and figures to those that they need; the claims are
     measured and the report is written from all finished steps. ``tell`` is called on rank 0 with what is about to be

@@ -1,1 +1,1 @@
-"""Questions asked of many runs."""
+"""Studies: measures of a run, and evaluations of many runs."""

@@ -1,4 +1,4 @@
-"""The measures of one run: ``run.h5`` in, ``analysis.h5`` out.
+"""The measures of one run: reads ``run.h5``, writes ``analysis.h5``.
 
 Kinetic energy in space and time, wavenumber content, dispersion (of the whole record, and of the cells before and
 after the first site), wavenumber partition and entropy (wavelets over the cells), energies of the pass bands and
@@ -30,15 +30,15 @@ from vipetsc.studies.velocity_record import VelocityRecord, options_of
 FORMAT_VERSION = 3
 HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
 SNAPSHOTS = 500  # at most this many samples are transformed by wavelets
-MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: left to those who window the record
+MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: a window of cells is needed
 
-# What is measured of a run whose fields are kept; "maps" are the space-time maps of the other measures.
+# Measures of a run whose fields are stored; "maps" are the space-time maps of the other measures.
 # "motion" are the measures of named points and the largest force, "statistics" those of the run's ledger and log.
 FULL = (
     *("kinetic", "wavenumber", "dispersion", "partition", "entropy", "bands", "modal", "transfers", "maps"),
     *("motion", "statistics"),
 )
-# Of a member of a sweep whose fields are kept, by the sweep's ``measures``: what its pictures show.
+# Measures of a sweep's member whose fields are stored, by the sweep's ``measures``, as its pictures need them.
 WHOLE = {
     "entropy": ("kinetic", "wavenumber", "dispersion", "partition", "entropy", "maps"),
     "transfer": ("kinetic", "dispersion", "bands", "modal", "maps"),
@@ -93,8 +93,8 @@ def analyse(
     Those ``measures`` of ``FULL`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
     paper's t_hat in s, the time of the largest host velocity at the first site in the linear run; by default it is
     estimated from the group velocity: half the burst and the time to the site. ``options`` are the case's where none
-    are given. What the run cannot give (no sites, a single cell) is left out and named in the attribute ``left_out``;
-    what the samples and cells that were kept do not resolve is named in the list ``warnings`` as well.
+    are given. Measures that the run does not allow (no sites, a single cell) are left out and named in the attribute
+    ``left_out``; those that the stored samples and cells do not resolve are also named in the list ``warnings``.
     """
     sys.audit("vipetsc.analyse")
     options = options or options_of(run)
@@ -143,7 +143,7 @@ def _dataset(
 def _numbers(
     record: RunRecord, taken: Mapping[str, Any]
 ) -> tuple[dict[str, tuple[str, str, str]], dict[str, Any], dict[str, dict[str, Any]]]:
-    """Rows of a layout, values and attributes, all by name, of the measures of the registry that were ``taken``."""
+    """Rows of a layout, values and attributes, all by name, of the computed measures of the registry."""
     layout: dict[str, tuple[str, str, str]] = {}
     values = dict(taken)
     attributes: dict[str, dict[str, Any]] = {}
@@ -166,7 +166,7 @@ def describe_options(options: AnalysisTable) -> str:
 def _measure(
     run: xr.Dataset, record: VelocityRecord, measures: Collection[str], arrival: float | None
 ) -> dict[str, Any]:
-    """The variables of all ``measures``; what cannot be taken is named in the ``record``."""
+    """The variables of all ``measures``; the ``record`` names those that cannot be computed."""
     measures = set(measures)
     samples, cells = record.velocity.shape[:2]
     values: dict[str, Any] = {}
@@ -271,7 +271,7 @@ def _windows(record: VelocityRecord) -> dict[str, slice]:
         low, high = map(int, np.searchsorted(record.cells, [record.site, record.site + 1]))
         lower = slice(0, low)
         upper = slice(high, len(record.cells))
-        # The wave may go down the cells: before and after are in its direction.
+        # The wave may travel to lower cells: before and after refer to its direction.
         drive_below = record.model.drive_cell < record.site
         windows["dispersion_before"] = lower if drive_below else upper
         windows["dispersion_after"] = upper if drive_below else lower
@@ -308,7 +308,7 @@ def _entropies(record: VelocityRecord, stride: int, arrival: float | None, maps:
 
     host = np.ascontiguousarray(record.velocity[::stride, :, record.model.chain.cell.host])
     entropy = spectra.entropy(host, start * options.snapshot_stride, options.cell_stride, options.snapshot_stride)
-    # What half of the snapshots and cells would give shows the error of those that were taken.
+    # The result from half of the snapshots and cells estimates the error of the result from all.
     local = entropy.local[start:][::2, ::2]
     weight = entropy.weight[start:]
     coarse = spectra.averages(local, weight[::2, ::2], 0, 2 * options.cell_stride, weight.max())

@@ -1,4 +1,4 @@
-"""Inter-band transfer laid over the slope of frequency-energy branches: ``backbone.h5`` (paper, section IV.C)."""
+"""Inter-band transfer compared with the slope of frequency-energy branches: ``backbone.h5`` (paper, section IV.C)."""
 
 import hashlib
 import json
@@ -116,11 +116,11 @@ def initiation_of(folder: Path, case: Case) -> Initiation:
 
 
 def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, branch: xr.Dataset) -> xr.Dataset:
-    """Lay the transfer ``ibtet`` (point) at the drive's ``work`` (point, J) over the slope of ``branch``.
+    """Align the transfer ``ibtet`` (point) at the drive's ``work`` (point, J) with the slope of ``branch``.
 
     The paper's three steps: the lattice's energy is scaled so that the ``initiation`` energy (J) falls on the
     transition from region I to II; the slope is divided by a scalar s; the linear transfer ``floor`` is added.
-    s makes the sum over the fitted points of [ln(slope/s + floor) - ln(ibtet)]^2 least. Raises as ``log_slope``.
+    s minimises the sum of [ln(slope/s + floor) - ln(ibtet)]^2 over the fitted points. Raises as ``log_slope``.
 
     Returns ``energy``, ``ibtet`` and ``fitted`` of ``LAYOUT``, energies rising, with the ``branch``. Attributes, unless
     there are too few points to fit: the ``divisor`` s in Hz/J, the transfer's power law (``factor``, ``exponent`` with
@@ -202,7 +202,7 @@ def _relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
 
 
 def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], folder: Path) -> xr.Dataset | str:
-    """Curve aligned with the branch that suits it best, or the reason why there is none."""
+    """Curve aligned with its branch, or the reason why there is no branch."""
     same_law = [slope for slope in slopes if slope.attrs["law"] == case.contacts.law]
     if not same_law:
         return f"no branch of the law {case.contacts.law}"
@@ -245,9 +245,9 @@ def is_related(folder: Path, branches: Sequence[Path]) -> bool:
 def relate_folders(folders: Sequence[Path]) -> list[Path]:
     """Relate every finished sweep among ``folders`` to the branches in the others; returns the files written.
 
-    A curve over the amplitude is laid over the branch of its law and reading, or of its law alone if there is none of
-    its reading; what could not be related is named in the attribute ``left_out``. Raises FolderError if one of the
-    other folders holds no out-of-phase branch, or a file cannot be used.
+    A curve over the amplitude is compared with the branch of its law and reading, or of its law if there is none of
+    its reading; the attribute ``left_out`` names curves without a branch. Raises FolderError if one of the
+    other folders contains no out-of-phase branch, or a file cannot be used.
     """
     sweeps = [folder for folder in folders if (folder / "ensemble.h5").exists()]
     branches = [folder for folder in folders if folder not in sweeps]

@@ -10,7 +10,7 @@ from vipetsc.lattice import pass_bands
 from vipetsc.spectra.measures import MEASURES
 from vipetsc.studies.velocity_record import VelocityRecord
 
-ENDS = 0.02  # part of a record at either end where band energies are too inaccurate for a mean (manual, files.md)
+ENDS = 0.02  # fraction of a record at either end where band energies are too inaccurate for a mean (manual, files.md)
 
 # Rows of ``studies.analysis.LAYOUT``.
 BANDS = {
@@ -89,7 +89,7 @@ def _span(record: VelocityRecord) -> AveragingSpan:
         first = spectra.front_arrival(spectra.kinetic_energy(record.weighted[:, at], record.masses))
         reason = f"the kinetic energy of cell {record.cells[at]} first exceeds 1 % of its largest value"
 
-    # The filters see less than the waves' length at the record's ends.
+    # Near the record's ends, the filters miss the part of the wave beyond them.
     ends = int(np.ceil(ENDS * samples))
     first = min(max(first, ends), samples - 1)
     last = max(samples - ends, first + 1)

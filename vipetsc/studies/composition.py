@@ -1,10 +1,10 @@
-"""Several sites composed from the response of one: waves between them, there and back, without a fitted number.
+"""Prediction of several sites from the response of one, with waves between them in both directions and no fit.
 
 Between the sites the lattice is linear, so all that sites do to each other goes through G_kj(omega), the response of
 the relative displacement at site k to a pair of forces at site j, ends of the lattice included. With the self response
-g of an infinite lattice, c_k = c0_k + sum_j (G_kj - delta_kj g) f1_j: what arrives at a site is the linear wave and
-what the others, and the ends, send back. f1 = Phi1(|c|/D) c closes the system: it is solved by GMRES with Phi1 held,
-and once more with that of what comes out, until it stays.
+g of an infinite lattice, c_k = c0_k + sum_j (G_kj - delta_kj g) f1_j: the linear wave and the waves from the other
+sites and from the ends arrive at a site. f1 = Phi1(|c|/D) c closes the system: GMRES solves it with Phi1 fixed, and
+this is iterated with the Phi1 of the solution until it converges.
 
 Third harmonics f3 = Phi3(z) |c| (c/|c|)^3 of the sites add with their phases; a site in contact is stiff to those of
 others: f3 has the term -c3/g too. They press on contacts: z = (|c| + |c3|)/D. The energy that the upper bands carry
@@ -22,7 +22,7 @@ from vipetsc.lattice import ToneBurst, WaveCompliance, bloch
 from vipetsc.studies.response import DECAY, SiteResponse, fastest_wave, in_contact, self_response, unit_phase
 
 WIDTH = 14  # of the burst's line, half of what is followed about a frequency
-WIDEST = 0.45  # of the drive's frequency, the most of that half: what is followed reaches neither 0 nor 2 Om
+WIDEST = 0.45  # of the drive's frequency, the largest half width: the followed line reaches neither 0 nor 2 Om
 WAVENUMBERS = 181  # from 0 to pi, at which the bands are sampled for their edges
 WEAK = 0.35  # over clearance: weaker waves lose as much at a site in contact as a driven wave of this amplitude
 MOST = 60  # iterations

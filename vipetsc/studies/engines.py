@@ -1,4 +1,4 @@
-"""Comparison of both engines: a sample of a sweep's members by ``ts`` against those of the sweep."""
+"""Comparison of both engines: a sample of a sweep's members simulated by ``ts``, compared with the sweep."""
 
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
 
 
 def agreement(sweep: Path, sample: Path) -> list[dict[str, Any]]:
-    """Differences of the members of the ``sample`` from those of the ``sweep`` (folders), the loudest last.
+    """Differences of the members of the ``sample`` from those of the ``sweep`` (folders), the largest amplitude last.
 
     A row has ``amplitude`` in N, contact ``episodes`` of both (sweep, sample) and whether they are the ``same`` number,
     ``differences`` by measure and the ``largest``, and whether the member ``agrees``: none above that of ``COMPARED``.

@@ -1,4 +1,4 @@
-"""``ensemble.h5``: what was measured of every member of a sweep, over the swept keys, with power-law fits."""
+"""``ensemble.h5``: the measures of all members of a sweep over the swept keys, with power-law fits."""
 
 import json
 import sys
@@ -29,7 +29,7 @@ STATUS = ("complete", "scaled", "failed", "missing")  # missing: not reached bef
 COMPLETE, SCALED, FAILED, MISSING = range(4)
 AMPLITUDE = "drive.amplitude"
 
-# What the ensemble takes of a member's statistics: as ``MEASURES`` of its analysis.
+# Statistics of a member in the ensemble, in addition to the ``MEASURES`` of its analysis.
 STATISTICS = {name: REGISTRY[name].row for name in ("contact_episodes", "dissipated_fraction", "work", "ledger_error")}
 FIT = {
     "peak_amplitude": ("N", "amplitude of the largest value"),
@@ -147,7 +147,7 @@ class Results:
         self.used["engine"].add(statistics["engine"])
 
     def _put(self, number: int | list[int], row: Record) -> None:
-        """Enter what was measured of a member, or the same of several, into the tables."""
+        """Enter the measures of a member, or of several equal ones, into the tables."""
         if row.get("parts"):
             self.parts.add(tuple(row["parts"]))
         if row.get("analysis"):
@@ -188,7 +188,7 @@ class Results:
                 energy[numbers] *= self.tables["work"][numbers, None] / run.statistics["work"]
 
     def merge_files(self) -> None:
-        """Put the records of all ranks together in one file, without those that count no more."""
+        """Merge the records of all ranks into one file, without outdated ones."""
         if self.damaged or self.files != [self.paths.merged]:
             merge_records(self.paths.merged, self.lines.values(), self.paths.by_rank())
 
@@ -299,7 +299,7 @@ def _fit_variables(results: Results, data: Variables) -> Variables:
 def _fits(data: Variables, along: str) -> Variables:
     """Power laws over the amplitude, the coordinate ``along``, from the peak on.
 
-    Entropies are normalised to [.01, 1] first, as the paper's.
+    Entropies are normalised to [0.01, 1] first, as the paper's.
     """
     fits: Variables = {}
     amplitude = data[along].values.astype(float)

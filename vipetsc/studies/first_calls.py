@@ -1,4 +1,4 @@
-"""First calls of compiled kernels: small runs and branches, after which those of most studies are compiled and kept."""
+"""First calls of compiled kernels: small runs and branches that compile and store the kernels of most studies."""
 
 import tempfile
 from collections.abc import Callable

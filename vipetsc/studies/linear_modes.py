@@ -1,4 +1,4 @@
-"""Linear modes of a finite lattice near a frequency: the place, band and shape of each, into ``modes.h5``."""
+"""Linear modes of a finite lattice near a frequency, with their place, band and shape, in ``modes.h5``."""
 
 from collections.abc import Sequence
 from pathlib import Path

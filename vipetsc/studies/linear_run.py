@@ -1,7 +1,8 @@
-"""Linear runs: what those members of a sweep have in common that differ in contacts and amplitude alone.
+"""Linear runs, which members of a sweep share if they differ only in contacts and amplitude.
 
-Until the first contact a lattice is linear, so displacements go with the drive's amplitude and energies with its
-square. The linear run, under 1 N and without contacts, shows which members nothing touches; those are that run, scaled.
+Until the first contact a lattice is linear: displacements are proportional to the drive's amplitude, and energies to
+its square. The linear run, under 1 N and without contacts, shows which members have no contact; they are scaled from
+it.
 """
 
 from collections.abc import Collection, Iterable
@@ -28,13 +29,13 @@ from vipetsc.studies.recorded_runs import RecordPaths
 MARGIN = 0.9
 MEMBERS = "members"  # what the records of a sweep are called
 
-# What the ensemble takes of a member's analysis: further dimension, units and description.
+# Measures of a member in the ensemble: further dimension, units and description.
 FITTED = ("ibtet", "entropy/energy_weighted", "entropy/masked", "entropy/joint")
 MEASURES = {name: measure.row for name, measure in REGISTRY.items() if measure.group in ("entropy", "transfer")}
 
 
 class LinearRun(NamedTuple):
-    """A linear wave, the statistics of its run, and the measures of the members in which nothing touches.
+    """A linear wave, the statistics of its run, and the measures of members without contact.
 
     ``envelope`` (cell): largest sqrt(w^2 + (w'/Om)^2) in m of the contact pair's relative displacement w, Om the
     drive's angular frequency. ``arrival`` (cell): time in s of the largest host velocity, the paper's t_hat when taken
@@ -74,7 +75,7 @@ class LinearRun(NamedTuple):
     def reached(self, case: Case) -> np.ndarray:
         """Linear relative displacement over the lesser clearance (site) at the amplitude of ``case``.
 
-        It is inf where contacts join other masses than the cell's pair, of which the envelope says nothing.
+        It is inf where contacts join other masses than the cell's pair, to which the envelope does not apply.
         """
         contacts = case.contacts
         sites = np.asarray(contacts.sites, int) - 1
@@ -155,7 +156,7 @@ def _pairs(case: Case) -> tuple[Pair, ...]:
 
 
 def is_proportional(case: Case) -> bool:
-    """Whether the lattice moves in proportion to the one amplitude of its drive until something touches."""
+    """Whether the motion is proportional to the amplitude of a single drive until the first contact."""
     if case.initial or case.drive.more or _pairs(case):
         return False
     return case.lattice.unit_cell().is_linear
@@ -196,7 +197,7 @@ def leading_cell(case: Case) -> int:
 
 
 def with_site(linear: xr.Dataset, site: int) -> xr.Dataset:
-    """The ``linear`` run with a ``site`` (cell; 0 for none) that nothing touches."""
+    """The ``linear`` run as a member whose ``site`` (cell; 0 for none) has no contact."""
     cells = [site] if site else []
     return linear.drop_dims("site").assign({"sites/cell": ("site", np.array(cells, np.int64))})
 

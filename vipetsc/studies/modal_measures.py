@@ -1,7 +1,7 @@
-"""Energies of the linear modes of one run by band, gap and wavenumber, and what the contacts moved between them.
+"""Energies of the linear modes of a run by band, gap and wavenumber, and the energy that contacts transferred.
 
-Contacts of sites that touch between the same two samples are one cluster, whose transfer is the change of the energies
-between these samples, less what the drive would have changed in the lattice without contacts.
+Contacts that occur between the same two samples form a cluster. Its transfer is the change of the energies between
+these samples, minus the change that the drive would have caused in the lattice without contacts.
 """
 
 from collections.abc import Collection

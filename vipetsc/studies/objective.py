@@ -1,4 +1,4 @@
-"""The runs by which a design is judged: simulated by teams of ranks, measured, and recorded as they end."""
+"""The runs that evaluate a design: simulated by teams of ranks, measured, and recorded as they end."""
 
 import itertools
 import json
@@ -23,7 +23,7 @@ from vipetsc.studies.analysis import analyse
 from vipetsc.studies.recorded_runs import Key, RecordedRuns
 
 SHARE = "band_share"
-# What ``analyse`` is asked for, by the group of a measure.
+# The measures requested of ``analyse``, by the group of a measure.
 ANALYSED = {"entropy": "entropy", "transfer": "bands", "motion": "motion", "statistics": "statistics"}
 # Names in searches of measures that have another one in results.
 RENAMED = {"entropy": "entropy/energy_weighted"}
@@ -115,7 +115,7 @@ class ObjectiveRuns:
         return Judgement(losses, bounded, excess)
 
     def _failure(self, record: Record) -> str:
-        """Why a run says nothing about its design; empty if it does."""
+        """The reason why a run cannot be used; empty if it can."""
         if "reason" in record:
             return str(record["reason"])
         values = record["values"]
@@ -206,7 +206,8 @@ def _part_of(parts: Sequence[str], band: int) -> int:
 def _energy_beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray) -> float:
     """Energy in J of the cells beyond the site that is farthest from the drive.
 
-    Springs between these cells count whole. Of one at the cut, of stiffness k, k u_b (u_b - u_a)/2 counts, u_b beyond.
+    Springs between these cells count in full; the spring k at the boundary counts as k u_b (u_b - u_a)/2, u_b beyond
+    it.
     """
     chain = model.chain
     sites = np.array(chain.sites)

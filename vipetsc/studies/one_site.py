@@ -1,4 +1,4 @@
-"""The runs of the scattering law: one site in an infinite lattice, ever finer in z; a case in, ``law.h5`` out.
+"""The runs of the scattering law: one site in an infinite lattice, refined in z; the result is ``law.h5``.
 
 ``studies.ring`` has the geometry: a lattice that is infinite while a run lasts. Waves need not have separated in space
 at the end: Bloch amplitudes give band and direction of each at an instant (``spectra.directions``), and are constant
@@ -56,12 +56,12 @@ def make_law(
     stop: StopRequest | None = None,
     progress: bool = False,
 ) -> ScatteringLaw:
-    """Take the scattering law of ``case`` on all ranks of ``comm``, and leave ``law.h5`` in ``folder``.
+    """Compute the scattering law of ``case`` on all ranks of ``comm``, and write ``law.h5`` to ``folder``.
 
-    Recorded runs are not simulated again: a law that was stopped or killed goes on, to the same bits on any number of
-    ranks. ``force`` begins anew, ``resume`` needs one to go on with.
+    Recorded runs are not simulated again: an interrupted law is continued, with the same bits on any number of ranks.
+    ``force`` starts again, ``resume`` requires an existing law.
 
-    Raises FolderError if the folder holds anything but this law, RuntimeError if a run does not come out, StoppedError
+    Raises FolderError if the folder contains anything else, RuntimeError if a run fails, StoppedError
     on a request to ``stop``.
     """
     with claimed(comm, folder, LAW, case.to_toml(), force=force, resume=resume) as claim:

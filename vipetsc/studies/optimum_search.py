@@ -1,4 +1,4 @@
-"""The best design for an objective, or the front of two: a case with ``[optimise]`` in, ``optimum.h5`` out.
+"""The best design for an objective, or the Pareto front of two: the result is ``optimum.h5``.
 
 Rank 0 asks the sampler for designs and reports their losses in that order; all ranks simulate the runs. The result of
 a run is recorded at once, so a search that was stopped or killed repeats the same exchange and goes on.
@@ -35,7 +35,7 @@ POPULATION = 24  # of NSGA-II
 # Designs are compared at so many amplitudes, from the least over this to the largest times this.
 CURVE_POINTS = 11
 CURVE_SPREAD = 4.0
-# Shown of every design, whatever its objective: a large transfer may go with a large loss.
+# Shown for every design with any objective: a large transfer may come with a large loss.
 SHOWN = ("upper_share_at_end", "dissipated")
 
 # Dimensions, units and description of every variable.
@@ -73,7 +73,7 @@ LAYOUT = {
 
 @dataclass
 class Design:
-    """A design that was tried: its ``values`` (variable) and what became of it.
+    """A design that was tried: its ``values`` (variable) and its results.
 
     ``case`` and ``runs`` are None and empty for an impossible one; ``losses`` (objective) are small for a good one, NaN
     if it failed for a ``reason``. ``constraints`` are the values of what is bounded, ``excess`` is by how much they are
@@ -190,9 +190,9 @@ def run_search(
     stop: StopRequest | None = None,
     progress: bool = False,
 ) -> str:
-    """Search for the best design of ``plan`` in ``folder``; returns a table of what was found.
+    """Search for the best design of ``plan`` in ``folder``; returns a table of the results.
 
-    Leaves ``optimum.h5`` and ``best.toml``, of two objectives the front's knee, with ``best-1.toml`` and
+    Writes ``optimum.h5`` and ``best.toml``, for two objectives the front's knee, with ``best-1.toml`` and
     ``best-2.toml`` for its ends. The same files, to the bit, on any number of ranks and after any stop. All ranks of
     ``comm`` must call it. Raises StoppedError, FolderError if the folder holds anything but this search.
     """
@@ -211,7 +211,7 @@ def run_search(
 
 
 def _search(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool) -> None:
-    """Try designs until the budget is spent, compare the best with the case, and write what was found."""
+    """Try designs until the budget is spent, compare the best one with the case, and write the results."""
     objective = ObjectiveRuns(plan, folder, comm, stop)
     bar = Progress(comm, plan.options.budget, "designs", show=progress)
     searches: list[OptimumSearch] = []  # one on rank 0, none on the others
@@ -380,7 +380,7 @@ def _curve_values(search: OptimumSearch) -> dict[str, Any]:
 
 
 def _summary(data: xr.Dataset, plan: OptimiseCase) -> str:
-    """A table of what was found, with a line for every compared design."""
+    """A table of the results, with a line for every compared design."""
     reasons = [reason for reason in data["reason"].values if reason]
     lines = [f"{data.sizes['design']} designs, {data.attrs['runs']} runs; {len(reasons)} designs failed"]
     if reasons:
@@ -390,7 +390,7 @@ def _summary(data: xr.Dataset, plan: OptimiseCase) -> str:
         met = int(((data["excess"] == 0) & (data["reason"] == "")).sum())
         lines += [f"  {met} designs meet the constraints:", *(f"    {text}" for text in data["constraint"].values)]
 
-    columns = [*data["objective"].values, "upper share", "dissipated"]
+    columns = [*data["objective"].values, "upper", "dissipated"]
     lines.append(f"  {'design':<8}{'number':>7}" + "".join(f"{name:>24}" for name in columns))
     for name, number in zip(data["compared"].values, data["comparison/number"].values, strict=True):
         row = [*data["value"].values[number], *(data[shown].values[number] for shown in SHOWN)]

@@ -1,4 +1,4 @@
-"""Jobs done by teams of ranks: one job may fail, a request to stop and a full disk end them all."""
+"""Jobs done by teams of ranks: a single job may fail; a request to stop or a full disk ends all jobs."""
 
 import errno
 import sys

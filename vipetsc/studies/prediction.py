@@ -1,4 +1,4 @@
-"""A run with any number of sites predicted from the response of one: a case in, ``prediction.h5`` out.
+"""Prediction of a run with any number of sites from the response of one: the result is ``prediction.h5``.
 
 Runs: the linear lattice under 1 N (onset, work, energies by band); one site in an infinite lattice (``studies.ring``)
 at ``predict.points`` amplitudes, dense near the onset (``studies.response``); then, to compare, the case itself at
@@ -86,11 +86,11 @@ def predict(
     stop: StopRequest | None = None,
     progress: bool = False,
 ) -> xr.Dataset:
-    """Predict ``case`` on all ranks of ``comm``, and leave ``prediction.h5`` in ``folder``; its content on all ranks.
+    """Predict ``case`` on all ranks of ``comm``, and write ``prediction.h5`` to ``folder``; returns its content.
 
-    Recorded runs are not simulated again; ``force`` begins anew, ``resume`` needs some to go on with. Raises
-    FolderError if the folder holds anything but this prediction, RuntimeError if a run that it needs does not come
-    out, StoppedError on a request to ``stop``.
+    Recorded runs are not simulated again; ``force`` starts again, ``resume`` requires existing runs. Raises
+    FolderError if the folder contains anything else, RuntimeError if a required run fails, StoppedError on a
+    request to ``stop``.
     """
     with claimed(comm, folder, PREDICTION, case.to_toml(), force=force, resume=resume) as claim:
         path = claim.folder / "prediction.h5"
@@ -207,7 +207,7 @@ class PredictionRuns:
         return burst, motion.largest()[0]
 
     def _member(self, amplitude: float) -> Record:
-        """The case under ``amplitude``: what is compared."""
+        """The case under ``amplitude``, for the comparison."""
         first_and_last = {"stride": self.model.samples - 1}
         run, statistics = self._run(
             self.case.varied(without=("output",), drive={"amplitude": amplitude}, output=first_and_last)

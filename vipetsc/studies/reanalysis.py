@@ -1,4 +1,4 @@
-"""New analyses of finished runs: of one run, or of all members of a sweep whose fields were kept."""
+"""New analyses of finished runs: of a single run, or of all members of a sweep whose fields are stored."""
 
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -39,12 +39,12 @@ class MeasurableRun(NamedTuple):
 def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str] = ()) -> list[Path]:
     """Measure the runs in ``paths`` (folders of runs or sweeps, or ``run.h5``); returns the files written.
 
-    ``overrides`` are of ``[analysis]``, and of runs alone: members that kept no fields could not follow.
+    ``overrides`` change keys of ``[analysis]``, for single runs only: members without stored fields could not follow.
 
-    The ranks of ``comm`` measure different runs. Members of a sweep that kept no fields stay as they are; the sweep's
-    ensemble is put together anew.
+    The ranks of ``comm`` measure different runs. Members without stored fields stay as they are; the ensemble of the
+    sweep is assembled again.
 
-    Raises FolderError if a path holds neither runs nor a sweep; nothing is written then.
+    Raises FolderError, and writes nothing, if a path contains neither runs nor a sweep.
     """
 
     def look() -> tuple[list[MeasurableRun], list[Path]]:
@@ -67,7 +67,7 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str
 
 
 def _reassemble(folder: Path) -> Path:
-    """Put the ensemble of the sweep in ``folder`` together anew; returns its path."""
+    """Assemble the ensemble of the sweep in ``folder`` again; returns its path."""
     results = Results(Sweep.load(folder / "case.toml"), folder)
     if (results.status == MISSING).any():
         raise FolderError(f"{folder}: the sweep is not finished; continue it with the verb sweep")

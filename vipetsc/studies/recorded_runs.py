@@ -1,4 +1,4 @@
-"""Runs of a study, simulated by teams of ranks and recorded as they end: a stopped or killed study goes on.
+"""Runs of a study, simulated by teams of ranks and recorded as they end, so that an interrupted study can continue.
 
 Every study with many runs has one ``RecordedRuns``: the scattering law, a prediction, a search for an optimum,
 and a sweep, whose records are in ``members.jsonl`` and are read by ``studies.ensemble``.
@@ -23,8 +23,8 @@ from vipetsc.progress import Progress
 from vipetsc.studies.pool import TaskPool
 
 Key = str | float | tuple[str, float]
-# What may be wrong with one run alone. Too little memory (also as CaseError) or disk is none of it: another try,
-# with more of it, may succeed.
+# Failures of a single run. Too little memory (also as CaseError) or disk is not among them: another attempt
+# with more of it may succeed.
 FAILURES = (RuntimeError, ArithmeticError)
 
 

@@ -1,4 +1,4 @@
-"""Response of one site to a wave: contact force and energies, by the driven wave's amplitude at the moment.
+"""Response of one site to a wave: contact force and energies, as functions of the wave's instantaneous amplitude.
 
 A burst meets a site in a lattice so long that nothing returns. With w the relative displacement of the contact pair,
 w_0 that of the lattice without contacts and g(omega) the response of w to a pair of opposite forces at the infinite
@@ -6,8 +6,8 @@ lattice, the contact's force is f = (w - w_0)/g at every frequency. Near the dri
 w_0 = Re c exp(i Om t) and f = Re f1 exp(i Om t), near 3 Om f = Re f3 exp(3 i Om t). Once |c| exceeds the clearance D,
 contact goes on until the last one ends, at the z = |c|/D that the run shows (``release``). Meanwhile all of it is taken
 for a function of z, averaged over bins of log z, over the burst's rise and fall and over runs of several amplitudes.
-What a whole burst loses and gives to other bands then comes out right by a factor. Both the factor and the release are
-those of bursts with the same largest z.
+A factor corrects the loss and the transfer of a whole burst. Both the factor and the release are those of bursts with
+the same largest z.
 """
 
 from dataclasses import dataclass

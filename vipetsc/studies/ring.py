@@ -1,4 +1,4 @@
-"""The ring, a lattice with one site that is infinite while a run lasts: the geometry of the law and the prediction.
+"""The ring, which acts as an infinite lattice with one site during a run: the geometry of the law and the prediction.
 
 The lattice is a ring of N cells, driven at one, with the site d cells on. The burst lasts T_b; v is the speed of its
 slow waves (all but 1e-3 of the energy in its band is faster), V the largest group velocity of any band. A run ends at

@@ -1,4 +1,4 @@
-"""A run as its measures see it: the record from which ``vipetsc.spectra.measures`` takes them."""
+"""The record of a run from which ``vipetsc.spectra.measures`` computes measures."""
 
 import numpy as np
 import xarray as xr

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-RESOLVED = 1e-4  # of the range between the bounds: what impacts make of a finer change is noise
+RESOLVED = 1e-4  # of the range between the bounds: impacts turn a finer change into noise
 LARGEST = 8  # times the first population
 WHOLE = 0.3  # least standard deviation of a whole number
 

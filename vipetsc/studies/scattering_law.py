@@ -1,4 +1,4 @@
-"""The scattering law of one site: what becomes of a wave's energy, against how hard it meets the site."""
+"""The scattering law of one site: the fractions of a wave's energy over its amplitude at the site."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -149,7 +149,7 @@ class ScatteringLaw:
         return np.where(lost.min(axis=0) > LEAST, mean_efficiency, 0.0)
 
     def matched(self) -> tuple[float, float]:
-        """Point z* at which upper bands get the most of what the drive's wave loses, and T there.
+        """Point z* at which the upper bands receive the largest part of the driven wave's loss, and T there.
 
         The efficiency U/(1-T) is flat: of the points within 10 % of its best the one with the largest T, which leaves
         most for further sites. Raises ValueError if no upper band gets anything.
@@ -193,7 +193,7 @@ class ScatteringLaw:
 
 
 def matched_clearances(law: ScatteringLaw, linear: LinearRun, sites: Sequence[int], amplitude: float) -> np.ndarray:
-    """Clearances in m of ``sites`` (cells from 1, in the order in which the wave meets them) that each meet at z*.
+    """Clearances in m with which each of the ``sites`` (cells from 1, in the order of the wave) operates at z*.
 
     D_k = A env(s_k) sqrt(T^k)/z*, with the envelope of the ``linear`` run under 1 N and the ``amplitude`` A in N: what
     the sites before leave of the drive's wave.

@@ -1,4 +1,4 @@
-"""Sweeps over all ranks: linear runs first, then the longest members; resumes, and goes on past failures."""
+"""Sweeps on all ranks: linear runs first, then the longest members; can be resumed, and continues after failures."""
 
 import json
 import re
@@ -95,14 +95,14 @@ def run_sweep(
     ``result.dataset`` is the ensemble, an xarray dataset. Without a folder it is held in memory; a sweep that is
     stopped then stays in a temporary folder, which ``result.folder`` names.
 
-    Complete members of this version are not simulated again, so a sweep that was killed goes on where
-    it was; ``force`` begins anew and replaces the sweep in the folder when the new one has ended, ``resume`` needs one
-    to go on with. A member that fails is recorded with its reason and the others go on. All ranks of
+    Complete members of this version are not simulated again, so that an interrupted sweep continues; ``force`` starts
+    again and replaces the sweep in the folder at the end, ``resume`` requires an existing sweep. A member that fails is
+    recorded with its reason, and the others continue. All ranks of
     ``comm`` work, ``[sweep] ranks`` of them together on each member.
 
-    Raises CaseError if no member is a valid case (of those drawn, where they are many), or if fields of members are to
-    be kept without a folder, FolderError if the folder holds anything but this sweep, ValueError without a folder where
-    ranks are on several machines.
+    Raises CaseError if no member is a valid case (of a sample, if there are many), or if fields of members are to be
+    stored without a folder; FolderError if the folder contains anything else; ValueError without a folder if the ranks
+    are on several machines.
     """
     on_root(comm, lambda: plan.tried()[:0])  # raises; the cases are not sent
     if folder is None:
@@ -119,7 +119,7 @@ def run_sweep(
 
 
 def _in_memory(plan: Sweep, comm: MPI.Comm, stop: StopRequest | None, progress: bool) -> SweepResult:
-    """The sweep in a temporary folder, which goes once rank 0 has read the ensemble."""
+    """The sweep in a temporary folder, which is removed after rank 0 has read the ensemble."""
     if plan.options.fields:
         remedy = "stores files of every member: give a folder for them, as in sweep(plan, 'my-sweep')"
         raise CaseError([Problem("sweep.fields", True, remedy)], plan.name)

@@ -1,5 +1,5 @@
-"""The verbs: a module declares the record of one, or of a few that belong together, and holds what it does.
+"""The verbs: each module declares the record of one verb, or of a few related ones, and implements it.
 
-A module here is a verb of the program: ``verb_list`` finds it. What a verb alone needs is imported inside
-its functions, since compiled kernels and matplotlib take seconds to load.
+``verb_list`` collects the verbs of all modules. Modules that only one verb needs are imported inside its functions,
+because compiled kernels and matplotlib take seconds to load.
 """

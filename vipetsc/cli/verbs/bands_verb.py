@@ -32,7 +32,7 @@ JSON = argument("--json", action="store_true", help="print JSON instead of a tab
 
 
 def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Print pass bands, gaps and group velocities of a case's cell, and leave them as a table and a picture."""
+    """Print pass bands, gaps and group velocities of a case's cell, and write them as a table and a picture."""
     case = on_root(comm, lambda: Case.load(options.case, options.set))
     folder = options.out or Path("runs") / path_named(f"{case.name}-bands")
 
@@ -133,7 +133,7 @@ def damping_report(numbers: dict[str, Any]) -> str:
 
 
 def modes_report(case: Case, options: argparse.Namespace, folder: Path, comm: MPI.Comm) -> str:
-    """The linear modes of ``--modes`` as text on rank 0, which writes them; empty if none are asked for."""
+    """The linear modes of ``--modes`` as text on rank 0, which writes them; empty if none are requested."""
     if options.modes is None:
         if options.near is not None:
             raise CaseError([Problem("--near", options.near, "gives the frequency for --modes; give both options")])

@@ -1,4 +1,4 @@
-"""The verbs ``nnm`` and ``nfrc``: branches of free and of driven periodic motions, which are drawn alike."""
+"""The verbs ``nnm`` and ``nfrc``: branches of free and of driven periodic motions, which share their pictures."""
 
 import itertools
 import logging
@@ -32,7 +32,7 @@ SHOW_EVERY = 0.5  # s between two lines of the live table
 
 
 def follow_modes(case: NnmCase, work: Work) -> Outcome:
-    """Follow the branches of the case; one that fails is written as far as it came."""
+    """Follow the branches of the case; the computed part of a failed branch is written."""
 
     def report(branch: "Branch") -> None:
         work.report(branch_table(branch))
@@ -42,7 +42,7 @@ def follow_modes(case: NnmCase, work: Work) -> Outcome:
 
 
 def follow_responses(case: NfrcCase, work: Work) -> Outcome:
-    """Follow the curves of steady states of the case; one that fails is written as far as it came."""
+    """Follow the curves of steady states of the case; the computed part of a failed curve is written."""
     return follow_branches(case, work, report=lambda curve: work.report(table(curve_rows(case, curve))))
 
 
@@ -84,7 +84,7 @@ def nnm_rows(case: NnmCase, ranks: int) -> Rows:
 
 
 def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
-    """Lattice and contacts; how many curves there are, over what, at which values, and how they are computed."""
+    """Lattice and contacts; the number of curves, their parameter and fixed values, and the method."""
     options = case.nfrc
     if options.source == "wave":
         excitation = f"an incident wave of band {options.band}, {options.direction}"
@@ -120,7 +120,7 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
 
 
 def branch_log() -> Callable[["Branch", "Point"], None]:
-    """A live table of growing branches: a line a point, no more than two a second."""
+    """A live table of growing branches: one line per point, at most two lines per second."""
     # Of reduced models points come in milliseconds: a line for each would hide all else.
     title = "branch           point      T (s)        E (J)  Newton  contacts  max multiplier\n"
     last = -math.inf

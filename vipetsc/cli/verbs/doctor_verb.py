@@ -1,4 +1,4 @@
-"""The verb ``doctor``: what an installation has, and what is missing."""
+"""The verb ``doctor``: versions of an installation, and missing packages."""
 
 import argparse
 
@@ -16,7 +16,7 @@ LOADING = 1.0  # s of the compiler's clock in which kernels that are there are l
 
 
 def doctor(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Print versions, MPI, HDF5 and ranks; what the program cannot work with, and how to get it."""
+    """Print versions, MPI, HDF5 and ranks, and faults with their remedies."""
     text, is_healthy = doctor_table(comm)
     echo(comm, text)
     if not is_healthy:
@@ -27,7 +27,7 @@ def doctor(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 
 
 def compile_now(comm: MPI.Comm) -> None:
-    """Compile the kernels that are not there yet, and say how long that took; all ranks must call it."""
+    """Compile missing kernels, and print the time that this took; all ranks must call it."""
     # Imported here: what it loads may be what is missing.
     from vipetsc.studies.first_calls import compile_kernels
 

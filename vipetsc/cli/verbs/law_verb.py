@@ -9,7 +9,7 @@ from vipetsc.io.folder import LAW
 
 
 def take_law(case: LawCase, work: Work) -> Outcome:
-    """Take the scattering law, refined until it is as fine as asked for."""
+    """Compute the scattering law, refined to the tolerance of the case."""
     from vipetsc.studies.one_site import make_law
 
     law = make_law(case, work.folder, work.comm, **work.keywords)

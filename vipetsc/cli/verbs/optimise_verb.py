@@ -17,7 +17,7 @@ def search_designs(plan: OptimiseCase, work: Work) -> Outcome:
 
 
 def optimise_rows(plan: OptimiseCase, ranks: int) -> Rows:
-    """Number of designs, what varies in them, and the objectives."""
+    """Number of designs, the variables, and the objectives."""
     variables = first_few([variable.name for variable in plan.variables()])
     return [
         ("optimise", f"{plan.options.budget} designs of {variables}"),

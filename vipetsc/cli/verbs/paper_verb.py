@@ -14,7 +14,7 @@ from vipetsc.parallel import StopRequest, on_root
 
 
 def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Compute what is missing of the paper, draw it, measure its claims, and put all into a report."""
+    """Compute the missing results of the paper, draw its figures, evaluate its claims, and write a report."""
     from vipetsc.paper.make import make_paper, plan_table
     from vipetsc.paper.plan import FULL, QUICK, paper_plan
     from vipetsc.paper.report import claims_table

@@ -1,4 +1,4 @@
-"""The verb ``plot``: pictures of what folders hold again, from their files, and movies of runs."""
+"""The verb ``plot``: pictures of result folders, drawn again from their files, and movies of runs."""
 
 import argparse
 import sys
@@ -18,7 +18,7 @@ from vipetsc.parallel import StopRequest, on_root
 
 NARROWEST = 320  # pixels
 WIDEST = 3840
-FASTEST = 50.0  # frames a second that a GIF can have
+FASTEST = 50.0  # largest number of frames per second of a GIF
 MOVIE_FORMATS = "gif", "mp4"
 
 
@@ -56,7 +56,7 @@ OF_MOVIES: dict[str, Argument] = {
 
 
 def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Draw what folders hold again, from their files, or render a movie of a run."""
+    """Draw the pictures of result folders again, or render a movie of a run."""
     pictures, folders = on_root(comm, lambda: pictures_of(options.path))
     formats = set(options.format or ())
     of_movie = {name: getattr(options, name) for name in OF_MOVIES if getattr(options, name) is not None}

@@ -24,7 +24,7 @@ SUMMARY = {
 
 
 def compose_sites(case: PredictCase, work: Work) -> Outcome:
-    """Predict the case's transfer at every amplitude, and simulate it where that is asked for."""
+    """Predict the case's transfer at every amplitude, and simulate it if requested."""
     from vipetsc.studies.prediction import predict
 
     prediction = predict(case, work.folder, work.comm, **work.keywords)
@@ -33,7 +33,7 @@ def compose_sites(case: PredictCase, work: Work) -> Outcome:
 
 
 def predict_rows(case: PredictCase, ranks: int) -> Rows:
-    """Lattice and contacts; the amplitudes, the runs that predictions are composed of, what they are compared with."""
+    """Lattice and contacts; the amplitudes, the runs from which predictions are composed, and the comparison."""
     options = case.predict
     if options.amplitudes:
         low = min(options.amplitudes)
@@ -58,7 +58,7 @@ def predict_rows(case: PredictCase, ranks: int) -> Rows:
 
 
 def prediction_table(data: xr.Dataset) -> str:
-    """Predicted and simulated fractions of the energy at every amplitude, and how far apart they are."""
+    """Predicted and simulated fractions of the energy at every amplitude, and their differences."""
     # Without ``predict.simulate`` nothing is simulated.
     kinds = [kind for kind in ("predicted", "simulated") if f"{kind}/other" in data]
     columns = [(kind, quantity) for quantity in ("upper", "other", "dissipated") for kind in kinds]

@@ -1,4 +1,4 @@
-"""The verb ``run``: one simulation, its analysis and its pictures; or a member of a sweep again, whole."""
+"""The verb ``run``: one simulation with analysis and pictures, or a member of a sweep with all its fields."""
 
 import argparse
 import json
@@ -43,7 +43,7 @@ def load(options: argparse.Namespace) -> Case:
 
 
 def simulate_and_measure(case: Case, work: Work) -> Outcome:
-    """Simulate the case, and measure its fields where they are kept."""
+    """Simulate the case, and measure its fields if they are stored."""
     from vipetsc.dynamics import simulate
     from vipetsc.dynamics.cost import estimate
     from vipetsc.io.export import has_xdmf, write_xdmf
@@ -128,7 +128,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
 
 
 def run_table(result: "Result", faster: str = "") -> str:
-    """Ending and statistics of a run; ``faster`` names what would have been faster."""
+    """Ending and statistics of a run; ``faster`` names a faster alternative."""
     numbers = result.statistics
     if numbers["engine"] == "propagator":
         method = f"{numbers['method']}, {numbers['bandwidth']} cells each way, exact to {numbers['truncation']:.1g}"

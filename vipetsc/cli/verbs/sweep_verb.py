@@ -20,7 +20,7 @@ MOST_FAILURES = 10  # that are printed
 
 
 def simulate_members(plan: Sweep, work: Work) -> Outcome:
-    """Simulate the members that are missing, and collect what was measured of all."""
+    """Simulate the missing members, and collect the measures of all members."""
     from vipetsc.studies.sweep import run_sweep
 
     result = run_sweep(plan, work.folder, work.comm, **work.keywords)
@@ -30,7 +30,7 @@ def simulate_members(plan: Sweep, work: Work) -> Outcome:
 
 
 def sweep_rows(plan: Sweep, ranks: int) -> Rows:
-    """Number of members of a sweep, and of those tried that are no valid cases."""
+    """Number of members of a sweep, and number of tested members that are not valid cases."""
     tried = plan.tried()
     impossible = sum(member.case is None for member in tried)
     counts = " x ".join(map(str, plan.shape))

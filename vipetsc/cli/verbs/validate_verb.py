@@ -1,4 +1,4 @@
-"""The verb ``validate``: numbers that follow from a case, as each verb whose section it has reads it."""
+"""The verb ``validate``: checks a case for each verb whose section it contains, and prints the resulting numbers."""
 
 import argparse
 
@@ -17,7 +17,7 @@ from vipetsc.parallel import StopRequest, on_root
 
 
 def validate(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Check a case as every verb whose section it has, and print what follows from it."""
+    """Check a case for every verb whose section it contains, and print the numbers that follow from it."""
     echo(comm, on_root(comm, lambda: report_of(options, comm.size)))
     return DONE
 

@@ -1,6 +1,6 @@
 """Criteria that decide on the claims (``claims.toml``), and the constants inside of the quantities they compare.
 
-Every number that decides stands in one of the two. Sections (sec., App., Suppl.) are the paper's; SPEC is the
+Every number that decides a verdict is in one of the two. Sections (sec., App., Suppl.) are the paper's; SPEC is the
 specification that fixes what the paper leaves open.
 """
 

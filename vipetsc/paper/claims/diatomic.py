@@ -1,4 +1,4 @@
-"""C1-C6: what the diatomic lattice does at low, medium and high amplitude (the paper's section II.B)."""
+"""C1-C6: the diatomic lattice at low, medium and high amplitude (the paper's section II.B)."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from vipetsc.paper.claims.criteria import BESIDE, NATIVE
 from vipetsc.paper.claims.evidence import EXCITED, AnalysedMember, Evidence, Measurement, MissingEvidence
 from vipetsc.spectra import Dispersion, ridge
 
-BRANCHES = f"share within {100 * BESIDE:g} % of the top edge from the Bloch branches"
+BRANCHES = f"fraction within {100 * BESIDE:g} % of the top edge from the Bloch branches"
 STEP = "scattering-amplitudes"
 OPTICAL = 2  # the band that the paper drives
 
@@ -107,8 +107,8 @@ def linear_content(evidence: Evidence, reading: str, result: Measurement) -> Non
     # Half, since energy that leaves one bin is counted again where it arrives.
     moved = 0.5 * np.abs(distribution - distribution[0]).sum(axis=1)
     result.value["contact episodes at low amplitude"] = triple.low.episodes
-    result.value["largest share of the energy that changes its wavenumber"] = moved.max()
-    result.uncertainty |= {"mean over time of that share": moved.mean(), "samples": free.sum()}
+    result.value["largest fraction of the energy that changes its wavenumber"] = moved.max()
+    result.uncertainty |= {"mean over time of that fraction": moved.mean(), "samples": free.sum()}
 
 
 def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -117,14 +117,14 @@ def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> No
     low = triple.new_fraction(triple.low)
     medium = triple.new_fraction(triple.medium)
     result.value |= {
-        "share at new wavenumbers, medium amplitude": medium.value,
-        "share at new wavenumbers, medium over low amplitude": medium.value / low.value,
+        "fraction at new wavenumbers, medium amplitude": medium.value,
+        "fraction at new wavenumbers, medium over low amplitude": medium.value / low.value,
         BRANCHES: _on_branches(triple.medium),
-        "share at new wavenumbers, low amplitude": low.value,
+        "fraction at new wavenumbers, low amplitude": low.value,
         f"{BRANCHES}, low amplitude": _on_branches(triple.low),
         "main lobe's half-width (rad/cell)": triple.lobe,
     }
-    result.uncertainty["deviation over time of the share at new wavenumbers"] = medium.deviation
+    result.uncertainty["deviation over time of the fraction at new wavenumbers"] = medium.deviation
     triple.explain_medium(result)
 
 
@@ -145,9 +145,9 @@ def reflected(evidence: Evidence, reading: str, result: Measurement) -> None:
         fraction = triple.new_fraction(run)
         back = _reflected_fraction(triple, run)
         new[name] = fraction.value
-        result.value[f"share at new wavenumbers, {name} amplitude"] = fraction.value
-        result.value[f"share of the incident energy reflected, {name} amplitude"] = back.value
-        deviations = "deviation over time of the share"
+        result.value[f"fraction at new wavenumbers, {name} amplitude"] = fraction.value
+        result.value[f"fraction of the incident energy reflected, {name} amplitude"] = back.value
+        deviations = "deviation over time of the fraction"
         result.uncertainty[f"{deviations} at new wavenumbers, {name} amplitude"] = fraction.deviation
         result.uncertainty[f"{deviations} reflected, {name} amplitude"] = back.deviation
     result.value["new wavenumbers, high over medium amplitude"] = new["high"] / new["medium"]
@@ -197,7 +197,7 @@ def native_bins(evidence: Evidence, reading: str, result: Measurement) -> None:
         by_method["wavelet"].append(energy[first:last].sum() / energy.sum())
 
     for method, fractions in by_method.items():
-        quantity = f"smallest share in bins {NATIVE[0]} and {NATIVE[1]}, {method}"
+        quantity = f"smallest fraction in bins {NATIVE[0]} and {NATIVE[1]}, {method}"
         result.value[quantity] = min(fractions)
         result.uncertainty[f"spread over the amplitudes: {quantity}"] = np.ptp(fractions)
 
@@ -213,7 +213,7 @@ def reconstruction(evidence: Evidence, reading: str, result: Measurement) -> Non
         largest.append(error[after].max())
         cross.append(between_bins[after].mean())
         result.value[f"largest error, {name} amplitude"] = largest[-1]
-        result.value[f"mean share between the bins, {name} amplitude"] = cross[-1]
+        result.value[f"mean fraction between the bins, {name} amplitude"] = cross[-1]
 
     result.value["largest error of the reconstructed kinetic energy after the drive"] = max(largest)
     result.uncertainty["snapshots"] = after.sum()

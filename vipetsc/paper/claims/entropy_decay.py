@@ -15,7 +15,7 @@ AVERAGES = ("energy_weighted", "masked", "joint")
 class EntropyDecay(AmplitudeCurve):
     """An ``average`` of the entropy with one number of ``sites`` at one wavenumber, and the power laws of its fall.
 
-    The values run from .01 to 1 as the paper's, NaN if they are all equal. Of the fits from the peak on, over
+    The values run from 0.01 to 1 as the paper's, NaN if they are all equal. Of the fits from the peak on, over
     ``points``, ``r2`` is the adjusted R^2 of the log-log line, ``best`` the better one of line and nonlinear fit, NaN
     without a fit; the ``exponent`` of the line has a 95 % interval of ``half_width`` to either side.
     """
@@ -72,8 +72,8 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     highest = np.max(behind) if behind else None
     result.value |= {
         "floor of the normalised entropy": quiet.max() if quiet.size else None,
-        "share of configurations with an abrupt rise": abrupt,
-        f"share of configurations with the peak at {PEAK[0]:g} to {PEAK[1]:g} N": in_place,
+        "fraction of configurations with an abrupt rise": abrupt,
+        f"fraction of configurations with the peak at {PEAK[0]:g} to {PEAK[1]:g} N": in_place,
         f"normalised entropy at {HIGH:g} N behind the peak, {SEVERAL} sites or more": highest,
     }
     _list_fits(result, spread, "spread", "spread")
@@ -103,7 +103,7 @@ def _list_fits(result: Measurement, configurations: list[EntropyDecay], sites: s
     """Add the fraction of configurations with a power law, and the fit of each of them."""
     straight = np.mean([c.reaches(c.r2, STRAIGHT) for c in configurations])
     fit = f"adjusted R^2 >= {STRAIGHT:g} over {FEWEST} points or more"
-    result.value[f"share of configurations of {sites} sites with {fit}"] = straight
+    result.value[f"fraction of configurations of {sites} sites with {fit}"] = straight
     for c in configurations:
         name = f"{c.sites} {'site' if c.sites == 1 else 'sites'}, {kind}"
         doubts = doubt(c.points, c.r2)
@@ -132,10 +132,10 @@ def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
         straight[average] = np.mean([c.reaches(c.best, STRAIGHT_EVERYWHERE) for c in curves])
     primary = by_average["energy_weighted"]
 
-    fit = f"share of curves with adjusted R^2 >= {STRAIGHT_EVERYWHERE:g} over {FEWEST} points or more"
+    fit = f"fraction of curves with adjusted R^2 >= {STRAIGHT_EVERYWHERE:g} over {FEWEST} points or more"
     finite = [c.r2 for c in primary if np.isfinite(c.r2) and c.points >= FEWEST]
     result.value |= {
-        "share of curves that rise, peak and fall by half": np.mean([c.falls for c in primary]),
+        "fraction of curves that rise, peak and fall by half": np.mean([c.falls for c in primary]),
         fit: straight["energy_weighted"],
         f"{fit}, log-log line alone": np.mean([c.reaches(c.r2, STRAIGHT_EVERYWHERE) for c in primary]),
         "median adjusted R^2 (log-log)": np.median(finite) if finite else None,
@@ -169,7 +169,7 @@ def error_bars(evidence: Evidence, reading: str, result: Measurement) -> None:
         if error.untouched.any():
             over_quiet.append(high.mean() / error.value[error.untouched].mean())
 
-    growth = f"share of configurations with larger error bars from {HIGH:g} N on than"
+    growth = f"fraction of configurations with larger error bars from {HIGH:g} N on than"
     result.value[f"{growth} at the peak"] = np.mean(np.greater(over_peak, 1))
     if over_quiet:
         result.value[f"{growth} without contact"] = np.mean(np.greater(over_quiet, 1))

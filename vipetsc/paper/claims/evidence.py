@@ -1,4 +1,4 @@
-"""The evidence that claims are measured from: the steps of the paper in one folder; and what a measurement gathers."""
+"""The evidence for the claims: the steps of the paper in one folder, and the numbers of a measurement."""
 
 import tomllib
 from contextlib import ExitStack, suppress

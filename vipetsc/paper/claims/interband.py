@@ -1,4 +1,4 @@
-"""C10-C14: energy that passes to higher bands of the four-band lattice (the paper's section III and supplement)."""
+"""C10-C14: energy transfer to higher bands in the four-band lattice (the paper's section III and supplement)."""
 
 import tomllib
 from contextlib import suppress
@@ -136,7 +136,7 @@ def medium_most(evidence: Evidence, reading: str, result: Measurement) -> None:
         upper = {name: curve.value[i] for name, i in index.items()}
         result.value[f"medium over low amplitude, {law}"] = upper["medium"] / upper["low"]
         result.value[f"medium over high amplitude, {law}"] = upper["medium"] / upper["high"]
-        result.value |= {f"share of the upper bands, {name}, {law}": value for name, value in upper.items()}
+        result.value |= {f"fraction of the upper bands, {name}, {law}": value for name, value in upper.items()}
         result.uncertainty |= {f"{name} amplitude (N)": curve.amplitude[i] for name, i in index.items()}
 
 
@@ -213,8 +213,8 @@ def split_errors(run: AnalysedMember) -> dict[str, float]:
     return {
         "largest error of the mean over the record": abs(parts.mean() / total.mean() - 1),
         "mean error over a period of the drive, largest of the runs": over_period.mean(),
-        "largest share outside the paper's bands and gaps": fraction[~counted].sum(),
-        "largest difference of a part's share from that in the space-time spectrum": from_spectrum.max(),
+        "largest fraction outside the paper's bands and gaps": fraction[~counted].sum(),
+        "largest difference of a part's fraction from that in the space-time spectrum": from_spectrum.max(),
         "mean error at an instant after the drive, largest of the runs": at_instants.mean(),
     }
 
@@ -249,7 +249,7 @@ def prediction(evidence: Evidence, reading: str, result: Measurement) -> None:
         predicted_contact = data["amplitude"].values > data.attrs["onset_amplitude"]
         result.value |= {
             f"rms of the upper bands' energy at the end, in decades, {law}": data.attrs["rms_upper"],
-            f"largest error of the dissipated share, {law}": data.attrs["worst_dissipated"],
+            f"largest error of the dissipated fraction, {law}": data.attrs["worst_dissipated"],
             f"amplitudes with contact on one side alone, {law}": int(np.sum(simulated_contact != predicted_contact)),
             f"largest error of the upper bands' energy, in decades, {law}": data.attrs["worst_upper"],
         }

@@ -155,9 +155,9 @@ def portraits(evidence: Evidence, reading: str, result: Measurement) -> None:
         result.value |= {
             f"I: correlation of host and resonator, {law}": correlation[0],
             f"II: correlation with the motion without contact, {law}": grazing,
-            f"III: largest share of energy above the driven band, {law}": max(above[i] for i in touching),
+            f"III: largest fraction of energy above the driven band, {law}": max(above[i] for i in touching),
             f"IV: correlation of host and resonator, {law}": correlation[last],
-            f"IV: share of energy above the driven band, {law}": above[last],
+            f"IV: fraction of energy above the driven band, {law}": above[last],
         }
         result.value |= {f"correlation at {runs[i].amplitude:g} N, {law}": correlation[i] for i in touching[:-1]}
         result.uncertainty[f"amplitudes, {law}"] = len(runs)
