@@ -25,6 +25,7 @@ MANUAL = Path(vipetsc.__file__).parent / "manual"
         (r"\sqrt{\kappa_c/\kappa}", "√(κ_c/κ)"),
         (r"\sqrt{m_j(x)}\, v", "√(mⱼ(x)) v"),
         (r"e^{i \kappa j}", "e^(i κ j)"),
+        (r"\int_{t_0}^{t_1} F", "∫_t₀^t₁ F"),
         (r"e^{i\kappa} z", "e^(iκ) z"),
         (r"k_c x^{n+1}", "k_c xⁿ⁺¹"),
         (r"\dot w/\dot w_-", "ẇ/ẇ₋"),
@@ -75,3 +76,13 @@ def test_plain_chapters_have_words_for_terms_and_keep_code():
     assert "echo $A $B" in shown
     assert shown.endswith("\n    x = 1/2\n")
     assert "{" not in shown
+
+
+def test_wide_tables_become_lists():
+    """A table whose columns fit a terminal stays one; of a wider one each row is an entry with the names of columns."""
+    narrow = plain("| a | b | c |\n|---|---|---|\n| 1 | 2 | 3 |\n")
+    assert narrow == "a  b  c\n1  2  3\n"
+
+    long = "word " * 10
+    wide = plain(f"| message | reason | remedy |\n|---|---|---|\n| {long} | {long} | wait |\n")
+    assert wide == f"  {long.strip()}\n      reason: {long.strip()}\n      remedy: wait\n"

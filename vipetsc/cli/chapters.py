@@ -7,6 +7,7 @@ from textwrap import indent
 
 from vipetsc.cli.formulas import FormulaError, formula_text
 
+WIDEST = 40  # characters of a column, on average over all but the last; wider ones hold sentences
 KEYS = "case-keys"  # the chapter that is written from the schema
 # What no formula is in: blocks of code, and code in a paragraph.
 CODE = re.compile(r"(^```.*?^```$|`(?:[^`\n]|\n(?!\n))+`)", flags=re.M | re.S)
@@ -78,13 +79,19 @@ def _formula(latex: str) -> str:
 
 
 def _columns(rows: str) -> str:
-    """The rows of a table in columns of equal width; the last one is free."""
+    """The rows of a table in columns of equal width, the last one free; a wide table as a list, an entry a row."""
     # An escaped bar is text of a cell.
     cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", row.strip("|"))] for row in rows.splitlines()]
     cells = [row for row in cells if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]) - 1)]
-
     lines = []
+    if sum(widths) > WIDEST * len(widths):
+        names = cells[0]
+        for row in cells[1:]:
+            lines.append(f"  {row[0]}")
+            lines += [f"      {name}: {cell}" for name, cell in zip(names[1:], row[1:], strict=False) if cell]
+        return "\n".join(lines) + "\n"
+
     for row in cells:
         # Not strict: the last column has no width.
         padded = [f"{cell:<{width}}" for cell, width in zip(row, widths, strict=False)]

@@ -117,7 +117,8 @@ def _script(mark: str, text: str, is_word: bool) -> str:
     letters = RAISED if mark == "^" else LOWERED
     if text and not is_word and all(character in letters for character in text):
         return "".join(letters[character] for character in text)
-    is_clear = is_word or len(text) == 1 or (mark == "_" and FACTOR.fullmatch(text))
+    has_one_letter = all(character in LOWERED.values() for character in text[1:])
+    is_clear = is_word or has_one_letter or (mark == "_" and FACTOR.fullmatch(text))
     return mark + (text if is_clear else f"({text})")
 
 
