@@ -8,7 +8,8 @@ import xarray as xr
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
-from vipetsc.figures import frequency_energy, nfrc, registry, style
+from vipetsc.figures import branch_curves, nfrc, registry, style
+from vipetsc.figures.without_picture import reasons_without_pictures
 from vipetsc.io import branch_kinds
 from vipetsc.io.netcdf import write_netcdf
 
@@ -38,10 +39,10 @@ def test_a_branch_is_drawn_through_its_points_along_its_tangents():
         kind=np.full(len(angle), "regular"),
     )
 
-    fine_energy, fine_frequency = frequency_energy.smooth(branch)
+    fine_energy, fine_frequency = branch_curves.smooth(branch)
 
-    assert np.allclose(fine_energy[:: frequency_energy.FINE], energy)
-    assert np.allclose(fine_frequency[:: frequency_energy.FINE], frequency)
+    assert np.allclose(fine_energy[:: branch_curves.FINE], energy)
+    assert np.allclose(fine_frequency[:: branch_curves.FINE], frequency)
     radius = np.hypot(np.log(fine_energy), np.log(fine_frequency / 100))
     # Straight lines between the points would be off by 6e-3.
     assert np.abs(radius - 0.1).max() < 3e-4
@@ -66,7 +67,7 @@ def test_a_branch_keeps_a_corner_where_a_contact_grazes(slope_at_grazing):
         kind=["regular", "regular", "grazing", "regular", "regular"],
     )
 
-    fine_energy, fine_frequency = frequency_energy.smooth(branch)
+    fine_energy, fine_frequency = branch_curves.smooth(branch)
 
     assert fine_frequency == pytest.approx(exact(fine_energy), rel=1e-9)
 
@@ -74,7 +75,7 @@ def test_a_branch_keeps_a_corner_where_a_contact_grazes(slope_at_grazing):
 def test_of_states_with_one_energy_that_of_the_lowest_frequency_is_marked():
     """A branch goes back from 4 J to 2 J at higher frequencies, and on at lower ones."""
     branch = branch_of(energy=[1.0, 3.0, 4.0, 3.5, 2.0, 2.5, 5.0], frequency=[1.0, 3.0, 4.0, 5.0, 2.9, 1.0, 5.9])
-    assert frequency_energy.lowest(branch).tolist() == [True, False, False, False, False, True, True]
+    assert branch_curves.lowest(branch).tolist() == [True, False, False, False, False, True, True]
 
 
 def test_a_branch_file_names_its_kind():
@@ -108,8 +109,8 @@ def test_every_kind_of_branch_has_a_figure_and_no_two_figures_one_name():
     ("options", "label"),
     [
         ({"source": "wave"}, "amplitude of the wave / clearance"),
-        ({"source": "force"}, "amplitude [N]"),
-        ({"source": "wave", "over": "frequency", "range": [900.0, 1100.0], "fixed": [1.0]}, "frequency [rad/s]"),
+        ({"source": "force"}, "amplitude (N)"),
+        ({"source": "wave", "over": "frequency", "range": [900.0, 1100.0], "fixed": [1.0]}, "frequency (rad/s)"),
     ],
 )
 def test_the_axis_of_a_response_names_what_drives_the_sites(options, label):
@@ -130,11 +131,18 @@ def put_condensed_branch(path: Path, points: int) -> None:
     write_netcdf(path, branch.isel(point=slice(points)))
 
 
-@pytest.mark.parametrize(
-    ("points", "panel", "note"), [(3, 2, "no motions stored"), (0, 0, "no point of the branch was found")]
-)
-def test_a_condensed_branch_that_was_interrupted_is_drawn_without_motions(tmp_path, points, panel, note):
-    put_condensed_branch(tmp_path / "branch-begun.h5", points)
+def test_a_condensed_branch_that_was_interrupted_is_drawn_without_motions(tmp_path):
+    put_condensed_branch(tmp_path / "branch-begun.h5", 3)
     with style.rc_style():
         figure = registry.branch([tmp_path / "branch-begun.h5"])
-    assert [text.get_text() for text in figure.axes[panel].texts] == [note]
+    assert [text.get_text() for text in figure.axes[2].texts] == ["no motions stored"]
+
+
+def test_a_branch_without_points_is_no_file(tmp_path):
+    """One of two is drawn, and the other named; a folder without any refuses the figure by its name."""
+    put_condensed_branch(tmp_path / "branch-empty.h5", 0)
+    assert registry.draw(registry.BRANCHES, [tmp_path]) == []
+    assert list(reasons_without_pictures(registry.BRANCHES, [tmp_path])) == [registry.BRANCH]
+    put_condensed_branch(tmp_path / "branch-begun.h5", 3)
+    assert [path.name for path in registry.draw(registry.BRANCHES, [tmp_path])] == ["branch-begun.png"]
+    assert list(reasons_without_pictures(registry.BRANCHES, [tmp_path])) == ["branch-empty"]

@@ -11,10 +11,14 @@ import pytest
 from matplotlib.image import imread
 from scipy.integrate import trapezoid
 
+from tests.readable import complaints
 from vipetsc.case import Case
-from vipetsc.figures.registry import BRANCHES, draw, draw_bands, figure_names
-from vipetsc.figures.schematics import draw_lattice, draw_unit_cell
-from vipetsc.figures.style import SCREEN, new_figure, rc_style
+from vipetsc.figures.lattice_strip import draw_lattice
+from vipetsc.figures.registry import BRANCHES, draw, draw_bands, drawings, figure_names
+from vipetsc.figures.schematics import draw_unit_cell
+from vipetsc.figures.style import SCREEN, new_figure, rc_style, save
+from vipetsc.figures.sweep_members import Files
+from vipetsc.figures.without_picture import reasons_without_pictures
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
 from vipetsc.spectra import kinetic_energy
 from vipetsc.studies.reanalysis import measure_run
@@ -130,6 +134,22 @@ SHAPES = {
     "every third sample": RunShape(stride=3),
     "no velocity": RunShape(fields=("displacement",)),
 }
+NO_SITES = "the lattice has no contact sites"
+NO_MODES = "needs the analysis of a run with all displacements and velocities"
+# What cannot be drawn is no file, for a reason.
+WITHOUT = {
+    "no sites": {"phase": NO_SITES, "impacts": NO_SITES},
+    "no impacts": {"impacts": "no contact closed in this run"},
+    "window after the site": {"modal_energies": NO_MODES, "phase": "cell 8, the first site, was not recorded"},
+    "single cell": {"modal_energies": NO_MODES, "dispersion": "needs two cells or more in the record, side by side"},
+    "two cells": {"modal_energies": NO_MODES},
+    "no velocity": {
+        "modal_energies": NO_MODES,
+        "spacetime": "needs the velocities, which were not recorded",
+        "dispersion": "needs the velocities of all cells",
+        "phase": "displacement and velocity were not both recorded",
+    },
+}
 # Those of which everything can be measured.
 COMPLETE = ("whole", "no impacts", "every third sample")
 
@@ -154,12 +174,33 @@ def assert_not_blank(path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", figure_names("run"))
 def test_every_figure_is_drawn_from_every_shape_of_run(measured, name):
-    folder, _ = measured
-    (path,) = draw("run", [folder], [name])
+    folder, shape = measured
+    paths = draw("run", [folder], [name])
+    if name in WITHOUT.get(shape, {}):
+        assert paths == []
+        return
+    (path,) = paths
     assert path == folder / "figures" / f"{name}.png"
     assert_not_blank(path)
     # No temporary file stays.
     assert not list(path.parent.glob(".*"))
+
+
+def test_what_cannot_be_drawn_is_said(measured):
+    folder, shape = measured
+    assert reasons_without_pictures("run", [folder]) == WITHOUT.get(shape, {})
+
+
+@pytest.mark.slow
+def test_all_of_a_picture_can_be_read(tmp_path):
+    """Every picture of a run: no text outside the page or over other text, labelled axes, lettered panels."""
+    write_run(tmp_path / "run.h5")
+    measure_run(tmp_path)
+    with rc_style(), Files() as files:
+        for name, make, _ in drawings("run", [tmp_path], files):
+            figure = make()
+            save(figure, tmp_path / f"{name}.json")
+            assert (name, complaints(figure)) == (name, [])
 
 
 def test_the_analysis_names_what_it_left_out(measured):
@@ -205,7 +246,8 @@ def test_ranks_divide_the_figures_among_them(tmp_path):
     for rank in range(2):
         paths = draw("run", [tmp_path], formats=("pdf",), rank=rank, ranks=2)
         written += [path.name for path in paths]
-    assert sorted(written) == sorted(f"{name}.pdf" for name in figure_names("run"))
+    drawable = {*figure_names("run")} - {*reasons_without_pictures("run", [tmp_path])}
+    assert sorted(written) == sorted(f"{name}.pdf" for name in drawable)
 
 
 def test_a_misspelt_figure_is_refused_with_the_nearest_name(tmp_path):
@@ -280,5 +322,51 @@ def test_warnings_about_a_run_stand_below_its_pictures_each_once(tmp_path):
     wide = "a sentence that is wider than the picture " * 4
     # Lines are about 0.16 inches high: three at least, and not more than four where there are many.
     assert height_with_warnings(tmp_path, ["one", wide, "one"]) >= plain + 3 * 0.15 * SCREEN
-    many = [f"warning {number}" for number in range(300)]
+    many = [f"warning {chr(number)}" for number in range(300, 600)]
     assert height_with_warnings(tmp_path, many) <= plain + 4 * 0.17 * SCREEN
+
+
+def test_a_note_leaves_the_picture_above_it_as_it_is(tmp_path):
+    """Also the legend of a whole page, which belongs to the page and not to the page with its strip."""
+    pixels = []
+    for number, label in enumerate(("", "a warning\nand another one")):
+        with rc_style():
+            figure = new_figure(3, 2, "a heading")
+            axes = figure.subplots()
+            (line,) = axes.plot([0, 1], [2, 3])
+            figure.get_layout_engine().set(rect=(0, 0.15, 1, 0.85))
+            figure.legend([line], ["a curve"], loc="lower center")
+            figure.set_label(label)
+            pixels.append(imread(save(figure, tmp_path / f"{number}.png")))
+    plain, noted = pixels
+    assert len(noted) > len(plain)
+    np.testing.assert_array_equal(noted[: len(plain)], plain)
+
+
+def test_fonts_of_a_pdf_are_outlines(tmp_path):
+    """Editors and printers take TrueType; bitmap fonts, Type 3, they do not."""
+    with rc_style():
+        figure = new_figure(2, 2, r"plain and $\kappa^2$")
+        path = save(figure, tmp_path / "text.pdf")
+    assert b"/Type3" not in path.read_bytes()
+    assert b"/CIDFontType2" in path.read_bytes()
+
+
+@pytest.mark.parametrize("low", [1e-7, 0.3, 2.0, 900.0])
+@pytest.mark.parametrize("ratio", [1.3, 4.0, 30.0, 1e3, 1e12])
+def test_logarithmic_axes_have_three_labels_or_more(low, ratio, tmp_path):
+    """Of any range; none over another, also on a small panel."""
+    with rc_style():
+        figure = new_figure(2.4, 1.5)
+        axes = figure.subplots()
+        axes.loglog([low, low * ratio], [low, low * ratio])
+        save(figure, tmp_path / "ranges.json")
+        assert complaints(figure) == []
+
+
+def test_a_long_heading_takes_lines(tmp_path):
+    with rc_style():
+        figure = new_figure(2, 2, "a heading that is longer than the page is wide, which is two inches and no more")
+        figure.subplots()
+        save(figure, tmp_path / "heading.json")
+        assert complaints(figure) == []

@@ -290,7 +290,7 @@ def test_what_is_up_to_date_is_neither_offered_nor_encoded_again(searched, tmp_p
         return quantize(image, *arguments, **options)
 
     def order_noted(drawings, *rest):
-        ordered.extend(stem for stem, _ in drawings)
+        ordered.extend(drawing.stem for drawing in drawings)
         return draw_each(drawings, *rest)
 
     monkeypatch.setattr(PaperFigure, "offers", offers_noted)

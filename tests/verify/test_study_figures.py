@@ -87,7 +87,7 @@ def only(name, study):
 
 def offered_figures(name, study):
     """Suffixes and figures of ``name`` that a study offers."""
-    return {suffix: make() for suffix, make in FIGURES[name].function(Sweeps(study, Files()))}
+    return {drawing.stem: drawing.draw() for drawing in FIGURES[name].function(Sweeps(study, Files()))}
 
 
 def maps(figure):
@@ -130,11 +130,11 @@ def test_no_figure_is_offered_where_its_data_lack(whole, curves):
 
 
 def test_suffixes_tell_figures_apart(curves):
-    names = [suffix for suffix, _ in FIGURES["entropy_history"].function(Sweeps([curves], Files()))]
+    names = [drawing.stem for drawing in FIGURES["entropy_history"].function(Sweeps([curves], Files()))]
     assert names == ["calibrated-4pi-9", "calibrated-5pi-9", "printed-4pi-9", "printed-5pi-9"]
 
     # Of several sweeps the name comes first.
-    named = [suffix for suffix, _ in FIGURES["entropy_history"].function(Sweeps([curves, curves], Files()))]
+    named = [drawing.stem for drawing in FIGURES["entropy_history"].function(Sweeps([curves, curves], Files()))]
     assert named[:4] == [f"curves-{name}" for name in names]
 
 
@@ -282,7 +282,7 @@ def test_entropy_curves_and_error_bars_are_the_ensembles(curves, entropy_figures
     grid = np.reshape(entropy_figures[f"calibrated-5pi-9-{average}"].axes, (2, 2))
     upper, lower = grid[:, column]
     assert (upper.get_yscale(), lower.get_xscale(), lower.get_yscale()) == ("linear", "log", "log")
-    assert upper.get_title(loc="left") == f"{sites} sites"
+    assert upper.get_title(loc="left").endswith(f".i) {sites} sites")
 
     row = select(curves, sites=sites, **CALIBRATED)
     raw = row[f"entropy/{average}"].values

@@ -86,7 +86,7 @@ def offered_figures(name, *folders):
     """Suffixes and figures of ``name`` from ``folders``."""
     with rc_style():
         sweeps = Sweeps(map(open_ensemble, folders), Files())
-        found = {suffix: make() for suffix, make in FIGURES[name].function(sweeps)}
+        found = {drawing.stem: drawing.draw() for drawing in FIGURES[name].function(sweeps)}
     assert all(isinstance(f, matplotlib.figure.Figure) for f in found.values())
     return found
 
@@ -119,14 +119,14 @@ def test_values_of_a_relation_have_units_and_names(reduced):
 def test_ibtet_shows_the_ensembles_values(reduced):
     (figure,) = offered_figures("ibtet", reduced).values()
     for law in ("hertz", "bilinear"):
-        for row in (1, 2):
+        for row in ("i", "ii"):
             axes = panel(figure, f".{row}) {law.capitalize()}, calibrated")
             x, y = lines(axes)["1 site, 4 cycles"]
             np.testing.assert_array_equal(x, AMPLITUDES)
             np.testing.assert_array_equal(y, select(open_ensemble(reduced), law=law)["ibtet"])
 
-    linear = panel(figure, "(a.1)")
-    logarithmic = panel(figure, "(a.2)")
+    linear = panel(figure, "(a.i)")
+    logarithmic = panel(figure, "(a.ii)")
     assert linear.get_xscale() == linear.get_yscale() == "linear"
     assert logarithmic.get_xscale() == logarithmic.get_yscale() == "log"
 
@@ -271,7 +271,7 @@ def test_transfer_spectrum_is_that_of_the_cells_velocity(whole, transfer_picture
 def test_dispersions_stand_by_law_and_amplitude(whole):
     (figure,) = offered_figures("transfer_dispersions", whole).values()
     found = all_axes(figure)
-    assert [a.get_title(loc="left") for a in found] == ["(a.1) Hertz, 1 N", "(a.2) Hertz, 60 N"]
+    assert [a.get_title(loc="left") for a in found] == ["(a) Hertz, 1 N", "(b) Hertz, 60 N"]
     for axes, value in zip(found, open_ensemble(whole)["ibtet"].values.ravel(), strict=True):
         assert axes.texts[0].get_text() == f"IBTET {value:.2g}"
         assert axes.images[0].get_array().max() == pytest.approx(1.0)
@@ -326,7 +326,7 @@ def test_regimes_show_the_motion_of_the_contact_cell(whole, reduced):
         w = u[:, 2] - u[:, 1]
         clearance = run["sites/clearance"].values[0]
 
-    assert [a.get_title(loc="left") for a in (first, second)] == ["1: 1 N", "2: 60 N"]
+    assert [a.get_title(loc="left") for a in (first, second)] == ["(b.1) 1 N", "(b.2) 60 N"]
 
     shown = np.diff(motion.displacement, axis=1)
     assert np.abs(shown).max() >= np.abs(w).max() > clearance

@@ -119,7 +119,7 @@ def _describe_samples(drive: "OneDrive") -> str:
 WAVEFORMS = {
     "burst": WaveformRecord(
         build=_build_burst,
-        describe=lambda drive: f"{drive.cycles} cycles, {_omega(drive)}",
+        describe=lambda drive: f"{drive.cycles} cycle{'s' * (drive.cycles != 1)}, {_omega(drive)}",
         takes=("cycles", "envelope"),
     ),
     "harmonic": WaveformRecord(

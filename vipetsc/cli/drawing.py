@@ -1,7 +1,8 @@
 """Pictures of the results in a folder, drawn from its files on all ranks."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,27 +55,39 @@ def draw_pictures(
     from vipetsc.figures.registry import draw
 
     def draw_part() -> list[Path]:
-        try:
+        with reading(pictures, folders):
             return draw(pictures.source, folders, names, formats, rank=comm.rank, ranks=comm.size, newest=newest)
-        except FolderError:
-            # The message says which file, and why.
-            raise
-        except (OSError, KeyError, ValueError) as error:
-            # `prepare` has checked the folder: an error after that is an error of the program.
-            if pictures.prepare:
-                raise
-            article = "an" if pictures.noun[0] in "aeiou" else "a"
-            path = folders[0] / pictures.file
-            raise FolderError(f"{path}: is not {article} {pictures.noun} of vipetsc ({error})") from None
 
     on_root(comm, lambda: prepare(pictures, folders, names))
-    for sentence in on_root(comm, lambda: left_out(pictures, folders, names)):
-        echo(comm, f"vipetsc: {sentence}", sys.stderr)
+    sentences = on_root(comm, lambda: left_out(pictures, folders, names))
+    for sentence in sentences:
+        if pictures.source == SWEEP_FIGURES:
+            echo(comm, f"vipetsc: {sentence}", sys.stderr)
+        else:
+            # A lattice without sites has no impacts: no matter to warn of.
+            echo(comm, f"  {sentence}")
     # Rank 0 reads the time, so that all ranks use the same one even if their file systems differ.
     newest = None if afresh else on_root(comm, lambda: newest_result(folders))
     drawn = on_every_rank(comm, draw_part)
     # ``gather`` gives None on all ranks but the first.
     return sorted(path for paths in comm.gather(drawn) or [] for path in paths)
+
+
+@contextmanager
+def reading(pictures: Pictures, folders: Sequence[Path]) -> Iterator[None]:
+    """Raise FolderError for a file that cannot be read within the block, unless `prepare` has checked it."""
+    try:
+        yield
+    except FolderError:
+        # The message says which file, and why.
+        raise
+    except (OSError, KeyError, ValueError) as error:
+        # `prepare` has checked the folder: an error after that is an error of the program.
+        if pictures.prepare:
+            raise
+        article = "an" if pictures.noun[0] in "aeiou" else "a"
+        path = folders[0] / pictures.file
+        raise FolderError(f"{path}: is not {article} {pictures.noun} of vipetsc ({error})") from None
 
 
 def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None = None) -> None:
@@ -91,20 +104,23 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
 
 
 def left_out(pictures: Pictures, folders: Sequence[Path], names: list[str] | None) -> list[str]:
-    """Messages about pictures of sweeps that are not drawn; on one rank. Raises FolderError for a requested figure."""
-    from vipetsc.figures.registry import OVER_BRANCHES, reasons_without_pages
+    """Messages about pictures that are not drawn; on one rank. Raises FolderError for a requested figure."""
+    from vipetsc.figures.registry import OVER_BRANCHES
     from vipetsc.figures.transfer_curves import curves_left_out
+    from vipetsc.figures.without_picture import reasons_without_pictures
 
-    if pictures.source != SWEEP_FIGURES:
-        return []
-    reasons = reasons_without_pages(folders, names)
-    if names and reasons:
-        missing = "; ".join(f"--fig {name}: {reason}" for name, reason in reasons.items())
+    with reading(pictures, folders):
+        reasons = reasons_without_pictures(pictures.source, folders, names)
+    asked = [name for name in names or () if name in reasons]
+    if asked:
+        missing = "; ".join(f"--fig {name}: {reasons[name]}" for name in asked)
         raise FolderError(f"{folders[0]}: {missing}")
     by_reason: dict[str, list[str]] = {}
     for name, reason in reasons.items():
         by_reason.setdefault(reason, []).append(name)
     sentences = [f"no picture of {', '.join(named)}: {reason}" for reason, named in by_reason.items()]
+    if pictures.source != SWEEP_FIGURES:
+        return sentences
 
     # Only one page shows branches, and perhaps not all curves of the sweep.
     branches = [str(folder) for folder in folders if not (folder / "ensemble.h5").exists()]

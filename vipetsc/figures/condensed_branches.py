@@ -11,8 +11,9 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from vipetsc.case.nnm import NnmCase
 from vipetsc.figures import style
-from vipetsc.figures.frequency_energy import MARKS, draw_branch
-from vipetsc.figures.panels import annotate_empty, empty_figure
+from vipetsc.figures.branch_curves import draw_branch
+from vipetsc.figures.frequency_energy import MARKS
+from vipetsc.figures.panels import annotate_empty, label_panels
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice import pass_bands
 
@@ -29,9 +30,6 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
         with open_netcdf(path, "branch", ("harmonics", "elongation", "kind")) as file:
             names = np.array(file["kind"].attrs["flag_meanings"].split())
             branches.append(file.load().assign(kind=("point", names[file["kind"].values])))
-    if not all(branch.sizes["point"] for branch in branches):
-        return empty_figure("no point of the branch was found")
-
     figure = style.new_figure(style.PAGE, 2.5 * len(branches))
     grid = figure.subplots(len(branches), 3, squeeze=False)
     for (frequency, elongation, motions), branch in zip(grid, branches, strict=True):
@@ -54,6 +52,7 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
             _draw_over_cells(motions, branch)
         else:
             _draw_over_masses(motions, branch)
+    label_panels(grid)
     return figure
 
 

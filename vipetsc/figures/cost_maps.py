@@ -8,7 +8,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from vipetsc.figures import style
-from vipetsc.figures.panels import KAPPA, colour_bar, draw_map
+from vipetsc.figures.panels import KAPPA, colour_bar, draw_map, label_panels
 
 WEIGHTED = 2  # index of the weighted cost
 TITLES = {"deflection": "Deflection", "group_velocity": "Group velocity", "weighted": "Weighted"}
@@ -39,6 +39,7 @@ def deflections(search: xr.Dataset) -> Figure:
             best = f"λ = {cell['optimum_lambda'].item():.3g}, η = {cell['optimum_eta'].item():.3g}"
             axes.set_ylabel(f"{cell['reading'].item().capitalize()}\n{best}\n|u| (unit norm)")
 
+    label_panels(grid)
     grid[0, 0].set(xlim=(0, 1), xticks=(0, 0.5, 1))
     figure.get_layout_engine().set(rect=(0, 0, 1, 1 - 0.22 / figure.get_figheight()))
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="upper center", ncols=5)
@@ -66,6 +67,7 @@ def cost_maps(search: xr.Dataset) -> Figure:
 
         if j == 0:
             axes.set_ylabel(f"{result['reading'].item().capitalize()}\nη")
+    label_panels(grid)
     return figure
 
 
@@ -90,7 +92,8 @@ def _draw_best(axes: Axes, result: xr.Dataset, best: dict[str, float]) -> None:
     axes.plot(best["lambda"], best["eta"], "s", **look)
     cell = result.sel(best, method="nearest")
     inset = axes.inset_axes((0.5, 0.1, 0.46, 0.46))
-    inset.plot(cell["wavenumber"] / np.pi, cell["frequency"].values, lw=0.8)
+    for number, frequency in enumerate(cell["frequency"].transpose("band", ...).values, 1):
+        inset.plot(cell["wavenumber"] / np.pi, frequency, color=style.band_colour(number), lw=0.8)
     inset.set(xlim=(0, 1), ylim=(0, None), xticks=(), yticks=(), xlabel="κ", ylabel="ω")
 
 
@@ -119,6 +122,7 @@ def dispersions(search: xr.Dataset, along: str, other: str) -> Figure:
                 axes.set_title(f"up to {frequency.max():.3g} krad/s ↑", loc="right", fontsize=6.5)
         row[0].set(ylabel=f"{result['reading'].item().capitalize()}\nω (krad/s)", ylim=(0, top))
 
+    label_panels(grid)
     grid[0, 0].set(xlim=(0, 1), xticks=(0, 0.5, 1))
     colour_bar(colours, grid, SYMBOLS[along], extend="neither")
     return figure

@@ -157,7 +157,7 @@ def _entropy(facet: Facet, average: str) -> Figure:
         upper.set_title(facet.row_title(row))
         curve = _curve_or_reason(upper, row, average)
         if curve is None:
-            lower.set_axis_off()
+            _scale_logarithmic(lower, row[AMPLITUDE].values)
             continue
 
         for name, label in AVERAGES.items():
@@ -170,6 +170,7 @@ def _entropy(facet: Facet, average: str) -> Figure:
         _draw_other_readings(lower, facet.ensemble, row, average)
         _draw_log_panel(lower, curve, average, size=2.2)
 
+    panels.label_panels(grid)
     figure.supylabel("Normalised entropy")
     _add_legend(figure, grid, columns=3 if len(facet.rows) > 4 else 2)
     return figure
@@ -211,12 +212,15 @@ def _entropy_all(facet: Facet, average: str) -> Figure:
         line[0].set_ylabel(wavenumber)
         for axes, row in zip(line, rows, strict=True):
             curve = _curve_or_reason(axes, row, average)
-            if curve is not None:
+            if curve is None:
+                _scale_logarithmic(axes, row[AMPLITUDE].values)
+            else:
                 _draw_log_panel(axes, curve, average, size=1.6)
             axes.label_outer()
 
     for axes, row in zip(grid[0], facet.rows, strict=False):
         axes.set_title(facet.row_title(row))
+    panels.label_panels(grid)
     return figure
 
 
@@ -224,8 +228,10 @@ def _curve_or_reason(axes: Axes, row: xr.Dataset, average: str) -> EntropyCurve 
     """Return the curve of ``row``; if there is none, None, and write the reason into ``axes``."""
     curve = EntropyCurve.of(row, average)
     if curve is None:
+        # The axes stay: those of the last row have the labels of all.
         none_came_out = np.isfinite(row[f"entropy/{average}"]).sum() < 2
-        panels.annotate_empty(axes, "no members" if none_came_out else "nothing touches")
+        reason = "no members" if none_came_out else "nothing touches"
+        axes.text(0.5, 0.5, reason, ha="center", va="center", color=style.GREY, transform=axes.transAxes)
     return curve
 
 
@@ -268,6 +274,11 @@ def _draw_log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float) 
         # Out of the layout, which would make room for a long reason by narrowing all panels.
         text = f"no power law:\n{doubts}"
         axes.text(0.04, 0.97, text, transform=axes.transAxes, va="top", color=style.GREY, fontsize=6, in_layout=False)
+    _scale_logarithmic(axes, amplitude)
+
+
+def _scale_logarithmic(axes: Axes, amplitude: np.ndarray) -> None:
+    """Make both ``axes`` logarithmic, from the lowest ``amplitude`` (N) to the highest."""
     axes.set(xscale="log", yscale="log", ylim=SPAN, xlim=(0.8 * amplitude[0], 1.25 * amplitude[-1]))
 
 
@@ -292,6 +303,8 @@ def _history(facet: Facet) -> Figure:
             axes.axvline(start, color="white", lw=0.7, ls="--")
     for axes in grid.flat[len(facet.rows) :]:
         axes.set_axis_off()
+    if len(facet.rows) > 1:
+        panels.label_panels(grid.flat[: len(facet.rows)])
 
     figure.supxlabel("Time (s)")
     figure.supylabel("Amplitude A (N)")

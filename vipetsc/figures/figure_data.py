@@ -52,7 +52,7 @@ def figure_data(figure: Figure, strip: float) -> list[dict[str, Any]]:
         edges = [box.x0, (1 - box.y1) * without_strip, box.x1, (1 - box.y0) * without_strip]
         entry = {
             "box": [round(float(edge), 4) for edge in edges],
-            "title": plain(axes.get_title("left")),
+            "title": plain(axes.get_title("left") or axes.get_title("center")),
             "x": _axis(axes, "x"),
             "y": _axis(axes, "y"),
         }

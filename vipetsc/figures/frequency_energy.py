@@ -17,7 +17,6 @@ compare points of a branch with orbits that other flows than its own have found.
 
 import tomllib
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from string import ascii_lowercase
 
@@ -28,11 +27,11 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from vipetsc.figures import style
-from vipetsc.figures.panels import REGIONS, annotate_empty, empty_figure, note, shade_regions
+from vipetsc.figures.branch_curves import draw_branch, lowest, smooth
+from vipetsc.figures.panels import REGIONS, ROMAN, annotate_empty, note, shade_regions
 from vipetsc.io.netcdf import open_netcdf
 
 NEEDS = ("energy", "frequency", "slope", "multiplier_max", "region", "contacts", "kind", "resonance")
-UNSTABLE = 1.0 + 1e-6  # with a Floquet multiplier of a larger modulus an orbit is unstable, beyond rounding
 MARKS = {
     "fold-energy": ("o", "energy fold"),
     "fold-frequency": ("s", "frequency fold"),
@@ -42,7 +41,6 @@ MARKS = {
 }
 HOLLOW = {"mfc": "white", "mec": style.BLACK, "mew": 0.6, "zorder": 4}
 MOST_MARKS = 12  # with more special points, tongues are labelled by their resonance instead, at their highest fold
-FINE = 8  # points of the curve drawn for each step of a branch
 LABELLED_TONGUES = 3, 5  # k of k:1; later ones crowd together
 LEAST_DIFFERENCE = 1e-17  # shown in place of 0, which a logarithmic axis has not: below all rounding
 
@@ -52,10 +50,13 @@ OTHER_HEIGHT = 1.0
 PORTRAITS_HEIGHT = 0.95
 INCHES = 1.55
 
-# The inset on grazing, in fractions of the axes: where its lower left corner may be, its size, and room for its labels.
-CORNERS = ((0.55, 0.1), (0.55, 0.5), (0.1, 0.1))
+# The inset on grazing, in fractions of the axes: its size, how far it may shrink, and room for its labels.
 INSET = (0.41, 0.36)
-MARGIN = 0.09
+SHRINKING = (1.0, 0.85, 0.7)
+MARGINS = (0.13, 0.1), (0.03, 0.07)  # left and below, right and above
+LEGEND = (0.45, 0.6)  # the upper left corner beyond which the legend is
+PLACES = 17  # along either axis that are tried
+CURVE_POINTS = 4000  # of the curve that the inset is kept off
 
 
 def backbone(paths: Sequence[Path]) -> Figure:
@@ -64,9 +65,6 @@ def backbone(paths: Sequence[Path]) -> Figure:
     Raises OSError or ValueError for a file that holds no branch.
     """
     branches = [_read(path) for path in paths]
-    if not all(branch.sizes["point"] for branch in branches):
-        return empty_figure("no point of the branch was found")
-
     # All columns have the panels that one of them needs, so that their axes are side by side.
     has_flows = any(_holds(branch, "flows/") for branch in branches)
     has_orbits = any(_holds(branch, "orbits/number") for branch in branches)
@@ -79,8 +77,8 @@ def backbone(paths: Sequence[Path]) -> Figure:
     if has_orbits:
         page_heights.append(PORTRAITS_HEIGHT)
 
-    width = style.COLUMN if len(branches) == 1 else style.PAGE
-    figure = style.new_figure(width, INCHES * sum(page_heights))
+    is_alone = len(branches) == 1
+    figure = style.new_figure(style.COLUMN if is_alone else style.PAGE, INCHES * sum(page_heights))
     columns = figure.subfigures(1, len(branches), squeeze=False)[0]
     for column, tag, branch in zip(columns, ascii_lowercase, branches, strict=False):
         upper, *lower = column.subfigures(len(page_heights), 1, squeeze=False, height_ratios=page_heights)[:, 0]
@@ -93,11 +91,14 @@ def backbone(paths: Sequence[Path]) -> Figure:
             draw_panel(axes, branch)
 
         heading = _heading(branch, with_law=len(branches) > 1)
-        panels[0].set_title(f"({tag}) {heading}")
+        panels[0].set_title(heading)
         panels[-1].set(xlabel="energy (J)")
+        letters = list(ascii_lowercase) if is_alone else [f"{tag}.{number}" for number in ROMAN]
+        for panel_tag, axes in zip(letters, panels, strict=False):
+            axes.set_title(f"({panel_tag}) {axes.get_title('left')}".rstrip())
         _label_narrow_energies(panels[-1], energy)
         for part in lower:
-            portraits(part, branch)
+            portraits(part, branch, letters[len(panels)])
     return figure
 
 
@@ -231,7 +232,7 @@ def flow_differences(axes: Axes, branch: xr.Dataset) -> None:
     axes.legend(fontsize=5.5, ncols=2, loc="upper right")
 
 
-def portraits(part: SubFigure, branch: xr.Dataset) -> None:
+def portraits(part: SubFigure, branch: xr.Dataset, tag: str) -> None:
     """Draw the first two masses of the first four orbits stored, which begin with one of every region there is."""
     if "orbits/number" not in branch:
         annotate_empty(part.subplots(), "no orbits stored")
@@ -247,9 +248,10 @@ def portraits(part: SubFigure, branch: xr.Dataset) -> None:
         # Orbits are stored without their regions: that of the regular point with the nearest energy is theirs.
         nearest = int(np.abs(np.log(regular["energy"] / energy)).argmin())
         region = REGIONS[int(regular["region"][nearest])]
-        axes.set_title(f"{region}\n{energy:.2g} J", loc="center", fontsize=7)
+        axes.set_title(f"{region}\n{float(f'{energy:.2g}'):g} J", loc="center", fontsize=7)
         axes.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
     grid[0].set_ylabel(r"$\dot u$/max")
+    part.suptitle(f"({tag}) Orbits", x=0.02, ha="left")
     part.supxlabel(r"$u$/max (solid: mass 1, dashed: mass 2)", fontsize=7)
 
 
@@ -262,105 +264,8 @@ def _draw_orbit(axes: Axes, u: np.ndarray, v: np.ndarray) -> None:
         axes.plot(x[:, mass], y[:, mass], color=colour, lw=0.8, ls=dashes)
 
 
-def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Return energies and frequencies, ``FINE`` for each step: cubic Hermite curves through points and tangents.
-
-    The curves are those of ln E and ln f, each over its range, and their parameter is the length of the chord. Where a
-    contact grazes, the branch may have a corner: one curve ends there and the next begins with a tangent of its own.
-    Branches of less than three points, or without tangents, come back as they are.
-    """
-    energy = branch["energy"].values
-    frequency = branch["frequency"].values
-    if len(energy) < 3 or "tangent_period" not in branch:
-        return energy, frequency
-
-    points = np.log(np.column_stack([energy, frequency]))
-    extent = np.ptp(points, axis=0)
-    scale = np.where(extent > 0, extent, 1)
-    points /= scale
-    chords = np.diff(points, axis=0)
-    length = np.maximum(np.linalg.norm(chords, axis=1), 1e-300)[:, None]
-    unit_chord = chords / length
-    begin, end = _end_tangents(branch, scale, unit_chord)
-
-    # The basis of a cubic Hermite curve; (step, FINE) points become one list, which ends with the last point itself.
-    t = (np.arange(FINE) / FINE)[:, None, None]
-    cubic = points[:-1] + t**2 * (3 - 2 * t) * chords + length * (t * (1 - t) ** 2 * begin - t**2 * (1 - t) * end)
-    fine = np.vstack([cubic.swapaxes(0, 1).reshape(-1, 2), points[-1:]])
-    fine_energy, fine_frequency = np.exp(fine * scale).T
-    return fine_energy, fine_frequency
-
-
-def _end_tangents(branch: xr.Dataset, scale: np.ndarray, unit_chord: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit tangents (step, 2) at the beginning and the end of every step, in logarithms over ``scale``."""
-    energy = branch["energy"].values
-    frequency = branch["frequency"].values
-
-    # The file has dT/ds and df/dE, so df/ds = -f^2 dT/ds, and dE/ds = (df/ds) / (df/dE). This is 0/0 at a frequency
-    # fold and where the branch is linear: such tangents are left to ``_completed``.
-    rate = -branch["tangent_period"].values * frequency**2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        tangents = np.column_stack([rate / branch["slope"].values / energy, rate / frequency])
-    tangents /= scale
-    tangents[~np.isfinite(tangents).all(axis=1) | ~tangents.any(axis=1)] = np.nan
-    tangents /= np.linalg.norm(tangents, axis=1)[:, None]
-
-    # All tangents point in the direction in which the branch was followed; the points may be listed in the other one.
-    tangents *= np.sign(np.nansum(tangents[:-1] * unit_chord)) or 1.0
-
-    # At a grazing point the tangent is that of one side: neither step takes it.
-    begin = tangents[:-1].copy()
-    end = tangents[1:].copy()
-    begin[branch["kind"].values[:-1] == "grazing"] = np.nan
-    end[branch["kind"].values[1:] == "grazing"] = np.nan
-    return _completed(begin, end, unit_chord), _completed(end, begin, unit_chord)
-
-
-def _completed(tangent: np.ndarray, other: np.ndarray, unit_chord: np.ndarray) -> np.ndarray:
-    """Return the ``tangent`` at one end of every step, completed where it is NaN.
-
-    With the tangent ``other`` of the other end the step is a parabola, whose two tangents have the chord as their mean;
-    without, it is straight.
-    """
-    by_other = np.where(np.isnan(other), unit_chord, 2 * unit_chord - other)
-    return np.where(np.isnan(tangent), by_other, tangent)
-
-
-def lowest(branch: xr.Dataset) -> np.ndarray:
-    """Return for each point (point,) whether its frequency is the lowest that the branch has at its energy."""
-    energy = branch["energy"].values
-    frequency = branch["frequency"].values
-    order = np.argsort(energy)
-    ranks = np.searchsorted(energy[order], energy)
-
-    # Each step of the branch is a straight line over energy; points of these energies above it are not the lowest.
-    least = frequency[order].copy()
-    for i, (rank, next_rank) in enumerate(pairwise(ranks)):
-        between = slice(min(rank, next_rank) + 1, max(rank, next_rank))
-        ends = np.sort([i, i + 1])[np.argsort(energy[i : i + 2])]
-        on_line = np.interp(energy[order[between]], energy[ends], frequency[ends])
-        least[between] = np.minimum(least[between], on_line)
-    return frequency <= least[np.argsort(order)] * (1 + 1e-9)
-
-
-def draw_branch(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
-    """Draw the whole branch in blue; over it vermilion where it is unstable, grey where multipliers are not known."""
-    energy, frequency = smooth(branch)
-    multiplier = branch["multiplier_max"].values
-    stable_label = "stable" if np.any(multiplier <= UNSTABLE) else None
-    axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2, label=stable_label)
-
-    parts = ((multiplier > UNSTABLE, style.VERMILION, "unstable"), (np.isnan(multiplier), style.GREY, "not known"))
-    for is_part, colour, label in parts:
-        if len(energy) > len(is_part):
-            # The curve has been smoothed: the points of a step belong to the part if both of its ends do.
-            is_part = np.append(np.repeat(is_part[:-1] & is_part[1:], FINE), is_part[-1])
-        if is_part.any():
-            axes.plot(energy, np.where(is_part, frequency, np.nan), color=colour, lw=1.3 * width, zorder=3, label=label)
-
-
 def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
-    """Draw the neighbourhood of grazing, point ``first``, in the corner where it covers least of the branch.
+    """Draw the neighbourhood of grazing, point ``first``, where it covers nothing of the branch, or least.
 
     It reaches to where the frequency is a tenth above that of the last energy fold, or of grazing if there is no fold,
     but at least three points further than grazing.
@@ -373,15 +278,7 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     last = min(max(last, first + 3), len(energy) - 1)
     near = branch.isel(point=slice(max(first - 1, 0), last + 1))
 
-    # The corner with the least points of the drawn curve behind the inset.
-    in_pixels = axes.transData.transform(np.column_stack(smooth(branch)))
-    curve = axes.transAxes.inverted().transform(in_pixels)
-    covered = []
-    for corner in CORNERS:
-        inside = (curve > np.subtract(corner, MARGIN)) & (curve < np.add(corner, INSET))
-        covered.append(np.sum(np.all(inside, axis=1)))
-    inset = axes.inset_axes([*CORNERS[int(np.argmin(covered))], *INSET])
-
+    inset = axes.inset_axes(_free_place(axes, np.column_stack(smooth(branch))))
     draw_branch(inset, near, width=0.9)
     at_fold = near["kind"].values == "fold-energy"
     inset.plot(near["energy"][at_fold], near["frequency"][at_fold], "o", ms=2.5, **HOLLOW)
@@ -389,6 +286,36 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     inset.tick_params(labelsize=5, pad=1.5)
     inset.locator_params(axis="both", nbins=3)
     inset.set_title("grazing", fontsize=6, pad=1.5)
+
+
+def _free_place(axes: Axes, curve: np.ndarray) -> tuple[float, float, float, float]:
+    """Return left, bottom, width and height, in fractions of ``axes``, of an inset off the drawn ``curve`` (point, 2).
+
+    The largest that is free, and of these the one nearest to the lower right corner; else the one that covers least.
+    """
+    corners = axes.transAxes.inverted().transform(axes.transData.transform(curve))
+    # As many points on each step of the curve as its length deserves.
+    position = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
+    along = np.linspace(0.0, position[-1], CURVE_POINTS)
+    points = np.column_stack([np.interp(along, position, values) for values in corners.T])
+
+    least = (len(points) + 1, (0.0, 0.0, *INSET))
+    for scale in SHRINKING:
+        size = scale * np.array(INSET)
+        low, high = (np.array(margin) for margin in MARGINS)
+        for left in np.linspace(1 - high[0] - size[0], low[0], PLACES):
+            for bottom in np.linspace(low[1], 1 - high[1] - size[1], PLACES):
+                begin = np.array([left, bottom])
+                # The legend stands in the upper left corner.
+                if left < LEGEND[0] and bottom + size[1] > LEGEND[1]:
+                    continue
+                inside = np.all((points > begin - low) & (points < begin + size + high), axis=1)
+                covered = int(inside.sum())
+                if covered < least[0]:
+                    least = covered, (left, bottom, *size)
+        if least[0] == 0:
+            break
+    return least[1]
 
 
 def _shade(axes: Axes, branch: xr.Dataset) -> None:

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from vipetsc.case import Case, Model
 from vipetsc.figures import panels, style
-from vipetsc.figures.panels import empty_figure
 from vipetsc.io.read import field_time
 
 MOST_ROWS = 16  # sites with a row of their own
@@ -64,6 +63,13 @@ class Episodes(NamedTuple):
         return len(self.cells) <= MOST_ROWS and len(self.site) <= MOST_MARKERS
 
 
+def without_impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
+    """Return why a run has no picture of its impacts; empty where it has one."""
+    if not run.sizes["site"]:
+        return "the lattice has no contact sites"
+    return "" if run.sizes["episode"] else "no contact closed in this run"
+
+
 def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw the onset of every contact episode by site and side, coloured by approach speed; energy lost per site.
 
@@ -71,11 +77,6 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     that touch or are pressed from the beginning have no impacts: a map of their indentation.
     """
     episodes = Episodes.of(run)
-    if not len(episodes.cells):
-        return empty_figure("Impacts: the lattice has no contact sites")
-    if not len(episodes.site):
-        return empty_figure("Impacts: no contact in this run")
-
     model = Case.of(run).model()
     are_pressed = bool(model.gaps) and max(min(gap) for gap in model.gaps) <= 0 and "displacement" in run
     has_indentation = are_pressed and len(run["cell"]) == model.chain.cells

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-from vipetsc.figures import style
+from vipetsc.figures import panels, style
 
 ENERGIES = {
     "transmitted": ("T, transmitted", style.BLUE),
@@ -16,7 +16,6 @@ ENERGIES = {
     "upper": ("U, upper bands", style.VERMILION),
     "dissipated": ("L, dissipated", style.ORANGE),
 }
-COLOURS = style.VERMILION, style.PURPLE, style.GREEN, style.YELLOW, style.GREY
 FLOOR = 1e-5  # of the energy that arrives, which a logarithmic axis shows
 DASHES = {"forward": "-", "backward": "--"}
 FEW_DECADES = 20  # largest z up to which 2 and 5 are labelled between the powers of ten
@@ -62,6 +61,7 @@ def law(data: xr.Dataset) -> Figure:
         transmitted = float(data.attrs["matched_transmitted"])
         onset.set_title(f"z* = {matched:.3g}, T = {transmitted:.3g}", fontsize=8)
 
+    panels.label_panels([all_energies, by_band, onset])
     all_energies.legend(fontsize=6, loc="center right")
     by_band.legend(fontsize=6, loc="lower left", ncols=2)
     onset.legend(fontsize=6, loc="center left", bbox_to_anchor=(0.0, 0.45))
@@ -73,14 +73,12 @@ def _curve(data: xr.Dataset, name: str) -> LawCurve:
 
 
 def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
-    """Draw what leaves in every band (a colour, the driven one blue), forward (full) and backward (dashed)."""
+    """Draw what leaves in every band (a colour), forward (full) and backward (dashed)."""
     z = data["z"].values
-    driven = int(data.attrs["drive_band"])
     bands = data["band"].values.tolist()
     directions = data["direction"].values.tolist()
-    other_colours = iter(COLOURS * len(bands))
     for i, number in enumerate(bands):
-        colour = style.BLUE if number == driven else next(other_colours)
+        colour = style.band_colour(number)
         for direction, dashes in DASHES.items():
             j = directions.index(direction)
             value = data["share"].values[:, i, j]

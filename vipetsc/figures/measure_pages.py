@@ -14,7 +14,16 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from vipetsc.figures.measure_panels import Curve, LargestOnMap, MeasurePage, draw_curves, draw_maps, draw_samples
+from vipetsc.figures import style
+from vipetsc.figures.measure_panels import (
+    CommonAxes,
+    Curve,
+    LargestOnMap,
+    MeasurePage,
+    draw_curves,
+    draw_maps,
+    draw_samples,
+)
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import in_file_name, table
 from vipetsc.figures.swept_axes import SweptAxis, SweptKey, joined
@@ -52,6 +61,11 @@ class Roles(NamedTuple):
     curves: tuple[SweptAxis, ...]
     panels: tuple[SweptAxis, ...]
     pages: tuple[SweptAxis, ...]
+
+    @property
+    def labels(self) -> list[str]:
+        """The labels of the axes of numbers: pages with the same ones can have common axes."""
+        return [axis.label if axis.is_number else "" for axis in (self.x, self.y) if axis]
 
     @classmethod
     def of(cls, axes: Sequence[SweptAxis]) -> Self:
@@ -211,8 +225,13 @@ def reason_without_page(ensemble: xr.Dataset, name: str, by_name: bool) -> str:
     return ""
 
 
-def measure_pages(ensemble: xr.Dataset, name: str, sweep: str = "") -> Iterator[Drawing]:
-    """Offer the pages of the measure ``name``; ``sweep`` names it where pictures of several lie in one folder."""
+def measure_pages(
+    ensemble: xr.Dataset, name: str, sweep: str = "", others: Sequence[xr.Dataset] = ()
+) -> Iterator[Drawing]:
+    """Offer the pages of the measure ``name``; ``sweep`` names it where pictures of several lie in one folder.
+
+    Pages over the same keys as those of the ``others`` have common axes with them.
+    """
     measure = Measure.of(ensemble, name)
     keys = [key.path for axis in measure.axes for key in axis.keys]
     heading = f"{table(ensemble)['name']}: {name}"
@@ -225,12 +244,31 @@ def measure_pages(ensemble: xr.Dataset, name: str, sweep: str = "") -> Iterator[
         yield Drawing(stem, partial(_samples_page, ensemble, measure, heading))
         return
     stem = in_file_name("-".join([begin, *keys]))[:LONGEST_STEM]
-    yield from _pages_over_keys(measure, heading, stem)
+    yield from _pages_over_keys(measure, heading, stem, [Measure.of(other, name) for other in others])
 
 
-def _pages_over_keys(measure: Measure, heading: str, stem: str) -> Iterator[Drawing]:
+def _common_axes(measure: Measure, others: Sequence[Measure]) -> CommonAxes | None:
+    """Return what the pages of a measure have in common with those of ``others`` over the same keys; None of none."""
+    roles = Roles.of(measure.axes)
+    together = [measure]
+    for other in others:
+        if other.axes and Roles.of(other.axes).labels == roles.labels:
+            together.append(other)
+    if len(together) == 1:
+        return None
+    parts = [values for one in together for values in (one.values, *(one.band or ()))]
+    places = [Roles.of(one.axes) for one in together]
+    return CommonAxes(
+        values=np.concatenate([part.values.ravel() for part in parts]),
+        x=np.concatenate([place.x.positions for place in places]),
+        y=np.concatenate([place.y.positions for place in places if place.y] or [[0.0]]),
+    )
+
+
+def _pages_over_keys(measure: Measure, heading: str, stem: str, others: Sequence[Measure]) -> Iterator[Drawing]:
     """Offer a page, or one at each value of the keys for which a page has no room."""
     roles = Roles.of(measure.axes)
+    common = _common_axes(measure, others)
     dimensions = [axis.dimension for axis in roles.pages]
     places = [dict(zip(dimensions, index, strict=True)) for index in product(*(range(a.size) for a in roles.pages))]
     cut = ""
@@ -243,7 +281,7 @@ def _pages_over_keys(measure: Measure, heading: str, stem: str) -> Iterator[Draw
         page = measure.at(place)
         if np.isfinite(page.values).any():
             page_stem = f"{stem}-{number}" if dimensions else stem
-            yield Drawing(page_stem, partial(_page, page, roles, [heading, cut + measure.place_text(place)]))
+            yield Drawing(page_stem, partial(_page, page, roles, [heading, cut + measure.place_text(place)], common))
 
 
 def _samples_page(ensemble: xr.Dataset, measure: Measure, heading: str) -> Figure:
@@ -251,10 +289,12 @@ def _samples_page(ensemble: xr.Dataset, measure: Measure, heading: str) -> Figur
     dimension = _seed_dimension(ensemble)
     values = ensemble[measure.name].isel({other: 0 for other in axes_of(ensemble) if other != dimension})
     names = [""]
+    colours = [""]
     if PART in values.dims:
         indices, bands = _bands_of(values)
         values = values.isel(part=indices)
         names = [f"{text}: " for text in bands.texts]
+        colours = _band_colours(bands)
     series = np.atleast_2d(values.transpose(..., dimension).values)
 
     labels = []
@@ -263,13 +303,17 @@ def _samples_page(ensemble: xr.Dataset, measure: Measure, heading: str) -> Figur
         labels.append(f"{name}mean {np.nanmean(samples):.4g}, 5 to 95 % of samples: {low:.4g} to {high:.4g}")
     page = MeasurePage(measure.label, [heading, f"of {measure.samples} samples"], labels)
     page.lay_out([""])
-    figure = draw_samples(page, _seeds(ensemble), list(series))
+    drawn = [
+        Curve(f"samples {i}", i, samples, None, colour)
+        for i, (samples, colour) in enumerate(zip(series, colours, strict=True))
+    ]
+    figure = draw_samples(page, _seeds(ensemble), drawn)
     page.write_legend()
     return figure
 
 
-def _page(measure: Measure, roles: Roles, title: Sequence[str]) -> Figure:
-    """Draw a measure in the panels of a page, its largest value marked."""
+def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAxes | None) -> Figure:
+    """Draw a measure in the panels of a page, its largest value marked, on axes ``common`` to several pages."""
     heading, *further = title
     over = joined([axis.label for axis in (roles.x, roles.y) if axis])
     compared = joined([key.label for axis in (*roles.panels, *roles.curves) for key in axis.keys])
@@ -297,12 +341,12 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str]) -> Figure:
         ring = None
         if marked is not None:
             ring = LargestOnMap(best[roles.x.dimension], best[roles.y.dimension], list(panels).index(marked))
-        return draw_maps(page, roles.x, roles.y, fields, ring)
+        return draw_maps(page, roles.x, roles.y, fields, ring, common)
 
     for axes, (text, panel) in zip(page.panels, panels.items(), strict=True):
         largest_point = (best[roles.x.dimension], float(measure.values.isel(best))) if text == marked else None
         draw_curves(axes, roles.x, _curves(panel, roles.curves), largest_point)
-    return page.finish_curves(roles.x, measure.values.values)
+    return page.finish_curves(roles.x, measure.values.values, common)
 
 
 def _by_place(measure: Measure, axes: Sequence[SweptAxis]) -> dict[str, Measure]:
@@ -314,8 +358,16 @@ def _by_place(measure: Measure, axes: Sequence[SweptAxis]) -> dict[str, Measure]
 
 def _curves(panel: Measure, compared: Sequence[SweptAxis]) -> list[Curve]:
     """Return the curves of a panel, one for each combination of what is ``compared`` in it."""
+    are_bands = [axis.dimension for axis in compared] == [PART]
+    colours = _band_colours(compared[0]) if are_bands else [""] * MOST_CURVES
     curves = []
     for number, (label, one) in enumerate(_by_place(panel, compared).items()):
         ends = one.band and (one.band[0].values, one.band[1].values)
-        curves.append(Curve(label, number, one.values.values, ends))
+        curves.append(Curve(label, number, one.values.values, ends, colours[number]))
     return curves
+
+
+def _band_colours(bands: SweptAxis) -> list[str]:
+    """Return the colour of each pass band along an axis of them."""
+    numbers = [style.band_number(text) for text in bands.texts]
+    return [style.band_colour(number) if number else "" for number in numbers]

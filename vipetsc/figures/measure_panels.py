@@ -11,9 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from vipetsc.figures import style
+from vipetsc.figures.log_ticks import has_room, label_log_axis, log_ticks
 from vipetsc.figures.panels import colour_bar
 from vipetsc.figures.swept_axes import SweptAxis
 
@@ -23,29 +24,41 @@ LETTERS = 17  # of a title on an inch
 PANEL_LETTERS = 15  # of that of a panel, which stands next to others
 LEGEND_LETTERS = 17  # of a legend on an inch
 MOST_COLUMNS = 4
-LEAST_TICKS = 3  # of a logarithmic scale
 MOST_TICKS = 8  # values of a key that are all ticks
 SIDES = 0.9  # inches of a page's width that its labels and its colour bar take
 PANEL_HEIGHT = 1.4  # inches, at least
-LETTER = 0.062  # inches of a letter of a tick's label
-LINE = 0.14  # inches of its height
 USED = 0.85  # of an axis that lies between the first and the last position
 LOG_RATIO = 100.0  # of the largest over the smallest value of a measure on a logarithmic scale
-CONTOURS = 6
+CONTOURS = 6, 3  # at most, of a map alone and of one of several
+BAND = "band "
+TOGETHER = "band\u00a0"  # no line ends between a band and its number
 
 
 class Curve(NamedTuple):
-    """A curve of a panel: its ``label``, its ``number`` among those of all panels, values, and ends of its band."""
+    """A curve of a panel: its ``label``, its ``number`` among those of all panels, values, and ends of its band.
+
+    ``colour`` is that of the pass band that it shows, if that tells it from the others.
+    """
 
     label: str
     number: int
     values: np.ndarray
     band: tuple[np.ndarray, np.ndarray] | None
+    colour: str = ""
 
     @property
     def look(self) -> dict[str, Any]:
         """The colour and the marker of the curve on all panels."""
-        return {"color": f"C{self.number}", "marker": MARKERS[self.number % len(MARKERS)], "ms": 3, "lw": 0.9}
+        colour = self.colour or f"C{self.number}"
+        return {"color": colour, "marker": MARKERS[self.number % len(MARKERS)], "ms": 3, "lw": 0.9}
+
+
+class CommonAxes(NamedTuple):
+    """What pages of one measure of several sweeps have in common: all ``values``, and positions along x (and y)."""
+
+    values: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
 
 
 @dataclass
@@ -82,7 +95,14 @@ class MeasurePage:
         grid = self.body.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for tag, axes, title in zip(ascii_lowercase, grid, titles, strict=False):
             if title:
-                axes.set_title("\n".join(wrap(f"({tag}) {title}", int(PANEL_LETTERS * (self.width - 0.6) / columns))))
+                axes.set_title(
+                    "\n".join(
+                        wrap(
+                            f"({tag}) {title.replace(BAND, TOGETHER)}",
+                            int(PANEL_LETTERS * (self.width - 0.6) / columns),
+                        )
+                    )
+                )
         for axes in grid[count:]:
             axes.set_axis_off()
         for index, axes in enumerate(grid[:count]):
@@ -108,13 +128,21 @@ class MeasurePage:
         self.body.supxlabel("\n".join(wrap(x.label, int(LETTERS * self.width))))
         self.body.supylabel("\n".join(wrap(y, int(LETTERS * self.figure.get_figheight()))))
 
-    def finish_curves(self, x: SweptAxis, values: np.ndarray) -> Figure:
-        """Label and scale the axes of all panels of curves, whose ``values`` these are, and write the legend."""
+    def finish_curves(self, x: SweptAxis, values: np.ndarray, common: CommonAxes | None = None) -> Figure:
+        """Label and scale the axes of all panels of curves, whose ``values`` these are, and write the legend.
+
+        With pages of other sweeps the axes are ``common`` to all.
+        """
+        if common:
+            values = common.values
         finite = values[np.isfinite(values)]
         first = self.panels[0]
+        if common and x.is_number:
+            first.update_datalim([(common.x.min(), finite.min()), (common.x.max(), finite.max())])
+            first.autoscale_view()
         if finite.min() > 0 and finite.max() > LOG_RATIO * finite.min():
             first.set_yscale("log")
-            _set_log_ticks(first.yaxis, finite, PANEL_HEIGHT)
+            label_log_axis(first.yaxis, float(finite.min()), float(finite.max()), USED * PANEL_HEIGHT)
         elif 0 <= finite.min() < 0.5 * finite.max():
             first.set_ylim(bottom=0)
         self.label_axes(x, self.label)
@@ -164,19 +192,30 @@ class LargestOnMap(NamedTuple):
 
 
 def draw_maps(
-    page: MeasurePage, x: SweptAxis, y: SweptAxis, fields: Sequence[np.ndarray], ring: LargestOnMap | None
+    page: MeasurePage,
+    x: SweptAxis,
+    y: SweptAxis,
+    fields: Sequence[np.ndarray],
+    ring: LargestOnMap | None,
+    common: CommonAxes | None = None,
 ) -> Figure:
-    """Draw ``fields`` (y, x) in the panels of ``page`` with one scale of colours, contours on them, and a ring."""
+    """Draw ``fields`` (y, x) in the panels of ``page`` with one scale of colours, contours on them, and a ring.
+
+    With pages of other sweeps, axes and colours are ``common`` to all.
+    """
     x_order = np.argsort(x.positions, kind="stable")
     y_order = np.argsort(y.positions, kind="stable")
-    norm = _norm(np.stack(fields))
+    norm = _norm(common.values if common else np.stack(fields))
     for axes, unordered in zip(page.panels, fields, strict=True):
         values = unordered[np.ix_(y_order, x_order)]
         axes.set(xscale=x.scale, yscale=y.scale, facecolor=style.PALE)
         edges = cell_edges(x.positions[x_order], x.scale), cell_edges(y.positions[y_order], y.scale)
         image = axes.pcolormesh(*edges, values, norm=norm, cmap="viridis", rasterized=True)
-        _draw_contours(axes, x.positions[x_order], y.positions[y_order], values, norm)
+        most = CONTOURS[len(fields) > 1]
+        _draw_contours(axes, x.positions[x_order], y.positions[y_order], values, norm, most)
         label_positions(axes.yaxis, y, PANEL_HEIGHT)
+        if common:
+            axes.update_datalim([(common.x.min(), common.y.min()), (common.x.max(), common.y.max())])
 
     if ring:
         at = x.positions[ring.x], y.positions[ring.y]
@@ -200,12 +239,12 @@ def _norm(values: np.ndarray) -> Normalize:
     return Normalize(low, high if high > low else low + 1)
 
 
-def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, norm: Normalize) -> None:
-    """Draw labelled contours of ``values`` (y, x), light where the map is dark."""
+def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, norm: Normalize, most: int) -> None:
+    """Draw at ``most`` so many labelled contours of ``values`` (y, x), light where the map is dark."""
     finite = values[np.isfinite(values)]
     if len(finite) < 4 or np.ptp(finite) == 0:
         return
-    locator = LogLocator(numticks=CONTOURS) if isinstance(norm, LogNorm) else MaxNLocator(CONTOURS)
+    locator = LogLocator(numticks=most) if isinstance(norm, LogNorm) else MaxNLocator(most)
     levels = [level for level in locator.tick_values(norm.vmin, norm.vmax) if finite.min() < level < finite.max()]
     if not levels:
         return
@@ -214,14 +253,14 @@ def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray,
     axes.clabel(lines, fmt="%.3g", fontsize=6)
 
 
-def draw_samples(page: MeasurePage, seeds: np.ndarray, series: Sequence[np.ndarray]) -> Figure:
+def draw_samples(page: MeasurePage, seeds: np.ndarray, series: Sequence[Curve]) -> Figure:
     """Draw every sample over its seed, with mean and band of each of ``series``, which the legend names."""
     (axes,) = page.panels
-    for number, values in enumerate(series):
-        look = Curve("", number, values, None).look
-        axes.plot(seeds, values, label=f"samples {number}", **look | {"ls": ""})
-        axes.axhspan(*np.nanquantile(values, (0.05, 0.95)), color=look["color"], alpha=0.2, lw=0)
-        axes.axhline(np.nanmean(values), color=look["color"], lw=0.9)
+    for curve in series:
+        look = curve.look
+        axes.plot(seeds, curve.values, label=curve.label, **look | {"ls": ""})
+        axes.axhspan(*np.nanquantile(curve.values, (0.05, 0.95)), color=look["color"], alpha=0.2, lw=0)
+        axes.axhline(np.nanmean(curve.values), color=look["color"], lw=0.9)
     axes.set(xlabel="disorder.seed", ylabel=page.label)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return page.figure
@@ -245,7 +284,7 @@ def label_positions(axis: Axis, swept: SweptAxis, length: float) -> None:
     positions = swept.positions
     texts = swept.value_texts
     if not swept.is_number:
-        is_long = axis.axis_name == "x" and not _have_room(axis, positions, texts, length)
+        is_long = axis.axis_name == "x" and not has_room(positions, texts, USED * length, is_horizontal=True)
         axis.set_ticks(positions, texts, **({"rotation": 25, "ha": "right"} if is_long else {}))
         if axis.axis_name == "x":
             axis.axes.set_xlim(-0.5, len(positions) - 0.5)
@@ -253,39 +292,12 @@ def label_positions(axis: Axis, swept: SweptAxis, length: float) -> None:
 
     on_scale = np.log(positions) if swept.scale == "log" else positions
     number = swept.first_number
-    if number and len(positions) <= MOST_TICKS and _have_room(axis, on_scale, number.value_texts, length):
+    if (
+        number
+        and len(positions) <= MOST_TICKS
+        and has_room(on_scale, number.value_texts, USED * length, axis.axis_name == "x")
+    ):
         axis.set_ticks(positions, number.value_texts)
         axis.set_minor_locator(NullLocator())
     elif swept.scale == "log":
-        _set_log_ticks(axis, positions, length)
-
-
-def _have_room(axis: Axis, positions: np.ndarray, texts: Sequence[str], length: float) -> bool:
-    """Whether labels ``texts`` at ``positions``, along an axis of ``length`` inches, stand apart."""
-    if len(positions) < 2:
-        return True
-    order = np.argsort(positions)
-    gaps = np.diff(positions[order]) / np.ptp(positions) * USED * length
-    sizes = np.array([LETTER * (len(texts[i]) + 1) if axis.axis_name == "x" else LINE for i in order])
-    return bool((gaps >= 0.5 * (sizes[1:] + sizes[:-1])).all())
-
-
-def _set_log_ticks(axis: Axis, values: np.ndarray, length: float) -> None:
-    """Label places of a logarithmic ``axis`` of ``length`` inches within the range of ``values``, three if it can."""
-    ticks = log_ticks(float(values.min()), float(values.max()))
-    while len(ticks) > 2 and not _have_room(axis, np.log(ticks), [f"{tick:g}" for tick in ticks], length):
-        ticks = ticks[::2]
-    axis.set_major_locator(FixedLocator(ticks))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_locator(NullLocator())
-
-
-def log_ticks(low: float, high: float) -> list[float]:
-    """Return three numbers or more between ``low`` and ``high``, both positive, for a logarithmic scale."""
-    exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    for steps in ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 5, 7)):
-        ticks = [step * 10.0**exponent for exponent in exponents for step in steps]
-        inside = [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
-        if len(inside) >= LEAST_TICKS:
-            return inside[:: -(-len(inside) // MOST_TICKS)]
-    return [float(tick) for tick in MaxNLocator(4).tick_values(low, high) if low <= tick <= high]
+        label_log_axis(axis, float(positions.min()), float(positions.max()), USED * length)

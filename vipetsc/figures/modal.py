@@ -1,6 +1,6 @@
 """The energies of a run's linear modes: their steps at impacts, and the energy that each site transferred."""
 
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 
+from vipetsc.case import Case
 from vipetsc.figures import panels, style
 
-COLOURS = style.GREY, style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.YELLOW
 LEAST = 1e-4  # of the largest energy, at the end or in transfers, below which a gap is not drawn
 MOST_ROWS = 24  # sites of a matrix; of more, those with the largest transfers
 MOST_TICKS = 6  # of sites next to the raster of impacts
@@ -51,14 +51,20 @@ class MovedEnergies(NamedTuple):
         return cls(labels=[labels[i] for i in rows], energy=moved[rows])
 
 
+def without_modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
+    """Return why a run has no picture of the energies of its modes; empty where it has one."""
+    if not Case.of(run).model().chain.cell.springs:
+        return "a lattice without springs has no modes that oscillate"
+    if analysis is None or "bands/transfer" not in analysis:
+        return "needs the analysis of a run with all displacements and velocities"
+    return "" if analysis["bands/modal_energy"].values.any() else "the drive did no work"
+
+
 def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw energies of the linear modes by pass band over time, the impacts below, and transfers by site and band."""
-    if analysis is None or "bands/transfer" not in analysis:
-        return panels.empty_figure("Modal energies: needs the analysis of a run with all displacements and velocities")
+    assert analysis is not None
     energy = analysis["bands/modal_energy"]
     largest = float(energy.sum("bands/part").max())
-    if largest == 0:
-        return panels.empty_figure("Modal energies: the drive did no work")
 
     # Bands are always drawn, gaps where they have or had any energy to speak of.
     names = list(energy.attrs["parts"])
@@ -76,11 +82,13 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     ratios = {"width_ratios": (1.55, 1), "height_ratios": (2.6, 1)}
     panel = figure.subplot_mosaic([["steps", "matrix"], ["impacts", "matrix"]], **ratios)
     _draw_steps(panel["steps"], run, analysis, parts)
-    panel["steps"].set_title("(a) Steps at impacts")
+    panel["steps"].set_title("Steps at impacts")
+    panel["impacts"].set_title("Impacts")
     panel["steps"].tick_params(labelbottom=False)
     _draw_impacts(panel["impacts"], run)
     percent = 100 * moved.energy / float(run["energy/work"][-1])
     _draw_matrix(panel["matrix"], moved.labels, [*(names[p] for p in parts), "lost"], percent)
+    panels.label_panels([panel["steps"], panel["impacts"], panel["matrix"]])
     return figure
 
 
@@ -89,17 +97,20 @@ def _draw_steps(axes: Axes, run: xr.Dataset, analysis: xr.Dataset, parts: list[i
     energy = analysis["bands/modal_energy"]
     names = list(energy.attrs["parts"])
     at_end = energy[:, -1].sum()
-    for p, colour in zip(parts, _colours(names, parts), strict=True):
+    for p, look in zip(parts, _looks(names, parts), strict=True):
         fraction = float(energy[p, -1] / at_end)
-        axes.plot(analysis["bands/instant"], energy[p], color=colour, lw=0.9, label=f"{names[p]}: {fraction:.1%}")
+        axes.plot(analysis["bands/instant"], energy[p], lw=0.9, label=f"{names[p]}: {fraction:.1%}", **look)
     axes.set(ylabel="Energy of the linear modes (J)", xlim=run["time"][[0, -1]], ylim=(0, None))
     axes.legend(loc="best", ncols=2 if len(parts) > 5 else 1, title="fraction at the end", title_fontsize=7)
 
 
-def _colours(names: list[str], parts: list[int]) -> list[str]:
-    """Return a colour for each part: bands in turn, what is no band in black."""
-    bands = [name for name in names if "band" in name]
-    return [COLOURS[bands.index(names[p]) % len(COLOURS)] if names[p] in bands else style.BLACK for p in parts]
+def _looks(names: list[str], parts: list[int]) -> list[dict[str, Any]]:
+    """Return colour and dashes for each part: those of its band, dotted black for what is no band."""
+    looks = []
+    for part in parts:
+        number = style.band_number(names[part])
+        looks.append(style.band_look(number) if number else {"color": style.BLACK, "ls": style.DOTTED})
+    return looks
 
 
 def _draw_impacts(axes: Axes, run: xr.Dataset) -> None:
@@ -128,7 +139,7 @@ def _draw_matrix(axes: Axes, rows: list[str], columns: list[str], percent: np.nd
     axes.set_yticks(range(len(rows)), rows, fontsize=6 if is_long else 8)
     axes.tick_params(length=0)
     axes.grid(visible=False)
-    axes.set(title="(b) Transferred by each site (% of the work)", ylabel="Contact site (cell)")
+    axes.set(title="Transferred by each site (% of the work)", ylabel="Contact site (cell)")
 
 
 def _in_cell(value: float, is_wide: bool) -> str:

@@ -18,7 +18,6 @@ from PIL import Image
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
-from vipetsc.figures.modal import COLOURS
 from vipetsc.figures.movie_frames import WIDTH, MovieFrames
 from vipetsc.io.atomic import atomic_write
 from vipetsc.lattice import UnitCell, bloch
@@ -32,24 +31,12 @@ UNCHANGED = 255  # the colour of pixels of a GIF that stay as they are
 REMEDY = "an MP4 needs ffmpeg: apt-get install --no-install-recommends ffmpeg, or pip install imageio-ffmpeg"
 
 
-def colour_of(band: int) -> str:
-    """Return the colour of a band, from 0."""
-    return COLOURS[band % len(COLOURS)]
-
-
 class EnergyCurve(NamedTuple):
     """An ``energy`` in J over ``time`` in s that a line grows along."""
 
     name: str
     time: np.ndarray
     energy: np.ndarray
-
-    @property
-    def band(self) -> int | None:
-        """The band, from 0; of several together the lowest; None of what is no band."""
-        if not self.name.startswith("band"):
-            return None
-        return int(self.name.split()[1].split("+")[0]) - 1
 
 
 class Moving(NamedTuple):
@@ -99,8 +86,8 @@ class MovieFigure:
         lines = axes.plot(content.cells, nothing, lw=1.1)
         self._wave = [self._add(axes, line) for line in lines]
         if content.quantity == "energy":
-            for band, line in enumerate(lines):
-                line.set_color(colour_of(band))
+            for band, line in enumerate(lines, 1):
+                line.set_color(style.band_colour(band))
             axes.set(yscale="log", ylim=(largest * 10.0**-DECADES, 2 * largest), ylabel="Energy of a cell (J)")
         else:
             axes.set(ylim=(-1.08 * largest, 1.08 * largest), ylabel="Velocity of the host (m/s)")
@@ -122,7 +109,7 @@ class MovieFigure:
         kappa = np.linspace(-np.pi, np.pi, 361)
         axes.plot(kappa / np.pi, bloch(cell, kappa).frequency / 1e3, color=style.GREY, lw=0.5)
         frequency = bloch(cell, content.wavenumber).frequency / 1e3
-        band_colours = [to_rgba(colour_of(band), 0.7) for band in range(cell.dofs)]
+        band_colours = [to_rgba(style.band_colour(band), 0.7) for band in range(1, cell.dofs + 1)]
         colours = np.tile(band_colours, (len(frequency), 1))
         x = np.repeat(content.wavenumber / np.pi, cell.dofs)
         self._waves = self._add(axes, axes.scatter(x, frequency.ravel(), 0 * x, colours, lw=0))
@@ -142,8 +129,9 @@ class MovieFigure:
         self._growing = []
         for curve in curves:
             look: dict[str, Any] = {"color": style.BLACK, "ls": style.DASHED}
-            if curve.band is not None:
-                look = {"color": colour_of(curve.band), "ls": "-"}
+            band = style.band_number(curve.name)
+            if band:
+                look = {"color": style.band_colour(band), "ls": "-"}
             (line,) = axes.plot([], [], lw=1.2, label=curve.name, **look)
             self._growing.append((self._add(axes, line), curve))
 

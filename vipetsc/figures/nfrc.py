@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.figures import style
+from vipetsc.figures import panels, style
 from vipetsc.io.netcdf import open_netcdf
 
 ENERGIES = {
@@ -40,17 +40,19 @@ def frequency_response(paths: Sequence[Path]) -> Figure:
         if has_energies:
             _draw_energies(column[1], branch)
         column[-1].set_xlabel(_parameter_label(branch))
-        column[0].set_title(str(branch.attrs["name"]), fontsize=8)
+        column[0].set_title(str(branch.attrs["name"]))
+    if rows * len(branches) > 1:
+        panels.label_panels(columns.T)
     return figure
 
 
 def _parameter_label(branch: xr.Dataset) -> str:
     """Return what the horizontal axis shows, with its unit."""
     if branch.attrs["over"] == "frequency":
-        return "frequency [rad/s]"
+        return "frequency (rad/s)"
     if NfrcCase.of(branch).nfrc.source == "wave":
         return "amplitude of the wave / clearance"
-    return "amplitude [N]"
+    return "amplitude (N)"
 
 
 def _parameter(branch: xr.Dataset) -> np.ndarray:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.objective import ObjectiveTable
 from vipetsc.case.optimise import OptimiseCase
-from vipetsc.figures import style
+from vipetsc.figures import panels, style
 from vipetsc.spectra.measures import row_of
 
 # The names of compared designs, in the order of drawing.
@@ -75,6 +75,7 @@ def convergence(optimum: xr.Dataset) -> Figure:
         others.plot(number, optimum[name].values, ".", color=colour, ms=3, label=name.replace("_", " "))
     others.set(xlabel="Design", ylabel="fraction of the work, mean", ylim=(0, None), title="All designs")
     others.legend(loc="best")
+    panels.label_panels([values, others])
     return figure
 
 
@@ -154,6 +155,7 @@ def compared_designs(optimum: xr.Dataset) -> Figure:
     variables.set(xlim=(-0.02, 1.02), xlabel="between its bounds", title="What varies", ylim=(len(names) - 0.3, -0.7))
     variables.set_yticks(np.arange(len(names)), names, fontsize=6 if len(names) > MOST_LINES else None)
     variables.grid(axis="y", color=style.PALE, lw=0.5)
+    panels.label_panels([sites, variables])
     return figure
 
 
@@ -163,11 +165,12 @@ def compared_curves(optimum: xr.Dataset) -> Figure:
     # Objectives of one measure, at different amplitudes, have one panel and the curve of the last of them.
     measures = {objective.name: i for i, objective in enumerate(plan.options.objective)}
     figure = style.new_figure(style.PAGE, 2.6)
-    *panels, at_case = figure.subplots(1, len(measures) + 1, squeeze=False)[0]
-    for axes, i in zip(panels, measures.values(), strict=True):
+    *curves, at_case = figure.subplots(1, len(measures) + 1, squeeze=False)[0]
+    for axes, i in zip(curves, measures.values(), strict=True):
         _draw_measure(axes, optimum, plan, i)
-    panels[0].legend(loc="best")
+    curves[0].legend(loc="best")
     _draw_energies(at_case, optimum, plan.base.drive.amplitude)
+    panels.label_panels([*curves, at_case])
     return figure
 
 

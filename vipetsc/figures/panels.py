@@ -1,13 +1,13 @@
 """Panels of several figures: maps in space-time, dispersion with Bloch branches, marks of sites, shaded bands."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
-from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import ArrayLike
 
@@ -19,7 +19,7 @@ from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 DECADES = 5  # of energy that a map shows
 PIXELS = 600  # most rows and columns of a map: a printed page shows no more
 MOST_LINES = 30  # of sites in a map
-ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii")
+ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii", "viii", "ix", "x", "xi", "xii")
 REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by number
 REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
 KAPPA = "Wavenumber κ (π rad/cell)"
@@ -41,11 +41,14 @@ def annotate_empty(axes: Axes, reason: str) -> None:
     axes.text(0.5, 0.5, reason, ha="center", va="center", color=style.GREY, wrap=True, transform=axes.transAxes)
 
 
-def empty_figure(reason: str) -> Figure:
-    """Return a figure of one column that shows the ``reason`` why it is empty."""
-    figure = style.new_figure(style.COLUMN, 1.6)
-    annotate_empty(figure.subplots(), reason)
-    return figure
+def label_panels(panels: Iterable[Axes]) -> None:
+    """Begin the titles of ``panels`` with (a), (b), ..., or with (a.i), (a.ii), ... those of a grid (row, column)."""
+    if isinstance(panels, np.ndarray) and panels.ndim == 2 and min(panels.shape) > 1:
+        tags = {axes: f"{ascii_lowercase[column]}.{ROMAN[row]}" for (row, column), axes in np.ndenumerate(panels)}
+    else:
+        tags = dict(zip(np.ravel(list(panels)).tolist(), ascii_lowercase, strict=False))
+    for axes, tag in tags.items():
+        axes.set_title(f"({tag}) {axes.get_title('left')}".rstrip())
 
 
 def block_means(values: np.ndarray) -> np.ndarray:
@@ -168,7 +171,8 @@ def band_diagram(axes: Axes, cell: UnitCell, frequency: float | None = None) -> 
     """Draw the Bloch branches of ``cell`` in colours, gaps shaded, the drive's ``frequency`` (rad/s) dotted."""
     kappa = np.linspace(0, np.pi, 361)
     bands = pass_bands(cell)
-    axes.plot(kappa / np.pi, bloch(cell, kappa).frequency / 1e3)
+    for number, frequencies in enumerate(bloch(cell, kappa).frequency.T, 1):
+        axes.plot(kappa / np.pi, frequencies / 1e3, color=style.band_colour(number))
     shade_bands(axes, gaps(bands))
     if frequency is not None:
         axes.axhline(frequency / 1e3, color=style.BLACK, lw=0.7, ls=":")

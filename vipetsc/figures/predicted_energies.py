@@ -7,9 +7,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vipetsc.figures import style
+from vipetsc.figures import panels, style
 
-COLOURS = style.BLACK, style.BLUE, style.VERMILION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY, style.GREY
 LEAST = 1e-4  # of the work, the smallest energy shown
 MOST_SITES = 6  # with a name in the legend
 LOOKS: dict[str, dict[str, Any]] = {"predicted": {"lw": 1.2}, "simulated": {"ls": "", "marker": "o", "ms": 3.2}}
@@ -51,7 +50,8 @@ def prediction(data: xr.Dataset) -> Figure:
     rms = data.attrs.get(f"rms_{name}")
     if rms is not None:
         transferred.set_title(f"{title}: rms {rms:.3f} decades")
-        dissipated.set_title(f"Dissipated: error at most {data.attrs['worst_dissipated']:.3f} at most")
+        dissipated.set_title(f"Dissipated: error at most {data.attrs['worst_dissipated']:.3f}")
+    panels.label_panels(grid.ravel())
     return figure
 
 
@@ -66,12 +66,12 @@ def _draw_total(axes: Axes, data: xr.Dataset, name: str) -> None:
 def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
     """Draw the energy of every band in its colour, predicted and simulated; the lines have the labels."""
     for i, band in enumerate(data["band"].values):
-        colour = COLOURS[i % len(COLOURS)]
+        of_band = {"predicted": style.band_look(int(band)), "simulated": {"color": style.band_colour(int(band))}}
         for kind, look in LOOKS.items():
             if f"{kind}/bands" in data:
                 values = data[f"{kind}/bands"].values[:, i]
                 label = f"band {band}" if kind == "predicted" else None
-                axes.plot(data["amplitude"].values, values, color=colour, label=label, **look)
+                axes.plot(data["amplitude"].values, values, label=label, **of_band[kind] | look)
 
 
 def _least(data: xr.Dataset, name: str) -> float:

@@ -3,6 +3,7 @@
 import difflib
 import itertools
 import json
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -37,6 +38,7 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
 
+NUMBER = re.compile(r"\d[\d.e+-]*")
 MOST_WARNINGS = 4  # below a picture
 
 # The sources: what folders hold.
@@ -66,6 +68,7 @@ class FigureSpec(NamedTuple):
     ``function`` is (run, analysis or None) -> Figure of a run, (data) -> Figure of a source in ``FILES``, (paths) ->
     Figure of branches. Of sweeps it is (sweeps) -> iterator of Drawing, called with those sweeps that take ``measure``;
     the stem of such a drawing follows the figure's name, and ``needs`` says what a sweep must hold for it.
+    ``without`` is (run, analysis or None) -> the reason why a run has no such picture, empty where it has one.
     """
 
     name: str
@@ -73,6 +76,7 @@ class FigureSpec(NamedTuple):
     function: Callable[..., Any]
     measure: str = ""
     needs: str = ""
+    without: Callable[[xr.Dataset, xr.Dataset | None], str] | None = None
 
 
 def branch(paths: Sequence[Path]) -> Figure:
@@ -93,6 +97,7 @@ BRANCH_FIGURES: Mapping[str, Callable[[Sequence[Path]], Figure]] = {
     branch_kinds.RESPONSES: nfrc.frequency_response,
 }
 
+BRANCH = "branch"  # the figure of branches
 OVER_BRANCHES = "ibtet_backbone"  # the figure of sweeps that shows branches too
 
 # What sweeps must hold for a figure.
@@ -102,13 +107,13 @@ BRANCHES_TOO = "branches of the same law, in a further folder, and a sweep over 
 
 _SPECS = (
     # The dearest of a run first, so that ranks which divide the work among them finish together.
-    FigureSpec("modal_energies", RUN, modal.modal_energies),
-    FigureSpec("spacetime", RUN, runs.spacetime),
-    FigureSpec("dispersion", RUN, runs.dispersion),
-    FigureSpec("phase", RUN, runs.phase),
+    FigureSpec("modal_energies", RUN, modal.modal_energies, without=modal.without_modal_energies),
+    FigureSpec("spacetime", RUN, runs.spacetime, without=runs.without_spacetime),
+    FigureSpec("dispersion", RUN, runs.dispersion, without=runs.without_dispersion),
+    FigureSpec("phase", RUN, runs.phase, without=runs.without_phase),
     FigureSpec("unit_cell", RUN, schematics.unit_cell),
-    FigureSpec("impacts", RUN, impact_panels.impacts),
-    FigureSpec("ledger", RUN, runs.ledger),
+    FigureSpec("impacts", RUN, impact_panels.impacts, without=impact_panels.without_impacts),
+    FigureSpec("ledger", RUN, runs.ledger, without=runs.without_ledger),
     FigureSpec("amplitudes", SWEEP, scattering.amplitudes, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("wavelets", SWEEP, scattering.wavelets, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("partition", SWEEP, scattering.partition, measure="entropy", needs=THREE_AMPLITUDES),
@@ -125,7 +130,7 @@ _SPECS = (
     FigureSpec("ibtet", PAPER, transfer_curves.ibtet, measure="transfer"),
     FigureSpec(OVER_BRANCHES, SWEEP, transfer_curves.ibtet_backbone, measure="transfer", needs=BRANCHES_TOO),
     FigureSpec("phase_regimes", SWEEP, transfer_curves.phase_regimes, measure="transfer", needs=WHOLE_MEMBERS),
-    FigureSpec("branch", BRANCHES, branch),
+    FigureSpec(BRANCH, BRANCHES, branch),
     FigureSpec("deflections", DESIGN, cost_maps.deflections),
     FigureSpec("cost_maps", DESIGN, cost_maps.cost_maps),
     FigureSpec("dispersion_against_lambda", DESIGN, partial(cost_maps.dispersions, along="lambda", other="eta")),
@@ -147,7 +152,7 @@ def figure_names(source: str, names: Sequence[str] | None = None, folders: Seque
     specified = [name for name, spec in FIGURES.items() if spec.source == source]
     measures: dict[str, str] = {}
     if source == SWEEP:
-        for folder in _with_ensemble(folders):
+        for folder in with_ensemble(folders):
             measures |= {
                 measure_pages.figure_name(name): name for name in measure_pages.measures_of(open_ensemble(folder))
             }
@@ -164,42 +169,9 @@ def figure_names(source: str, names: Sequence[str] | None = None, folders: Seque
     return list(names)
 
 
-def _with_ensemble(folders: Iterable[Path]) -> list[Path]:
+def with_ensemble(folders: Iterable[Path]) -> list[Path]:
     """Return the folders of sweeps; others that share a page with them hold branches."""
     return [folder for folder in folders if (folder / "ensemble.h5").exists()]
-
-
-def reasons_without_pages(folders: Sequence[Path], names: Sequence[str] | None = None) -> dict[str, str]:
-    """Return why figures of the sweeps in ``folders`` are not drawn, by name.
-
-    They are those in ``names``, by default measures, and what lays branches over them where ``folders`` hold any.
-    Raises KeyError as ``figure_names``.
-    """
-    expected = {*(names or ())}
-    if len(_with_ensemble(folders)) < len(folders) and names is None:
-        expected.add(OVER_BRANCHES)
-    reasons: dict[str, str] = {}
-    with Files() as files:
-        ensembles = [files.get(folder, open_ensemble) for folder in _with_ensemble(folders)]
-        for name in figure_names(SWEEP, names, folders):
-            spec = FIGURES.get(name)
-            if spec and spec.source == SWEEP:
-                if name in expected and not any(_specified_drawings(spec, ensembles, files)):
-                    unrelated = transfer_curves.curves_left_out(folders) if name == OVER_BRANCHES else ""
-                    reasons[name] = unrelated or f"needs {spec.needs}"
-                continue
-            by_sweep = [_reason(ensemble, name, by_name=names is not None) for ensemble in ensembles]
-            if all(by_sweep):
-                reasons[name] = by_sweep[0]
-    return reasons
-
-
-def _reason(ensemble: xr.Dataset, name: str, by_name: bool) -> str:
-    """Return why the measure whose pages have that ``name`` has none for an ensemble; empty where it has some."""
-    for measure in measure_pages.measures_of(ensemble):
-        if measure_pages.figure_name(measure) == name:
-            return measure_pages.reason_without_page(ensemble, measure, by_name)
-    return "the sweep does not measure it"
 
 
 def draw(
@@ -267,8 +239,8 @@ def drawings(
         return _sweep_drawings(chosen, folders, files, by_name=names is not None)
     specs = [FIGURES[name] for name in chosen]
     if source == PAPER:
-        ensembles = [files.get(folder, open_ensemble) for folder in _with_ensemble(folders)]
-        return itertools.chain.from_iterable(_specified_drawings(spec, ensembles, files) for spec in specs)
+        ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
+        return itertools.chain.from_iterable(specified_drawings(spec, ensembles, files) for spec in specs)
     if source == BRANCHES:
         return _branch_drawings(specs, folders, files)
     if source == RUN:
@@ -278,12 +250,12 @@ def drawings(
 
 def _sweep_drawings(names: Sequence[str], folders: Sequence[Path], files: Files, by_name: bool) -> Iterator[Drawing]:
     """Yield the pages of measures and what the other figures offer, each with a stem of its own."""
-    ensembles = [files.get(folder, open_ensemble) for folder in _with_ensemble(folders)]
+    ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
     used: dict[str, int] = {}
     for name in names:
         spec = FIGURES.get(name)
         if spec and spec.source == SWEEP:
-            offered = _specified_drawings(spec, ensembles, files)
+            offered = specified_drawings(spec, ensembles, files)
         else:
             offered = _measure_drawings(name, ensembles, by_name)
         for drawing in offered:
@@ -299,23 +271,26 @@ def _measure_drawings(name: str, ensembles: Sequence[xr.Dataset], by_name: bool)
         for measure in measure_pages.measures_of(ensemble):
             is_asked = measure_pages.figure_name(measure) == name
             if is_asked and not measure_pages.reason_without_page(ensemble, measure, by_name):
-                for drawing in measure_pages.measure_pages(ensemble, measure, sweep):
+                others = [other for other in ensembles if other is not ensemble and measure in other]
+                for drawing in measure_pages.measure_pages(ensemble, measure, sweep, others):
                     yield drawing._replace(draw=warned(drawing.draw, ensemble))
 
 
-def _specified_drawings(spec: FigureSpec, ensembles: Sequence[xr.Dataset], files: Files) -> Iterator[Drawing]:
+def specified_drawings(spec: FigureSpec, ensembles: Sequence[xr.Dataset], files: Files) -> Iterator[Drawing]:
     """Yield what the function of ``spec`` offers of the sweeps that take its measure."""
     measured = [ensemble for ensemble in ensembles if spec.measure in table(ensemble)["sweep"]["measures"]]
     sweeps = Sweeps(measured, files)
     for offered in spec.function(sweeps):
         stem = f"{spec.name}-{offered.stem}" if offered.stem else spec.name
-        yield Drawing(stem, warned(offered.draw, *sweeps))
+        yield Drawing(stem, warned(offered.draw, *(offered.shown or sweeps)))
 
 
 def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files) -> Iterator[Drawing]:
     """Yield one drawing a branch of the first folder, next to the branches of its name in the other folders."""
     for spec, first in itertools.product(specs, sorted(folders[0].glob("branch-*.h5"))):
-        paths = [folder / first.name for folder in folders if (folder / first.name).exists()]
+        paths = of_one_name(folders, first.name)
+        if not all(point_count(path) for path in paths):
+            continue
         stem = first.stem
         if len(folders) > 1:
             stem = stem.replace("branch", "branches", 1)
@@ -323,16 +298,32 @@ def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files
         yield Drawing(stem, warned(partial(spec.function, paths), *branches))
 
 
+def point_count(path: Path) -> int:
+    """Return the number of points of a branch."""
+    with open_netcdf(path, "branch") as file:
+        return int(file.sizes["point"])
+
+
+def of_one_name(folders: Sequence[Path], name: str) -> list[Path]:
+    """Return the files of that ``name`` in the ``folders`` that have one."""
+    return [folder / name for folder in folders if (folder / name).exists()]
+
+
 def _run_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> Iterator[Drawing]:
-    """Yield every figure of the run in ``folder``, whose analysis may be missing."""
-    run = files.get(folder / "run.h5", open_run)
-    analysis = None
-    results = [run]
-    if (folder / "analysis.h5").exists():
-        analysis = files.get(folder / "analysis.h5", partial(open_netcdf, kind="analysis"))
-        results.append(analysis)
+    """Yield every figure that the run in ``folder`` has, whose analysis may be missing."""
+    run, analysis = run_and_analysis(folder, files)
+    results = [run] if analysis is None else [run, analysis]
     for spec in specs:
-        yield Drawing(spec.name, warned(partial(spec.function, run, analysis), *results))
+        if not (spec.without and spec.without(run, analysis)):
+            yield Drawing(spec.name, warned(partial(spec.function, run, analysis), *results))
+
+
+def run_and_analysis(folder: Path, files: Files) -> tuple[xr.Dataset, xr.Dataset | None]:
+    """Return the run in ``folder``, and its analysis if there is one."""
+    run = files.get(folder / "run.h5", open_run)
+    if not (folder / "analysis.h5").exists():
+        return run, None
+    return run, files.get(folder / "analysis.h5", partial(open_netcdf, kind="analysis"))
 
 
 def _file_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> Iterator[Drawing]:
@@ -348,8 +339,11 @@ def warned(make: Callable[[], Figure], *results: xr.Dataset) -> Callable[[], Fig
 
     They stand as JSON in the attribute ``warnings``; `vipetsc.figures.style.save` prints the label below the picture.
     """
-    warnings = (line for data in results for line in json.loads(data.attrs.get("warnings", "[]")))
-    sentences = list(dict.fromkeys(warnings))
+    # Of sentences that differ in numbers alone one stands for all.
+    by_kind: dict[str, str] = {}
+    for line in (line for data in results for line in json.loads(data.attrs.get("warnings", "[]"))):
+        by_kind.setdefault(NUMBER.sub("0", line), line)
+    sentences = list(by_kind.values())
     if len(sentences) > MOST_WARNINGS:
         sentences[MOST_WARNINGS - 1 :] = [f"{len(sentences) - MOST_WARNINGS + 1} more warnings are in the file"]
 

@@ -8,12 +8,11 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, MaxNLocator
 from scipy.interpolate import Akima1DInterpolator, CubicHermiteSpline
 
 from vipetsc.case import Case, Model
 from vipetsc.figures import panels, style
-from vipetsc.figures.panels import empty_figure
 from vipetsc.io.read import field_time, leading_site
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 from vipetsc.lattice.damped import decay_length
@@ -24,14 +23,22 @@ CELLS = {
     "dispersion": ("All cells", style.BLACK),
 }
 LARGEST_RESIDUAL = 1e-8  # of the ledger, over the work of the drive
+MOST_OF_A_RECORD = 0.05  # that a mean over two periods of the drive may take
 REFINE = 10  # points of a phase portrait drawn for each sample
+
+
+def without_spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
+    """Return why a run has no picture of its energy in space and time; empty where it has one."""
+    if "velocity" not in run:
+        return "needs the velocities, which were not recorded"
+    if analysis is None or analysis.sizes.get("time", 0) < 2:
+        return "needs the analysis of a run with two samples or more"
+    return ""
 
 
 def spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw kinetic energy (J) of every cell over time with the sites marked, next to the wavenumber content."""
-    if analysis is None or analysis.sizes.get("time", 0) < 2:
-        return empty_figure("Kinetic energy: needs the analysis of a run with two samples or more")
-
+    assert analysis is not None
     has_content = "wavenumber_content" in analysis
     figure = style.new_figure(style.PAGE if has_content else style.COLUMN, 2.5)
     left, *right = np.atleast_1d(figure.subplots(1, 2 if has_content else 1))
@@ -56,17 +63,34 @@ def _draw_energy(axes: Axes, run: xr.Dataset, analysis: xr.Dataset) -> None:
         return
 
     image = panels.space_time_map(axes, energy, panels.log_norm(energy), run)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     panels.colour_bar(image, axes, "Kinetic energy of a cell (J)")
     if len(panels.recorded_sites(run)):
-        axes.legend(loc="upper left", labelcolor="white", handletextpad=0.3)
+        dark = {"frameon": True, "facecolor": style.BLACK, "edgecolor": "none", "framealpha": 0.5}
+        axes.legend(loc="upper left", labelcolor="white", handletextpad=0.3, **dark)
+
+
+def without_dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
+    """Return why a run has no picture of its dispersion; empty where it has one."""
+    if analysis is not None and any(name in analysis for name in CELLS):
+        return ""
+    if not Case.of(run).model().chain.cell.springs:
+        return "a lattice without springs has no dispersion"
+    if run.sizes["cell"] < 2:
+        return "needs two cells or more in the record, side by side"
+    return _left_out(analysis, "dispersion") or "needs the velocities of all cells"
+
+
+def _left_out(analysis: xr.Dataset | None, measure: str) -> str:
+    """Return the sentence of an ``analysis`` about a ``measure`` that it has left out; empty for none."""
+    sentences = "" if analysis is None else str(analysis.attrs.get("left_out", ""))
+    return next((sentence for sentence in sentences.split("; ") if measure in sentence), "")
 
 
 def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw 2-D spectra of the cells before and after the first site, and their sums over wavenumber."""
-    measured = [name for name in CELLS if analysis is not None and name in analysis]
-    if analysis is None or not measured:
-        return empty_figure("Dispersion: needs the analysis of a run that recorded two cells or more")
-
+    assert analysis is not None
+    measured = [name for name in CELLS if name in analysis]
     # Spectra of all cells together only where there are none before and after a site.
     model = Case.of(run).model()
     cell = model.chain.cell
@@ -101,16 +125,20 @@ def _mark_drive(axes: Axes, model: Model) -> None:
     frequency = model.drive.frequency / 1e3
     axes.axhline(frequency, color=style.BLACK, lw=0.6, ls=":")
     text = "drive" if model.drive.amplitude else "motion"
-    place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
-    panels.note(axes, text, (1, frequency), (-2, 2), **place)
+    place = {"xycoords": ("axes fraction", "data"), "ha": "left", "va": "bottom"}
+    panels.note(axes, text, (0, frequency), (2, 1), **place)
+
+
+def without_ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
+    """Return why a run has no picture of its energies; empty where it has one."""
+    if len(run["time"]) < 2 or not np.any(run["energy/work"]):
+        return "the drive did no work"
+    return ""
 
 
 def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw energies over time, and below them the residual relative to the work done, on a log scale."""
     largest = float(np.abs(run["energy/work"]).max())
-    if len(run["time"]) < 2 or largest == 0:
-        return empty_figure("Energy balance: the drive did no work")
-
     figure = style.new_figure(style.COLUMN, 3.3)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1))
     _draw_ledger(upper, run)
@@ -118,6 +146,9 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     upper.yaxis.set_major_formatter(EngFormatter("J"))
     upper.legend(loc="upper center", ncol=2, columnspacing=1.2, labelspacing=0.25)
     _draw_residual(lower, run, largest)
+    upper.set_title("Energies")
+    lower.set_title("Residual of their balance over the work")
+    panels.label_panels([upper, lower])
     return figure
 
 
@@ -131,18 +162,25 @@ def _draw_ledger(axes: Axes, run: xr.Dataset) -> None:
 
     # Both swing at twice the drive's frequency, which no page can resolve; means over two periods can be seen.
     two_periods = 4 * np.pi / case.model().drive.frequency
-    window = min(int(np.ceil(two_periods / (time[1] - time[0]))), len(time))
-    means = run[["energy/kinetic", "energy/spring"]].rolling(time=window, center=True, min_periods=1).mean()
+    window = int(np.ceil(two_periods / (time[1] - time[0])))
+    parts = run[["energy/kinetic", "energy/spring"]]
+    mean = ""
+    if window < MOST_OF_A_RECORD * len(time):
+        parts = parts.rolling(time=window, center=True, min_periods=1).mean()
+        mean = ", mean"
 
     given = "initial energy and work" if case.initial else "work of the drive"
     curves = [
         (given, run["energy/work"], style.BLACK, "-"),
         ("kinetic + potential", stored, style.BLUE, "-"),
-        ("dissipated", run["energy/dissipated"], style.VERMILION, "-"),
-        ("kinetic, mean", means["energy/kinetic"], style.SKY, "-"),
-        ("springs, mean", means["energy/spring"], style.GREEN, (0, (3, 1.5))),
-        ("contacts", contact, style.PURPLE, "-"),
+        (f"kinetic{mean}", parts["energy/kinetic"], style.SKY, "-"),
     ]
+    # What a lattice does not have stands nowhere.
+    if case.model().chain.cell.springs:
+        curves.append((f"springs{mean}", parts["energy/spring"], style.GREEN, (0, (3, 1.5))))
+    if run.sizes["site"]:
+        curves.append(("contacts", contact, style.PURPLE, "-"))
+        curves.append(("dissipated", run["energy/dissipated"], style.VERMILION, style.DASHED))
     if "energy/dissipated_by_damping" in run:
         curves.append(("dissipated in dashpots", run["energy/dissipated_by_damping"], style.ORANGE, "-"))
     for label, energy, colour, dashes in curves:
@@ -188,20 +226,27 @@ class Motion(NamedTuple):
     v: np.ndarray
 
 
+def without_phase(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
+    """Return why a run has no phase portraits; empty where it has some."""
+    site = leading_site(run)
+    if site is None:
+        return "the lattice has no contact sites"
+    cell = int(run["sites/cell"][site])
+    if cell not in run["cell"].values:
+        return f"cell {cell}, the first site, was not recorded"
+    if "displacement" not in run or "velocity" not in run:
+        return "displacement and velocity were not both recorded"
+    if Case.of(run).model().chain.pairs:
+        return "portraits show the cell's contact pair, but the contacts join other masses"
+    return ""
+
+
 def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw velocity against displacement at the first site: grey before the first contact, then by time."""
     site = leading_site(run)
-    if site is None:
-        return empty_figure("Phase portraits: the lattice has no contact sites")
+    assert site is not None
     cell = int(run["sites/cell"][site])
-    if cell not in run["cell"].values:
-        return empty_figure(f"Phase portraits: cell {cell}, the first site, was not recorded")
-    if "displacement" not in run or "velocity" not in run:
-        return empty_figure("Phase portraits: displacement and velocity were not both recorded")
     chain = Case.of(run).model().chain
-    if chain.pairs:
-        return empty_figure("Phase portraits show the cell's contact pair, but the contacts join other masses")
-
     recorded = run.sel(cell=cell)
     u, v, time = refined(recorded["displacement"].values, recorded["velocity"].values, field_time(run))
     host = chain.cell.host
@@ -257,7 +302,8 @@ def _mark_stops(axes: Axes, stops: list[float]) -> None:
     axes.set_xlim(-reach, reach)
     axes.vlines(stops, *axes.get_ylim(), color=style.VERMILION, lw=0.8, ls=style.DASHED)
     place = {"xycoords": ("data", "axes fraction"), "ha": "right", "va": "top", "color": style.VERMILION}
-    panels.note(axes, "clearance", (stops[0], 1), (-2, -2), **place)
+    box = {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.0}
+    panels.note(axes, "clearance", (stops[0], 1), (-3, -3), bbox=box, **place)
 
 
 def refined(u: np.ndarray, v: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -291,13 +337,15 @@ def bands(cell: UnitCell, frequency: float | None = None) -> Figure:
     left, right, *decay = figure.subplots(1, len(widths), sharey=True, width_ratios=widths)
 
     panels.band_diagram(left, cell, frequency)
-    for i, band in enumerate(passing):
+    for band in passing:
         middle = (band.low + band.high) / 2e3
-        panels.note(left, f"{band.number}", (1, middle), (3, 0), va="center", color=f"C{i}")
+        colour = style.band_colour(band.number)
+        panels.note(left, f"{band.number}", (1, middle), (3, 0), va="center", color=colour)
     left.set_title("(a) Bands; gaps shaded")
 
     point = bloch(cell, np.linspace(0, np.pi, 361))
-    right.plot(point.group_velocity, point.frequency / 1e3)
+    for number, (speed, omega) in enumerate(zip(point.group_velocity.T, point.frequency.T, strict=True), 1):
+        right.plot(speed, omega / 1e3, color=style.band_colour(number))
     right.set(title="(b) Group velocity", xlabel="Group velocity dω/dκ (cells/s)")
 
     for axes in decay:

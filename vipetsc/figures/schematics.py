@@ -13,12 +13,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import shortest_path
 
 from vipetsc.case import Case
-from vipetsc.case.contacts import Gaps
 from vipetsc.figures import style
+from vipetsc.figures.lattice_strip import draw_lattice, draw_wall
 from vipetsc.figures.panels import band_diagram, note
 from vipetsc.figures.style import with_prefix
 from vipetsc.figures.sweep_members import counted
-from vipetsc.lattice import Chain, Spring, UnitCell
+from vipetsc.lattice import Spring, UnitCell
+from vipetsc.lattice.chain import Pair
 
 # Lengths in units of the drawing.
 PITCH = 2.0  # distance between neighbouring masses
@@ -26,6 +27,7 @@ HALF = 0.34  # half the side of a mass
 WIDE = 1.0  # half the width of a host that holds its resonator
 TALL = 0.62  # half its height
 GAP = 0.17  # clearance as drawn
+NEXT = 0.9  # from the border of a cell to the first mass of the next one
 SIDE = 0.5  # half the side of a mass of the reduced model
 
 STRIP = 0.52  # height in inches of a lattice drawn as a strip of cells
@@ -40,7 +42,7 @@ def unit_cell(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     model = Case.of(run).model()
     figure = style.new_figure(style.PAGE, 2.7)
     upper, lower = figure.subplots(2, 1, height_ratios=(2.1, 1))
-    draw_unit_cell(upper, model.chain.cell)
+    draw_unit_cell(upper, model.chain.cell, tuple(dict.fromkeys(model.chain.pairs)))
     draw_lattice(lower, model.chain, model.drive_cell, model.gaps)
 
     title = "(a) Unit cell"
@@ -83,7 +85,7 @@ def reduced_model(masses: tuple[float, float], springs: tuple[float, float], cle
     start = host + SIDE
     end = resonator - SIDE
 
-    _draw_wall(axes, (-0.35, -0.8), 0.35, 1.9)
+    draw_wall(axes, (-0.35, -0.8), 0.35, 1.9)
     axes.plot([0, 0], [-0.8, 1.1], color=style.BLACK, lw=1.0)
     _draw_spring(axes, [(0, 0), (host - SIDE, 0)], rf"$k_1$ = {with_prefix(springs[0], 'N/m')}")
     _draw_spring(axes, [(start, 0.26), (end, 0.26)], rf"$k_2$ = {with_prefix(springs[1], 'N/m')}")
@@ -157,15 +159,18 @@ class CellLayout(NamedTuple):
         return line
 
 
-def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
-    """Draw masses, springs and the contact pair of ``cell``; a resonator held by its host alone sits inside it."""
+def draw_unit_cell(axes: Axes, cell: UnitCell, pairs: Sequence[Pair] = ()) -> None:
+    """Draw masses and springs of ``cell``, and the contacts of its ``pairs``, by default its host and resonator.
+
+    A resonator held by its host alone sits inside it.
+    """
     layout = _layout(cell)
     nested_pair = {cell.host, cell.resonator} if layout.nested else set()
     highest = _draw_springs(axes, cell, layout, nested_pair)
 
     for mass, (x, y) in layout.centre.items():
         if mass not in nested_pair:
-            colour = {cell.host: style.SKY, cell.resonator: style.ORANGE}.get(mass, style.PALE)
+            colour = {cell.resonator: style.ORANGE, cell.host: style.SKY}.get(mass, style.PALE)
             _draw_mass(axes, (x, y), HALF, mass, colour)
             # Left of the lower left corner, clear of what hangs below it and of the spring on its left.
             text = with_prefix(1e3 * cell.masses[mass], "g")
@@ -175,16 +180,48 @@ def draw_unit_cell(axes: Axes, cell: UnitCell) -> None:
     resonator = layout.centre[cell.resonator]
     if layout.nested:
         _draw_host_with_resonator(axes, host, cell)
-    elif cell.host != cell.resonator:
+    elif cell.host != cell.resonator and not pairs:
         _draw_contact(axes, host, resonator)
+    for pair in pairs:
+        _draw_pair(axes, layout, pair)
 
     low = min(y for _, y in layout.centre.values()) - TALL - 0.55
     high = highest + 0.5
     borders = [layout.left, layout.right]
     axes.vlines(borders, low + 0.15, high - 0.1, color=style.GREY, lw=0.6, ls=style.DASHED)
     axes.text(layout.left + 0.07, low + 0.1, "one cell", color=style.GREY, va="bottom")
-    axes.set(xlim=(layout.left - 0.5, layout.right + 0.5), ylim=(low, high), aspect="equal")
+    beyond = NEXT + 2 * HALF if any(pair.next_cell for pair in pairs) else 0.0
+    axes.set(xlim=(layout.left - 0.5, layout.right + beyond + 0.5), ylim=(low, high), aspect="equal")
     axes.set_axis_off()
+
+
+def _draw_pair(axes: Axes, layout: CellLayout, pair: Pair) -> None:
+    """Draw the contact of a ``pair``: within the cell, with a mass of the next cell, or with the ground."""
+    x, y = layout.centre[pair.resonator]
+    if pair.host < 0:
+        # A post on the ground in the way of the mass, below what is tied to the mass.
+        edge = x + layout.half[pair.resonator] + GAP
+        axes.add_patch(Rectangle((edge, y - 2 * HALF), 0.12, 2 * HALF - 0.1, fc=style.VERMILION, lw=0, zorder=3))
+        draw_wall(axes, (edge - 0.3, y - 2 * HALF - 0.2), 0.72, 0.2)
+        axes.text(edge + 0.2, y - HALF, "contact, Δ", color=style.VERMILION, va="center")
+        return
+    if not pair.next_cell:
+        _draw_contact(axes, layout.centre[pair.host], (x, y))
+        return
+
+    # The mass of the next cell as it stands behind the border, in dashes.
+    ghost = layout.right + NEXT + HALF
+    look = {"fc": "white", "ec": style.GREY, "ls": style.DASHED, "lw": 0.7, "zorder": 3}
+    axes.add_patch(Rectangle((ghost - HALF, y - HALF), 2 * HALF, 2 * HALF, **look))
+    axes.text(ghost, y, f"$m_{{{pair.resonator + 1}}}$", ha="center", va="center", color=style.GREY, zorder=4)
+    start = layout.end_at(pair.host)
+    middle = 0.5 * (start.x + start.half + ghost - HALF)
+    # Two stops that face each other, below the springs between these masses.
+    level = y - 0.55 * HALF
+    for edge, stop in ((start.x + start.half, middle - 0.5 * GAP), (ghost - HALF, middle + 0.5 * GAP)):
+        axes.plot([edge, stop], [level, level], color=style.VERMILION, lw=1.0)
+        axes.plot([stop, stop], [level - 0.16, level + 0.16], color=style.VERMILION, lw=2.0)
+    axes.text(layout.right - 0.08, level - 0.24, "contact, Δ", color=style.VERMILION, ha="right", va="top")
 
 
 def _draw_springs(axes: Axes, cell: UnitCell, layout: CellLayout, nested_pair: set[int]) -> float:
@@ -284,11 +321,6 @@ def _draw_mass(axes: Axes, centre: Point, half: float, index: int, colour: str) 
     axes.text(*centre, f"$m_{{{index + 1}}}$", ha="center", va="center", zorder=4)
 
 
-def _draw_wall(axes: Axes, corner: Point, width: float, height: float) -> None:
-    """Draw a hatched wall from its lower left ``corner`` on."""
-    axes.add_patch(Rectangle(corner, width, height, fc="white", ec=style.GREY, hatch="//////", lw=0.0))
-
-
 def _draw_host_with_resonator(axes: Axes, centre: Point, cell: UnitCell) -> None:
     """Draw the host as a box with two stops, the resonator between them on its spring."""
     x, y = centre
@@ -344,57 +376,3 @@ def _draw_spring(
         axes.text(middle[0] + 0.2, middle[1], text, ha="left", va="center")
     else:
         axes.text(middle[0], middle[1] + 0.2, text, ha="center", va="bottom")
-
-
-def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, gaps: Gaps = ()) -> None:
-    """Draw the lattice as a strip: its ends, drive (0-based cell) and contacts with their cells and clearances.
-
-    ``gaps`` in m are those of the sides + and -, where they differ.
-    """
-    n = chain.cells
-    axes.add_patch(Rectangle((0.5, 0), n, 1, fc="#EEEEEE", ec=style.BLACK, lw=0.6))
-    if n <= 150:  # borders of more cells would merge
-        axes.vlines(np.arange(1, n) + 0.5, 0, 1, color="white", lw=0.5)
-    if chain.ends == "fixed":
-        for wall in (0.5 - 0.02 * n, n + 0.5):
-            _draw_wall(axes, (wall, -0.25), 0.02 * n, 1.5)
-        axes.vlines([0.5, n + 0.5], -0.25, 1.25, color=style.BLACK, lw=1.0)
-    arrow = {"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8}
-    axes.annotate("", (drive_cell + 1, 1), (drive_cell + 1 + 0.025 * n, 1.75), arrowprops=arrow)
-
-    if chain.sites:
-        _draw_sites(axes, chain, gaps)
-    else:
-        axes.text(n / 2, -0.2, "no contact sites", color=style.GREY, ha="center", va="top")
-    axes.set(xlim=(-0.035 * n, 1.035 * n), ylim=(-1.2, 2.3))
-    axes.set_axis_off()
-
-
-def _draw_sites(axes: Axes, chain: Chain, gaps: Gaps) -> None:
-    """Draw a mark for every site, with its cell above and its clearance in mm below where there is room."""
-    n = chain.cells
-    width = max(0.006 * n, 1)
-    if gaps:
-        texts = [_gap_label(plus, minus) for plus, minus in gaps]
-    else:
-        texts = [f"{1e3 * clearance:#.3g}" for clearance in chain.clearances]
-    last_labelled = -np.inf
-    for site, text in sorted(zip(chain.sites, texts, strict=True)):
-        axes.add_patch(Rectangle((site + 1 - width / 2, 0), width, 1, fc=style.VERMILION, lw=0))
-
-        # Labels need about a twentieth of the strip each; neighbouring sites go without.
-        if site - last_labelled > 0.06 * n:
-            axes.text(site + 1, 1.2, f"{site + 1}", ha="center", va="bottom", fontsize=7)
-            below = {"color": style.VERMILION, "ha": "center", "va": "top", "linespacing": 1.0}
-            axes.text(site + 1, -0.2, text, **below)
-            last_labelled = site
-
-
-def _gap_label(plus: float, minus: float) -> str:
-    """The clearances in mm of a site's stops by their side, a line each; a stop that touches is 0."""
-    lines = []
-    for side, gap in (("+", plus), ("-", minus)):
-        if np.isfinite(gap):
-            # The side + is where the clearance is positive: a stop that is pressed has a sign of its own.
-            lines.append(f"{side} {1e3 * gap:.4g}" if gap else "0")
-    return "\n".join(lines)

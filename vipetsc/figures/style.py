@@ -6,22 +6,25 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from textwrap import wrap
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
+import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, LogLocator
+from matplotlib.ticker import EngFormatter
 from matplotlib.transforms import Bbox
 
 from vipetsc.figures.figure_data import figure_data
+from vipetsc.figures.log_ticks import label_log_axes
 from vipetsc.io.atomic import atomic_write, write_text
 
 COLUMN = 3.4  # width of one journal column in inches
 PAGE = 7.0  # width of two
 NOTE = 0.165  # height in inches of the strip that a line of a note takes below a picture
 LETTERS = 19  # of a note on an inch
+HEADING_LETTERS = 15  # of a heading
 SCREEN = 200  # dots per inch of a PNG, so that a page can hold many; a PDF's maps have more
 
 # Okabe and Ito (2008): distinguishable with every kind of colour vision.
@@ -40,12 +43,36 @@ RED = "#CC0000"
 DASHED = (0, (4, 2))
 DOTTED = (0, (1, 2))
 
+# Pass bands, from the lowest; beyond the sixth they come round. The dashes are for greyscale print.
+BAND_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
+BAND_DASHES = ("-", (0, (6, 1)), (0, (4, 1, 1, 1)), (0, (1.5, 0.8)), (0, (6, 1, 1, 1, 1, 1)), (0, (3, 2)))
+
 
 class Drawing(NamedTuple):
-    """A picture to come: the ``stem`` of its file's name; ``draw`` is called before the next drawing is asked for."""
+    """A picture to come: the ``stem`` of its file's name; ``draw`` is called before the next drawing is asked for.
+
+    ``shown`` are the results that the picture shows, where these are not all of what the figure was offered from.
+    """
 
     stem: str
     draw: Callable[[], Figure]
+    shown: Sequence[xr.Dataset] = ()
+
+
+def band_colour(number: int) -> str:
+    """The colour of pass band ``number`` (from 1) in every picture."""
+    return BAND_COLOURS[(number - 1) % len(BAND_COLOURS)]
+
+
+def band_look(number: int) -> dict[str, Any]:
+    """The colour and the dashes of pass band ``number`` (from 1), for curves that greyscale print must tell apart."""
+    return {"color": band_colour(number), "ls": BAND_DASHES[(number - 1) % len(BAND_DASHES)]}
+
+
+def band_number(part: str) -> int | None:
+    """The pass band that a ``part`` of the frequency axis is ("band 2"), the lowest of several; else None."""
+    kind, _, numbers = part.partition(" ")
+    return int(numbers.split("+")[0]) if kind == "band" else None
 
 
 def rc_style() -> AbstractContextManager[None]:
@@ -59,10 +86,10 @@ def with_prefix(value: float, unit: str) -> str:
 
 
 def new_figure(width: float, height: float, heading: str = "") -> Figure:
-    """An empty figure of ``width`` x ``height`` inches that needs no display and no pyplot."""
+    """An empty figure of ``width`` x ``height`` inches under a ``heading``, which needs no display and no pyplot."""
     figure = Figure(figsize=(width, height))
     if heading:
-        figure.suptitle(heading)
+        figure.suptitle("\n".join(wrap(heading, int(HEADING_LETTERS * width))))
     return figure
 
 
@@ -91,8 +118,8 @@ def save(figure: Figure, path: Path, note: str = "") -> Path:
 def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
     """Write the picture of a laid-out ``figure`` with ``lines`` of text in a strip below it."""
     width, height = figure.get_size_inches()
-    look = {"ha": "right", "va": "top", "fontsize": 7, "color": GREY}
-    text = figure.text(1 - 0.05 / width, -0.3 * NOTE / height, "\n".join(lines), **look)
+    look = {"ha": "left", "va": "top", "fontsize": 7, "color": GREY}
+    text = figure.text(0.05 / width, -0.3 * NOTE / height, "\n".join(lines), **look)
 
     with atomic_write(path) as partial_path:
         # ``savefig`` draws a figure twice; its own canvas suffices where nothing is added to the figure's box.
@@ -111,16 +138,14 @@ def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
 
 
 def _lay_out(figure: Figure) -> None:
-    """Lay the figure out once, with two minor ticks a decade: eight would be most of what a page of panels costs."""
-    for axes in figure.get_axes():
-        for axis in (axes.xaxis, axes.yaxis):
-            locator = axis.get_minor_locator()
-            if isinstance(locator, LogLocator):
-                locator.set_params(subs=(2.0, 5.0))
-
+    """Label the logarithmic axes of the figure, and lay it out, once for all formats."""
+    label_log_axes(figure)
     figure.set_dpi(SCREEN)
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine("none")
+    # In fractions of the figure, not of its box: that grows by the strip of a note.
+    for legend in figure.legends:
+        legend.set_bbox_to_anchor((0, 0, 1, 1), figure.transFigure)
 
 
 def draw_each(

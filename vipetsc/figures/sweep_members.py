@@ -71,6 +71,11 @@ class MemberRun(NamedTuple):
         """The names of the member on pages and in their files' names."""
         return Labels.of(self.case, self.varied)
 
+    @property
+    def results(self) -> tuple[xr.Dataset, xr.Dataset]:
+        """What a picture of the member shows, with its warnings."""
+        return self.run, self.analysis
+
     @classmethod
     @contextmanager
     def open(cls, folder: Path) -> Iterator[Self]:
@@ -84,26 +89,26 @@ def transfer_members(sweeps: Sweeps) -> Iterator[MemberRun]:
     """Yield the whole members with sites and a band above the driven one."""
     for ensemble in sweeps:
         for row, folder in whole_members(ensemble):
-            member = sweeps.files.get(folder, MemberRun.open)._replace(varied=varied_in(row, ensemble))
+            member = sweeps.files.get(folder, MemberRun.open)._replace(varied=varied_at(row["number"].item(), ensemble))
             # The transfer of a lattice without a higher band is not a number.
             if member.analysis.get("ibtet", -1) >= 0 and member.run.sizes["site"]:
                 yield member
 
 
-def varied_in(member: xr.Dataset, ensemble: xr.Dataset) -> str:
-    """Return the keys of an ``ensemble`` that are not among ``NAMED``, with their values in a ``member`` of it."""
+def varied_at(number: int, ensemble: xr.Dataset) -> str:
+    """Return the keys of an ``ensemble`` that are not among ``NAMED``, with their values in member ``number`` of it."""
     texts = []
     for axis in SweptAxis.all_of(ensemble):
         # Equal numbers of sites in other cells have one name.
         keys = [key for key in axis.keys if key.path not in NAMED or (key.values.dtype == object and key.path == SITES)]
-        texts += [key.texts[_place(member, ensemble)[axis.dimension]] for key in keys]
+        texts += [key.texts[_place(number, ensemble)[axis.dimension]] for key in keys]
     return ", ".join(texts)
 
 
-def _place(member: xr.Dataset, ensemble: xr.Dataset) -> dict[str, int]:
-    """Return the index of a ``member`` along every dimension of its ``ensemble``."""
+def _place(number: int, ensemble: xr.Dataset) -> dict[str, int]:
+    """Return the index of member ``number`` along every dimension of its ``ensemble``."""
     numbers = ensemble["number"]
-    index = np.argwhere(numbers.values == member["number"].item())[0]
+    index = np.argwhere(numbers.values == number)[0]
     return {str(dimension): int(i) for dimension, i in zip(numbers.dims, index, strict=True)}
 
 
@@ -187,7 +192,8 @@ def from_series(*needs: str, wave: bool = False, sites: bool = False) -> Callabl
                 has_wave = series.wave.band > 0
                 has_sites = len(recorded_sites(run)) > 0 and run.sizes["cell"] > 1
                 if (has_wave or not wave) and (has_sites or not sites):
-                    yield Drawing(series.suffix, partial(page, series))
+                    shown = [result for run in series.runs for result in run.results]
+                    yield Drawing(series.suffix, partial(page, series), shown)
 
         return offer
 
@@ -225,7 +231,7 @@ def _series_title(member: xr.Dataset, ensemble: xr.Dataset, case: Case, wave: Dr
     parts = [f"{case.lattice.reading.capitalize()} reading"] if case.lattice.preset else []
     for axis in SweptAxis.all_of(ensemble):
         if axis.dimension not in (AMPLITUDE, "reading", "wavenumber", "sites"):
-            parts.append(axis.texts[_place(member, ensemble)[axis.dimension]])
+            parts.append(axis.texts[_place(member["number"].item(), ensemble)[axis.dimension]])
     parts.append(counted(len(sites_of(case)), "site"))
     if wave.band:
         parts.append(f"κ* = {in_pi(wave.wavenumber)}")
@@ -327,6 +333,7 @@ class Labels(NamedTuple):
     page_stem: str
     member: str  # Hertz, calibrated, 5 sites, 30 cycles, 24.33 N
     member_stem: str
+    amplitude: str  # 24.33 N
 
     @classmethod
     def of(cls, case: Case, varied: str = "") -> Self:
@@ -338,7 +345,7 @@ class Labels(NamedTuple):
         # A lattice that begins in motion may have no drive.
         amplitude = f"{case.drive.amplitude:.4g} {unit}" if case.drive.amplitude else ""
         has_cycles = amplitude and "cycles" in case.drive.record.keys
-        cycles = f"{case.drive.cycles:g} cycles" if has_cycles else ""
+        cycles = f"{case.drive.cycles:g} {'cycle' if case.drive.cycles == 1 else 'cycles'}" if has_cycles else ""
         configuration = phrase(counted(sites, "site"), cycles, varied)
         page_stem = in_file_name(phrase(reading, configuration).replace(", ", "-").replace(" ", "-"))
         return cls(
@@ -348,6 +355,7 @@ class Labels(NamedTuple):
             page_stem=page_stem,
             member=phrase(law.capitalize(), reading, configuration, amplitude),
             member_stem="-".join(filter(None, [law, page_stem, in_file_name(amplitude.replace(" ", ""))])),
+            amplitude=amplitude,
         )
 
 

@@ -2,14 +2,17 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from itertools import count, cycle
+from itertools import cycle
 from pathlib import Path
 from string import ascii_lowercase
+from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.patheffects import withStroke
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
@@ -36,10 +39,14 @@ class SegmentLook(NamedTuple):
 # By the spectra of the analysis.
 SEGMENTS = {
     "dispersion_before": SegmentLook("Input segment", style.SKY),
-    "dispersion_after": SegmentLook("Output segment", style.YELLOW),
+    "dispersion_after": SegmentLook("Output segment", "white"),
 }
+OUTLINE = [withStroke(linewidth=3.4, foreground=style.BLACK)]  # seen on bright and dark places of a map
 ROOM = 1e4  # of a spectrum's axis above its peak, for the time history
 GAPS = (style.DASHED, (0, (1, 1.5)), (0, (4, 1.5, 1, 1.5)), (0, (6, 3)))
+MOST_COLUMNS = 4  # of dispersions
+MOST_PANELS = 12
+LETTERS = 14  # of their titles on an inch
 DECADES = 6  # below the total energy, that parts of it are shown over
 LARGEST_ERROR = 0.01
 LEAST_TOTAL = 1e-3  # of the largest total: the error is not judged below
@@ -49,7 +56,7 @@ def transfer(sweeps: Sweeps) -> Iterator[Drawing]:
     """Offer for every whole member: energy in space-time, dispersion and spectra before and behind the first site."""
     for member in transfer_members(sweeps):
         if "velocity" in member.run and all(name in member.analysis for name in (FIELD, *SEGMENTS)):
-            yield Drawing(member.labels.member_stem, partial(nine_panels, member))
+            yield Drawing(member.labels.member_stem, partial(nine_panels, member), member.results)
 
 
 def nine_panels(member: MemberRun) -> Figure:
@@ -68,7 +75,9 @@ def nine_panels(member: MemberRun) -> Figure:
     for axes, (name, segment) in zip(maps, SEGMENTS.items(), strict=True):
         image = panels.dispersion_map(axes, spectra[name], norm, cell)
         axes.set_title(f"({next(tags)}) {segment.label}")
-        axes.plot([0.03, 0.03], [0.03, 0.97], color=segment.colour, lw=2.2, transform=axes.transAxes)
+        axes.plot(
+            [0.03, 0.03], [0.03, 0.97], color=segment.colour, lw=2.2, path_effects=OUTLINE, transform=axes.transAxes
+        )
         axes.label_outer()
     panels.colour_bar(image, maps, "Energy per bin (J)")
 
@@ -115,10 +124,10 @@ def _mark_segments(axes: Axes, member: MemberRun) -> None:
 
     across = axes.get_yaxis_transform()
     for segment, (low, high) in zip(SEGMENTS.values(), spans, strict=True):
-        line = {"color": segment.colour, "lw": 2.2, "solid_capstyle": "butt"}
+        line = {"color": segment.colour, "lw": 2.2, "solid_capstyle": "butt", "path_effects": OUTLINE}
         axes.plot([0.98, 0.98], [low + 1, high - 1], transform=across, **line)
         name = segment.label.split()[0].lower()
-        text = {"color": segment.colour, "rotation": 90, "ha": "right", "va": "center"}
+        text = {"color": segment.colour, "rotation": 90, "ha": "right", "va": "center", "path_effects": OUTLINE}
         axes.text(0.955, 0.5 * (low + high), name, transform=across, **text)
 
 
@@ -163,36 +172,83 @@ class CaseFolder(NamedTuple):
     folder: Path
 
 
+class DispersionPanel(NamedTuple):
+    """A panel of dispersion: its member, None where the sweep has none there, and its title."""
+
+    member: CaseFolder | None
+    title: str
+
+
 def transfer_dispersions(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer every reading and configuration: laws in rows, amplitudes in columns."""
-    members = (CaseFolder(m.case, m.labels, m.folder) for m in transfer_members(sweeps) if "dispersion" in m.analysis)
-    for name, group in grouped(members, lambda member: member.labels.page_stem).items():
-        yield Drawing(name, partial(_dispersion_table, group, sweeps.files))
+    """Offer every reading and configuration: laws in rows, amplitudes in columns; members that would be alone together.
+
+    More amplitudes than ``MOST_COLUMNS`` go on in the next row.
+    """
+    members = [CaseFolder(m.case, m.labels, m.folder) for m in transfer_members(sweeps) if "dispersion" in m.analysis]
+    pages = grouped(members, lambda member: member.labels.page_stem)
+    for name, group in pages.items():
+        if len(group) > 1:
+            yield Drawing(name, partial(_dispersion_table, group, sweeps.files), _results(group, sweeps.files))
+
+    alone = [group[0] for group in pages.values() if len(group) == 1]
+    for first in range(0, len(alone), MOST_PANELS):
+        group = alone[first : first + MOST_PANELS]
+        name = group[0].labels.page_stem
+        if len(group) > 1:
+            name = f"members-{first + 1}-to-{first + len(group)}"
+        yield Drawing(name, partial(_dispersion_page, group, sweeps.files), _results(group, sweeps.files))
+
+
+def _results(members: Sequence[CaseFolder], files: Files) -> list[xr.Dataset]:
+    """Return runs and analyses of ``members``."""
+    return [result for member in members for result in files.get(member.folder, MemberRun.open).results]
 
 
 def _dispersion_table(members: Sequence[CaseFolder], files: Files) -> Figure:
-    """Draw one panel a member; colours run over five decades below each panel's own largest value."""
-    folders = {(member.case.contacts.law, member.case.drive.amplitude): member.folder for member in members}
-    laws = sorted({law for law, _ in folders}, reverse=True)
-    amplitudes = sorted({amplitude for _, amplitude in folders})
-    figure = style.new_figure(style.PAGE, 0.4 + 2.1 * len(laws), members[0].labels.page)
-    grid = figure.subplots(len(laws), len(amplitudes), sharex=True, sharey=True, squeeze=False)
+    """Draw one panel a member of a page: laws in rows, amplitudes in columns, in further rows if these are many."""
+    laws = sorted({member.case.contacts.law for member in members}, reverse=True)
+    amplitudes = sorted({member.case.drive.amplitude for member in members})
+    at = {(member.case.contacts.law, member.case.drive.amplitude): member for member in members}
+    names = {member.case.drive.amplitude: member.labels.amplitude for member in members}
+    panels_of_page = [
+        DispersionPanel(at.get((law, amplitude)), f"{law.capitalize()}, {names[amplitude]}")
+        for law in laws
+        for amplitude in amplitudes
+    ]
+    return _dispersion_panels(members[0].labels.page, panels_of_page, len(amplitudes), files)
 
-    for (i, j), axes in np.ndenumerate(grid):
-        law = laws[i]
-        amplitude = amplitudes[j]
-        if (law, amplitude) not in folders:
+
+def _dispersion_page(members: Sequence[CaseFolder], files: Files) -> Figure:
+    """Draw one panel a member, under its name."""
+    panels_of_page = [DispersionPanel(member, member.labels.member) for member in members]
+    return _dispersion_panels("", panels_of_page, MOST_COLUMNS - 1, files)
+
+
+def _dispersion_panels(heading: str, shown: Sequence[DispersionPanel], columns: int, files: Files) -> Figure:
+    """Draw panels in rows of ``columns``; colours run over five decades below each panel's own largest value."""
+    columns = min(len(shown), columns, MOST_COLUMNS)
+    rows = -(-len(shown) // columns)
+    figure = style.new_figure(style.PAGE, 0.4 + 2.1 * rows, heading)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    letters = int(LETTERS * style.PAGE / columns)
+    for axes, (member_folder, text) in zip(grid.flat, shown, strict=False):
+        axes.set_title("\n".join(wrap(text, letters)))
+        if member_folder is None:
             panels.annotate_empty(axes, "no such run")
             continue
-        member = files.get(folders[law, amplitude], MemberRun.open)
+        member = files.get(member_folder.folder, MemberRun.open)
         cell = member.model.chain.cell
         energy = panels.below_cutoff(member.analysis, cell, ["dispersion"])["dispersion"]
         energy = energy / (float(energy.max()) or 1.0)
         image = panels.dispersion_map(axes, energy, panels.log_norm(energy), cell)
         axes.label_outer()
-        axes.set_title(f"({'abcdef'[i]}.{j + 1}) {law.capitalize()}, {amplitude:.4g} N")
         transferred = f"IBTET {float(member.analysis['ibtet']):.2g}"
         axes.text(0.03, 0.41, transferred, color="white", transform=axes.transAxes)
+
+    for axes in grid.flat[len(shown) :]:
+        axes.set_axis_off()
+    if len(shown) > 1:
+        panels.label_panels(grid if len(shown) == grid.size else grid.flat[: len(shown)])
     panels.colour_bar(image, grid, "Energy per bin / maximum", aspect=35)
     return figure
 
@@ -201,7 +257,7 @@ def band_energies(sweeps: Sweeps) -> Iterator[Drawing]:
     """Offer energies of all parts and their sum over time for every whole member."""
     for member in transfer_members(sweeps):
         if member.analysis.sizes["bands/part"] and "bands/total" in member.analysis:
-            yield Drawing(member.labels.member_stem, partial(energies_over_time, member))
+            yield Drawing(member.labels.member_stem, partial(energies_over_time, member), member.results)
 
 
 def band_shares(sweeps: Sweeps) -> Iterator[Drawing]:
@@ -238,9 +294,9 @@ def energies_over_time(member: MemberRun) -> Figure:
 
     figure = style.new_figure(style.PAGE * 0.8, 4.2, member.labels.member)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1))
-    _draw_parts(upper, mean_time, analysis["bands/energy"].attrs["parts"], mean_parts)
+    draw_parts(upper, mean_time, analysis["bands/energy"].attrs["parts"], mean_parts)
     upper.plot(mean_time, mean_total, color=style.BLACK, lw=1.6, label="total")
-    upper.plot(mean_time, mean_sum, color=style.YELLOW, lw=0.8, ls="--", label="sum of parts")
+    upper.plot(mean_time, mean_sum, color=style.SKY, lw=0.8, ls="--", label="sum of parts")
     top = total.max() or 1.0
     upper.set(yscale="log", ylim=(top * 10.0**-DECADES, 3 * top), ylabel="Kinetic energy (J)")
     upper.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -262,7 +318,7 @@ def _draw_fractions(axes: Axes, curve: TransferCurve) -> str:
     """Draw the mean fraction of every part after the wave's arrival against the amplitude; return the law's name."""
     amplitude = curve.data["amplitude"]
     fraction = curve.data["bands/share"]
-    _draw_parts(axes, amplitude, fraction.attrs["parts"], np.maximum(fraction.values.T, 1e-300))
+    draw_parts(axes, amplitude, fraction.attrs["parts"], np.maximum(fraction.values.T, 1e-300))
     axes.plot(amplitude, fraction.values.sum(axis=1), color=style.BLACK, lw=0.6, ls=":", label="sum")
     axes.set(xscale="log", yscale="log", ylim=(10.0**-DECADES, 2), xlabel="Amplitude of the drive (N)")
     if axes.get_subplotspec().is_last_col():
@@ -270,12 +326,12 @@ def _draw_fractions(axes: Axes, curve: TransferCurve) -> str:
     return Labels.of(curve.case).law
 
 
-def _draw_parts(axes: Axes, x: ArrayLike, names: ArrayLike, energies: Iterable[np.ndarray]) -> None:
+def draw_parts(axes: Axes, x: ArrayLike, names: ArrayLike, energies: Iterable[np.ndarray]) -> None:
     """Draw a curve for each part: a colour for each pass band, grey dashes for each gap and for what lies above."""
-    band_colours = (f"C{i}" for i in count())
     gap_dashes = cycle(GAPS)
     for name, energy in zip(np.atleast_1d(names), energies, strict=True):
-        if name.startswith("band"):
-            axes.plot(x, energy, label=name, color=next(band_colours))
+        band = style.band_number(name)
+        if band:
+            axes.plot(x, energy, label=name, **style.band_look(band))
         else:
             axes.plot(x, energy, label=name, color=style.GREY, lw=0.7, ls=next(gap_dashes))

@@ -26,6 +26,7 @@ from vipetsc.figures.sweep_members import (
     phrase,
     sites_of,
     transfer_members,
+    varied_at,
 )
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves, field_interval, field_time
@@ -68,7 +69,8 @@ def columns_of_laws(shown: Sequence[TransferCurve], ylabel: str, panel: Callable
     """Draw a page of one configuration: a column a law, drawn by ``panel``, which returns the column's title."""
     shown = sorted(shown, key=lambda curve: curve.case.contacts.law, reverse=True)
     width = style.PAGE if len(shown) > 1 else 4.3
-    figure = style.new_figure(width, 2.9, Labels.of(shown[0].case).page)
+    varied = str(shown[0].data.get("varied", ""))
+    figure = style.new_figure(width, 2.9, Labels.of(shown[0].case, varied).page)
     grid = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     for tag, axes, curve in zip(ascii_lowercase, grid, shown, strict=False):
         axes.set_title(f"({tag}) {panel(axes, curve)}")
@@ -125,8 +127,8 @@ def _page(reading: str, page_curves: Sequence[TransferCurve], points: Sequence[T
             _mark_peak(linear, curve, looks[kind], row)
 
         reach = max(REACH * curve.data[AMPLITUDE][curve.data["peak"]] for curve in law_curves)
-        linear.set(title=f"({tag}.1) {law.capitalize()}, {reading}", xlim=(0, float(reach)))
-        logarithmic.set(title=f"({tag}.2) {law.capitalize()}, {reading}", xscale="log", yscale="log")
+        linear.set(title=f"({tag}.i) {law.capitalize()}, {reading}", xlim=(0, float(reach)))
+        logarithmic.set(title=f"({tag}.ii) {law.capitalize()}, {reading}", xscale="log", yscale="log")
         logarithmic.legend(loc="upper right")
 
     # The limits of all columns, once all is drawn: their axes are common.
@@ -179,9 +181,17 @@ def ibtet_backbone(sweeps: Sweeps) -> Iterator[Drawing]:
         if values["case"] != ensemble.attrs["case"]:
             continue
 
-        aligned = [TransferCurve(Case.from_toml(table["case"]), table) for table in _groups(values)]
-        for name, columns in grouped(aligned, lambda curve: Labels.of(curve.case).page_stem).items():
+        aligned = []
+        for table in _groups(values):
+            varied = varied_at(int(table["number"]), ensemble) if "number" in table else ""
+            aligned.append(TransferCurve(Case.from_toml(table["case"]), {**table, "varied": varied}))
+        for name, columns in grouped(aligned, _backbone_page_stem).items():
             yield Drawing(name, partial(columns_of_laws, columns, BACKBONE_LABEL, _superposition))
+
+
+def _backbone_page_stem(curve: TransferCurve) -> str:
+    """Return the stem of the page that a related curve stands on, by whatever its sweep varies but the law."""
+    return Labels.of(curve.case, curve.data["varied"]).page_stem
 
 
 def curves_left_out(folders: Iterable[Path]) -> str:
@@ -281,7 +291,7 @@ def phase_regimes(sweeps: Sweeps) -> Iterator[Drawing]:
         shows_its_site = len(recorded_sites(run)) == run.sizes["site"] == 1
         if shows_its_site and "displacement" in run and "velocity" in run:
             # The names of a page are those of its members but for the amplitude.
-            labels = member.labels._replace(member="", member_stem="")
+            labels = member.labels._replace(member="", member_stem="", amplitude="")
             folders.setdefault((f"{member.case.contacts.law}-{labels.page_stem}", labels), []).append(member.folder)
 
     curves_by_site = {
@@ -290,9 +300,11 @@ def phase_regimes(sweeps: Sweeps) -> Iterator[Drawing]:
     }
     for (name, labels), page_folders in folders.items():
         # A page of members at one value of a further key has a name that no curve has.
-        (site,) = sites_of(sweeps.files.get(page_folders[0], MemberRun.open).case)
+        members = [sweeps.files.get(folder, MemberRun.open) for folder in page_folders]
+        (site,) = sites_of(members[0].case)
         curve = curves_by_site.get((name, site))
-        yield Drawing(name, partial(_regimes, page_folders, sweeps.files, labels, curve))
+        shown = [result for member in members for result in member.results]
+        yield Drawing(name, partial(_regimes, page_folders, sweeps.files, labels, curve), shown)
 
 
 def _regimes(folders: Sequence[Path], files: Files, labels: Labels, curve: TransferCurve | None) -> Figure:
@@ -317,13 +329,13 @@ def _regimes(folders: Sequence[Path], files: Files, labels: Labels, curve: Trans
         transfer.plot(*point, "o", color=style.RED, ms=4, zorder=3)
         note(transfer, str(number), point, (4, 3), fontsize=7.5, color=style.RED)
         _draw_portrait(axes, motion)
-        axes.set(title=f"{number}: {motion.case.drive.amplitude:.4g} N", box_aspect=1)
+        axes.set(title=f"(b.{number}) {motion.case.drive.amplitude:.4g} N", box_aspect=1)
     for axes in panels[len(motions) :]:
         axes.set_axis_off()
 
     transfer.set(xscale="log", yscale="log", xlabel="Amplitude of the drive (N)", ylabel="Inter-band transfer (1)")
     transfer.margins(x=0.08, y=0.12)
-    transfer.set_title("Transfer to higher bands")
+    transfer.set_title("(a) Transfer to higher bands")
     right.supxlabel("Displacement $u$ (mm)")
     right.supylabel(r"Velocity $\dot u$ (m/s)")
     right.legend(handles=panels[0].get_lines(), loc="lower right", ncols=2)

@@ -1,5 +1,5 @@
-// Pictures that can be read off: values under the pointer, a larger picture by a click, curves drawn anew with zoom and
-// without those that are switched off. The numbers stand beside each picture, as vipetsc.figures.drawn tells them.
+// Pictures that can be read off: values of the point nearest to the pointer, a larger picture by a click, curves drawn anew
+// with zoom and without those that are switched off. The numbers of each picture are those of vipetsc.figures.figure_data.
 "use strict";
 
 const SVG = "http://www.w3.org/2000/svg", WIDTH = 720, HEIGHT = 400, LEFT = 64, RIGHT = 12, TOP = 10, BOTTOM = 42;
@@ -18,8 +18,9 @@ const share = (axis, v) => axis.log ? Math.log(v / axis.low) / Math.log(axis.hig
 const value = (axis, s) => axis.log ? axis.low * (axis.high / axis.low) ** s : axis.low + s * (axis.high - axis.low);
 const told = (axes, x, y) => `${axes.x.label || "x"}: ${number(x)}; ${axes.y.label || "y"}: ${number(y)}`;
 
-function nearest(axes, curves, sx, sy, width, height, reach) {
-  let best = null;
+// The point of the curves that is nearest to a place, both in shares of the axes; null where no point is within them.
+function nearest(axes, curves, sx, sy, width, height) {
+  let best = null, reach = Infinity;
   for (const curve of curves) curve.x.forEach((x, i) => {
     if (x === null || curve.y[i] === null) return;
     const px = share(axes.x, x), py = share(axes.y, curve.y[i]);
@@ -128,7 +129,7 @@ function plot(axes, host) {
   svg.onpointerdown = event => { begin = at(event); svg.setPointerCapture(event.pointerId); };
   svg.onpointermove = event => {
     const [sx, sy] = at(event);
-    const best = nearest(shown, axes.curves.filter(c => !off.has(c)), sx, sy, w, h, 40);
+    const best = nearest(shown, axes.curves.filter(c => !off.has(c)), sx, sy, w, h);
     readout.textContent = best ? `${best.curve.label} ${told(axes, best.x, best.y)}` : told(axes, value(shown.x, sx), value(shown.y, sy));
     if (begin) for (const [key, v] of Object.entries({
       x: LEFT + Math.min(begin[0], sx) * w, y: TOP + (1 - Math.max(begin[1], sy)) * h,
@@ -154,6 +155,25 @@ async function unpacked(source) {
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).json();
 }
 
+// The names of axes in full, no two of them equal: title, and what is drawn over what.
+function names(all) {
+  const full = all.map(({title, x, y}) => [title, [y.label, x.label].filter(Boolean).join(" over ")].filter(Boolean).join(": "));
+  return full.map((name, i) => name && full.indexOf(name) === full.lastIndexOf(name) ? name : `${name || "panel"} (${i + 1})`);
+}
+
+// A picture on the whole screen, where a finger moves it; a tap, the button or Escape closes it.
+const viewer = document.querySelector("dialog");
+
+function show(image, fx, fy) {
+  const large = viewer.querySelector("img"), width = Math.max(2.5 * viewer.ownerDocument.documentElement.clientWidth, image.naturalWidth);
+  large.src = image.src;
+  large.alt = image.alt;
+  large.style.width = `${width}px`;
+  viewer.showModal();
+  viewer.scrollTo(fx * width - viewer.clientWidth / 2, fy * large.clientHeight - viewer.clientHeight / 2);
+}
+if (viewer) viewer.onclick = () => viewer.close();
+
 async function explore(figure) {
   const source = figure.querySelector("script"), holder = figure.querySelector(".frame"), image = figure.querySelector("img");
   if (!source || !holder) return;
@@ -167,7 +187,7 @@ async function explore(figure) {
     mark.hidden = true;
     if (!axes) { readout.textContent = ""; return; }
     const [l, t, r, b] = axes.box, sx = (fx - l) / (r - l), sy = (b - fy) / (b - t);
-    const best = nearest(axes, axes.curves, sx, sy, (r - l) * box.width, (b - t) * box.height, 14);
+    const best = nearest(axes, axes.curves, sx, sy, (r - l) * box.width, (b - t) * box.height);
     readout.textContent = best ? `${best.curve.label} ${told(axes, best.x, best.y)}` : told(axes, value(axes.x, sx), value(axes.y, sy));
     if (axes.map) readout.textContent += read(axes.map, image, fx, fy);
     if (best) {
@@ -179,6 +199,7 @@ async function explore(figure) {
   image.onpointerleave = () => { mark.hidden = true; };
   image.onclick = event => {
     const fx = event.offsetX / image.offsetWidth, fy = event.offsetY / image.offsetHeight;
+    if (event.pointerType === "touch") { show(image, fx, fy); return; }
     const large = holder.classList.toggle("large");
     if (large) holder.scrollTo(fx * image.offsetWidth - holder.clientWidth / 2, fy * image.offsetHeight - holder.clientHeight / 2);
   };
@@ -186,7 +207,7 @@ async function explore(figure) {
   if (!curves.length) return;
   const choice = make("select", {"aria-label": "curves to draw larger"}, tools);
   make("option", {value: -1}, choice, "curves, larger …");
-  curves.forEach((axes, i) => make("option", {value: i}, choice, axes.title || axes.y.label || `panel ${i + 1}`));
+  names(curves).forEach((name, i) => make("option", {value: i}, choice, name));
   choice.onchange = () => {
     figure.querySelectorAll(".plot").forEach(other => other.remove());
     if (choice.value >= 0) plot(curves[choice.value], tools);
@@ -194,3 +215,6 @@ async function explore(figure) {
 }
 
 document.querySelectorAll("figure").forEach(explore);
+// On a narrow screen the contents are folded.
+const contents = document.querySelector("nav details");
+if (contents) contents.open = matchMedia("(min-width: 70rem)").matches;

@@ -79,10 +79,11 @@ class PaperFigure:
 
             finished = [folders[step] for step in part.steps if step in folders]
             if finished:
-                for stem, make in drawings(FIGURES[part.figure].source, finished, files, [part.figure]):
+                for drawing in drawings(FIGURES[part.figure].source, finished, files, [part.figure]):
+                    stem = drawing.stem
                     # Between dashes, so that no part of a longer word matches.
                     if all(f"-{word}-" in f"{stem}-" for word in part.only):
-                        yield Picture(f"{self.id}-{part.stem.format(stem=stem)}", make, part.cost)
+                        yield Picture(f"{self.id}-{part.stem.format(stem=stem)}", drawing.draw, part.cost)
 
 
 def lattice(reading: str, preset: str, sites: Sequence[int]) -> Figure:

@@ -178,13 +178,13 @@ def _relate(ensemble: xr.Dataset, branches: Sequence[Path]) -> Path | None:
             continue
         name = f"{case.lattice.reading}-{case.contacts.law}-{sites}-sites-{case.drive.cycles:g}-cycles"
         if name in related:
-            left_out.append(f"{name}: another curve has the same law, reading, sites and cycles")
-            continue
+            # Another key tells the curves apart: figures name it by the member's number.
+            name += f"-{number}"
         relation = _relate_curve(curve, case, slopes, folder)
         if isinstance(relation, str):
             left_out.append(f"{name}: {relation}")
         else:
-            related[name] = relation
+            related[name] = relation.assign_attrs(number=number)
 
     about: dict[str, Any] = origin() | {
         "format_version": FORMAT_VERSION,

@@ -1,0 +1,72 @@
+"""What of a figure cannot be read: text outside the page or over other text, axes without labels, unnamed panels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+OVERLAP = 2  # pixels that boxes of text may share: these are higher than their letters
+FEWEST = 3  # labels of a logarithmic axis
+
+
+def complaints(figure: Figure) -> list[str]:
+    """Return a sentence for everything that cannot be read in a laid-out figure."""
+    return [*_texts(figure), *_logarithmic_axes(figure), *_letters(figure)]
+
+
+def _texts(figure: Figure) -> Iterator[str]:
+    FigureCanvasAgg(figure)
+    figure.draw_without_rendering()
+    renderer = figure.canvas.get_renderer()
+    hidden = set(_hidden(figure))
+    boxes = []
+    for text in figure.findobj(Text):
+        if text.get_visible() and text.get_text().strip() and text not in hidden:
+            box = text.get_window_extent(renderer)
+            boxes.append((text.get_text(), box))
+            if min(box.x0, box.y0) < -1 or box.x1 > figure.bbox.width + 1 or box.y1 > figure.bbox.height + 1:
+                yield f"outside the page: {text.get_text()!r}"
+    for (first, a), (second, b) in combinations(boxes, 2):
+        width = min(a.x1, b.x1) - max(a.x0, b.x0)
+        height = min(a.y1, b.y1) - max(a.y0, b.y0)
+        if min(width, height) > OVERLAP:
+            yield f"one over the other: {first!r}, {second!r}"
+
+
+def _hidden(figure: Figure) -> Iterator[Text]:
+    """Yield labels of ticks that are beyond their axis, switched off, or of axes that are."""
+    for axes in figure.findobj(Axes):
+        for axis in (axes.xaxis, axes.yaxis):
+            if not axes.axison:
+                yield from axis.findobj(Text)
+            low, high = sorted(axis.get_view_interval())
+            for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks()):
+                beyond = not low <= tick.get_loc() <= high
+                yield from (label for label in (tick.label1, tick.label2) if beyond or not label.get_visible())
+
+
+def _logarithmic_axes(figure: Figure) -> Iterator[str]:
+    for axes in figure.get_axes():
+        for axis in (axes.xaxis, axes.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            inside = [place for place in axis.get_majorticklocs() if low * (1 - 1e-9) <= place <= high * (1 + 1e-9)]
+            if axes.axison and axis.get_scale() == "log" and len(inside) < FEWEST:
+                yield f"{axes.get_title('left')!r}: {len(inside)} labels along {axis.axis_name}"
+
+
+def _letters(figure: Figure) -> Iterator[str]:
+    """Yield panels without a letter on a page of several; small ones in a row may have one together."""
+    together = {part for part in figure.findobj(lambda one: getattr(one, "_suptitle", None)) if _begins(part._suptitle)}
+    shown = [axes for axes in figure.get_axes() if axes.axison and axes.get_label() != "<colorbar>"]
+    for axes in shown:
+        if len(shown) > 1 and axes.figure not in together and not axes.get_title("left").startswith("("):
+            yield f"no letter: {axes.get_title('left')!r}, {axes.get_ylabel()!r}"
+
+
+def _begins(text: Text) -> bool:
+    return text.get_text().startswith("(")

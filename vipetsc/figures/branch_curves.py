@@ -1,0 +1,109 @@
+"""The curve of a branch as it is drawn: smooth through its points, coloured by stability; its lowest states."""
+
+from itertools import pairwise
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+
+from vipetsc.figures import style
+
+FINE = 8  # points of the curve drawn for each step of a branch
+UNSTABLE = 1.0 + 1e-6  # with a Floquet multiplier of a larger modulus an orbit is unstable, beyond rounding
+
+
+def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Return energies and frequencies, ``FINE`` for each step: cubic Hermite curves through points and tangents.
+
+    The curves are those of ln E and ln f, each over its range, and their parameter is the length of the chord. Where a
+    contact grazes, the branch may have a corner: one curve ends there and the next begins with a tangent of its own.
+    Branches of less than three points, or without tangents, come back as they are.
+    """
+    energy = branch["energy"].values
+    frequency = branch["frequency"].values
+    if len(energy) < 3 or "tangent_period" not in branch:
+        return energy, frequency
+
+    points = np.log(np.column_stack([energy, frequency]))
+    extent = np.ptp(points, axis=0)
+    scale = np.where(extent > 0, extent, 1)
+    points /= scale
+    chords = np.diff(points, axis=0)
+    length = np.maximum(np.linalg.norm(chords, axis=1), 1e-300)[:, None]
+    unit_chord = chords / length
+    begin, end = _end_tangents(branch, scale, unit_chord)
+
+    # The basis of a cubic Hermite curve; (step, FINE) points become one list, which ends with the last point itself.
+    t = (np.arange(FINE) / FINE)[:, None, None]
+    cubic = points[:-1] + t**2 * (3 - 2 * t) * chords + length * (t * (1 - t) ** 2 * begin - t**2 * (1 - t) * end)
+    fine = np.vstack([cubic.swapaxes(0, 1).reshape(-1, 2), points[-1:]])
+    fine_energy, fine_frequency = np.exp(fine * scale).T
+    return fine_energy, fine_frequency
+
+
+def _end_tangents(branch: xr.Dataset, scale: np.ndarray, unit_chord: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit tangents (step, 2) at the beginning and the end of every step, in logarithms over ``scale``."""
+    energy = branch["energy"].values
+    frequency = branch["frequency"].values
+
+    # The file has dT/ds and df/dE, so df/ds = -f^2 dT/ds, and dE/ds = (df/ds) / (df/dE). This is 0/0 at a frequency
+    # fold and where the branch is linear: such tangents are left to ``_completed``.
+    rate = -branch["tangent_period"].values * frequency**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tangents = np.column_stack([rate / branch["slope"].values / energy, rate / frequency])
+    tangents /= scale
+    tangents[~np.isfinite(tangents).all(axis=1) | ~tangents.any(axis=1)] = np.nan
+    tangents /= np.linalg.norm(tangents, axis=1)[:, None]
+
+    # All tangents point in the direction in which the branch was followed; the points may be listed in the other one.
+    tangents *= np.sign(np.nansum(tangents[:-1] * unit_chord)) or 1.0
+
+    # At a grazing point the tangent is that of one side: neither step takes it.
+    begin = tangents[:-1].copy()
+    end = tangents[1:].copy()
+    begin[branch["kind"].values[:-1] == "grazing"] = np.nan
+    end[branch["kind"].values[1:] == "grazing"] = np.nan
+    return _completed(begin, end, unit_chord), _completed(end, begin, unit_chord)
+
+
+def _completed(tangent: np.ndarray, other: np.ndarray, unit_chord: np.ndarray) -> np.ndarray:
+    """Return the ``tangent`` at one end of every step, completed where it is NaN.
+
+    With the tangent ``other`` of the other end the step is a parabola, whose two tangents have the chord as their mean;
+    without, it is straight.
+    """
+    by_other = np.where(np.isnan(other), unit_chord, 2 * unit_chord - other)
+    return np.where(np.isnan(tangent), by_other, tangent)
+
+
+def lowest(branch: xr.Dataset) -> np.ndarray:
+    """Return for each point (point,) whether its frequency is the lowest that the branch has at its energy."""
+    energy = branch["energy"].values
+    frequency = branch["frequency"].values
+    order = np.argsort(energy)
+    ranks = np.searchsorted(energy[order], energy)
+
+    # Each step of the branch is a straight line over energy; points of these energies above it are not the lowest.
+    least = frequency[order].copy()
+    for i, (rank, next_rank) in enumerate(pairwise(ranks)):
+        between = slice(min(rank, next_rank) + 1, max(rank, next_rank))
+        ends = np.sort([i, i + 1])[np.argsort(energy[i : i + 2])]
+        on_line = np.interp(energy[order[between]], energy[ends], frequency[ends])
+        least[between] = np.minimum(least[between], on_line)
+    return frequency <= least[np.argsort(order)] * (1 + 1e-9)
+
+
+def draw_branch(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
+    """Draw the whole branch in blue; over it vermilion where it is unstable, grey where multipliers are not known."""
+    energy, frequency = smooth(branch)
+    multiplier = branch["multiplier_max"].values
+    stable_label = "stable" if np.any(multiplier <= UNSTABLE) else None
+    axes.plot(energy, frequency, color=style.BLUE, lw=width, zorder=2, label=stable_label)
+
+    parts = ((multiplier > UNSTABLE, style.VERMILION, "unstable"), (np.isnan(multiplier), style.GREY, "not known"))
+    for is_part, colour, label in parts:
+        if len(energy) > len(is_part):
+            # The curve has been smoothed: the points of a step belong to the part if both of its ends do.
+            is_part = np.append(np.repeat(is_part[:-1] & is_part[1:], FINE), is_part[-1])
+        if is_part.any():
+            axes.plot(energy, np.where(is_part, frequency, np.nan), color=colour, lw=1.3 * width, zorder=3, label=label)

@@ -1,0 +1,88 @@
+"""Labels of logarithmic axes: three or more on each, at round numbers that have room."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+
+LEAST_TICKS = 3
+MOST_TICKS = 8
+LETTER = 0.062  # inches of a letter of a tick's label
+LINE = 0.14  # inches of its height
+PLAIN = 1e-3, 1e4  # numbers that need no power of ten
+MARKUP = re.compile(r"[${}^]|\\cdot")
+PART = 0.8  # of the room of axes before they are laid out, that is left for what they show
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Return three numbers or more between ``low`` and ``high``, both positive, for a logarithmic scale."""
+    exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    for steps in ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 5, 7)):
+        ticks = [step * 10.0**exponent for exponent in exponents for step in steps]
+        inside = [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
+        if len(inside) >= LEAST_TICKS:
+            return inside[:: -(-len(inside) // MOST_TICKS)]
+    return [float(tick) for tick in MaxNLocator(4).tick_values(low, high) if low <= tick <= high]
+
+
+def tick_text(value: float) -> str:
+    """Return a number as a label: plain, or with a power of ten where it has many zeros."""
+    low, high = PLAIN
+    if low <= abs(value) < high:
+        return f"{value:.4g}"
+    exponent = int(np.floor(np.log10(abs(value)) + 1e-9))
+    factor = f"{value / 10.0**exponent:.3g}"
+    return f"$10^{{{exponent}}}$" if factor == "1" else rf"${factor}\cdot 10^{{{exponent}}}$"
+
+
+def has_room(positions: np.ndarray, texts: Sequence[str], length: float, is_horizontal: bool) -> bool:
+    """Return whether labels ``texts`` at ``positions`` that span ``length`` inches of an axis stand apart."""
+    if len(positions) < 2:
+        return True
+    order = np.argsort(positions)
+    gaps = np.diff(positions[order]) / np.ptp(positions) * length
+    sizes = np.array([LETTER * (len(texts[i]) + 1) if is_horizontal else LINE for i in order])
+    return bool((gaps >= 0.5 * (sizes[1:] + sizes[:-1])).all())
+
+
+def label_log_axis(axis: Axis, low: float, high: float, length: float) -> None:
+    """Label round numbers between ``low`` and ``high`` on a logarithmic ``axis`` on which they span ``length`` inches.
+
+    They are thinned where there is no room, as long as three are left.
+    """
+    ticks = log_ticks(low, high)
+    is_horizontal = axis.axis_name == "x"
+    while len(ticks) > LEAST_TICKS:
+        texts = [MARKUP.sub("", tick_text(tick)) for tick in ticks]
+        if has_room(np.log(ticks), texts, length * np.log(ticks[-1] / ticks[0]) / np.log(high / low), is_horizontal):
+            break
+        ticks = ticks[::2] if len(ticks) >= 2 * LEAST_TICKS - 1 else [ticks[0], ticks[len(ticks) // 2], ticks[-1]]
+    axis.set_major_locator(FixedLocator(ticks))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: tick_text(value)))
+    axis.set_minor_locator(NullLocator())
+
+
+def label_log_axes(figure: Figure) -> None:
+    """Label the logarithmic axes of ``figure`` on which fewer than three powers of ten lie; thin out the minor ticks.
+
+    Eight minor ticks a decade would be most of what a page of panels costs to draw: two stay.
+    """
+    for axes in figure.get_axes():
+        if not axes.axison:
+            continue
+        for axis, span in ((axes.xaxis, axes.bbox.width), (axes.yaxis, axes.bbox.height)):
+            minor = axis.get_minor_locator()
+            if isinstance(minor, LogLocator):
+                minor.set_params(subs=(2.0, 5.0))
+            if axis.get_scale() != "log" or isinstance(axis.get_major_formatter(), NullFormatter):
+                continue
+            low, high = sorted(axis.get_view_interval())
+            ticks = np.asarray(axis.get_majorticklocs())
+            # Those that a figure has set are its own affair.
+            is_set = isinstance(axis.get_major_locator(), FixedLocator)
+            inside = ((ticks >= low * (1 - 1e-9)) & (ticks <= high * (1 + 1e-9))).sum()
+            if inside < LEAST_TICKS and not is_set and 0 < low < high:
+                label_log_axis(axis, low, high, PART * span / figure.dpi)

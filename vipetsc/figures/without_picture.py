@@ -1,0 +1,80 @@
+"""Why something has no picture: what cannot be drawn is no file, and a sentence says so."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import xarray as xr
+
+from vipetsc.figures import measure_pages, transfer_curves
+from vipetsc.figures.registry import (
+    BRANCH,
+    BRANCHES,
+    FIGURES,
+    OVER_BRANCHES,
+    RUN,
+    SWEEP,
+    figure_names,
+    of_one_name,
+    point_count,
+    run_and_analysis,
+    specified_drawings,
+    with_ensemble,
+)
+from vipetsc.figures.sweep_members import Files
+from vipetsc.io.read import open_ensemble
+
+
+def reasons_without_pictures(
+    source: str, folders: Sequence[Path], names: Sequence[str] | None = None
+) -> dict[str, str]:
+    """Return why figures of what the ``folders`` hold are not drawn, by name; of branches by the names of their files.
+
+    They are those in ``names``, by default all; of sweeps by default measures, and what lays branches over them where
+    ``folders`` hold any. Raises KeyError as ``figure_names``.
+    """
+    if source == SWEEP:
+        return _reasons_of_sweeps(folders, names)
+    reasons: dict[str, str] = {}
+    with Files() as files:
+        if source == RUN:
+            run, analysis = run_and_analysis(folders[0], files)
+            for name in figure_names(source, names):
+                without = FIGURES[name].without
+                reasons[name] = without(run, analysis) if without else ""
+        elif source == BRANCHES:
+            paths = sorted(folders[0].glob("branch-*.h5"))
+            for path in paths:
+                has_points = all(point_count(path) for path in of_one_name(folders, path.name))
+                reasons[path.stem] = "" if has_points else "no point of the branch was computed"
+            if paths and all(reasons.values()):
+                reasons = {BRANCH: "no branch has a point"}
+    return {name: reason for name, reason in reasons.items() if reason}
+
+
+def _reasons_of_sweeps(folders: Sequence[Path], names: Sequence[str] | None) -> dict[str, str]:
+    """Return why figures of the sweeps in ``folders`` are not drawn, by name."""
+    expected = {*(names or ())}
+    if len(with_ensemble(folders)) < len(folders) and names is None:
+        expected.add(OVER_BRANCHES)
+    reasons: dict[str, str] = {}
+    with Files() as files:
+        ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
+        for name in figure_names(SWEEP, names, folders):
+            spec = FIGURES.get(name)
+            if spec and spec.source == SWEEP:
+                if name in expected and not any(specified_drawings(spec, ensembles, files)):
+                    unrelated = transfer_curves.curves_left_out(folders) if name == OVER_BRANCHES else ""
+                    reasons[name] = unrelated or f"needs {spec.needs}"
+                continue
+            by_sweep = [_reason(ensemble, name, by_name=names is not None) for ensemble in ensembles]
+            if all(by_sweep):
+                reasons[name] = by_sweep[0]
+    return reasons
+
+
+def _reason(ensemble: xr.Dataset, name: str, by_name: bool) -> str:
+    """Return why the measure whose pages have that ``name`` has none for an ensemble; empty where it has some."""
+    for measure in measure_pages.measures_of(ensemble):
+        if measure_pages.figure_name(measure) == name:
+            return measure_pages.reason_without_page(ensemble, measure, by_name)
+    return "the sweep does not measure it"
