@@ -347,6 +347,7 @@ def test_fonts_of_a_pdf_are_outlines(tmp_path):
     """Editors and printers take TrueType; bitmap fonts, Type 3, they do not."""
     with rc_style():
         figure = new_figure(2, 2, r"plain and $\kappa^2$")
+        figure.subplots()
         path = save(figure, tmp_path / "text.pdf")
     assert b"/Type3" not in path.read_bytes()
     assert b"/CIDFontType2" in path.read_bytes()
