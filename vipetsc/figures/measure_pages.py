@@ -49,6 +49,9 @@ ON_REQUEST = {
     "entropy/error",
     "entropy/start",
     "bands/modal_energy",
+    "rms_displacement",
+    "rms_velocity",
+    "rms_acceleration",
     "steady_drift",
 }
 
@@ -329,6 +332,10 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAx
     failed = int(measure.failed.sum())
     if failed:
         lines.append(f"{failed} of {measure.failed.size} members failed and are left out")
+
+    without_value = int((measure.values.isnull() & ~measure.failed).sum())
+    if without_value:
+        lines.append(f"{without_value} of {measure.values.size} have no value")
 
     panels = _by_place(measure, roles.panels)
     page = MeasurePage(measure.label, lines, list(_by_place(measure, roles.curves)) if roles.curves else [])

@@ -155,7 +155,7 @@ class Results:
         for name, error in row.get("errors", {}).items():
             self.errors[name] = max(error, self.errors.get(name, 0.0))
 
-        for name in row.keys() - {"parts", "analysis", "errors"}:
+        for name in row.keys() - {"parts", "analysis", "errors", "unsettled"}:
             value = np.asarray(row[name], float)
             if name not in self.tables:
                 self.tables[name] = np.full((len(self.ids), *value.shape), np.nan)
@@ -180,6 +180,8 @@ class Results:
                 self.status[numbers] = MISSING
                 continue
             row = run.measures[source.site]
+            for number in numbers:
+                self.warnings[number] = [*self.warnings[number], *row.get("unsettled", [])]
             for name in of_motion(row):
                 row = row | {name: np.asarray(row[name], float) * source.factor ** power_of(name)}
             self._put(numbers, row)

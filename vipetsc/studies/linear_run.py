@@ -5,6 +5,7 @@ its square. The linear run, under 1 N and without contacts, shows which members 
 it.
 """
 
+import json
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -19,7 +20,7 @@ from vipetsc.io.read import field_time
 from vipetsc.io.records import Record, read_records
 from vipetsc.lattice.chain import Pair, cells_between
 from vipetsc.spectra.measures import MEASURES as REGISTRY
-from vipetsc.spectra.measures import PART, group_of, is_measure, row_of
+from vipetsc.spectra.measures import PART, UNSETTLED, group_of, is_measure, row_of
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.pair_motion import PairMotion
 from vipetsc.studies.recorded_runs import RecordPaths
@@ -119,7 +120,8 @@ class LinearRun(NamedTuple):
 def measured(analysis: xr.Dataset) -> Record:
     """Values that the ensemble takes from an ``analysis``: measures of the registry and their attributes.
 
-    ``parts`` of the frequency axis by name, ``errors`` by the samples left out, the options of the ``analysis``.
+    ``parts`` of the frequency axis by name, ``errors`` by the samples left out, the options of the ``analysis``,
+    ``unsettled``: sentences about steady amplitudes that are none.
     """
     row: Record = {}
     errors: dict[str, float] = {}
@@ -139,6 +141,10 @@ def measured(analysis: xr.Dataset) -> Record:
             row["parts"] = list(analysis[name].attrs["parts"])
     if "bands/modal_energy" in row:
         row["bands/modal_energy"] = analysis["bands/modal_energy"].values[:, -1].tolist()
+    warnings = json.loads(analysis.attrs.get("warnings", "[]"))
+    unsettled = [text for text in warnings if text.startswith(UNSETTLED)]
+    if unsettled:
+        row["unsettled"] = unsettled
     if "entropy/history" in row:
         row["entropy/start"] = float(analysis.attrs["entropy/start"])
     return row

@@ -1,0 +1,197 @@
+"""Measures of points in sweeps and in searches: those of single runs, scaled where nothing touches, with pages."""
+
+from __future__ import annotations
+
+import json
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.conftest import run_of, search_table
+from vipetsc.case import Case, CaseError, Sweep
+from vipetsc.case.optimise import OptimiseCase
+from vipetsc.figures.registry import draw
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.io.read import open_ensemble
+from vipetsc.spectra.measures import measures_of
+from vipetsc.studies.analysis import analyse
+from vipetsc.studies.ensemble import COMPLETE, SCALED
+from vipetsc.studies.optimum_search import run_search
+from vipetsc.studies.sweep import run_sweep
+
+POINTS = [{"name": "base", "cell": 2}, {"name": "tip", "cell": 8, "mass": 2}]
+FORCE = 11.8  # N: some designs of the search miss it
+OUTPUT = {"points": POINTS, "transmission": [["base", "tip"]]}
+SHAKEN = {
+    "name": "shaken",
+    "lattice": {
+        "cells": 24,
+        "damping": {"mass": 60.0, "stiffness": 2e-5},
+        "cell": {
+            "masses": [0.01, 0.004],
+            "springs": [
+                {"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True},
+                {"start": 1, "end": 2, "stiffness": 6e3},
+            ],
+        },
+    },
+    "contacts": {"stiffness": 5e6, "restitution": 0.7, "sites": [4], "clearance": 4e-5},
+    "drive": {"waveform": "harmonic", "cell": 2},
+    "time": {"end": 0.4, "rtol": 1e-8},
+    "output": OUTPUT,
+}
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """A sweep over amplitude and frequency in which contacts begin: its plan, its folder, its result."""
+    folder = tmp_path_factory.mktemp("shaken")
+    axes = {"drive": {"amplitude": [0.25, 3.0], "frequency": [300.0, 900.0]}, "measures": ["motion"]}
+    plan = Sweep.from_table(SHAKEN | {"sweep": axes})
+    return plan, folder, run_sweep(plan, folder, MPI.COMM_SELF)
+
+
+def test_members_have_the_measures_of_single_runs(swept):
+    """Whether a member was simulated or scaled from the linear run, it has the numbers of a run of its case."""
+    plan, folder, result = swept
+    assert {COMPLETE, SCALED} == set(result.status.ravel().tolist())
+    ensemble = open_ensemble(folder)
+    of_points = {name for name in measures_of(["base", "tip"], [("base", "tip")]) if "base" in name or "tip" in name}
+    assert len(of_points) == 23
+    assert "ibtet" not in ensemble
+
+    for number in (1, 3):
+        case = plan.case(number)
+        single = analyse(run_of(case), ["motion"])
+        place = dict(zip(ensemble["status"].dims, np.unravel_index(number, plan.shape), strict=True))
+        for name in (*of_points, "largest_force"):
+            value = ensemble[name].isel(place).values
+            # The linear run has steps of its own.
+            tolerance = 1e-9 if "drift" in name else 1e-5 * np.abs(single[name].values).max()
+            if name.startswith("band"):
+                # Parts that the drive does not reach hold what the ends of the record leak.
+                value, tolerance = value[:1], 1e-3
+            assert value == pytest.approx(
+                np.atleast_1d(single[name].values)[: value.size].reshape(value.shape), abs=tolerance, nan_ok=True
+            ), name
+    assert ensemble["largest_force"].values.max() > 0.1
+    assert ensemble["largest_force"].attrs["units"] == "N"
+
+
+def test_members_too_short_for_a_steady_amplitude_are_named(swept):
+    """At 300 rad/s three windows and the ramp are longer than the run: NaN, and one sentence for all members."""
+    _, folder, result = swept
+    ensemble = open_ensemble(folder)
+    is_missing = np.isnan(ensemble["steady_velocity/tip"].transpose("amplitude", "frequency").values)
+    assert is_missing.tolist() == [[True, False]] * 2
+    assert any(text.startswith("2 members: steady amplitude at tip") for text in result.warnings)
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_every_measure_of_a_point_has_a_page_of_its_own(swept):
+    """By default those of peaks, steady amplitudes and transmission; rms and drift where they are asked for."""
+    _, folder, _ = swept
+    stems = {path.stem.partition("-over-")[0] for path in draw("sweep", [folder])}
+    expected = {
+        f"{kind}_{quantity}_{point}"
+        for kind in ("peak", "steady")
+        for quantity in ("displacement", "velocity", "acceleration")
+        for point in ("base", "tip")
+    }
+    expected |= {f"{name}_base-tip" for name in ("transmission", "steady_transmission", "band_transmission")}
+    assert expected | {"largest_force", "contact_episodes", "dissipated_fraction"} == stems
+
+    (page,) = draw("sweep", [folder], ["rms_velocity_tip"])
+    assert page.exists()
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory):
+    """A small search that minimises the velocity at a point, with a bounded force and a bounded transmission."""
+    table = search_table(
+        24,
+        [8],
+        output={"points": [{"name": "base", "cell": 2}, {"name": "tip", "cell": 16, "mass": 3}]},
+        drive={"amplitude": 24.33},
+        optimise={"budget": 6, "population": 4},
+    )
+    table["output"]["transmission"] = [["base", "tip"]]
+    table["optimise"] |= {
+        "objective": [{"measure": "peak_velocity/tip", "goal": "minimise"}],
+        "constraint": [
+            {"measure": "largest_force", "at_least": FORCE},
+            {"measure": "band_transmission/base-tip", "band": 2, "at_most": 100.0, "amplitudes": [5.0]},
+        ],
+    }
+    folder = tmp_path_factory.mktemp("search")
+    plan = OptimiseCase.from_table(table)
+    return plan, folder, run_search(plan, folder, MPI.COMM_SELF)
+
+
+def test_a_search_takes_measures_of_points_and_keeps_to_its_constraints(searched):
+    """Values are those of single runs; the best design is the best of those that miss no bound."""
+    plan, folder, summary = searched
+    with open_netcdf(folder / "optimum.h5", "search") as file:
+        optimum = file.load()
+    design = plan.design(optimum["parameter"].values[2])
+    run = analyse(run_of(plan.run(design, 24.33)), ["motion"])
+    assert float(optimum["value"][2, 0]) == pytest.approx(float(run["peak_velocity/tip"]), rel=1e-12)
+    assert float(optimum["constrained"][2, 0]) == pytest.approx(float(run["largest_force"]), rel=1e-12)
+    weaker = analyse(run_of(plan.run(design, 5.0)), ["motion"])["band_transmission/base-tip"]
+    second = list(weaker.attrs["parts"]).index("band 2")
+    assert float(optimum["constrained"][2, 1]) == pytest.approx(float(weaker[second]), rel=1e-12)
+
+    force = optimum["constrained"].values[:, 0]
+    assert optimum["excess"].values == pytest.approx(np.maximum((FORCE - force) / FORCE, 0.0), rel=1e-12)
+    feasible = np.flatnonzero(force >= FORCE)
+    # Some of the designs miss the bound.
+    assert 0 < len(feasible) < len(force)
+    assert optimum["front"].values.tolist() == [feasible[np.argmin(optimum["value"].values[feasible, 0])]]
+    assert "designs meet the constraints" in summary
+    assert Case.load(folder / "best.toml").output.points[1].name == "tip"
+
+
+@pytest.mark.parametrize(
+    ("objective", "sentence"),
+    [
+        ({"measure": "peak_velocity/tp"}, "did you mean 'peak_velocity/tip'?"),
+        ({"measure": "steady_velocity/tip"}, "a burst becomes no steady vibration"),
+        ({"measure": "band_transmission/base-tip"}, "needs a band, 1 to 4"),
+        ({"measure": "band_transmission/base-tip", "band": 5}, "the cell has 4 bands"),
+        ({"measure": "peak_velocity/tip", "band": 1}, "has no bands"),
+        ({"measure": "entropy/history"}, "is no measure of this case"),
+    ],
+)
+def test_measures_that_a_case_has_not_are_one_problem(objective, sentence):
+    table = search_table(24, [8], output={"points": [{"name": "base", "cell": 2}, {"name": "tip", "cell": 16}]})
+    table["output"]["transmission"] = [["base", "tip"]]
+    table["optimise"] |= {"objective": [objective]}
+    with pytest.raises(CaseError) as raised:
+        OptimiseCase.from_table(table)
+    (problem,) = raised.value.problems
+    assert sentence in str(problem)
+    assert problem.key.startswith("optimise.objective[1]")
+
+
+@pytest.mark.parametrize(
+    ("constraint", "sentence"),
+    [
+        ({"measure": "largest_force"}, "has no bound"),
+        ({"measure": "largest_force", "at_least": 2.0, "at_most": 1.0}, "is above at_most"),
+    ],
+)
+def test_constraints_need_bounds_that_can_be_met(constraint, sentence):
+    table = search_table(24, [8])
+    table["optimise"] |= {"constraint": [constraint]}
+    with pytest.raises(CaseError) as raised:
+        OptimiseCase.from_table(table)
+    assert sentence in str(raised.value.problems[0])
+
+
+def test_results_in_json_have_no_nan(swept):
+    """Records are read back with NaN where a member has no value."""
+    _, folder, _ = swept
+    lines = (folder / "members.jsonl").read_text().splitlines()
+    assert all(isinstance(json.loads(line), dict) for line in lines)
