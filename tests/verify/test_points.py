@@ -116,6 +116,14 @@ def test_transmission_by_part_is_that_of_each_frequency():
 
     assert parts[:2] == pytest.approx([0.5, 2.0], rel=1e-12)
     assert np.isnan(parts[2])
+    # A tone that is cut where it is fast is in all parts; where it fades out, what is weak there is seen.
+    tone = np.cos(20.37 * phase)  # without a kink at its beginning
+    weak = 0.01 * np.cos(60 * phase)
+    cut = histories.transmission_by_part(tone + weak, tone + 2 * weak, interval, edges)
+    faded = histories.transmission_by_part(tone + weak, tone + 2 * weak, interval, edges, goes_on=True)
+    assert cut[1] < 1.5
+    assert faded[:2] == pytest.approx([1.0, 2.0], rel=0.02)
+
     # The parts' mean squares add up to that of the record.
     assert histories.transmission(source, receiver) ** 2 == pytest.approx((0.25 + 4 * 9) / 10, rel=1e-12)
 

@@ -10,6 +10,7 @@ from scipy import fft
 WINDOWS = 3  # that are compared
 HARMONICS = 5  # of the drive that are fitted at most
 RESOLVED = 0.8  # of the samples' Nyquist frequency, up to which harmonics are fitted
+FADING = 0.2  # of a record, over which a vibration fades out that does not end
 SILENT = 1e-12  # of a mean square: what a part of the frequencies has less is rounding
 
 
@@ -97,16 +98,28 @@ def transmission(source: np.ndarray, receiver: np.ndarray) -> float:
 
 
 def transmission_by_part(
-    source: np.ndarray, receiver: np.ndarray, interval: float, edges: Sequence[float] | np.ndarray
+    source: np.ndarray,
+    receiver: np.ndarray,
+    interval: float,
+    edges: Sequence[float] | np.ndarray,
+    *,
+    goes_on: bool = False,
 ) -> np.ndarray:
     """Transmission (part,) of the frequencies between the ``edges`` (part + 1) in rad/s, samples ``interval`` s apart.
 
     Records are continued by their mirror image (cosine transform), without a jump at their ends; the mean square of a
-    record is the sum of those of its parts. NaN for parts in which the source has less than 1e-12 of its mean square.
+    record is the sum of those of its parts. A vibration that ``goes_on`` beyond the record fades out over the last
+    fifth of it, because its kink at the end would be in all parts. NaN for parts in which the source has less than
+    1e-12 of its mean square.
     """
+    window = np.ones(len(source))
+    if goes_on:
+        fading = int(FADING * len(source))
+        window[len(source) - fading :] = np.cos(0.5 * np.pi * (np.arange(fading) + 0.5) / fading) ** 2
+
     energies = []
     for values in (source, receiver):
-        squares = np.square(fft.dct(values, norm="ortho"))
+        squares = np.square(fft.dct(window * values, norm="ortho"))
         frequency = np.pi * np.arange(len(squares)) / (len(squares) * interval)
         bounds = np.searchsorted(frequency, edges)
         energies.append(np.array([squares[low:high].sum() for low, high in pairwise(bounds)]))

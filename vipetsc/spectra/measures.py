@@ -98,8 +98,9 @@ class RunMeasure(NamedTuple):
     ``of(record)``, ``of(record, point)`` or ``of(record, source, receiver)`` gives it, in ``unit``, from a
     ``RunRecord``; None where the run has no such thing, NaN where it has but no value. Measures without ``of`` are
     variables of that name of the run's analysis or its statistics. ``dimension``: "" for a number, ``PART`` for one of
-    each part of the frequency axis, "snapshot". Until something touches it goes with the amplitude to the ``power``.
-    ``group`` says what a run must be measured for.
+    each part of the frequency axis, "snapshot". Until something touches, it is proportional to the amplitude to the
+    ``power``; if a measure has none, sweeps simulate every member, instead of scaling a linear run. ``group`` says what
+    a run must be measured for.
     """
 
     name: str
@@ -108,7 +109,7 @@ class RunMeasure(NamedTuple):
     of: Callable[..., Any] | None = None
     over: Over = "run"
     dimension: str = ""
-    power: float = 0.0
+    power: float | None = None
     group: Group = "motion"
 
     @property
@@ -184,8 +185,13 @@ def _of_name(name: str) -> RunMeasure:
 
 
 def power_of(name: str) -> float:
-    """The power of the amplitude with which the measure ``name`` goes until something touches."""
-    return _of_name(name).power
+    """The power of the amplitude to which the measure ``name`` is proportional without contact; 0 if it is unknown."""
+    return _of_name(name).power or 0.0
+
+
+def can_be_scaled() -> bool:
+    """Whether every measure that sweeps take of the motion is proportional to a power of the amplitude."""
+    return all(measure.power is not None for measure in MEASURES.values() if measure.group == "motion")
 
 
 def group_of(name: str) -> Group:
@@ -238,8 +244,9 @@ def _band_transmission(record: RunRecord, source: str, receiver: str) -> np.ndar
     time = record.points[source].time
     if len(time) < 2:
         return None
-    velocities = _velocities(record, source, receiver)
-    return histories.transmission_by_part(*velocities, float(time[1] - time[0]), record.edges)
+    below, above = _velocities(record, source, receiver)
+    goes_on = record.drive is not None and record.drive.stop > time[-1]
+    return histories.transmission_by_part(below, above, float(time[1] - time[0]), record.edges, goes_on=goes_on)
 
 
 def _steady_transmission(record: RunRecord, source: str, receiver: str) -> float | None:
@@ -303,13 +310,20 @@ STANDARD = (
         dimension=PART,
         group="transfer",
     ),
-    RunMeasure("largest_force", "N", "largest contact force of all impacts", _largest_force),
+    RunMeasure("largest_force", "N", "largest contact force of all impacts", _largest_force, power=0.0),
     *(_of_points(kind, quantity) for kind in ("peak", "rms", "steady") for quantity in QUANTITIES),
     RunMeasure(
-        "steady_drift", "1", "drift of the steady amplitude", lambda record, point: record.drift(point), over="point"
+        "steady_drift",
+        "1",
+        "drift of the steady amplitude",
+        lambda record, point: record.drift(point),
+        over="point",
+        power=0.0,
     ),
-    RunMeasure("transmission", "1", "transmission, rms velocity", _transmission, over="pair"),
-    RunMeasure("steady_transmission", "1", "transmission, steady velocity", _steady_transmission, over="pair"),
+    RunMeasure("transmission", "1", "transmission, rms velocity", _transmission, over="pair", power=0.0),
+    RunMeasure(
+        "steady_transmission", "1", "transmission, steady velocity", _steady_transmission, over="pair", power=0.0
+    ),
     RunMeasure(
         "band_transmission",
         "1",
@@ -317,6 +331,7 @@ STANDARD = (
         _band_transmission,
         over="pair",
         dimension=PART,
+        power=0.0,
     ),
 )
 for standard in STANDARD:

@@ -20,6 +20,7 @@ from vipetsc.io.read import open_run
 from vipetsc.io.records import Record
 from vipetsc.io.store import RunFolder, RunMemory
 from vipetsc.parallel import StopRequest, on_root
+from vipetsc.spectra.measures import can_be_scaled
 from vipetsc.studies.analysis import WHOLE, analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
 from vipetsc.studies.linear_run import (
@@ -91,7 +92,8 @@ class SweepRuns:
         site = leading_cell(case)
         name = linear_name(case)
         linear = self._linear_of(case, name, site)
-        quiet = not self.plan.options.fields and bool((linear.reached(case) < MARGIN).all())
+        scales = not self.plan.options.fields and can_be_scaled()
+        quiet = scales and bool((linear.reached(case) < MARGIN).all())
         if quiet:
             record = _scaled(case, linear, name, site)
         else:
