@@ -11,7 +11,7 @@ from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Chain, WaveCompliance, four_band
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
-from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.harmonics import SiteForces, Stops
 from vipetsc.modes.branches.condensed import condensed_system, state_of
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.point import Point
@@ -41,7 +41,7 @@ def condensed_breather(
     """The problem and the breather of ``omega`` in rad/s about a contact in cell ``site`` (from 1)."""
     chain = Chain(four_band("calibrated"), cells, "fixed", (site - 1,), (CLEARANCE,))
     control = NnmTable(truncation=truncation, tolerance=1e-12, **options)
-    forces = SiteForces([(four_band_contact("hertz"), CLEARANCE)])
+    forces = SiteForces([Stops.both(four_band_contact("hertz"), CLEARANCE)])
     problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), forces, control)
     return problem, problem.from_gap(omega, np.array([1.0]))
 

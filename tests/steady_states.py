@@ -45,7 +45,9 @@ def motion_at(states: SteadyStates, xi: np.ndarray, cells: np.ndarray, phase: fl
     """Displacement and velocity (cell, dof) of a steady state at a ``phase`` of its drive."""
     omega, amplitude = states.drive(xi[-1])
     unknowns = xi[:-1] * states.clearance
-    orders = np.arange(1, states.balance.unpack(unknowns).shape[1])
+    # Motions that are the same on both sides have no mean.
+    first = 1 if states.options.symmetric else 0
+    orders = np.arange(first, states.balance.unpack(unknowns).shape[1])
 
     # Forces on the lattice, harmonic by harmonic: of its contacts, and of the drive at the first one.
     forces = states.balance.series(unknowns, omega).forces
@@ -54,7 +56,7 @@ def motion_at(states: SteadyStates, xi: np.ndarray, cells: np.ndarray, phase: fl
     for order in orders:
         acting = forces[:, order]
         if order == 1 and not states.wave:
-            acting = np.append(acting, amplitude)
+            acting = np.append(acting, amplitude * states.weights)
         field = states.compliance.field(order * omega, acting, cells)
         if order == 1 and states.wave:
             field = field + states.linear_motion(omega).wave.field(cells) * amplitude * states.clearance

@@ -23,7 +23,7 @@ from vipetsc.io.state import State
 from vipetsc.lattice import Chain, Contact, WaveCompliance, four_band, pass_bands
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
-from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.harmonics import SiteForces, Stops
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import claim_branches, follow_all
@@ -133,7 +133,7 @@ def test_the_cost_of_a_breather_does_not_grow_with_the_cells():
         chain = Chain(four_band("calibrated"), cells, "fixed", (cells // 3,), (CLEARANCE,))
         compliance = CountedCompliance(WaveCompliance(chain))
         control = NnmTable(truncation=1e-5, tolerance=1e-11)
-        problem = ConservativeMotions(compliance, SiteForces([(HERTZ, CLEARANCE)]), control)
+        problem = ConservativeMotions(compliance, SiteForces([Stops.both(HERTZ, CLEARANCE)]), control)
         problem.from_gap(4000.0, np.array([1.0]))
         counts[cells] = compliance.frequencies
     assert counts[1_000_000] <= 2 * counts[300]
@@ -154,7 +154,7 @@ def breather_of_two_sites(signs: list[int]) -> Point:
     """The breather at 4000 rad/s of a chain with contacts in cells 29 and 32, mirror images of one another."""
     chain = Chain(four_band("calibrated"), 60, "fixed", (28, 31), (CLEARANCE, CLEARANCE))
     control = NnmTable(truncation=1e-6, tolerance=1e-11)
-    forces = SiteForces([(HERTZ, CLEARANCE)] * 2)
+    forces = SiteForces([Stops.both(HERTZ, CLEARANCE)] * 2)
     problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), forces, control)
     return problem.from_gap(4000.0, np.array(signs))
 

@@ -10,9 +10,10 @@ from scipy.integrate import trapezoid
 from vipetsc.case.nnm import NnmTable
 from vipetsc.lattice import Contact, Spring
 from vipetsc.modes.balance import conservative
+from vipetsc.modes.balance.arcs import arcs
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import SiteForces, arcs
+from vipetsc.modes.balance.harmonics import SiteForces, Stops
 from vipetsc.modes.problem import ContinuationError
 
 Symmetry = Literal["at rest", "odd", "any"]
@@ -79,7 +80,7 @@ def harmonics_of(samples: np.ndarray, orders: int) -> np.ndarray:
 @pytest.mark.parametrize("law", CONSERVATIVE)
 @pytest.mark.parametrize("seed", range(3))
 def test_force_harmonics_are_those_of_a_dense_sampling(law, seed):
-    forces = SiteForces([(law, 1.0), (law, 0.8)])
+    forces = SiteForces([Stops.both(law, 1.0), Stops(law, 0.8, 0.4), Stops(law, 0.5, np.inf)])
     order = 9
     z = random_harmonics(forces, order, seed, "any")
 
@@ -89,14 +90,15 @@ def test_force_harmonics_are_those_of_a_dense_sampling(law, seed):
     phasors = np.exp(1j * np.arange(order + 1)[:, None] * theta)
     w = np.sum(z[..., None] * phasors, axis=1).real
     pairs = list(zip(w, forces.contacts, strict=True))
-    sampled = np.array([law.force(row, clearance) for row, (law, clearance) in pairs])
-    potential = [law.potential(row, clearance).mean() for row, (law, clearance) in pairs]
+    sampled = np.array([law.elastic_force(w - s.plus) - law.elastic_force(-w - s.minus) for w, s in pairs])
+    potential = [(law.elastic_energy(w - s.plus) + law.elastic_energy(-w - s.minus)).mean() for w, s in pairs]
     # 2**18 samples of a force that begins linearly: its kinks are off by half a sample, squared.
     assert series.forces == pytest.approx(harmonics_of(sampled, 2 * order + 1), abs=1e-9 * np.abs(sampled).max())
     assert series.potential == pytest.approx(potential, rel=1e-9)
     assert np.abs(series.loss).max() < 1e-10
     # The closed part of a period is counted in whole samples.
-    assert series.closed == pytest.approx(np.mean(np.abs(w) > [[1.0], [0.8]], axis=1), abs=1e-4)
+    closed = (w > [[1.0], [0.8], [0.5]]) | (-w > [[1.0], [0.4], [np.inf]])
+    assert series.closed == pytest.approx(closed.mean(axis=1), abs=1e-4)
 
 
 def test_smooth_springs_have_the_harmonics_of_powers_of_a_cosine():
@@ -108,7 +110,7 @@ def test_smooth_springs_have_the_harmonics_of_powers_of_a_cosine():
 
 @pytest.mark.parametrize("law", DISSIPATIVE)
 def test_a_dissipative_contact_loses_the_work_of_its_force(law):
-    forces = SiteForces([(law, 0.5)])
+    forces = SiteForces([Stops.both(law, 0.5)])
 
     series = forces.series(np.array([[0.0, 1.0]], complex), OMEGA)
 
@@ -132,7 +134,9 @@ def test_a_dissipative_contact_loses_the_work_of_its_force(law):
 def test_derivatives_are_those_of_the_residual(law, symmetry):
     # A quadratic spring would break the symmetry of odd motions.
     quadratic = 0.3 if symmetry == "any" else 0.0
-    forces = SiteForces([(law, 1.0), (law, 0.8)], [Spring(0, 1, 0.0, quadratic=quadratic, cubic=0.2)])
+    forces = SiteForces(
+        [Stops.both(law, 1.0), Stops.both(law, 0.8)], [Spring(0, 1, 0.0, quadratic=quadratic, cubic=0.2)]
+    )
     balance = random_balance(forces, 7, symmetry)
     x = balance.pack(random_harmonics(forces, 7, 1, symmetry))
     shift = balance.shift(OMEGA)
@@ -164,7 +168,7 @@ def assert_derivatives_by_differences(
 @pytest.mark.parametrize("law", [CONSERVATIVE[1], DISSIPATIVE[0]])
 def test_a_growing_perturbation_has_the_derivative_of_its_frozen_growth(law):
     """Over one episode, exp(mu theta) dz is a perturbation like another, and mu = i shifts the orders by one."""
-    series = SiteForces([(law, 0.5)]).series(np.array([[0.1, 1.0, 0.2j, 0.1]]), OMEGA)
+    series = SiteForces([Stops.both(law, 0.5)]).series(np.array([[0.1, 1.0, 0.2j, 0.1]]), OMEGA)
     orders = np.arange(-3, 4)
     growing = series.jacobian(1j, orders[:-1])
     shifted = series.jacobian(0.0, orders[1:])
@@ -191,17 +195,17 @@ def test_an_arc_that_ends_exactly_with_the_period_is_not_missed():
 
 def test_a_contact_that_never_separates_is_a_spring_if_it_is_conservative_and_refused_else():
     z = np.array([[3.0, 1.0]], complex)
-    series = SiteForces([(CONSERVATIVE[0], 1.0)]).series(z, OMEGA)
+    series = SiteForces([Stops.both(CONSERVATIVE[0], 1.0)]).series(z, OMEGA)
     assert series.forces[0] == pytest.approx([6.0, 3.0, 0.0], abs=1e-13)
     assert series.closed == [1.0]
 
     # Its loss goes with the approach velocity of an onset that there is not.
     with pytest.raises(ArithmeticError, match="never separates"):
-        SiteForces([(DISSIPATIVE[0], 1.0)]).series(z, OMEGA)
+        SiteForces([Stops.both(DISSIPATIVE[0], 1.0)]).series(z, OMEGA)
 
 
 def hardening_forces() -> SiteForces:
-    return SiteForces([(CONSERVATIVE[1], 1.0)], [Spring(0, 1, 0.0, cubic=0.2)])
+    return SiteForces([Stops.both(CONSERVATIVE[1], 1.0)], [Spring(0, 1, 0.0, cubic=0.2)])
 
 
 def test_the_solution_does_not_depend_on_the_shift():
@@ -255,7 +259,7 @@ def gap_motions(**options: object) -> ConservativeMotions:
     stiffness = np.array([[2.0, -1.0], [-1.0, 2.0]])
     compliance = DefinedCompliance(np.ones(2), stiffness, np.array([[1.0, 0.0]]))
     control = NnmTable(tolerance=1e-12, truncation=1e-4, **options)
-    return ConservativeMotions(compliance, SiteForces([(CONSERVATIVE[1], 1.0)]), control)
+    return ConservativeMotions(compliance, SiteForces([Stops.both(CONSERVATIVE[1], 1.0)]), control)
 
 
 def record_weights(monkeypatch) -> list[float]:

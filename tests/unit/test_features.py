@@ -28,6 +28,7 @@ CHANGES = {
     "unlike sites": ({"contacts": {"side": "plus"}}, "contacts.side"),
     "initial motion": ({"initial": {"kind": "mode", "number": 3, "amplitude": 1e-4}}, "initial.kind"),
     "many drives": ({"drive": {"more": [{"frequency": 1000.0, "cell": 2}]}}, "drive.waveform"),
+    "moved wall": ({"drive": {"end": "left"}}, "drive.waveform"),
     "disorder": ({"disorder": {"clearance": {"relative": 1e-3}}}, "disorder"),
 }
 # Sections without which a verb's case is incomplete.

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from tests.steady_states import motion_at, nfrc_case
 from vipetsc.lattice import Contact, DenseCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.harmonics import SiteForces, Stops
 from vipetsc.modes.balance.hill import LEAST_OF_FINITE, Hill
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.parallel(1)
 def test_determinants_do_not_depend_on_the_states_before(last):
     """Without contact the orders beyond 48 are eliminated, with dissipation they are all kept: at 119 sizes divide."""
     omega = 1.8
-    forces = SiteForces([(Contact("hertz", 50.0, restitution=0.7), 1.0)])
+    forces = SiteForces([Stops.both(Contact("hertz", 50.0, restitution=0.7), 1.0)])
     compliance = DenseCompliance(np.ones(1), np.eye(1), np.eye(1))
     balance = HarmonicBalance(compliance, forces, last, True, cosines=False)
     amplitudes = [0.9, 1.1]
@@ -45,7 +45,7 @@ class ForcedCell:
         chain = model.chain
         dofs = chain.cell.dofs
         first = chain.sites[0] * dofs
-        self.contact = states.case.contact(states.restitution)
+        self.contact = states.forces.contacts[0].law
         self.clearance = chain.clearances[0]
         self.masses = chain.masses()
         self.stiffness = chain.stiffness_matrix().toarray()

@@ -158,7 +158,7 @@ def test_a_forced_lattice_with_ends_returns_after_a_period(tmp_path):
     few = SteadyStates(case, 1.0, 14.0)
     many = SteadyStates(varied(case, harmonics=41), 1.0, 14.0)
     start = np.ravel(motion_at(many, refined(few, many, last.xi), np.arange(6)))
-    end = after_a_period(case.model().chain, case.contact(1.0), site=2, omega=2010.0, state=start, force=14.0)
+    end = after_a_period(case.model().chain, case.laws(1.0)[0], site=2, omega=2010.0, state=start, force=14.0)
 
     u = slice(0, 24)
     assert np.abs(end[u] - start[u]).max() < 1e-5 * np.abs(start[u]).max()

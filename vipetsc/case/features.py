@@ -21,7 +21,8 @@ FEATURES = frozenset({
     "rings",  # periodic ends
     "unlike sites",  # laws that differ, stops on one side, other masses than the cell's pair, no clearance
     "initial motion",
-    "many drives",  # more than one, or the motion of a wall
+    "many drives",  # more than one
+    "moved wall",
     "disorder",
 })  # fmt: skip
 
@@ -64,8 +65,9 @@ def _unlike_sites(contacts: ContactsTable) -> Iterator[Problem]:
 
 
 def _other_drives(kind: type[CaseFile], drive: DriveTable) -> Iterator[Problem]:
-    many = bool(drive.end or drive.more) and "many drives" not in kind.takes
-    if many or (kind.waveforms and drive.kind not in kind.waveforms):
+    refused = bool(drive.more) and "many drives" not in kind.takes
+    refused |= bool(drive.end) and "moved wall" not in kind.takes
+    if refused or (kind.waveforms and drive.kind not in kind.waveforms):
         remedy = f"this verb accepts only one {' or '.join(kind.waveforms)} on a mass; run accepts all others"
         yield Problem("drive.waveform", drive.kind, remedy)
 

@@ -9,11 +9,14 @@ from pydantic import AfterValidator, Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Problem, Section, Table, Valid
+from vipetsc.case.contacts import gaps_of_sites
 from vipetsc.case.names import distinct
-from vipetsc.case.resolve import check_stiffness
+from vipetsc.case.resolve import build_chain, check_stiffness
 from vipetsc.case.schema import Positive, once
-from vipetsc.lattice import Contact, UnitCell, waves_at
+from vipetsc.case.sites import ContactsTable
+from vipetsc.lattice import Chain, Contact, UnitCell, waves_at
 from vipetsc.lattice.contact import LEAST_RESTITUTION
+from vipetsc.lattice.modal_compliance import MOST_DOFS
 
 Restitution = Annotated[float, Field(ge=0, le=1)]
 
@@ -21,16 +24,18 @@ Restitution = Annotated[float, Field(ge=0, le=1)]
 class NfrcTable(Section):
     """Steady responses of the sites to an incident ``wave`` of a ``band``, or to a ``force`` on the driven mass.
 
-    ``over`` the amplitude (of a wave: the relative displacement that it alone would make at the first site, over the
-    clearance there; of a force: N) or the frequency (rad/s), within the ``range`` [low, high]: a curve for each of
-    the others in ``fixed`` (frequencies: by default the drive's) and each of the ``restitutions`` (by default that
-    of ``[contacts]``). The lattice is ``infinite``, or ends where its cells do. ``harmonics`` is the number of the
-    last one; motions that are not ``symmetric`` (w(t + T/2) = -w(t)) have even ones too. Steps are in units of the
-    clearance and of the amplitude that touches, or half the range of frequencies.
+    With ``drive.end`` the force is that of the wall, which moves. ``over`` the amplitude (of a wave: the relative
+    displacement that it alone would make at the first site, over the clearance there; of a force: N; of a wall: m) or
+    the frequency (rad/s), within the ``range`` [low, high]: a curve for each of the others in ``fixed`` (frequencies:
+    by default the drive's) and each of the ``restitutions`` (by default that of ``[contacts]``). The lattice is
+    ``infinite``, or ends where its cells do: always if it has dashpots, cells that differ, or contacts between other
+    masses than the cell's pair. ``harmonics`` is the number of the last one; motions that are not ``symmetric``
+    (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too. Steps are in units
+    of the clearance and of the amplitude that touches, or half the range of frequencies.
     """
 
     source: Literal["wave", "force"] = "wave"
-    infinite: bool = True
+    infinite: bool | None = None
     band: Annotated[int, Field(ge=1)] | None = None
     direction: Literal["forward", "backward"] = "forward"
     over: Literal["amplitude", "frequency"] = "amplitude"
@@ -38,7 +43,7 @@ class NfrcTable(Section):
     fixed: Annotated[list[Positive], AfterValidator(once)] = Field([])
     restitutions: Annotated[list[Restitution], AfterValidator(once)] = Field([])
     harmonics: int = Field(41, ge=1, le=2000)
-    symmetric: bool = True
+    symmetric: bool | None = None
     points: int = Field(1000, ge=1)
     first_step: Positive = 0.02
     smallest_step: Positive = 1e-9
@@ -59,7 +64,7 @@ class NfrcCase(Case):
 
     verb = section = "nfrc"
     kept_by_resume: ClassVar[str] = "the case with which its curves were started, except nfrc.points"
-    takes = frozenset({"disorder", "rings"})
+    takes = frozenset({"disorder", "rings", "damping", "inhomogeneity", "absorbing ends", "unlike sites", "moved wall"})
     waveforms = ("burst", "harmonic")
     premise = "steady states are computed only for lattices"
 
@@ -71,8 +76,18 @@ class NfrcCase(Case):
             return sections, problems
 
         nfrc = sections["nfrc"]
-        cell = sections["lattice"].unit_cell()
-        update: dict[str, Any] = {"restitutions": nfrc.restitutions or [sections["contacts"].restitution]}
+        contacts = sections["contacts"]
+        chain = build_chain(sections["lattice"], contacts)
+        cell = chain.cell
+        problems = list(_check_lattice(nfrc, contacts, chain))
+        if problems:
+            return sections, problems
+
+        update: dict[str, Any] = {"restitutions": nfrc.restitutions or [contacts.restitution]}
+        if nfrc.infinite is None:
+            update["infinite"] = not needs_modes(chain)
+        if nfrc.symmetric is None:
+            update["symmetric"] = not gaps_of_sites(contacts, list(chain.clearances))
         if nfrc.over == "amplitude":
             update["fixed"] = nfrc.fixed or [sections["drive"].frequency]
         nfrc = nfrc.model_copy(update=update)
@@ -93,7 +108,7 @@ class NfrcCase(Case):
         nfrc = sections["nfrc"]
         if not nfrc.range[0] < nfrc.range[1]:
             yield Problem("nfrc.range", nfrc.range, "must be [low, high]")
-        if nfrc.source == "wave" and not nfrc.infinite:
+        if nfrc.source == "wave" and nfrc.infinite is False:
             yield Problem("nfrc.infinite", False, "an incident wave needs an infinite lattice; omit it")
         if nfrc.over == "frequency" and not nfrc.fixed:
             yield Problem("nfrc.fixed", [], "give the amplitudes of the curves over frequency")
@@ -102,7 +117,11 @@ class NfrcCase(Case):
 
         # Curves are those of the sites: without one there is nothing to follow.
         if valid("contacts"):
-            yield from check_stiffness(sections["contacts"], True, valid)
+            contacts = sections["contacts"]
+            yield from check_stiffness(contacts, True, valid)
+            if nfrc.restitutions and contacts.each and contacts.each.restitution:
+                remedy = "each site has a restitution of its own, contacts.each.restitution; omit one of them"
+                yield Problem("nfrc.restitutions", nfrc.restitutions, remedy)
             bounded = sections["contacts"].damping in ("exact", "flores")
             if bounded and (small := [r for r in nfrc.restitutions if r < LEAST_RESTITUTION]):
                 yield Problem(
@@ -125,15 +144,51 @@ class NfrcCase(Case):
         """A frequency of the curves in rad/s."""
         return self.nfrc.fixed[0] if self.nfrc.over == "amplitude" else self.nfrc.range[0]
 
-    def contact(self, restitution: float) -> Contact:
-        """The contact law with a ``restitution``."""
-        return replace(self.model().contact, restitution=restitution)
+    def laws(self, restitution: float) -> list[Contact]:
+        """The law of each site with a ``restitution``; where each has a restitution of its own, with that."""
+        model = self.model()
+        laws = list(model.laws or (model.contact,) * len(model.chain.sites))
+        if self.contacts.each and self.contacts.each.restitution:
+            return laws
+        return [replace(law, restitution=restitution) for law in laws]
 
     def curves(self) -> list[tuple[str, float, float]]:
         """Name, restitution and the fixed parameter of every curve."""
         restitutions = zip(distinct(self.nfrc.restitutions), self.nfrc.restitutions, strict=True)
         fixed = zip(distinct(self.nfrc.fixed), self.nfrc.fixed, strict=True)
         return [(f"r{of_r}-{of_f}", r, f) for (of_r, r), (of_f, f) in itertools.product(restitutions, fixed)]
+
+
+def needs_modes(chain: Chain) -> bool:
+    """Whether the response of ``chain`` follows from its modes: Bloch waves are those of equal cells without loss."""
+    return chain.is_damped or not chain.is_uniform() or bool(chain.pairs)
+
+
+def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> Iterator[Problem]:
+    """Problems with a wave, an infinite lattice, or symmetric motions that the lattice does not have."""
+    gaps = gaps_of_sites(contacts, list(chain.clearances))
+    if nfrc.symmetric and gaps:
+        remedy = "contacts that differ on their two sides make even harmonics; omit it"
+        yield Problem("nfrc.symmetric", True, remedy)
+    if nfrc.source == "wave" and min((min(gap) for gap in gaps), default=min(chain.clearances)) <= 0:
+        remedy = "a wave's amplitude counts in clearances, and a contact has none; a force can be given"
+        yield Problem("nfrc.source", "wave", remedy)
+    if not needs_modes(chain):
+        return
+
+    reason = "contacts join other masses than the cell's pair"
+    if chain.is_damped:
+        reason = "in a lattice with dashpots a wave from far away has decayed before it arrives"
+    elif not chain.is_uniform():
+        reason = "a wave of equal cells does not pass cells that differ as it came"
+    if nfrc.source == "wave":
+        yield Problem("nfrc.source", "wave", f'{reason}; source = "force" drives a mass')
+    elif nfrc.infinite:
+        yield Problem("nfrc.infinite", True, f"{reason}; omit it, and give the lattice absorbing ends")
+    dofs = chain.cells * chain.cell.dofs
+    if dofs > MOST_DOFS:
+        remedy = f"{dofs} masses: all modes of a lattice with dashpots, unlike cells or other contact pairs are needed"
+        yield Problem("lattice.cells", chain.cells, f"{remedy}, of at most {MOST_DOFS} masses")
 
 
 def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:

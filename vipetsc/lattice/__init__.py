@@ -6,5 +6,6 @@ from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.compliance import DenseCompliance, IncidentWave, WaveCompliance
 from vipetsc.lattice.contact import Contact, contact_stiffness
 from vipetsc.lattice.drive import Drive, Pieces, ToneBurst, Waveform
+from vipetsc.lattice.modal_compliance import ModalCompliance
 from vipetsc.lattice.modes import Modes, linear_modes
 from vipetsc.lattice.variation import Coefficients, Variation

@@ -91,7 +91,9 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
         amplitude_unit = "of the clearance"
     else:
         excitation = f"a force on mass {case.drive.mass} of cell {case.drive.cell}"
-        amplitude_unit = "N"
+        if case.drive.end:
+            excitation = f"the motion of the {case.drive.end} wall"
+        amplitude_unit = "m" if case.drive.end else "N"
 
     if options.over == "amplitude":
         over_unit = amplitude_unit

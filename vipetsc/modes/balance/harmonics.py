@@ -30,16 +30,15 @@ T. M. Cameron, J. H. Griffin, An alternating frequency/time domain method for ca
 nonlinear dynamic systems, J. Appl. Mech. 56 (1989) 149-154.
 """
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.compiled import allocating, kernel
-from vipetsc.contact.search import bernstein, first_upcrossing, first_upcrossing_after_start
+from vipetsc.compiled import kernel
 from vipetsc.lattice import Contact, Spring
+from vipetsc.modes.balance.arcs import arcs, common, cut, minima
 
 # Samples per period of the last harmonic. Quintic Hermite interpolation over a step h has an error of at most
 # h^6 max|z^(6)| / (6! 2^6): here (2 pi/24)^6/46080 = 7e-9 of the last harmonic, less of all others.
@@ -48,9 +47,6 @@ DENSITY = 24
 # The error is 5e-16 at s = 64, 2e-11 at 90 and 2e-4 at 110: s = 64 leaves room for the variation of the force itself.
 NODES = 64
 SPAN = 64.0
-# By Bernstein's inequality, |z''| <= K^2 range/2, a motion exceeds its samples by (2 pi/24)^2/16 = 0.4 % of its range
-# at most; where even this fraction of the range does not lead to the offset, no root need be sought.
-OVERSHOOT = 0.1
 
 
 class Episode(NamedTuple):
@@ -104,69 +100,6 @@ def _transform(theta: np.ndarray, weighted: np.ndarray, out: np.ndarray) -> None
             for row in range(out.shape[0]):
                 out[row, k] += weighted[row, i] * phasor
             phasor *= turn
-
-
-@allocating
-def _crossings(motion: np.ndarray, offset: float, out: np.ndarray) -> int:
-    """Write the phases where a motion passes ``offset`` into ``out``, in order, and return their number.
-
-    ``motion`` (samples, 3) holds (z, z', z'') over a period. The first crossing is upwards unless the period begins
-    above; then they alternate. A value that equals the offset counts as below.
-    """
-    samples = motion.shape[0]
-    h = 2.0 * np.pi / samples
-    count = 0
-    above = motion[0, 0] > offset
-    b = np.empty(6)
-    c = np.empty(6)
-    for i in range(samples):
-        bernstein(motion[i], motion[(i + 1) % samples], h, b)
-        b -= offset
-        if (b.max() <= 0.0 and not above) or (b.min() > 0.0 and above):
-            continue
-
-        # The search finds where a polynomial turns positive (2 if nowhere); downcrossings are those of its negative.
-        c[:] = b if not above else -b
-        begin = 0.0
-        root = first_upcrossing(c)
-        while root <= 1.0 and count < out.size:
-            begin += root * (1.0 - begin)
-            out[count] = (i + begin) * h
-            count += 1
-            above = not above
-            if begin >= 1.0:
-                break
-
-            # De Casteljau's scheme: coefficients on the part of the interval after the root, where the value is 0.
-            for k in range(1, 6):
-                for j in range(6 - k):
-                    c[j] = (1.0 - root) * c[j] + root * c[j + 1]
-            c[:] = -c
-            c[0] = 0.0
-            root = first_upcrossing_after_start(c, 0.0)
-    return count
-
-
-def arcs(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
-    """Intervals of phase (begin, end), begin < end, on which a periodic motion is above ``offset``.
-
-    ``motion`` (samples, 3) holds (z, z', z'') over a period. A motion that is always above has the interval (0, 2 pi).
-    An interval that contains phase 0 is not split there: it begins at a negative phase.
-    """
-    if motion[:, 0].max() + OVERSHOOT * np.ptp(motion[:, 0]) <= offset:
-        return []
-    out = np.empty(4 * len(motion))
-    roots = out[: _crossings(motion, offset, out)]
-    if len(roots) % 2 and motion[0, 0] <= offset:
-        # The motion comes down to the offset exactly at the period's end, whose value counts as below already.
-        roots = np.append(roots, 2 * np.pi)
-    if len(roots) < 2:
-        return [(0.0, 2 * np.pi)] if motion[0, 0] > offset else []
-
-    # A period ends as it began: crossings are even in number. If it begins above, the last one, upwards, comes first.
-    if motion[0, 0] > offset:
-        roots = np.concatenate([[roots[-1] - 2 * np.pi], roots[:-1]])
-    return [(a, b) for a, b in zip(roots[::2].tolist(), roots[1::2].tolist(), strict=True) if b > a]
 
 
 @lru_cache(maxsize=256)
@@ -262,21 +195,48 @@ class ForceSeries:
         return matrix
 
 
+class Stops(NamedTuple):
+    """The ``law`` of a contact, and where its stops are: clearances in m on the sides ``plus`` and ``minus``.
+
+    inf: there is no stop; negative: it is pressed at rest, where a static load balances its force.
+    """
+
+    law: Contact
+    plus: float
+    minus: float
+
+    @classmethod
+    def both(cls, law: Contact, clearance: float) -> "Stops":
+        """Stops at the same ``clearance`` in m on both sides."""
+        return cls(law, clearance, clearance)
+
+    @property
+    def clearance(self) -> float:
+        """The smaller clearance in m."""
+        return min(self.plus, self.minus)
+
+    @property
+    def load(self) -> float:
+        """Force in N, on the side + positive, that a static load balances."""
+        return float(self.law.elastic_force(max(-self.plus, 0.0)) - self.law.elastic_force(max(-self.minus, 0.0)))
+
+
 class SiteForces:
-    """The pairs of a system, one row each of arrays: contacts (law, clearance in m), then nonlinear springs.
+    """The pairs of a system, one row each of arrays: contacts with their ``Stops``, then nonlinear springs.
 
     A spring's force is here what it has beyond k z, which belongs to the stiffness of the system.
     """
 
-    def __init__(self, contacts: Sequence[tuple[Contact, float]], springs: Sequence[Spring] = ()) -> None:
+    def __init__(self, contacts: Sequence[Stops], springs: Sequence[Spring] = ()) -> None:
         self.contacts = tuple(contacts)
         self.springs = tuple(springs)
         self.pairs = len(contacts) + len(springs)
 
     @property
     def odd(self) -> bool:
-        """Whether all forces change sign with the elongations; those of contacts do, alike on both sides."""
-        return all(spring.is_odd for spring in self.springs)
+        """Whether all forces change sign with the elongations; those of contacts that are alike on both sides do."""
+        both_sides = all(stops.plus == stops.minus for stops in self.contacts)
+        return both_sides and all(spring.is_odd for spring in self.springs)
 
     def amplitude_scale(self, place: int, g: float) -> float:
         """Amplitude in m at which the pair ``place`` with the compliance ``g`` in m/N begins to feel its force.
@@ -285,7 +245,7 @@ class SiteForces:
         its force at z = a cos theta only the cubic part has a first harmonic.
         """
         if place < len(self.contacts):
-            return self.contacts[place][1]
+            return self.contacts[place].clearance
         cubic = self.springs[place - len(self.contacts)].cubic
         return float(1 / np.sqrt(np.abs(g * cubic)))
 
@@ -297,11 +257,12 @@ class SiteForces:
         order = z.shape[1] - 1
         series = ForceSeries(self.pairs, order)
         motion = self._sampled(z)
-        for pair, (_, clearance) in enumerate(self.contacts):
-            for side in (1, -1):
+        for pair, stops in enumerate(self.contacts):
+            for side, clearance in ((1, stops.plus), (-1, stops.minus)):
                 for begin, end in arcs(np.ascontiguousarray(side * motion[pair, :, :3]), clearance):
                     arc = Episode(pair, side, begin, end - begin, approach=0.0)
                     self._add_arc(series, arc, motion[pair], z, omega)
+            series.forces[pair, 0] -= stops.load
 
         # Uniform samples are exact for springs: f exp(-i k theta) has orders up to 3K + 2K, the energy up to 4K.
         samples = motion.shape[1]
@@ -333,7 +294,9 @@ class SiteForces:
         ``motion`` (samples, 4) is that of the pair (``_sampled``), ``z`` (pairs, K + 1) are the harmonics.
         """
         pair, side, a, length, _ = arc
-        law, clearance = self.contacts[pair]
+        stops = self.contacts[pair]
+        law = stops.law
+        clearance = stops.plus if side > 0 else stops.minus
         c = law.damping
         at_onset = np.empty((1, 3))
         _evaluate(z[pair], np.array([a]), at_onset)
@@ -345,11 +308,11 @@ class SiteForces:
         if floored:
             approach = side * law.approach_floor / omega
 
-        pieces = list(_cut(a, a + length, _minima(side * motion[:, 1])))
+        pieces = list(cut(a, a + length, minima(side * motion[:, 1])))
         if c and law.adhesion == "clip":
             # g > 0 where side z' > -side z'_minus/c = -|z'_minus|/c.
             pushing = arcs(np.ascontiguousarray(side * motion[:, 1:]), -side * approach / c)
-            pieces = list(_common(pieces, pushing))
+            pieces = list(common(pieces, pushing))
 
         theta, weights = nodes(pieces, 2 * series.order)
         at_nodes = np.empty((len(theta), 3))
@@ -364,7 +327,7 @@ class SiteForces:
         if c:
             g = 1 + c * rate / approach
             per_rate = side * elastic * c / approach
-        values = np.array([side * elastic * g, slope * g, per_rate, law.potential(at_nodes[:, 0], clearance)])
+        values = np.array([side * elastic * g, slope * g, per_rate, law.elastic_energy(x)])
         series.add(pair, theta, weights, values, rate)
 
         if c and not floored:
@@ -373,28 +336,3 @@ class SiteForces:
             series.add_onset(_Onset(pair, a, bend, theta, weighted))
         series.closed[pair] += length / (2 * np.pi)
         series.episodes.append(arc._replace(approach=abs(approach) * omega))
-
-
-def _minima(slope: np.ndarray) -> np.ndarray:
-    """Phases of the minima of a periodic motion by the secant of its sampled ``slope``: near enough to cut arcs."""
-    after = np.roll(slope, -1)
-    before_minimum = np.nonzero((slope < 0) & (after >= 0))[0]
-    change = slope[before_minimum] - after[before_minimum]
-    return (before_minimum + slope[before_minimum] / change) * (2 * np.pi / len(slope))
-
-
-def _cut(a: float, b: float, places: np.ndarray) -> Iterator[tuple[float, float]]:
-    """The interval from ``a`` to ``b``, cut at ``places`` of period 2 pi; a whole period stays whole."""
-    turns = np.concatenate([places - 2 * np.pi, places]) if b - a < 2 * np.pi else np.empty(0)
-    inside = np.sort(turns[(turns > a) & (turns < b)]).tolist()
-    yield from itertools.pairwise([a, *inside, b])
-
-
-def _common(
-    pieces: Sequence[tuple[float, float]], others: Sequence[tuple[float, float]]
-) -> Iterator[tuple[float, float]]:
-    """The parts of ``pieces`` that lie in one of ``others``, both of period 2 pi."""
-    for (a, b), (c, d), turn in itertools.product(pieces, others, (-2 * np.pi, 0.0, 2 * np.pi)):
-        low, high = max(a, c + turn), min(b, d + turn)
-        if high > low:
-            yield low, high

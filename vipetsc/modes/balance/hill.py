@@ -31,7 +31,8 @@ from vipetsc.modes.balance.harmonics import ForceSeries
 
 # Growth rate over Om up to which a motion counts as stable ...
 LEAST = 1e-4
-# ... in a finite system, whose poles lie at Re lambda = 0: D is smooth over this length of the line. 1 % a period.
+# ... in a finite system: the least distance of the line from the poles, at Re lambda = -decay Om or below, over which D
+# is smooth. 1 % a period without damping.
 LEAST_OF_FINITE = 1.6e-3
 # Lines on which the fastest growth is looked for first: far from the poles D has few turns and is cheap to follow.
 LINES = (0.1, 0.02)
@@ -63,14 +64,18 @@ class ContourLine(NamedTuple):
 class Hill:
     """Stability of motions at ``omega`` (rad/s) with harmonics up to ``order``, ``odd`` ones alone or all.
 
-    The ``compliance`` at a perturbation's frequencies is kept, for motions that differ in their forces alone.
+    The ``compliance`` at a perturbation's frequencies is kept, for motions that differ in their forces alone. The
+    linear modes of a ``finite`` system decay at the rate ``decay`` Om at least.
     """
 
-    def __init__(self, compliance: Compliance, omega: float, order: int, odd: bool, finite: bool) -> None:
+    def __init__(
+        self, compliance: Compliance, omega: float, order: int, odd: bool, finite: bool, decay: float = 0.0
+    ) -> None:
         self.compliance = compliance
         self.omega = omega
         self.finite = finite
-        self.least = LEAST_OF_FINITE if finite else LEAST
+        self.decay = decay
+        self.least = max(LEAST_OF_FINITE - decay, LEAST) if finite else LEAST
         orders = np.arange(-order, order + 1)
         self._blocks = [orders[1 - order % 2 :: 2], orders[order % 2 :: 2]] if odd else [orders]
         # Compliances by block, number of its orders and exponent, and the latest forces with their reduced Jacobians.
@@ -121,7 +126,7 @@ class Hill:
 
     def _line(self, series: ForceSeries, growth: float) -> ContourLine:
         """D on Re lambda = ``growth`` Om, so finely that no turn of it is missed."""
-        count = max(COARSE, int(0.5 / growth) if self.finite else 0) + 1
+        count = max(COARSE, int(0.5 / (growth + self.decay)) if self.finite else 0) + 1
         positions = np.linspace(0, 0.5, count)
         values = self.determinants(series, growth + 1j * positions)
         for _ in range(FINEST):

@@ -16,7 +16,7 @@ from vipetsc.io.netcdf import Variables
 from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, pass_bands
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
-from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.harmonics import SiteForces, Stops
 from vipetsc.modes.balance.hill import Hill
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, start_energy
@@ -48,7 +48,7 @@ class Condensed(NamedTuple):
         options = case.nnm
         if options.system == "condensed":
             chain = build_chain(case.lattice, case.contacts)
-            forces = SiteForces([(case.contact(), clearance) for clearance in chain.clearances])
+            forces = SiteForces([Stops.both(case.contact(), clearance) for clearance in chain.clearances])
             compliance = SeriesCompliance(WaveCompliance(chain))
             return cls(ConservativeMotions(compliance, forces, options), chain, None)
         system = System.from_case(case)
@@ -58,7 +58,7 @@ class Condensed(NamedTuple):
 def condensed_system(system: System, options: NnmTable) -> ConservativeMotions:
     """The motions of a ``system`` condensed onto its contacts and springs."""
     rows = np.vstack([system.contact_rows, system.spring_rows])
-    contacts = [(pair.law, pair.clearance) for pair in system.contacts]
+    contacts = [Stops.both(pair.law, pair.clearance) for pair in system.contacts]
     forces = SiteForces(contacts, [spring.law for spring in system.springs])
     return ConservativeMotions(DenseCompliance(system.masses, system.stiffness, rows), forces, options)
 

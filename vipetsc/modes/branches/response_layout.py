@@ -23,7 +23,9 @@ class Stored(NamedTuple):
 
 LAYOUT = {
     "frequency": Stored("", "rad/s", "frequency"),
-    "amplitude": Stored("", "1", "amplitude: of a wave over the clearance of the first site, of a force in N"),
+    "amplitude": Stored(
+        "", "1", "amplitude: of a wave over the first site's clearance, of a force in N, of a wall in m"
+    ),
     "largest": Stored("site", "m", "largest relative displacement"),
     "share": Stored("way", "1", "energy that leaves or is lost, over what comes in"),
     "unstable": Stored("", "1", "perturbations that grow (Hill's method); -1: not told"),

@@ -19,7 +19,7 @@ from scipy.sparse.linalg import splu
 
 from vipetsc.lattice import Chain
 from vipetsc.modes.balance.conservative import describing_amplitude
-from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.harmonics import SiteForces, Stops
 from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.newton import BorderedNewton, Equations
 from vipetsc.modes.point import Point
@@ -205,7 +205,7 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
         pair = system.contacts[0]
         field = splu((system.stiffness - omega**2 * diags(system.masses)).tocsc()).solve(row)  # of 1 N, in m
         compliance = row @ field
-        amplitude = describing_amplitude(SiteForces([(pair.law, pair.clearance)]), 0, compliance, omega)
+        amplitude = describing_amplitude(SiteForces([Stops.both(pair.law, pair.clearance)]), 0, compliance, omega)
 
         x = field * (amplitude / compliance)
         frame = self.frame_at("relative", x, 2 * np.pi / omega, np.empty(0))

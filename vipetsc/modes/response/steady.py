@@ -20,10 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.case.nfrc import NfrcCase
-from vipetsc.lattice import IncidentWave, WaveCompliance
+from vipetsc.case.nfrc import NfrcCase, needs_modes
+from vipetsc.lattice import IncidentWave, ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.harmonics import SiteForces, Stops
 from vipetsc.modes.balance.hill import Hill
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, Solution, SpecialKind
@@ -238,22 +238,44 @@ class SteadyStates(SteadyEquations):
         self.options = options
         self.restitution = restitution
         self.wave = options.source == "wave"
-        self.point = model.drive_cell, model.drive_mass
-        self.compliance = WaveCompliance(model.chain, options.infinite, () if self.wave else (self.point,))
-        law = case.contact(restitution)
-        self.forces = SiteForces([(law, clearance) for clearance in model.chain.clearances])
+        self.forces = SiteForces(stops_of(case, restitution))
+
+        # A wall acts on each mass that a spring ties to it, by that spring's stiffness times its motion.
+        self.points: tuple[tuple[int, int], ...] = ()
+        if not self.wave:
+            self.points = tuple((drive.cell, drive.mass) for drive in model.drives)
+        self.weights = np.array([drive.stiffness or 1.0 for drive in model.drives])[: len(self.points)]
+        self.compliance: WaveCompliance | ModalCompliance
+        if needs_modes(model.chain):
+            self.compliance = ModalCompliance(model.chain, self.points)
+        else:
+            self.compliance = WaveCompliance(model.chain, bool(options.infinite), self.points)
+
         # Latest linear motions by frequency, and the latest determinant: neighbours on a curve over the amplitude.
         self._motions: dict[float, LinearMotion] = {}
         self._hill: Hill | None = None
 
-        clearance = model.chain.clearances[0]
+        clearance = self._unit()
         super().__init__(
-            balance=HarmonicBalance(self.compliance, self.forces, options.harmonics, options.symmetric, cosines=False),
+            balance=HarmonicBalance(
+                self.compliance, self.forces, options.harmonics, odd=bool(options.symmetric), cosines=False
+            ),
             clearance=clearance,
             parameter=ContinuationParameter(options.over, fixed, self._scale(clearance)),
             tolerance=options.tolerance,
             max_newton=options.max_newton,
         )
+
+    def _unit(self) -> float:
+        """Unit of displacements in m: the first clearance; of contacts without any the linear motion of the range."""
+        for stops in self.forces.contacts:
+            for gap in (stops.plus, stops.minus):
+                if 0 < gap < np.inf:
+                    return gap
+        over_amplitude = self.options.over == "amplitude"
+        omega = self.case.frequency
+        amplitude = self.options.range[1] if over_amplitude else self.options.fixed[0]
+        return float(amplitude * np.abs(self.linear_motion(omega).harmonics).max())
 
     def _scale(self, clearance: float) -> float:
         """Unit of the parameter: half the range of frequencies, or the amplitude that touches, 1 of a wave."""
@@ -276,13 +298,14 @@ class SteadyStates(SteadyEquations):
         pairs = self.forces.pairs
         z = np.zeros((pairs, self.options.harmonics + 1), complex)
         if not self.wave:
-            z[:, 1] = self.compliance.response(omega)[0, :, pairs]
+            z[:, 1] = self.compliance.response(omega)[0, :, pairs:] @ self.weights
             return LinearMotion(z, None)
+        assert isinstance(self.compliance, WaveCompliance)
         try:
             wave = self.compliance.incident(omega, self.options.band or 0, self.options.towards)
         except ValueError as error:
             raise FlowError(str(error)) from None
-        z[:, 1] = wave.relative * self.case.model().chain.clearances[0]
+        z[:, 1] = wave.relative * self._unit()
         return LinearMotion(z, wave)
 
     def measured(self, xi: np.ndarray) -> Measures:
@@ -314,8 +337,17 @@ class SteadyStates(SteadyEquations):
         """Hill's determinant at a frequency; the latest is kept, since it keeps the compliances of perturbations."""
         if self._hill is None or self._hill.omega != omega:
             options = self.options
-            finite = not options.infinite
-            self._hill = Hill(self.compliance, omega, options.harmonics, options.symmetric, finite)
+            decay = 0.0
+            if isinstance(self.compliance, ModalCompliance):
+                decay = self.compliance.slowest / omega
+            self._hill = Hill(
+                compliance=self.compliance,
+                omega=omega,
+                order=options.harmonics,
+                odd=bool(options.symmetric),
+                finite=not options.infinite,
+                decay=decay,
+            )
         return self._hill
 
     def _fractions(self, omega: float, amplitude: float, forces: np.ndarray, loss: float) -> np.ndarray:
@@ -327,14 +359,16 @@ class SteadyStates(SteadyEquations):
             amplitude = amplitude * self.clearance
             given = amplitude**2 * wave.flux
         else:
-            first = np.append(first, amplitude)
-            moved = self.compliance.field(omega, first, [self.point[0]])[0, self.point[1]]
+            first = np.append(first, amplitude * self.weights)
+            moved = 0.0
+            for (cell, mass), weight in zip(self.points, self.weights.tolist(), strict=True):
+                moved = moved + weight * self.compliance.field(omega, first, [cell])[0, mass]
             given = 0.5 * amplitude * float((1j * omega * moved).real)
             if not given > LEAST_WORK * amplitude * omega * abs(moved):
                 given = 0.0
 
         powers = np.full(4, 0.0 if self.options.infinite else np.nan)
-        if self.options.infinite:
+        if isinstance(self.compliance, WaveCompliance) and self.options.infinite:
             outgoing = self.compliance.outgoing(omega, first, wave, amplitude).sum(axis=1)
             powers[:2] = outgoing if self.options.towards > 0 else outgoing[::-1]
             for k in range(2, forces.shape[1]):
@@ -343,6 +377,13 @@ class SteadyStates(SteadyEquations):
                     powers[2] += self.compliance.outgoing(k * omega, forces[:, k]).sum()
         powers[3] = loss * (omega / (2 * np.pi))
         return powers / given if given > 0 else np.full(4, np.nan)
+
+
+def stops_of(case: NfrcCase, restitution: float) -> list[Stops]:
+    """The law and the stops of each site of a ``case``, with a ``restitution``."""
+    model = case.model()
+    gaps = model.gaps or [(clearance, clearance) for clearance in model.chain.clearances]
+    return [Stops(law, plus, minus) for law, (plus, minus) in zip(case.laws(restitution), gaps, strict=True)]
 
 
 def _largest(z: np.ndarray) -> np.ndarray:

@@ -64,17 +64,17 @@ class TurningSteps:
         )
 
 
-def first_state(states: SteadyStates) -> Response:
+def first_state(states: SteadyStates, is_ramp: bool = False) -> Response:
     """The state at the beginning of the range, by growing amplitudes from one that touches no contact.
 
-    Raises ContinuationError where amplitudes cannot grow so far.
+    ``is_ramp``: it is the beginning of such growing amplitudes itself. Raises ContinuationError where amplitudes cannot
+    grow so far.
     """
     low = states.options.range[0] / states.parameter.scale
     omega, amplitude = states.drive(low)
     linear = states.linear_motion(omega).harmonics
-    clearances = [clearance for _, clearance in states.forces.contacts]
     guess = states.balance.pack(amplitude * linear) / states.clearance
-    if not amplitude * float((np.abs(linear[:, 1]) / clearances).max()) < 1:
+    if _touches(states, amplitude * linear[:, 1]) and not is_ramp:
         guess = _ramp(states, omega, amplitude)
 
     # Newton's method from the linear motion, or from the state on the ramp, which is one already but for rounding.
@@ -83,11 +83,19 @@ def first_state(states: SteadyStates) -> Response:
     return Response(xi=start.xi, tangent=tangent, next_step=start.next_step)
 
 
+def _touches(states: SteadyStates, linear: np.ndarray) -> bool:
+    """Whether the linear motion (pairs,) in m comes to a stop; a contact that is pressed at rest need not open."""
+    for stops, motion in zip(states.forces.contacts, np.abs(linear).tolist(), strict=True):
+        if not motion < abs(stops.clearance):
+            return True
+    return False
+
+
 def _ramp(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
     """Scaled harmonics of the state at ``omega`` to which growing amplitudes lead."""
     below = states.options.model_copy(update={"over": "amplitude", "range": [1e-3 * amplitude, amplitude]})
     ramp = SteadyStates(states.case.model_copy(update={"nfrc": below}), states.restitution, omega)
-    points = list(Continuation(ramp, first_state(ramp), TurningSteps(ramp, MOST_RAMP)))
+    points = list(Continuation(ramp, first_state(ramp, is_ramp=True), TurningSteps(ramp, MOST_RAMP)))
     if not points or not np.isclose(points[-1].xi[-1] * ramp.parameter.scale, amplitude):
         raise ContinuationError(f"growing amplitudes do not reach {amplitude:g}: begin nfrc.range or nfrc.fixed lower")
     return points[-1].xi[:-1]

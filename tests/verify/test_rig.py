@@ -1,0 +1,295 @@
+"""Frequency responses of what stands on a table: dashpots, stops on one side, sites that differ, a wall that moves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from tests.conftest import run_of
+from tests.steady_states import motion_at
+from vipetsc.case import Case, CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, WaveCompliance
+from vipetsc.lattice.chain import Pair
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.response.steady import Response, SteadyStates, stops_of
+from vipetsc.modes.response.steps import first_state
+
+pytestmark = pytest.mark.parallel(1)
+
+# Two masses of 1 kg between walls, of which the first one meets a stop of the table; the left wall shakes.
+TWO_MASSES: dict[str, Any] = {
+    "name": "rig",
+    "lattice": {
+        "cells": 2,
+        "cell": {
+            "masses": [1.0],
+            "springs": [{"start": 1, "end": 1, "stiffness": 1.0, "next_cell": True}],
+            "contact": [1, 1],
+        },
+        "damping": {"mass": 0.06},
+    },
+    "contacts": {"law": "bilinear", "stiffness": 20.0, "restitution": 1.0, "sites": [1], "clearance": 0.8},
+    "drive": {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "end": "left"},
+    "time": {"end": 10.0},
+    "nfrc": {"source": "force", "over": "frequency", "range": [0.8, 1.9], "fixed": [0.2], "harmonics": 41},
+}
+TWO_MASSES["contacts"] |= {"pair": [0, 1], "side": "plus"}
+
+# Ten cells whose masses and springs scatter, with dashpots to the ground and sites that differ in all they can.
+TEN_CELLS: dict[str, Any] = {
+    "name": "ten",
+    "lattice": {
+        "cells": 10,
+        "cell": {
+            "masses": [1.0, 0.3],
+            "springs": [
+                {"start": 1, "end": 1, "stiffness": 1.0, "next_cell": True},
+                {"start": 1, "end": 2, "stiffness": 0.5},
+            ],
+            "contact": [1, 2],
+        },
+        "damping": {"mass": 0.03, "stiffness": 0.02},
+    },
+    "disorder": {"seed": 4, "cells": {"masses[1]": {"relative": 0.05}, "springs[2].stiffness": {"relative": 0.05}}},
+    "contacts": {"law": "bilinear", "stiffness": 8.0, "restitution": 1.0, "sites": [2, 4, 5], "clearance": 0.5},
+    "drive": {"waveform": "harmonic", "amplitude": 0.3, "frequency": 0.9, "cell": 1, "mass": 1},
+    "time": {"end": 10.0},
+    "nfrc": {"source": "force", "over": "frequency", "range": [0.5, 1.0], "fixed": [0.35], "harmonics": 31},
+}
+TEN_CELLS["nfrc"]["points"] = 90
+TEN_CELLS["contacts"]["each"] = {
+    "side": ["plus", "both", "minus"],
+    "clearance_minus": [0.4, 0.9, 0.5],
+    "stiffness": [8.0, 5.0, 12.0],
+    "pair": [[1, 2], [0, 1], [1, 1]],
+    "next_cell": [False, False, True],
+}
+
+
+def rate_of(states: SteadyStates, omega: float, amplitude: float):
+    """The equations of motion of a lattice with elastic contacts, from its matrices: y' = f(t, y), y = (u, u')."""
+    chain = states.case.model().chain
+    stiffness = chain.stiffness_matrix().tocsr()
+    damping = chain.damping_rows(0, chain.cells)
+    masses = chain.masses()
+    n = len(masses)
+    d = chain.cell.dofs
+
+    drive = np.zeros(n)
+    for (cell, mass), weight in zip(states.points, states.weights, strict=True):
+        drive[cell * d + mass] += weight * amplitude
+    joins = []
+    for site, pair, stops in zip(chain.sites, chain.contact_pairs, states.forces.contacts, strict=True):
+        host = site * d + pair.host if pair.host >= 0 else None
+        joins.append((host, (site + pair.next_cell) % chain.cells * d + pair.resonator, stops))
+
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        u, v = y[:n], y[n:]
+        force = drive * np.cos(omega * t) - stiffness @ u - damping @ v
+        for host, resonator, stops in joins:
+            w = u[resonator] - (0.0 if host is None else u[host])
+            push = stops.law.elastic_force(w - stops.plus) - stops.law.elastic_force(-w - stops.minus) - stops.load
+            force[resonator] -= push
+            if host is not None:
+                force[host] += push
+        return np.concatenate([v, force / masses])
+
+    return rate
+
+
+def after_a_period(states: SteadyStates, point: Response, state: np.ndarray) -> np.ndarray:
+    """The ``state`` (displacements, velocities) a period later, by SciPy."""
+    omega, amplitude = states.drive(point.xi[-1])
+    rate = rate_of(states, omega, amplitude)
+    period = 2 * np.pi / omega
+    return solve_ivp(rate, (0, period), state, "DOP853", rtol=1e-10, atol=1e-12, max_step=period / 300).y[:, -1]
+
+
+def multipliers(states: SteadyStates, point: Response, state: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Floquet multipliers of the motion through ``state``, by differences of the map of a period."""
+    step = 1e-6
+    columns = []
+    for direction in np.eye(len(state)):
+        columns.append((after_a_period(states, point, state + step * direction) - end) / step)
+    return np.linalg.eigvals(np.array(columns).T)
+
+
+def followed(case: NfrcCase, folder):
+    """The only curve of a case, and its equations."""
+    folder.mkdir(exist_ok=True)
+    (curve,) = follow_all(case, folder, MPI.COMM_SELF)
+    _, restitution, fixed = case.curves()[0]
+    return SteadyStates(case, restitution, fixed), curve.points
+
+
+@pytest.fixture(scope="module")
+def two_masses(tmp_path_factory):
+    return followed(NfrcCase.from_table(TWO_MASSES), tmp_path_factory.mktemp("rig") / "two")
+
+
+@pytest.fixture(scope="module")
+def ten_cells(tmp_path_factory):
+    return followed(NfrcCase.from_table(TEN_CELLS), tmp_path_factory.mktemp("rig") / "ten")
+
+
+def test_what_follows_from_the_lattice_is_filled_in():
+    case = NfrcCase.from_table(TWO_MASSES)
+    assert (case.nfrc.infinite, case.nfrc.symmetric) == (False, False)
+    plain = NfrcCase.from_table({"nfrc": {"range": [0.9, 1.1]}})
+    assert (plain.nfrc.infinite, plain.nfrc.symmetric) == (True, True)
+
+
+@pytest.mark.parametrize(
+    ("section", "values", "key", "reason"),
+    [
+        ("nfrc", {"source": "wave", "over": "amplitude"}, "nfrc.source", "decayed before it arrives"),
+        ("nfrc", {"infinite": True}, "nfrc.infinite", "absorbing ends"),
+        ("nfrc", {"symmetric": True}, "nfrc.symmetric", "even harmonics"),
+        ("lattice", {"cells": 4000}, "lattice.cells", "at most 3000"),
+    ],
+)
+def test_what_has_no_response_is_refused_with_its_reason(section, values, key, reason):
+    with pytest.raises(CaseError) as caught:
+        NfrcCase.from_table(TWO_MASSES | {section: TWO_MASSES[section] | values})
+    assert [problem.key for problem in caught.value.problems] == [key]
+    assert reason in caught.value.problems[0].remedy
+
+
+def rounded_cell(grounding: tuple[float, ...] = ()) -> UnitCell:
+    """A cell of two masses, with dashpots to the ground."""
+    springs = (Spring(0, 0, 1.0, next_cell=True, damping=0.1), Spring(0, 1, 0.5, damping=0.02))
+    return UnitCell((1.0, 0.3), springs, host=0, resonator=1, grounding=grounding)
+
+
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+@pytest.mark.parametrize("grounding", [(), (0.05, 0.2)])
+def test_the_sum_over_poles_is_the_inverse_of_the_dynamic_stiffness(ends, grounding):
+    """Also where the lattice moves as a rigid body, held by dashpots or by nothing."""
+    pairs = (Pair(0, 1), Pair(0, 0, next_cell=True))
+    chain = Chain(rounded_cell(grounding), 5, ends, sites=(1, 3), clearances=(1.0, 1.0), pairs=pairs)
+    compliance = ModalCompliance(chain, ((0, 0),))
+    loads = compliance.loads
+    for omega in (0.3, 1.1 - 0.2j, -0.7, 4.0):
+        dynamic = chain.stiffness_matrix().toarray() + 1j * omega * chain.damping_rows(0, 5).toarray()
+        u = np.linalg.solve(dynamic - omega**2 * np.diag(chain.masses()), loads)
+        np.testing.assert_allclose(compliance.response(omega)[0], loads[:, :2].T @ u, rtol=1e-9, atol=1e-12)
+        field = compliance.field(omega, [0.5, -2.0, 3.0], range(5))
+        np.testing.assert_allclose(field.ravel(), u @ [-0.5, 2.0, 3.0], rtol=1e-9, atol=1e-12)
+
+
+def test_without_dashpots_it_is_that_of_bloch_waves():
+    cell = UnitCell((1.0, 0.3), (Spring(0, 0, 1.0, next_cell=True), Spring(0, 1, 0.5)), host=0, resonator=1)
+    chain = Chain(cell, 9, "free", sites=(2, 6), clearances=(1.0, 1.0))
+    omega = np.array([0.0, 0.31, 1.27, 2.9])
+    modal = ModalCompliance(chain, ((0, 0),)).response(omega)
+    waves = WaveCompliance(chain, points=((0, 0),)).response(omega)
+    # At rest a force on one mass carries the free lattice away.
+    np.testing.assert_allclose(modal[:, :, :2], waves[:, :, :2], rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(modal[1:], waves[1:], rtol=1e-8, atol=1e-10)
+    assert np.isrealobj(modal)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", ["two_masses", "ten_cells"])
+def test_a_response_is_a_periodic_motion_and_is_stable_as_its_multipliers_are(rig, request):
+    """A state comes back after a period of time integration, and Hill's method counts its multipliers beyond 1."""
+    states, points = request.getfixturevalue(rig)
+    cells = np.arange(states.case.lattice.cells)
+    touching = [point for point in points if point.measured.episodes]
+    chosen = [touching[i] for i in np.linspace(0, len(touching) - 1, 10 if rig == "two_masses" else 5).astype(int)]
+    assert len(touching) > 20
+
+    unstable = set()
+    for point in chosen:
+        u, v = motion_at(states, point.xi, cells)
+        state = np.concatenate([u.ravel(), v.ravel()])
+        end = after_a_period(states, point, state)
+        # Contacts are bilinear: harmonics that are left out fall with the third power of their number.
+        assert np.abs(end - state).max() < 1e-3 * np.abs(state).max()
+        if rig == "two_masses":
+            grows = np.abs(multipliers(states, point, state, end)) > 1.001
+            assert point.measured.unstable == np.count_nonzero(grows)
+            unstable.add(point.measured.unstable)
+    assert rig == "ten_cells" or len(unstable) > 1
+
+
+def test_errors_fall_as_harmonics_are_added(two_masses):
+    """With four times the harmonics the period's map misses by 1/16 or less: forces have kinks, z has not."""
+    states, points = two_masses
+    few = max(points, key=lambda point: point.measured.largest[0])
+    errors = []
+    for order in (20, 80):
+        case = states.case.model_copy(update={"nfrc": states.options.model_copy(update={"harmonics": order})})
+        finer = SteadyStates(case, states.restitution, states.parameter.fixed)
+        z = np.zeros((1, order + 1), complex)
+        kept = min(order, states.options.harmonics) + 1
+        z[:, :kept] = few.measured.harmonics[:, :kept]
+        xi = finer.at(np.append(finer.balance.pack(z) / finer.clearance, few.xi[-1]), few.xi[-1])
+        u, v = motion_at(finer, xi, np.arange(2))
+        state = np.concatenate([u.ravel(), v.ravel()])
+        errors.append(np.abs(after_a_period(finer, Response(xi=xi), state) - state).max())
+    assert errors[1] < errors[0] / 16
+
+
+def test_a_force_that_touches_nothing_has_the_linear_response(two_masses):
+    states, points = two_masses
+    quiet = [point for point in points if not point.measured.episodes]
+    assert quiet
+    chain = states.case.model().chain
+    for point in quiet[::10]:
+        omega, amplitude = states.drive(point.xi[-1])
+        dynamic = chain.stiffness_matrix().toarray() + 1j * omega * chain.damping_rows(0, 2).toarray()
+        u = np.linalg.solve(dynamic - omega**2 * np.eye(2), [amplitude * 1.0, 0.0])
+        np.testing.assert_allclose(point.measured.harmonics[0, 1], u[0], rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_lossy_run_settles_into_the_response():
+    """A run with restitution 0.6 from rest comes to the amplitudes of the response at its frequency."""
+    table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"restitution": 0.6}}
+    frequency = 1.02
+    options = {"over": "amplitude", "range": [0.02, 0.2], "fixed": [frequency], "harmonics": 61}
+    case = NfrcCase.from_table(table | {"nfrc": {"source": "force"} | options})
+    states = SteadyStates(case, 0.6, frequency)
+
+    period = 2 * np.pi / frequency
+    run = run_of(
+        Case.from_table(
+            {
+                **{key: table[key] for key in ("name", "lattice", "contacts")},
+                "drive": table["drive"] | {"amplitude": 0.2, "frequency": frequency},
+                "time": {"end": 90 * period, "sample_interval": period / 64, "rtol": 1e-10},
+            }
+        )
+    )
+    w = run["displacement"].values[-64:, 0, 0]
+    settled = np.fft.rfft(w) / 32
+
+    case = NfrcCase.from_table(table | {"nfrc": {"source": "force"} | options | {"range": [0.2, 0.3]}})
+    states = SteadyStates(case, 0.6, frequency)
+    measured = states.measured(first_state(states).xi)
+    assert measured.episodes == 1
+    assert measured.unstable == 0
+    np.testing.assert_allclose(np.abs(measured.harmonics[0, 1:4]), np.abs(settled[1:4]), rtol=2e-4)
+
+
+def test_a_contact_that_is_pressed_at_rest_pulls_as_far_as_it_is_pressed():
+    """Of a small motion it is a spring: the response is that of the lattice with the contact's stiffness added."""
+    contacts = TWO_MASSES["contacts"] | {"clearance": 0.0, "precompression": 0.3}
+    nfrc = TWO_MASSES["nfrc"] | {"fixed": [0.01], "range": [0.8, 0.9]}
+    case = NfrcCase.from_table(TWO_MASSES | {"contacts": contacts, "nfrc": nfrc})
+    (stops,) = stops_of(case, 1.0)
+    assert (stops.plus, stops.minus, stops.load) == (-0.3, np.inf, pytest.approx(6.0))
+
+    states = SteadyStates(case, 1.0, 0.01)
+    point = states.measured(first_state(states).xi)
+    stiffness = np.array([[2.0 + 20.0, -1.0], [-1.0, 2.0]])
+    dynamic = stiffness + 0.8j * 0.06 * np.eye(2) - 0.8**2 * np.eye(2)
+    assert point.closed[0] == 1.0
+    np.testing.assert_allclose(point.harmonics[0, 1], np.linalg.solve(dynamic, [0.01, 0.0])[0], rtol=1e-8)

@@ -1,0 +1,206 @@
+r"""Compliance of a finite lattice of any cells, with dashpots, from its modes: poles and residues.
+
+With the modes phi of M u'' + K u = 0, phi^T M phi = 1, as coordinates, u = sum_n phi_n q_n, motions obey
+
+    q'' + D q' + Omega^2 q = phi^T f,    D = phi^T C phi.
+
+Without dashpots each mode answers for itself. With dashpots the state (S q, q'), S a diagonal scale, has the matrix
+[[0, S], [-Omega^2/S, -D]], whose eigenvalues p and eigenvectors give the compliance as a sum over poles,
+
+    G(omega) = sum_r a_r b_r / (i omega - p_r).
+
+A motion as a rigid body, which neither a spring nor a dashpot opposes, is kept apart: its pole is double, and such a
+matrix has too few eigenvectors. Cf. F. Tisseur, K. Meerbergen, The quadratic eigenvalue problem, SIAM Rev. 43 (2001)
+235.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import eig, eigh
+from scipy.sparse import diags
+from scipy.sparse.linalg import spsolve
+
+from vipetsc.lattice.chain import Chain
+
+MOST_DOFS = 3000  # masses of a lattice whose modes are all computed: minutes, and 600 MB of vectors
+RIGID = 1e-12  # squared frequencies, or losses of a mode, below this fraction of the largest are none
+UNMOVED = 1e-10  # a rigid motion whose relative displacements are below this fraction of the largest moves no pair
+# Error over the largest compliance that is accepted of the sum over poles: near critical damping two of them are
+# nearly parallel, and cancel.
+ACCURACY = 1e-8
+
+
+class Poles(NamedTuple):
+    """A sum over ``poles`` (pole,) in 1/s: ``output`` (dofs, pole) and ``input`` (pole, dofs), see ``ModalCompliance``.
+
+    ``rigid`` (dofs, motion) are the mass-normalised motions as a rigid body.
+    """
+
+    poles: np.ndarray
+    output: np.ndarray
+    input: np.ndarray
+    rigid: np.ndarray
+
+
+@dataclass(frozen=True)
+class ModalCompliance:
+    """Compliance of the contacts of a finite ``chain``, whose cells may differ and have dashpots.
+
+    Relative displacements of the contact pairs follow from pairs of opposite forces, and from forces on single masses
+    at the ``points``, which are (cell, mass) from 0. Raises ValueError for more than ``MOST_DOFS`` masses, and where
+    the damping is so close to critical that the modes do not represent the motion.
+    """
+
+    chain: Chain
+    points: tuple[tuple[int, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        dofs = self.chain.cells * self.chain.cell.dofs
+        if dofs > MOST_DOFS:
+            raise ValueError(f"a lattice of {dofs} masses: all modes are computed of up to {MOST_DOFS}")
+
+    @cached_property
+    def slowest(self) -> float:
+        """Rate in 1/s at which the linear mode that is damped least decays; 0 without dashpots."""
+        return float(np.abs(self._poles.poles.real).min(initial=np.inf))
+
+    @cached_property
+    def loads(self) -> np.ndarray:
+        """Unit loads (dofs, pairs and points): columns that pick a relative displacement, or one of a mass."""
+        chain = self.chain
+        d = chain.cell.dofs
+        pairs = len(chain.sites)
+        loads = np.zeros((chain.cells * d, pairs + len(self.points)))
+        for j, (site, pair) in enumerate(zip(chain.sites, chain.contact_pairs, strict=True)):
+            resonator_cell = (site + pair.next_cell) % chain.cells
+            loads[resonator_cell * d + pair.resonator, j] = 1
+            # The ground does not move.
+            if pair.host >= 0:
+                loads[site * d + pair.host, j] = -1
+        for j, (cell, mass) in enumerate(self.points, pairs):
+            loads[cell * d + mass, j] = 1
+        return loads
+
+    def at(self, omegas: ArrayLike) -> np.ndarray:
+        """Compliance (omega, pair, pair) in m/N at frequencies ``omegas`` in rad/s, on or below the real axis."""
+        return self.response(omegas)[:, :, : len(self.chain.sites)]
+
+    def response(self, omegas: ArrayLike) -> np.ndarray:
+        """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s.
+
+        Real for a lattice without dashpots at real frequencies.
+        """
+        rows, columns, rigid_rows, rigid_columns = self._parts
+        omega = np.atleast_1d(np.asarray(omegas, complex))
+        gain = 1 / (1j * omega[:, None] - self._poles.poles)
+        out = (rows * gain[:, None, :]) @ columns
+        if rigid_columns.size:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                out += rigid_rows @ rigid_columns / (-(omega[:, None, None] ** 2))
+        if not self.chain.is_damped and np.all(omega.imag == 0):
+            return np.asarray(out.real)
+        return np.asarray(out)
+
+    def field(self, omega: complex, forces: ArrayLike, cells: ArrayLike) -> np.ndarray:
+        """Displacement (cells, dofs) in m at ``cells`` (from 0).
+
+        ``forces`` in N are those of the pairs, which pull back (-F on the resonator, F on the host), then those on the
+        points, if there are any.
+        """
+        given = np.asarray(forces, complex)
+        pairs = len(self.chain.sites)
+        signed = np.concatenate([-given[:pairs], given[pairs:]])
+        force = self.loads[:, : len(signed)] @ signed
+
+        poles = self._poles
+        u = poles.output @ ((poles.input @ force) / (1j * omega - poles.poles))
+        moved = poles.rigid.T @ force
+        if np.any(moved):
+            u = u - poles.rigid @ moved / omega**2
+        return np.asarray(u.reshape(self.chain.cells, -1)[np.atleast_1d(cells)])
+
+    @cached_property
+    def _parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Outputs and inputs of the pairs and points: (pairs, pole), (pole, loads), and those of rigid motions."""
+        poles = self._poles
+        loads = self.loads
+        pairs = loads[:, : len(self.chain.sites)]
+        rigid_rows = pairs.T @ poles.rigid
+        rigid_columns = poles.rigid.T @ loads
+
+        # Forces of pairs do not move a rigid motion without relative displacement. Rounding would make them do so, and
+        # at omega = 0 without bound.
+        scale = np.abs(poles.rigid).max(initial=0.0)
+        rigid_rows[np.abs(rigid_rows) < UNMOVED * scale] = 0
+        rigid_columns[np.abs(rigid_columns) < UNMOVED * scale] = 0
+        if not rigid_rows.any():
+            rigid_rows, rigid_columns = rigid_rows[:, :0], rigid_columns[:0]
+        return pairs.T @ poles.output, poles.input @ loads, rigid_rows, rigid_columns
+
+    @cached_property
+    def _poles(self) -> Poles:
+        """All poles of the lattice; raises ValueError where they do not represent it."""
+        chain = self.chain
+        masses = chain.masses()
+        root = 1 / np.sqrt(masses)
+        stiffness = chain.stiffness_matrix().toarray()
+        squared, vectors = eigh(stiffness * np.outer(root, root))
+        vectors = vectors * root[:, None]
+
+        damping = chain.damping_rows(0, chain.cells)
+        modal_damping = vectors.T @ (damping @ vectors)
+        still = np.abs(squared) < RIGID * np.abs(squared).max()
+        lossless = np.abs(modal_damping).max(axis=1) <= RIGID * np.abs(modal_damping).max(initial=0.0)
+        rigid = still & lossless
+
+        poles = _sum_over_poles(
+            squared=np.where(still, 0.0, squared)[~rigid],
+            damping=modal_damping[np.ix_(~rigid, ~rigid)],
+            vectors=vectors[:, ~rigid],
+            rigid=vectors[:, rigid],
+        )
+        if chain.is_damped:
+            self._check(poles)
+        return poles
+
+    def _check(self, poles: Poles) -> None:
+        """Compare the sum over ``poles`` with a direct solution; raises ValueError where they differ."""
+        chain = self.chain
+        omega = float(np.median(np.abs(poles.poles)))
+        dynamic = chain.stiffness_matrix() + 1j * omega * chain.damping_rows(0, chain.cells)
+        dynamic = dynamic - omega**2 * diags(chain.masses())
+        force = self.loads.sum(axis=1)
+
+        direct = spsolve(dynamic.tocsc(), force.astype(complex))
+        u = poles.output @ ((poles.input @ force) / (1j * omega - poles.poles))
+        u = u - poles.rigid @ (poles.rigid.T @ force) / omega**2
+        if not np.abs(u - direct).max() <= ACCURACY * np.abs(direct).max():
+            raise ValueError(
+                "a mode is damped so close to critically that its two rates agree; change a dashpot a little"
+            )
+
+
+def _sum_over_poles(squared: np.ndarray, damping: np.ndarray, vectors: np.ndarray, rigid: np.ndarray) -> Poles:
+    """The poles of q'' + ``damping`` q' + ``squared`` q = ``vectors``^T f, and of the ``rigid`` motions."""
+    count = len(squared)
+    if not damping.any():
+        # Pairs of poles +-i Omega of residues 1/(2 i Omega).
+        frequency = np.sqrt(squared)
+        poles = 1j * np.concatenate([frequency, -frequency])
+        output = np.hstack([vectors, vectors])
+        return Poles(poles, output, (output / (2 * poles)).T, rigid)
+
+    # A scale of the displacements by the frequencies makes the matrix one of a single size; a mode that dashpots
+    # alone hold has none, and takes a thousandth of the highest.
+    scale = np.maximum(np.sqrt(squared), 1e-3 * np.sqrt(squared.max()))
+    matrix = np.zeros((2 * count, 2 * count))
+    matrix[:count, count:] = np.diag(scale)
+    matrix[count:, :count] = np.diag(-squared / scale)
+    matrix[count:, count:] = -damping
+    poles, right = eig(matrix)
+    left = np.linalg.inv(right)
+    return Poles(poles, vectors @ (right[:count] / scale[:, None]), left[:, count:] @ vectors.T, rigid)

@@ -1,0 +1,105 @@
+"""Arcs of contact: the intervals of phase on which a periodic motion is beyond an offset, cut and joined.
+
+Their ends are roots of the quintics that interpolate uniform samples of the motion and its two derivatives, found by
+``vipetsc.contact.search``, which misses no root of a quintic.
+"""
+
+import itertools
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from vipetsc.compiled import allocating
+from vipetsc.contact.search import bernstein, first_upcrossing, first_upcrossing_after_start
+
+# By Bernstein's inequality, |z''| <= K^2 range/2, a motion exceeds its samples by (2 pi/24)^2/16 = 0.4 % of its range
+# at most; where even this fraction of the range does not lead to the offset, no root need be sought.
+OVERSHOOT = 0.1
+
+
+@allocating
+def _crossings(motion: np.ndarray, offset: float, out: np.ndarray) -> int:
+    """Write the phases where a motion passes ``offset`` into ``out``, in order, and return their number.
+
+    ``motion`` (samples, 3) holds (z, z', z'') over a period. The first crossing is upwards unless the period begins
+    above; then they alternate. A value that equals the offset counts as below.
+    """
+    samples = motion.shape[0]
+    h = 2.0 * np.pi / samples
+    count = 0
+    above = motion[0, 0] > offset
+    b = np.empty(6)
+    c = np.empty(6)
+    for i in range(samples):
+        bernstein(motion[i], motion[(i + 1) % samples], h, b)
+        b -= offset
+        if (b.max() <= 0.0 and not above) or (b.min() > 0.0 and above):
+            continue
+
+        # The search finds where a polynomial turns positive (2 if nowhere); downcrossings are those of its negative.
+        c[:] = b if not above else -b
+        begin = 0.0
+        root = first_upcrossing(c)
+        while root <= 1.0 and count < out.size:
+            begin += root * (1.0 - begin)
+            out[count] = (i + begin) * h
+            count += 1
+            above = not above
+            if begin >= 1.0:
+                break
+
+            # De Casteljau's scheme: coefficients on the part of the interval after the root, where the value is 0.
+            for k in range(1, 6):
+                for j in range(6 - k):
+                    c[j] = (1.0 - root) * c[j] + root * c[j + 1]
+            c[:] = -c
+            c[0] = 0.0
+            root = first_upcrossing_after_start(c, 0.0)
+    return count
+
+
+def arcs(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
+    """Intervals of phase (begin, end), begin < end, on which a periodic motion is above ``offset``.
+
+    ``motion`` (samples, 3) holds (z, z', z'') over a period. A motion that is always above has the interval (0, 2 pi).
+    An interval that contains phase 0 is not split there: it begins at a negative phase.
+    """
+    if motion[:, 0].max() + OVERSHOOT * np.ptp(motion[:, 0]) <= offset:
+        return []
+    out = np.empty(4 * len(motion))
+    roots = out[: _crossings(motion, offset, out)]
+    if len(roots) % 2 and motion[0, 0] <= offset:
+        # The motion comes down to the offset exactly at the period's end, whose value counts as below already.
+        roots = np.append(roots, 2 * np.pi)
+    if len(roots) < 2:
+        return [(0.0, 2 * np.pi)] if motion[0, 0] > offset else []
+
+    # A period ends as it began: crossings are even in number. If it begins above, the last one, upwards, comes first.
+    if motion[0, 0] > offset:
+        roots = np.concatenate([[roots[-1] - 2 * np.pi], roots[:-1]])
+    return [(a, b) for a, b in zip(roots[::2].tolist(), roots[1::2].tolist(), strict=True) if b > a]
+
+
+def minima(slope: np.ndarray) -> np.ndarray:
+    """Phases of the minima of a periodic motion by the secant of its sampled ``slope``: near enough to cut arcs."""
+    after = np.roll(slope, -1)
+    before_minimum = np.nonzero((slope < 0) & (after >= 0))[0]
+    change = slope[before_minimum] - after[before_minimum]
+    return (before_minimum + slope[before_minimum] / change) * (2 * np.pi / len(slope))
+
+
+def cut(a: float, b: float, places: np.ndarray) -> Iterator[tuple[float, float]]:
+    """The interval from ``a`` to ``b``, cut at ``places`` of period 2 pi; a whole period stays whole."""
+    turns = np.concatenate([places - 2 * np.pi, places]) if b - a < 2 * np.pi else np.empty(0)
+    inside = np.sort(turns[(turns > a) & (turns < b)]).tolist()
+    yield from itertools.pairwise([a, *inside, b])
+
+
+def common(
+    pieces: Sequence[tuple[float, float]], others: Sequence[tuple[float, float]]
+) -> Iterator[tuple[float, float]]:
+    """The parts of ``pieces`` that lie in one of ``others``, both of period 2 pi."""
+    for (a, b), (c, d), turn in itertools.product(pieces, others, (-2 * np.pi, 0.0, 2 * np.pi)):
+        low, high = max(a, c + turn), min(b, d + turn)
+        if high > low:
+            yield low, high
