@@ -38,7 +38,8 @@ def open_run(path: str | Path) -> xr.Dataset:
 
 def with_point_names(run: xr.Dataset) -> xr.Dataset:
     """The ``run`` with the names of its points, which its case has, as their coordinate, so that ``sel`` takes them."""
-    if "point" not in run.sizes:
+    # The points of a branch, over a dimension of the same name, have none.
+    if not any(str(name).startswith("points/") for name in run.variables):
         return run
     names = [point["name"] for point in tomllib.loads(run.attrs["case"])["output"]["points"]]
     named = run.assign_coords(point=("point", np.array(names, dtype=object), run["point"].attrs))

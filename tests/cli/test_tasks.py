@@ -1,0 +1,359 @@
+"""Thirteen questions of a user's own, each answered by the commands of the manual, without a script."""
+
+from __future__ import annotations
+
+import csv
+import shlex
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import vipetsc
+from tests.cli.test_python import my_lattice
+from vipetsc.case import Case
+
+# The lattice of the README with the fast engine; pictures are asked for where they are looked at.
+PLAIN = '\n[time]\nengine = "auto"\n\n[output]\nfigures = false\n'
+RESTITUTIONS = """
+[sweep.contacts]
+restitution = [0.3, 0.9]
+
+[sweep.drive]
+amplitude = { log = [0.5, 50.0], count = 7 }
+"""
+CLEARANCES = """
+[sweep.contacts]
+clearance = [5e-4, 1e-3, 1.5e-3, 2e-3]
+restitution = [0.3, 0.6, 0.9]
+"""
+HARMONIC = """
+[[output.points]]
+name = "base"
+cell = 2
+
+[[output.points]]
+name = "tip"
+cell = 60
+
+[sweep.drive]
+frequency = [500.0, 900.0, 1100.0, 1420.0]
+"""
+SCATTER = """
+[disorder]
+clearance = { relative = 0.05 }
+
+[sweep.disorder]
+seed = { count = 5 }
+
+[sweep.drive]
+amplitude = [1.0, 8.0, 30.0]
+"""
+BEADS = """
+[lattice]
+cells = 50
+ends = "free"
+
+[lattice.cell]
+masses = [2.05e-3]
+
+[contacts]
+stiffness = 7.4e9
+sites = { first = 1, last = 49, count = 49 }
+next_cell = true
+side = "minus"
+clearance = 0.0
+
+[initial]
+kind = "velocity"
+cell = 1
+velocity = 0.1
+
+[time]
+end = 1e-3
+sample_interval = 1e-6
+rtol = 1e-9
+
+[output]
+figures = false
+"""
+BRANCH = """
+[nnm]
+modes = [2]
+energy = [0.0, 0.05]
+"""
+SEARCH = """
+[optimise]
+budget = 24
+curve = [8.0]
+
+[optimise.variables]
+clearance = [3e-4, 3e-3]
+
+[[optimise.objective]]
+measure = "ibtet"
+"""
+RESPONSE = """
+[lattice]
+preset = "four-band"
+
+[contacts]
+sites = [100]
+clearance = 1.8e-3
+
+[nfrc]
+restitutions = [1.0, 0.7]
+range = [0.97, 1.01]
+harmonics = 5
+"""
+
+
+@pytest.fixture
+def typed(in_process, tmp_path, plain_pictures) -> Callable[[str], str]:
+    """Type commands, a line each, in a folder of one's own: ``typed("validate x.toml")`` returns what was printed."""
+
+    def call(lines: str) -> str:
+        printed = ""
+        for line in lines.strip().splitlines():
+            ended = in_process(*shlex.split(line), cwd=tmp_path)
+            assert ended.returncode == 0, f"{line}\n{ended.stdout}{ended.stderr}"
+            printed += ended.stdout + ended.stderr
+        return printed
+
+    return call
+
+
+@pytest.fixture
+def put(tmp_path) -> Callable[..., None]:
+    """Save case files in that folder, each of sections that are put together."""
+
+    def save(name: str, *sections: str) -> None:
+        (tmp_path / name).write_text("".join(sections), encoding="utf-8")
+
+    return save
+
+
+def ensemble(folder: Path) -> xr.Dataset:
+    """Return the measures of a sweep."""
+    with vipetsc.open(folder) as data:
+        return data.load()
+
+
+def pages(folder: Path) -> set[str]:
+    """Return the names of the pictures in a folder of results."""
+    return {path.stem for path in (folder / "figures").glob("*.png")}
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.slow
+def test_an_own_lattice_with_pictures(typed, put, tmp_path):
+    """Bands, check and run of the README's lattice: nothing is warned of, energy is accounted for, seven pictures."""
+    put("my-lattice.toml", my_lattice())
+    printed = typed("bands my-lattice.toml\nvalidate my-lattice.toml\nrun my-lattice.toml --set time.engine=auto")
+    assert "warning" not in printed
+
+    # The highest wave of band 3 alternates from cell to cell: the hosts' springs count four times.
+    masses, stiffness = np.diag([0.010, 0.004, 0.002]), np.array([[8.6e4, -6e3, 0], [-6e3, 7e3, -1e3], [0, -1e3, 1e3]])
+    top = np.sqrt(np.linalg.eigvals(np.linalg.solve(masses, stiffness)).max())
+    assert f"{top:.2f}" in printed
+
+    with vipetsc.open(tmp_path / "runs/my-lattice") as run:
+        work, lost = run["energy/work"][-1], run["energy/dissipated"][-1]
+        kept = run["energy/kinetic"][-1] + run["energy/spring"][-1] + run["energy/contact"][-1]
+        assert float(kept + lost) == pytest.approx(float(work), rel=1e-8)
+    assert pages(tmp_path / "runs/my-lattice") == {
+        "dispersion", "impacts", "ledger", "modal_energies", "phase", "spacetime", "unit_cell"
+    }  # fmt: skip
+
+
+@pytest.mark.slow
+def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put, in_process, tmp_path):
+    """A curve for each restitution over the amplitude; the slope of a branch on a page of its own, or a sentence."""
+    put("rest.toml", my_lattice(), PLAIN, RESTITUTIONS, BRANCH)
+    typed("sweep rest.toml\nplot runs/rest --fig ibtet")
+    data = ensemble(tmp_path / "runs/rest")
+    assert pages(tmp_path / "runs/rest") == {"ibtet-over-contacts.restitution-drive.amplitude"}
+
+    impacts = data.contact_episodes.transpose("restitution", "amplitude").values
+    lost = data.dissipated_fraction.transpose("restitution", "amplitude").values
+    hit = impacts.min(axis=0) > 0
+    assert not impacts[:, 0].any()
+    assert hit.sum() == 4
+    # Stops that return less dissipate more, at every amplitude with contact.
+    assert np.all(lost[0, hit] > 1.2 * lost[1, hit])
+
+    # The eleventh question: the sweep and the branch of the cell on one page.
+    printed = typed(
+        "nnm rest.toml --out runs/branch --set output.figures=false\n"
+        "plot runs/rest runs/branch --fig ibtet_backbone\nplot runs/rest runs/branch --fig ibtet"
+    )
+    assert any(name.startswith("ibtet_backbone") for name in pages(tmp_path / "runs/rest"))
+    assert "ibtet: without the branches of runs/branch; --fig ibtet_backbone draws both" in printed
+
+
+@pytest.mark.slow
+def test_clearances_and_restitutions_as_a_map(typed, put, in_process, tmp_path):
+    """Two keys of three values and more are a map; a page that a sweep cannot have is refused with the reason."""
+    put("map.toml", my_lattice(), PLAIN, CLEARANCES)
+    typed("sweep map.toml\nplot runs/map --fig contact_episodes\nexport runs/map")
+    assert pages(tmp_path / "runs/map") == {"contact_episodes-over-contacts.clearance-contacts.restitution"}
+
+    rows = table(tmp_path / "runs/map/curves/ensemble-members.csv")
+    impacts = {(row["clearance (m)"], row["restitution"]): float(row["contact_episodes"]) for row in rows}
+    assert len(impacts) == 12
+    # Numbers as the case has them. The wider the clearance, the fewer impacts.
+    for restitution in ("0.3", "0.6", "0.9"):
+        counts = [impacts[clearance, restitution] for clearance in ("0.0005", "0.001", "0.0015", "0.002")]
+        assert counts == sorted(counts, reverse=True)
+
+    refused = in_process("plot", "runs/map", "--fig", "ibtet_backbone", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "needs branches of the same law, in a further folder, and a sweep over drive.amplitude" in refused.stderr
+
+
+@pytest.mark.slow
+def test_an_own_cell_under_a_harmonic_drive_over_the_frequency(typed, put, tmp_path):
+    """What passes from cell 2 to cell 60, over the frequency: waves in a band, nothing in a gap."""
+    driven = my_lattice().replace("cycles = 10\n", 'waveform = "harmonic"\n')
+    driven = "".join(line for line in driven.splitlines(keepends=True) if not line.startswith(("band =", "at =")))
+    put("harmonic.toml", driven, PLAIN, 'transmission = [["base", "tip"]]\n', HARMONIC)
+    typed(
+        "sweep harmonic.toml --set time.end=0.4 --set contacts.clearance=1.0\n"
+        "plot runs/harmonic --fig transmission_base-tip"
+    )
+
+    data = ensemble(tmp_path / "runs/harmonic")
+    passed = dict(zip(data.frequency.values, data["transmission/base-tip"].values, strict=True))
+    # Bands: 0-632, 717-1312, 1529-2955 rad/s. In the gap only transients pass, of the beginning of the drive.
+    assert passed[1420.0] < 0.3 * min(passed[500.0], passed[900.0], passed[1100.0])
+    assert pages(tmp_path / "runs/harmonic") == {"transmission_base-tip-over-drive.frequency"}
+
+
+@pytest.mark.slow
+def test_clearances_that_scatter_as_a_band(typed, put, tmp_path):
+    """Mean and band of samples over the amplitude: no scatter without contact, some with it."""
+    put("scatter.toml", my_lattice(), PLAIN, SCATTER)
+    typed("sweep scatter.toml\nplot runs/scatter --fig ibtet\nexport runs/scatter")
+    assert pages(tmp_path / "runs/scatter") == {"ibtet-over-drive.amplitude"}
+
+    data = ensemble(tmp_path / "runs/scatter")
+    deviation = data["statistics/ibtet/deviation"].values
+    assert deviation[0] == 0
+    assert np.all(deviation[1:] > 0.01 * data["statistics/ibtet/mean"].values[1:])
+    rows = table(tmp_path / "runs/scatter/curves/ensemble-amplitude.csv")
+    assert [float(row["statistics/ibtet/deviation"]) for row in rows] == deviation.tolist()
+
+
+def crossing(folder: Path, first: int, last: int) -> float:
+    """Return the time in s that the largest velocity takes from one cell to another, between samples too."""
+    with vipetsc.open(folder) as run:
+        time = run.time.values
+        arrivals = []
+        for cell in (first, last):
+            speed = run.velocity.sel(cell=cell).isel(dof=0).values
+            k = int(speed.argmax())
+            a, b, c = speed[k - 1 : k + 2]
+            arrivals.append(time[k] + 0.5 * (a - c) / (a - 2 * b + c) * (time[1] - time[0]))
+    return arrivals[1] - arrivals[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "exponent"),
+    [("", 1.5), (" --set contacts.law=power --set contacts.exponent=2 --set contacts.stiffness=3e13", 2)],
+)
+def test_struck_beads(typed, put, tmp_path, changes, exponent):
+    """A struck bead sends a solitary wave, whose speed grows as the velocity to the power (n - 1)/(n + 1)."""
+    put("beads.toml", BEADS)
+    typed(f"run beads.toml --out slow{changes}\nrun beads.toml --out fast{changes} --set initial.velocity=0.8")
+
+    # Nesterenko: by dimensions alone, for F = k x^n of beads that just touch.
+    ratio = crossing(tmp_path / "slow", 15, 40) / crossing(tmp_path / "fast", 15, 40)
+    assert ratio == pytest.approx(8 ** ((exponent - 1) / (exponent + 1)), rel=1e-3)
+
+
+def test_a_measured_force_and_its_units(typed, put, tmp_path):
+    """A record with time in ms is asked about; with time in s it drives the lattice, and nothing is asked."""
+    typed("examples waveform")
+    rows = [line.split(",") for line in (tmp_path / "waveform.csv").read_text().splitlines()]
+    put("ms.csv", "time (ms), force\n", *(f"{float(time) * 1e3!r},{value}\n" for time, value in rows[1:]))
+
+    asked = typed("validate waveform.toml --set drive.samples.file=ms.csv")
+    question = "up to 61.4 s, in s? In ms, their spectrum would be largest at 1020 rad/s"
+    assert question in asked
+    printed = typed("validate waveform.toml\nrun waveform.toml --set output.figures=false")
+    assert "warning" not in printed
+    with vipetsc.open(tmp_path / "runs/waveform") as run:
+        assert float(run["energy/work"][-1]) > 0
+        # The run is repeated from its own folder, where no file of samples is.
+        assert Case.of(run).drive.samples.time[1] == float(rows[2][0])
+
+
+@pytest.mark.slow
+def test_a_breather(typed, put, tmp_path):
+    """A motion of the branch that begins in a run stays at its site, with its energy."""
+    small = "--set nnm.points=3 --set nnm.start_frequency=[1420.0] --set nnm.orbits_at=[] --set output.figures=false"
+    begun = "--set initial.orbit=1 --set time.end=0.05 --set output.figures=false"
+    typed(f"examples breather gallery/breather-run\nnnm breather.toml {small}\nrun gallery/breather-run.toml {begun}")
+
+    with vipetsc.open(tmp_path / "runs/breather-run") as run:
+        energy = (run["energy/kinetic"] + run["energy/spring"] + run["energy/contact"]).values
+        assert energy == pytest.approx(energy[0], rel=1e-8)
+        speed = np.abs(run.velocity).max(("time", "dof")).values
+        cells = run.cell.values
+    assert cells[speed.argmax()] == 100
+    # The branch decays from its site as exp(-0.2 n), in the gap between bands 2 and 3.
+    assert speed[np.abs(cells - 100) > 20].max() < 0.03 * speed.max()
+
+
+@pytest.mark.slow
+def test_a_frequency_response(typed, put, tmp_path):
+    """Steady states over the frequency, of conservative and of lossy stops, as a table."""
+    put("response.toml", RESPONSE)
+    typed("nfrc response.toml --set output.figures=false\nexport runs/response")
+    curves = {
+        restitution: table(tmp_path / f"runs/response/curves/branch-r{restitution}-1023.27-point.csv")
+        for restitution in ("1", "0.7")
+    }
+    for rows in curves.values():
+        amplitude = np.array([float(row["amplitude"]) for row in rows])
+        touching = np.array([float(row["episodes"]) for row in rows]) > 0
+        # Waves below the clearance need not touch; the curve folds where contact begins, and turns back.
+        assert not touching[0]
+        assert amplitude[~touching].max() == pytest.approx(1.0, abs=0.01)
+        assert amplitude[touching].min() < 0.98
+    assert curves["1"] != curves["0.7"]
+
+
+@pytest.mark.slow
+def test_the_best_clearances(typed, put, tmp_path):
+    """A search leaves a case file of its best design, whose run has the objective that the search says."""
+    put("search.toml", my_lattice(), PLAIN, SEARCH)
+    typed("optimise search.toml\nrun runs/search/best.toml --out runs/best --set output.figures=false")
+    with vipetsc.open(tmp_path / "runs/search") as found:
+        values = found["value"].values.ravel()
+    with vipetsc.open(tmp_path / "runs/best/analysis.h5") as measured:
+        assert float(measured["ibtet"]) == pytest.approx(values.max(), rel=1e-6)
+    assert values.max() > 1.3 * values[0]
+
+    case = tomllib.loads((tmp_path / "runs/search/best.toml").read_text(encoding="utf-8"))
+    assert len(case["contacts"]["clearance"]) == 2
+
+
+@pytest.mark.slow
+def test_a_movie_and_tables(typed, put, tmp_path):
+    """A run in motion, and its curves for another program, whose numbers are those of the run."""
+    put("mine.toml", my_lattice(), PLAIN)
+    typed("run mine.toml\nplot runs/mine --movie --format gif --width 320 --from 0.05 --to 0.06\nexport runs/mine")
+    assert (tmp_path / "runs/mine/figures/movie-energy.gif").read_bytes()[:4] == b"GIF8"
+
+    rows = table(tmp_path / "runs/mine/curves/run-time.csv")
+    with vipetsc.open(tmp_path / "runs/mine") as run:
+        assert [float(row["energy/work (J)"]) for row in rows] == run["energy/work"].values.tolist()
