@@ -83,7 +83,7 @@ figures = false
 BRANCH = """
 [nnm]
 modes = [2]
-energy = [0.0, 0.05]
+energy = [0.0, 1.0]
 """
 SEARCH = """
 [optimise]
@@ -190,13 +190,21 @@ def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put
     # Stops that return less dissipate more, at every amplitude with contact.
     assert np.all(lost[0, hit] > 1.2 * lost[1, hit])
 
-    # The eleventh question: the sweep and the branch of the cell on one page.
+    # The eleventh question: the sweep and the branch of the cell on one page, a page for each restitution.
     printed = typed(
         "nnm rest.toml --out runs/branch --set output.figures=false\n"
         "plot runs/rest runs/branch --fig ibtet_backbone\nplot runs/rest runs/branch --fig ibtet"
     )
-    assert any(name.startswith("ibtet_backbone") for name in pages(tmp_path / "runs/rest"))
+    drawn = {name for name in pages(tmp_path / "runs/rest") if name.startswith("ibtet_backbone")}
+    assert len(drawn) == 2
+    assert {restitution for restitution in ("0.3", "0.9") for name in drawn if restitution in name} == {"0.3", "0.9"}
     assert "ibtet: without the branches of runs/branch; --fig ibtet_backbone draws both" in printed
+
+    # A branch that is too short for a comparison is refused with the key that lengthens it.
+    typed("nnm rest.toml --out runs/short --set output.figures=false --set nnm.energy=[0.0,0.003]")
+    refused = in_process("plot", "runs/rest", "runs/short", "--fig", "ibtet_backbone", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "of 3 needed; follow the branch to more energy (nnm.energy)" in refused.stderr
 
 
 @pytest.mark.slow

@@ -216,7 +216,9 @@ def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], f
     floor = float(untouched.mean())
     aligned = align(curve["work"].values, curve["ibtet"].values, initiation.energy, floor, slope)
     if "exponent" not in aligned.attrs:
-        return f"{int(aligned['fitted'].sum())} points in region III beyond the peak"
+        count = int(aligned["fitted"].sum())
+        remedy = "follow the branch to more energy (nnm.energy), or sweep more amplitudes"
+        return f"amplitudes beyond the peak that lie in region III of the branch: {count}, of {FEWEST} needed; {remedy}"
     return aligned.assign_attrs(
         case=case.to_toml(),
         branch_reading=slope.attrs["reading"],
