@@ -1,8 +1,8 @@
-"""Compiled kernels, kept between runs until their sources change: ``njit`` and ``cfunc`` as in numba.
+"""Compiled kernels, stored between runs until their sources change: ``njit`` and ``cfunc`` as in numba.
 
-Numba's own cache looks at the file of a kernel alone: a kernel that calls a changed one of another file, or uses a
-constant of it, would go on with the old code. Here the folder of the cache bears a hash of the kernel's file, of the
-modules from which it takes kernels or constants, and of the tables of numbers: constants are frozen into compiled code.
+Numba's own cache checks only the file of a kernel: a kernel that calls a changed kernel of another file, or uses a
+constant of it, would keep the old code. Here the name of the cache folder contains a hash of the kernel's file, of the
+modules from which it uses kernels or constants, and of the tables of numbers, because compiled code contains constants.
 """
 
 import ast
@@ -25,7 +25,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 logger = logging.getLogger(__name__)
 
-PARENTS: set[Path] = set()  # folders in which kernels are kept
+PARENTS: set[Path] = set()  # folders in which kernels are stored
 HAS_KERNELS = re.compile(rb"^(from|import) (vipetsc\.compiled|numba)\b", re.MULTILINE)
 
 
@@ -67,7 +67,7 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
 
 
 class CompilerListener(event.Listener):
-    """Hears numba compile a function, which it does not where the cache has it: times it, and says so once."""
+    """Measures the time in which numba compiles functions that are not in the cache, and reports it once."""
 
     def on_start(self, event: Any) -> None:
         """Begin to compile; a function that is called is compiled within."""
@@ -84,7 +84,7 @@ class CompilerListener(event.Listener):
 
 @cache
 def _announce() -> None:
-    """Say once, on one rank, why the first run of a version takes a minute more than the next."""
+    """Report once, on one rank, why the first run of a version takes a minute longer than the next."""
     # Where kernels cannot be kept, a warning has said that they are compiled at every start.
     if not launched_rank() and all(_can_keep(parent) for parent in PARENTS):
         say("vipetsc: compiling kernels (once, about a minute)")
@@ -114,7 +114,7 @@ def kernel_cache(package: Path, file: Path, chosen: str = "") -> Path:
 
 @cache
 def _can_keep(parent: Path) -> bool:
-    """Whether kernels can be written below ``parent``; says so where they cannot."""
+    """Whether kernels can be written below ``parent``; prints a message if they cannot."""
     try:
         parent.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=parent).close()

@@ -319,7 +319,7 @@ def test_an_unstable_run_ends_with_time_place_and_last_good_sample(vipetsc, tmp_
 
     assert ended.returncode == 1, ended.stdout + ended.stderr
     status = json.loads((out / "summary.json").read_text())["status"]
-    for text in ("runs away", "at t = ", "nearest site 1 in cell 10", "last good sample: t = "):
+    for text in ("diverges", "at t = ", "nearest site 1 in cell 10", "last good sample: t = "):
         assert text in status
 
     # Samples up to the last good one are kept, and none of those that ran away.

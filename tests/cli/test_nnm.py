@@ -98,7 +98,7 @@ def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
     done = vipetsc(2, "nnm", case, "--out", out, "--set", "nnm.smallest_step=1e-3")
 
     assert done.returncode == 1
-    assert "turn nnm.smallest_step" in done.stdout
+    assert "change nnm.smallest_step" in done.stdout
     assert len((out / "branch-out-of-phase.csv").read_text().splitlines()) > 5
 
 

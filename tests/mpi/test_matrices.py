@@ -174,6 +174,6 @@ def test_modes_that_cannot_be_found_are_refused(monkeypatch, folder):
 
     monkeypatch.setattr(eigen, "RESTARTS", 1)
     long = LatticeMatrices(Chain(four_band("calibrated"), 2000), COMM)
-    with pytest.raises(CaseError, match="of 6 modes come out"):
+    with pytest.raises(CaseError, match="of 6 modes are found"):
         modes_near(long, 6, 2034.0)
     assert not (folder / "modes.h5").exists()

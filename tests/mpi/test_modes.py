@@ -83,7 +83,7 @@ def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
     whole = folder / "whole"
     if comm.rank == 0:
         first, second = stopped
-        assert first.ending == "stopped on request after point 13; resume goes on"
+        assert first.ending == "stopped on request after point 13; continue with --resume"
         assert len(read_branch(folder / "branch-mode-1.h5").points) == 14
         assert second.ending.startswith("20 points reached")
         whole.mkdir()

@@ -193,7 +193,7 @@ def test_a_checkpoint_that_one_rank_cannot_read_is_refused_on_all(folder):
 def test_without_hdf5_for_mpi_all_ranks_refuse_to_write_together(folder, monkeypatch):
     monkeypatch.setattr(h5py, "get_config", lambda: SimpleNamespace(mpi=False))
     case = small_case(output={"writer": "parallel"}, time={"end": 0.01})
-    with pytest.raises(CaseError, match=r"output\.writer = 'parallel': needs an h5py that is built for MPI"):
+    with pytest.raises(CaseError, match=r"output\.writer = 'parallel': needs an h5py with MPI support"):
         simulate(case, folder / "run")
     COMM.Barrier()
     assert not (folder / "run").exists()

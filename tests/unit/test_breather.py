@@ -255,7 +255,7 @@ def test_a_branch_that_fails_keeps_its_points_and_names_the_key(tmp_path):
 
 
 def test_a_frequency_at_which_no_breather_begins_is_refused_with_a_remedy():
-    with pytest.raises(ContinuationError, match=r"no breather begins at 2200 rad/s: .*change nnm.start_frequency"):
+    with pytest.raises(ContinuationError, match=r"no breather starts at 2200 rad/s: .*change nnm.start_frequency"):
         condensed_breather(300, 100, 2200.0)
 
 

@@ -78,7 +78,7 @@ def test_several_ranks_without_a_direct_solver_for_them_factor_the_whole_matrix_
 def test_a_machine_without_slepc_is_refused_with_what_to_install(monkeypatch):
     # None in sys.modules makes an import fail.
     monkeypatch.setitem(sys.modules, "slepc4py", None)
-    with pytest.raises(CaseError, match=r"slepc4py: is needed for modes of long lattices .*apt install slepc-dev"):
+    with pytest.raises(CaseError, match=r"slepc4py: is needed only for modes of long lattices .*apt install slepc-dev"):
         load_slepc()
 
 

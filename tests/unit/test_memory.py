@@ -54,7 +54,7 @@ def test_memory_grows_with_cells_and_sites_of_a_rank_but_not_with_samples_times_
 )
 def test_what_takes_most_is_named_with_a_remedy(folder, monkeypatch, key, sections):
     monkeypatch.setattr(memory, "memory_available", lambda: 2**10)
-    with pytest.raises(CaseError, match=f"{key}.* need .* on a rank, which has .*; fewer .* need less"):
+    with pytest.raises(CaseError, match=f"{key}.* need .* per rank, but only .*; fewer .* reduce it"):
         simulate(small_case(**sections), folder / "run")
 
 
@@ -65,16 +65,14 @@ def test_a_lattice_of_fifty_million_cells_needs_many_gigabytes(engine, least):
 
 
 def test_a_run_too_large_is_refused_with_what_it_needs(folder):
-    with pytest.raises(CaseError, match=r"50000000 cells, 1 sites and 251 samples need \d+ GB of memory on a rank"):
+    with pytest.raises(CaseError, match=r"50000000 cells, 1 sites and 251 samples need \d+ GB of memory per rank"):
         simulate(small_case(**HUGE), folder / "run")
     assert not (folder / "run").exists()
 
 
 def test_a_state_beyond_petscs_indices_is_refused_with_the_build_that_counts_it(folder, monkeypatch):
     case = small_case(lattice={"cells": 300_000_000}, contacts={"sites": [6], "clearance": 1e-4})
-    message = (
-        r"lattice.cells = 300000000: makes a state of 2400000002 numbers, more than the 2147483647 .*64-bit-indices"
-    )
+    message = r"lattice.cells = 300000000: results in a state of 2400000002 numbers, .*2147483647 .*64-bit-indices"
     monkeypatch.setattr(memory.PETSc, "IntType", np.int32)
     with pytest.raises(CaseError, match=message):
         simulate(case, folder / "run")

@@ -141,7 +141,7 @@ def test_normalised_keeps_gaps_and_refuses_a_constant():
     ("x", "y", "message"),
     [
         ([1.0, 2.0], [1.0, 2.0], "2 points"),
-        ([1.0, 1.0, 1.0], [1.0, 2.0, 3.0], "at 1 places"),
+        ([1.0, 1.0, 1.0], [1.0, 2.0, 3.0], "at 1 different x"),
         ([1.0, 2.0, 3.0], [1.0, 0.0, 3.0], "positive"),
         ([1.0, 2.0, 3.0], [1.0, np.nan, 3.0], "positive"),
         ([1.0, 2.0, 3.0], [1.0, 2.0], "same length"),

@@ -23,7 +23,7 @@ def test_a_case_stores_the_earlier_name():
 
 
 def test_both_names_are_refused():
-    with pytest.raises(CaseError, match=r"petsc\.ts_time_step = .*is ts_dt by another name: give one"):
+    with pytest.raises(CaseError, match=r"petsc\.ts_time_step = .*is another name of ts_dt: give only one"):
         check_options(small_case(petsc={"ts_time_step": 1e-5, "ts_dt": 1e-5}))
 
 

@@ -173,7 +173,7 @@ def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(
     assert first.ending.startswith("stopped on request")
     assert not (parts / f"{NAME}.h5").exists()
     second = follow(parts, listener, stop, resume=True, **nnm)
-    assert second.ending == "stopped on request after point 7; resume goes on"
+    assert second.ending == "stopped on request after point 7; continue with --resume"
     assert {f"{NAME}-down.h5", f"{NAME}.h5"} <= saved
 
     last = follow(parts, resume=True, **nnm)

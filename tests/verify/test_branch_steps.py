@@ -66,7 +66,7 @@ def test_a_branch_that_has_used_up_its_points_is_not_finished():
     points = list(continuation)
 
     assert len(points) == 3
-    assert continuation.ending == "3 points reached: raise nnm.points and resume to go on"
+    assert continuation.ending == "3 points reached: increase nnm.points and resume to continue"
     assert not continuation.finished
 
 

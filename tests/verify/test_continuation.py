@@ -121,7 +121,7 @@ def test_a_failure_states_where_it_stopped_why_and_what_to_change():
     assert points
     assert f"E = {points[-1].energy:.9g} J" in text
     assert "residuals of the last attempt" in text
-    assert "turn nnm." in text
+    assert "change nnm." in text
 
 
 @pytest.mark.slow

@@ -272,7 +272,7 @@ def test_a_curve_goes_on_to_the_same_bits(tmp_path):
 
     (first,) = follow_all(varied(case, points=3), parts, MPI.COMM_SELF)
     assert not first.complete
-    assert "raise nfrc.points" in first.ending
+    assert "increase nfrc.points" in first.ending
 
     (second,) = follow_all(case, parts, MPI.COMM_SELF, resume=True)
     assert second.complete

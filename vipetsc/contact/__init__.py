@@ -1,8 +1,8 @@
-r"""Contacts: the force of a contact, the search for its changes, landing on them, the log of impacts.
+r"""Contacts: the contact force, the search for changes of contact, the landing of steps on them, the log of impacts.
 
 A site is a pair of masses, host and resonator, with the relative displacement w = u_resonator - u_host and a
-clearance D on both sides. ``law`` holds the compiled force, ``search`` the guaranteed root search and the landing on a
-root, ``changes`` the changes of a site's mode within a step, ``tracker`` the modes and the log.
+clearance D on both sides. ``law`` contains the compiled force, ``search`` the guaranteed root search and the landing on
+a root, ``changes`` the changes of a site's mode within a step, ``tracker`` the modes and the log.
 
 **Law.** With the indentation x = sigma w - D on the side sigma = +1 or -1, the force on the host is
 
@@ -14,23 +14,22 @@ larger on the way in than on the way out, and the contact dissipates the power
 
     P = sigma kc x^n (g - 1) w' = c kc x^n w'^2 / |w'_minus| >= 0.
 
-For the reduced mass m, m w'' = -F gives w' dw'/(1 + c w'/w'_minus) = -kc x^n dx/m. The right side vanishes over a
-whole contact, hence the rebound e = -w'_plus/w'_minus solves e + log(1 - c e)/c = log(1 + c)/c - 1, whose
-expansion is e = r + O((1 - r)^2): r is the restitution of a nearly elastic impact. The exact damping is the c that
-solves it for e = r. Fast separation makes g < 0, a
-pull; ``adhesion = "clip"`` holds the force at zero then, and a grazing onset is kept from an unbounded g by a floor
-of |w'_minus|.
+For the reduced mass m, m w'' = -F gives w' dw'/(1 + c w'/w'_minus) = -kc x^n dx/m. The right side vanishes over a whole
+contact, hence the rebound e = -w'_plus/w'_minus solves e + log(1 - c e)/c = log(1 + c)/c - 1, whose expansion is e = r
++ O((1 - r)^2): r is the restitution of a nearly elastic impact. The exact damping is the c that solves it for e = r. A
+fast separation makes g < 0, a pull; ``adhesion = "clip"`` then sets the force to zero. A floor of |w'_minus| bounds g
+at a grazing onset.
 
 **Modes.** A site is free, closed (in contact), clipped or at rest in contact. Within a time step its mode is frozen and
 the law is continued as an odd function through x = 0: the force is smooth, so that no kink spoils the order of the
 method. Every change of mode is a switching function that crosses zero upwards: sigma w - D (onset), D - sigma w
 (separation), -g and g (clipping begins and ends).
 
-**Rest.** A site whose stop has no clearance may touch it at rest. A wave's front comes to it through all magnitudes
-below the tolerance of a landing, each with a root of its own: landings that lead nowhere. A site that would land again
-without having left the tolerance rests: its force is that of max(x, 0), without loss, and nothing is landed on until it
-is a hundred tolerances away. There it is free, or closed as after an onset from rest, which has no approach velocity:
-w'_minus is then the floor, without which only c = 0 has a limit.
+**Rest.** A site whose stop has no clearance may touch it at rest. As the front of a wave arrives, the motion passes
+through all magnitudes below the tolerance of a landing, with many roots and useless landings. A site that would land
+again without having left the tolerance therefore rests: its force is that of max(x, 0), without loss, and there are no
+landings until it is a hundred tolerances away. There it is free, or closed as after an onset from rest, which has no
+approach velocity: w'_minus is then the floor, without which only c = 0 has a limit.
 
 **Search.** w on a step of length h is the quintic Hermite interpolant of (w, w', w'') at both ends, in Bernstein
 form: w(s h) = sum_i b_i B_i(s). The coefficients bound the polynomial, and the number of their changes of sign bounds
@@ -40,7 +39,7 @@ first. The first crossing is found even when a second one follows within the ste
 
 **Landing.** The step is repeated so that it ends on the change: Newton's method on the switching function, evaluated
 on the trajectory itself and not on the interpolant, as long as it halves the distance; where it does not, the search
-is repeated on the shorter step. What looked like a change may turn out to be a near miss.
+is repeated on the shorter step. An apparent change may turn out to be a near miss.
 
 References
 ----------

@@ -1,7 +1,7 @@
 """The compiled contact force: one law for time stepping, for the propagator and for normal modes.
 
-The formulas stand in the package's docstring. ``vipetsc.lattice.Contact`` is the same law on arrays: an elastic law has
-its force, slope and energy there and here, and nowhere else.
+The docstring of the package derives the formulas. ``vipetsc.lattice.Contact`` is the same law on arrays: force, slope
+and energy of an elastic law are defined there and here, and nowhere else.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from vipetsc.compiled import kernel
 from vipetsc.lattice import Contact
 from vipetsc.lattice.contact import PHASES
 
-# Speeds of approach in m/s are raised to this for an impact's duration: the energy of a slower one underflows.
+# Smallest approach speed in m/s for an impact's duration: the energy of a slower impact underflows.
 SLOWEST = 1e-100
 # Modes of a site; the sign is the side. Those from PERMANENT on have the force of max(x, 0), without loss.
 FREE, CLOSED, CLIPPED, PERMANENT, RESTING = 0, 1, 2, 3, 4

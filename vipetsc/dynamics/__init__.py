@@ -1,4 +1,4 @@
-"""A lattice in motion, on PETSc."""
+"""Time integration of lattices, on PETSc."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -8,7 +8,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> object:
-    """Load a run when it is first asked for: its options and its memory are checked without compiled kernels."""
+    """Load a run when it is first used: its options and its memory are checked without compiled kernels."""
     if name in ("Result", "simulate"):
         return getattr(import_module("vipetsc.dynamics.run"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,8 +1,8 @@
-"""Cost of a run, estimated before it begins: its engine, the number of contacts to expect, CPU time.
+"""Cost of a run, estimated before it begins: its engine, the expected number of contacts, CPU time.
 
-Models of CPU time fitted to the paper's lattices on one core, within a factor of two or so there; on another machine
-both engines are off by one factor, and how they compare stays. Contacts are those of the linear wave: where waves
-return to the sites, up to several times as many.
+The models of CPU time are fitted to the paper's lattices on one core, to about a factor of two. On another machine both
+engines differ by a common factor, so that their ratio remains. The contacts are those of the linear wave; if waves
+return to the sites, there are up to several times as many.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class Seconds(NamedTuple):
 class Cost:
     """The ``engine`` that simulates a run, and a note on it; contact ``episodes``; CPU times in s.
 
-    The ``note`` says why it is not the engine asked for, or how many cells have rows of their own.
+    The ``note`` says why it is not the requested engine, or how many cells have separate rows.
 
     ``seconds`` of this engine on each of the ranks, of which ``contacts`` for the episodes; ``propagator``: those of
     the engine that takes linear steps, None where it does not suit.
@@ -111,8 +111,8 @@ def _propagator_seconds(model: Model, series: StepSeries, episodes: float, ranks
     seconds = Seconds(begin + steps * step, EPISODE * episodes)
     if not differing:
         return seconds, None
-    size = f"{tables} tables of {8e-6 * tables * numbers:.3g} MB on a rank"
-    return seconds, f"{differing} cells have rows of their own, {size}"
+    size = f"{tables} tables of {8e-6 * tables * numbers:.3g} MB per rank"
+    return seconds, f"{differing} cells have separate rows, {size}"
 
 
 def expected_episodes(model: Model) -> float:

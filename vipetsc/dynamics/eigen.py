@@ -42,7 +42,7 @@ def load_slepc() -> Any:
     try:
         from slepc4py import SLEPc
     except ImportError as error:
-        remedy = "is needed for modes of long lattices and multipliers of whole ones, nothing else"
+        remedy = "is needed only for modes of long lattices and multipliers of whole lattices"
         how = "apt install slepc-dev python3-slepc4py; conda-forge: slepc4py; it must belong to the PETSc of petsc4py"
         raise CaseError([Problem("slepc4py", None, f"{remedy} ({error}); Debian: {how}")], "this machine") from None
     return SLEPc
@@ -89,7 +89,7 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
             if distance(value) < farthest:
                 pairs.append((value, vector))
         if not before and len(pairs) < count:
-            remedy = f"only {len(pairs)} of {count} modes come out, the others crowd: ask for fewer, or for another"
+            remedy = f"only {len(pairs)} of {count} modes are found, the others lie too close; change --modes or --near"
             raise CaseError([Problem("--near", near, remedy)])
         # From then on one at a time, until none is nearer than those that there are.
         wanted = int(before != len(pairs) < matrices.rows)

@@ -1,4 +1,4 @@
-"""Initial motion of a run: each rank's own cells, the motion of all sites, the energy of the state."""
+"""Initial motion of a run: the cells of each rank, the motion of all sites, the energy of the state."""
 
 from typing import Any
 

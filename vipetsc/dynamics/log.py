@@ -1,4 +1,4 @@
-"""Stages and events of PETSc's log, which ``-log_view`` shows: contexts, at .3 us each where nothing is logged.
+"""Stages and events of PETSc's log, which ``-log_view`` shows: contexts, at 0.3 us each if nothing is logged.
 
 Exchanges of cells are in PETSc's own events (VecScatterBegin, VecScatterEnd), steps of ``ts`` in TSStep.
 """

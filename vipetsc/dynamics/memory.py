@@ -29,10 +29,10 @@ POINT_BYTES = 48
 SITE_BYTES = 600
 OWN_SITE_BYTES = 2500
 REMEDIES = {
-    "lattice.cells": 'fewer cells or more machines need less, and so does time.engine = "propagator"',
-    "contacts.sites": "fewer sites or more machines need less",
-    "output.window": 'fewer cells or output.writer = "parallel" need less',
-    "time.sample_interval": "fewer samples need less",
+    "lattice.cells": 'fewer cells, more machines or time.engine = "propagator" reduce it',
+    "contacts.sites": "fewer sites or more machines reduce it",
+    "output.window": 'fewer cells or output.writer = "parallel" reduce it',
+    "time.sample_interval": "fewer samples reduce it",
 }
 
 
@@ -105,8 +105,8 @@ def check_indices(model: Model) -> None:
     most = int(np.iinfo(PETSc.IntType).max)
     size = chain.cells * (2 * chain.cell.dofs + chain.is_damped) + len(chain.sites) + 1
     if size > most:
-        remedy = f"makes a state of {size} numbers, more than the {most} that the indices of this PETSc count"
-        build = "one configured --with-64-bit-indices counts more (Debian: python3-petsc4py-64-real)"
+        remedy = f"results in a state of {size} numbers, more than the {most} that the indices of this PETSc count"
+        build = "use a PETSc configured --with-64-bit-indices (Debian: python3-petsc4py-64-real)"
         raise CaseError([Problem("lattice.cells", chain.cells, f"{remedy}; {build}")])
 
 
@@ -120,7 +120,7 @@ def check_memory(model: Model, output: OutputTable, engine: str, comm: MPI.Comm)
     output = possible_output(output, comm.size)
     sample = 8 * len(output.fields) * model.chain.cell.dofs * len(recorded_cells(output, model.chain.cells))
     if comm.size > 1 and output.writer == "gather" and sample > GATHER_LIMIT:
-        remedy = f'a sample of {sample / 1e9:.3g} GB is more than one message holds; "parallel" sends none'
+        remedy = f'a sample of {sample / 1e9:.3g} GB exceeds the size of one MPI message; "parallel" sends none'
         raise CaseError([Problem("output.writer", output.writer, remedy)])
 
     # The ranks of a machine divide what it has left.
@@ -132,5 +132,5 @@ def check_memory(model: Model, output: OutputTable, engine: str, comm: MPI.Comm)
     if needed > available:
         key = max(parts, key=lambda part: parts[part])
         size = f"{model.chain.cells} cells, {len(model.chain.sites)} sites and {model.samples} samples"
-        need = f"{size} need {needed / 1e9:.3g} GB of memory on a rank, which has {available / 1e9:.3g} GB"
+        need = f"{size} need {needed / 1e9:.3g} GB of memory per rank, but only {available / 1e9:.3g} GB are free"
         raise CaseError([Problem(key, None, f"{need}; {REMEDIES[key]}")])

@@ -1,8 +1,8 @@
 """Observers of a run, which see it block by block of samples without changing it: interface, and those of every run.
 
-``guard`` ends a run whose state is no solution any more, ``ledger`` keeps the error of the energy balance, ``progress``
-reports how far it is, ``recorder`` (a module of its own) stores its samples. A further observer is a subclass of
-``Observer``, passed to ``simulate``.
+``guard`` ends a run whose state is no longer a solution, ``ledger`` records the error of the energy balance,
+``progress`` reports the progress, ``recorder`` (a module of its own) stores its samples. A further observer is a
+subclass of ``Observer``, passed to ``simulate``.
 """
 
 import sys
@@ -31,7 +31,7 @@ MOST_LEDGER = 1e-4
 
 
 class RunawayError(RuntimeError):
-    """The state is no solution any more from the ``sample`` of a block on; the message says why."""
+    """The state is no longer a solution from the ``sample`` of a block on; the message gives the reason."""
 
     def __init__(self, reason: str, sample: int) -> None:
         super().__init__(reason)
@@ -97,12 +97,12 @@ class Observer:
         return {}
 
     def warnings(self) -> list[str]:
-        """Sentences about a result that is not what it seems; those of rank 0 count."""
+        """Warnings about a result that needs care; those of rank 0 count."""
         return []
 
 
 class Guard(Observer):
-    """Raises RunawayError for a state that is not finite, or holds energy that nothing has put in."""
+    """Raises RunawayError for a state that is not finite, or has more energy than it received."""
 
     name = "guard"
     saved = ("most_work",)
@@ -123,7 +123,7 @@ class Guard(Observer):
             if finite[k]:
                 total = energies.total[k]
                 work = energies.work[k]
-                reason = f"the energy runs away: {total:.4g} J in the lattice, {work:.4g} J of work done"
+                reason = f"the energy diverges: {total:.4g} J in the lattice, {work:.4g} J of work done"
             raise RunawayError(reason, k)
         self.most_work = float(most_work[-1])
 
@@ -163,8 +163,8 @@ class Ledger(Observer):
         bound = min(max(LEDGER_PER_RTOL * rtol, LEAST_LEDGER), MOST_LEDGER)
         if error is None or error <= bound:
             return []
-        missing = f"the energy balance misses {error:.2g} of the work, more than {bound:.2g}"
-        return [f"{missing}: the trajectory is no better; lower time.rtol = {rtol:g}"]
+        missing = f"the error of the energy balance is {error:.2g} of the work, above {bound:.2g}"
+        return [f"{missing}: the trajectory is no more accurate than that; reduce time.rtol = {rtol:g}"]
 
 
 class ProgressReport(Observer):

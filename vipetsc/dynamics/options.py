@@ -94,7 +94,9 @@ def _problems(options: Mapping[str, str]) -> list[tuple[str, str]]:
     ts = PETSc.TS().create(PETSc.COMM_SELF)
     ts.setType(PETSc.TS.Type.RK)
     # A case keeps the later name where it has both.
-    problems = [(new, f"is {old} by another name: give one") for new, old in RENAMED_OPTIONS.items() if new in options]
+    problems = [
+        (new, f"is another name of {old}: give only one") for new, old in RENAMED_OPTIONS.items() if new in options
+    ]
     if problems:
         return problems
 

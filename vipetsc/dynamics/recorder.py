@@ -47,8 +47,8 @@ def possible_output(output: OutputTable, ranks: int) -> OutputTable:
         return output
     if output.writer == "parallel":
         remedy = (
-            "needs an h5py that is built for MPI (Debian: python3-h5py-mpi; conda-forge: h5py=*=mpi_openmpi*);"
-            ' "gather" does without'
+            "needs an h5py with MPI support (Debian: python3-h5py-mpi; conda-forge: h5py=*=mpi_openmpi*);"
+            ' "gather" does not need it'
         )
         raise CaseError([Problem("output.writer", output.writer, remedy)])
     return output.model_copy(update={"writer": "gather"})
@@ -232,8 +232,8 @@ class Recorder(Observer):
         is_hertz = any(law.law == "hertz" for law in self.setup.model.used_laws)
         if radius is None or not is_hertz or self.deepest <= radius:
             return []
-        beyond = f"the deepest indentation, {self.deepest:.3g} m, is beyond the contacts' radius of {radius:g} m"
-        return [f"{beyond}: Hertz's law holds for indentations far below it"]
+        beyond = f"the deepest indentation, {self.deepest:.3g} m, exceeds the contacts' radius of {radius:g} m"
+        return [f"{beyond}: Hertz's law requires indentations far below it"]
 
 
 def _coordinates(model: Model, recorded: np.ndarray) -> dict[str, np.ndarray]:

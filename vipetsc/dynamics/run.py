@@ -100,7 +100,7 @@ class Result:
     def _repr_html_(self) -> str:
         """The ending, warnings and some numbers, as a notebook shows them."""
         rows = [(text, self.statistics.get(key)) for key, text in SHOWN.items()]
-        rows += [("run", self.folder or "in memory, as dataset")]
+        rows += [("run", self.folder or "in memory, as `dataset`")]
         rows += [("warning", warning) for warning in self.warnings]
         return html_table(self.sentence, rows)
 
@@ -240,7 +240,7 @@ def select_engine(case: Case, model: Model) -> tuple[type[Engine], str | None]:
     engine = next((engine for engine in ENGINES if engine.name == case.time.engine), ENGINES[0])
     refusal = engine.refusal(model)
     if options_of(case) and engine is not ENGINES[-1]:
-        refusal = "PETSc options are for ts"
+        refusal = "PETSc options require ts"
     return (engine, None) if refusal is None else (ENGINES[-1], f"{engine.name} refused: {refusal}")
 
 
@@ -342,7 +342,7 @@ class Run:
         comm = self.setup.output.comm
         if ending == STOPPED:
             self.checkpoint()
-            sentence += "; the same command goes on from there"
+            sentence += "; the same command continues from there"
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
         statistics["effective_restitution"] = _effective_restitution(self.setup.model)
 

@@ -1,4 +1,4 @@
-"""The unit cell: masses, springs inside it and to the next cell, and the pair that may collide."""
+"""The unit cell: masses, springs within it and to the next cell, and the contact pair."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -140,7 +140,7 @@ class UnitCell:
 def cell_problems(
     masses: tuple[float, ...], springs: tuple[Spring, ...], host: int, resonator: int, grounding: tuple[float, ...] = ()
 ) -> list[tuple[str, str]]:
-    """Everything wrong with a cell as (key, message) pairs; empty for a valid one.
+    """All problems of a cell as (key, message) pairs; empty for a valid cell.
 
     Messages count masses from 1, as case files do.
     """
@@ -159,12 +159,12 @@ def cell_problems(
     if host == resonator and n > 1:
         problems.append(("contact", "host and resonator must be two different masses"))
     if springs and not any(s.next_cell for s in springs):
-        problems.append(("springs", "no spring has next_cell = true, so cells are not connected"))
+        problems.append(("springs", "no spring has next_cell = true, so that the cells are not connected"))
     return problems
 
 
 def _spring_problems(spring: Spring, key: str, n: int) -> list[tuple[str, str]]:
-    """Everything wrong with a ``spring`` of a cell of ``n`` masses, as ``cell_problems``."""
+    """All problems of a ``spring`` in a cell of ``n`` masses, as ``cell_problems``."""
     problems = []
     if not 0 < spring.stiffness < np.inf:
         problems.append((f"{key}.stiffness", f"stiffness {spring.stiffness!r} must be positive (N/m)"))
@@ -179,10 +179,10 @@ def _spring_problems(spring: Spring, key: str, n: int) -> list[tuple[str, str]]:
 
 
 def _dashpot_problems(grounding: tuple[float, ...], n: int) -> list[tuple[str, str]]:
-    """Everything wrong with the dashpots to ground of a cell of ``n`` masses, as ``cell_problems``."""
+    """All problems of the dashpots to ground in a cell of ``n`` masses, as ``cell_problems``."""
     problems = []
     if len(grounding) not in (0, n):
-        problems.append(("grounding", f"one dashpot for each of the {n} masses is needed, 0 for none"))
+        problems.append(("grounding", f"give one dashpot for each of the {n} masses, 0 for none"))
     for i, c in enumerate(grounding, 1):
         if not 0 <= c < np.inf:
             problems.append((f"grounding[{i}]", f"damping {c!r} must not be negative (N s/m)"))
@@ -200,7 +200,7 @@ def diatomic(reading: Reading = "printed") -> UnitCell:
     """The paper's diatomic cell (Table I): a host with a resonator inside it.
 
     The calibrated reading divides both stiffnesses by ten, which brings the onset of contact to the
-    amplitudes that the paper reports (.58 N instead of 5.3 N).
+    amplitudes that the paper reports (0.58 N instead of 5.3 N).
     """
     k = {"printed": 9e4, "calibrated": 9e3}[reading]
     springs = (Spring(0, 0, k, next_cell=True), Spring(0, 1, k))
@@ -211,7 +211,7 @@ def four_band(reading: Reading = "printed", lam: float = 0.1, eta: float = 0.5) 
     """The paper's four-band cell, Eq. (7), in its Hermitian reading: u4-u1(next), u1-u2-u4, u2-u3.
 
     ``lam`` and ``eta`` set the resonator's spring and mass. The printed reading has the spring
-    lam k = 2000 N/m; the calibrated one lam k2 = 1000 N/m, which meets the paper's transfer of .30-.35.
+    lam k = 2000 N/m; the calibrated one lam k2 = 1000 N/m, which gives the paper's transfer of 0.30 to 0.35.
     """
     m = 0.005
     k = 2e4

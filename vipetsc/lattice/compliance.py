@@ -1,4 +1,4 @@
-r"""Compliance between contact pairs: what relative displacement harmonic forces make in a lattice of any length.
+r"""Compliance between contact pairs: relative displacements per harmonic force in a lattice of any length.
 
 Of the Bloch waves (``waves``) half decay or carry energy to higher cells, half to lower ones. Loaded cells and the ends
 are solved for with the amplitudes of both kinds in every stretch between, each counted from the end that it leaves: all

@@ -79,7 +79,7 @@ class Contact:
     approach_floor: float = 0.0
     factor: Damping = "paper"
     exponent: float | None = field(
-        default=None, metadata=parameter("power", "", "of the law power: n in F = k x^n", least=1, most=10)
+        default=None, metadata=parameter("power", "", "for the law power: n in F = k x^n", least=1, most=10)
     )
 
     def __post_init__(self) -> None:

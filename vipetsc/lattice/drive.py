@@ -201,7 +201,7 @@ class Pieces:
         What is held at the end for ever has the transform of a step. Raises ValueError for a sine that does not end.
         """
         if self.repeats:
-            raise ValueError("a waveform that does not end has no spectrum; give it a duration")
+            raise ValueError("a waveform without an end has no spectrum; give a duration")
         w = np.asarray(frequency, float)
         end = self.settled
         values = self.response(w.ravel(), 0.0, end).reshape(w.shape)

@@ -110,7 +110,7 @@ def _modes(chain: Chain) -> Modes:
         # A wall on both sides is a cell of the ring that is at rest.
         return _ring(chain, chain.cells + (chain.ends == "fixed"), exact=ring)
     if many:
-        raise ValueError(f"modes of {chain.cells} cells that differ, more than {MOST_DOFS} masses")
+        raise ValueError(f"modes of {chain.cells} cells that differ, with more than {MOST_DOFS} masses")
 
     matrix = _scaled(chain)
     if ring:

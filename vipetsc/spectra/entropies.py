@@ -5,7 +5,7 @@ With the Morlet transform X (kappa, x) of a snapshot (``vipetsc.spectra.wavelet`
     W(x) = sum_kappa S,   P = S/W,   H(x) = -sum_kappa P log2 P = log2 W - (1/W) sum_kappa S log2 S    (a)
     energy-weighted   H(t) = sum_x Q H,   Q = W / sum_x W                                              (b)
     joint over kappa and x   H_j(t) = H(t) - sum_x Q log2 Q                                            (c)
-    masked   the mean of H over the points (x, t) with W > .01 max W                                   (d)
+    masked   the mean of H over the points (x, t) with W > 0.01 max W                                   (d)
 
 A filtered snapshot holds positive wavenumbers alone, so its spectrum folded onto every n-th wavenumber of the padded
 line gives it at every n-th cell without loss; only the sums over x are then sums over fewer cells.

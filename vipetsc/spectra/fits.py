@@ -68,7 +68,7 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
     if x.shape != y.shape or x.ndim != 1:
         raise ValueError(f"power law: x {x.shape} and y {y.shape} are not two lists of the same length")
     if len(x) < 3 or np.ptp(x) == 0:
-        raise ValueError(f"power law: {len(x)} points at {len(np.unique(x))} places; 3 at 2 places are needed")
+        raise ValueError(f"power law: {len(x)} points at {len(np.unique(x))} different x; 3 points at 2 are needed")
     if not (np.all(x > 0) and np.all(y > 0) and np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
         raise ValueError("power law: x and y must be positive and finite")
 

@@ -276,9 +276,9 @@ def _of_points(kind: str, quantity: str) -> RunMeasure:
     return RunMeasure(name, unit, text, of, over="point", power=1.0)
 
 
-IBTET_WHOLE = "inter-band energy transfer as the paper's: the record's last samples are in the mean"
+IBTET_WHOLE = "inter-band energy transfer as in the paper: the mean includes the ends of the record"
 UPPER_SHARE = "energy of the bands above the driven one at the end, over the drive's work"
-MEAN_SHARE = "mean share of a pass band or gap after the wave's arrival"
+MEAN_SHARE = "mean fraction of the energy in a pass band or gap after the wave's arrival"
 STANDARD = (
     RunMeasure("contact_episodes", "1", "contact episodes", _contact_episodes, group="statistics"),
     RunMeasure(
@@ -289,13 +289,13 @@ STANDARD = (
     RunMeasure("ibtet", "1", "inter-band energy transfer", group="transfer"),
     RunMeasure("entropy/energy_weighted", "bit", "mean over time of the energy-weighted entropy", group="entropy"),
     RunMeasure(
-        "entropy/masked", "bit", "mean entropy where the wave is louder than 1 % of its loudest", group="entropy"
+        "entropy/masked", "bit", "mean entropy where the wave energy exceeds 1 % of its largest value", group="entropy"
     ),
     RunMeasure(
-        "entropy/joint", "bit", "mean over time of the entropy over cells and wavenumbers together", group="entropy"
+        "entropy/joint", "bit", "mean over time of the joint entropy over cells and wavenumbers", group="entropy"
     ),
     RunMeasure("ibtet_whole", "1", IBTET_WHOLE, group="transfer"),
-    RunMeasure("entropy/error", "bit", "deviation over the cells of the masked time mean", group="entropy"),
+    RunMeasure("entropy/error", "bit", "standard deviation over the cells of the masked time mean", group="entropy"),
     RunMeasure("entropy/start", "s", "time at which averages of the entropy begin", group="entropy"),
     RunMeasure("entropy/history", "bit", "entropy of a snapshot", dimension="snapshot", group="entropy"),
     RunMeasure("entropy/snapshot", "s", "time of a snapshot", dimension="snapshot", group="entropy"),
@@ -306,7 +306,7 @@ STANDARD = (
     RunMeasure(
         "bands/share",
         "1",
-        "mean share of a pass band or gap after the wave's arrival",
+        "mean fraction of the energy in a pass band or gap after the wave's arrival",
         dimension=PART,
         group="transfer",
     ),

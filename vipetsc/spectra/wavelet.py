@@ -34,7 +34,7 @@ class Nodes:
     def log(cls, kc: float, voices: float = VOICES) -> Self:
         """Nodes from pi/60 to pi (1 + 4/kc), both included, ``voices`` an octave or a few more.
 
-        Raises ValueError below .65 kc voices, where the sum over the nodes would ripple.
+        Raises ValueError below 0.65 kc voices, where the sum over the nodes would ripple.
         """
         if voices < 0.65 * kc:
             raise ValueError(f"voices = {voices}: kc = {kc} needs at least {0.65 * kc:.3g} an octave")
@@ -133,7 +133,7 @@ class Bank:
 
     ``transfer`` (bin, k) over the wavenumbers of the padded ``length``:
     T_b(eta) = (1/C) sum over the nodes of bin b of (dkappa/kappa) |Psi(kc eta/kappa)|^2. The sum over b is 1
-    within 1 % from 1.3 pi/60 to pi, .56 at pi/60 and 0 at eta = 0 (kc = 6).
+    within 1 % from 1.3 pi/60 to pi, 0.56 at pi/60 and 0 at eta = 0 (kc = 6).
     """
 
     transfer: np.ndarray

@@ -53,8 +53,8 @@ in the cells within r. Nothing else of the forces' history is needed.
 
 **6. Clusters and ranks** (``clusters``, ``stencil``). DoFs within r cells of one another, counted from any cell that
 they have a mass in, must be solved for together: they are a group, and on a rank that feels it a cluster. Every rank
-that owns a cell within r of a cluster advances it, from the same numbers to the same bits, so that one exchange of
-``HaloRegions`` a step is all that ranks must say to each other. ``engine`` weighs a step's cost against the size of its
+that owns a cell within r of a cluster advances it, from the same numbers to the same bits, so that ranks communicate
+only by one exchange of ``HaloRegions`` per step. ``engine`` weighs a step's cost against the size of its
 clusters. Its loop over a block of samples is compiled as a whole: ranks agree on requests and failures at a block's
 end, to which a rank that cannot follow its contacts goes on without them.
 
@@ -67,9 +67,9 @@ In the norm of the energy the state turns by no more than [gamma + (gamma^2 + 4 
 Gershgorin's circles of M^-1/2 C M^-1/2: H times that is theta in the bounds of 1. M p^2 + C p + K is symmetric, so is
 its inverse, and Q_k M^-1: in 3 and 5, where G has all powers, M^-1 (c Q_k)^T is the motion after an impulse.
 
-**8. Cells that differ** have rows of their own, with the masses, springs and dashpots of the cells up to r + 1 away;
-what those beyond would change took a way out there and back, and counts as entries left out once more. Cells with equal
-ones around them share their rows. omega_max and gamma are the largest of all cells; r and the truncation are those of a
+**8. Cells that differ** have separate rows, with the masses, springs and dashpots of the cells up to r + 1 away. Cells
+beyond could only act by waves that travel there and back, which counts as entries left out once more. Cells with equal
+neighbourhoods share their rows. omega_max and gamma are the largest of all cells; r and the truncation are those of a
 lattice each of whose entries of K M^-1 and C M^-1 has the largest magnitude that any cell's has.
 
 **9. Variations** of an orbit move by P and by one small matrix a step in contact: ``tangent``, ``tangent_kernels``.

@@ -83,7 +83,7 @@ def _no_step(model: Model) -> str:
     series = StepSeries(model.chain, model.sample_interval / MOST_PARTS, tolerance)
     step = f"a step of {series.interval:.3g} s, time.sample_interval over {MOST_PARTS},"
     if model.chain.cells < series.width:
-        return f"{model.chain.cells} cells are fewer than the {series.width} that {step} acts on"
+        return f"{model.chain.cells} cells are fewer than the {series.width} cells that {step} couples"
 
     bursts = [drive.waveform.highest for drive in model.drives if isinstance(drive.waveform, ToneBurst)]
     fastest = max([series.omega_max_h / series.interval, *bursts])
@@ -218,7 +218,7 @@ class Propagator(Engine):
     def refusal(cls, model: Model) -> str | None:
         """Why it does not suit ``model``: springs that are not linear; too few cells; too many sites close together."""
         if not model.chain.cell.is_linear:
-            return "its steps are those of linear springs, and some have a quadratic or cubic part"
+            return "its steps require linear springs, but some springs have a quadratic or cubic part"
         series = step_series(model)
         if series is None:
             return _no_step(model)

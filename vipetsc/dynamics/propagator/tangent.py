@@ -88,7 +88,7 @@ class TangentPropagator(Propagator):
         """Why it does not suit ``model``: what the engine refuses, and contacts that touch or are pressed at rest."""
         sites = site_records(model, np.arange(len(model.chain.sites)))
         if (np.abs(sites["mode"]) == PERMANENT).any():
-            return "contacts touch or are pressed at rest, beside which no variations are moved"
+            return "contacts touch or are precompressed at rest; variations are not supported for them"
         return super().refusal(model)
 
     def place(self, cells: np.ndarray, speed: float) -> None:

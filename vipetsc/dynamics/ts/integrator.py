@@ -24,7 +24,7 @@ from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, register
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.parallel import StopRequest
 
-# PETSc's suggestions carry a safety factor .9; stretching one by this much keeps the error below the tolerance
+# PETSc's suggestions carry a safety factor 0.9; stretching one by this much keeps the error below the tolerance
 # and often saves a step on the way to a sample.
 STRETCH = 1.08
 # Steps and rejected trials for each site, on the way to one time, beyond which a run counts as stalled.

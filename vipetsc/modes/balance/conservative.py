@@ -73,7 +73,7 @@ class HarmonicFrame:
     def residual(self, xi: np.ndarray) -> np.ndarray:
         """The residual (n,), which vanishes at a solution, over the size."""
         if not np.all(np.isfinite(xi)) or not 0.5 < xi[-1] < 2:
-            raise FlowError("Newton left the domain: the frequency is off by a factor")
+            raise FlowError("Newton's method left the domain: the frequency changed by a large factor")
         return self.balance.residual(*self.motion(xi), self.shift) / self.size
 
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
@@ -230,7 +230,7 @@ class ConservativeMotions:
             attempt = frame.solve(frame.xi, row, row @ frame.xi)
             if not attempt.converged:
                 why = f"{attempt.reason}; residuals {attempt.residuals}"
-                raise ContinuationError(f"no motion at f = {point.frequency:.9g} Hz ({why}): change where it begins")
+                raise ContinuationError(f"no motion at f = {point.frequency:.9g} Hz ({why}): choose another start")
             point = frame.measures(attempt)
             if point.truncation <= MORE * self.control.truncation or point.order == order:
                 return point
@@ -292,7 +292,7 @@ def describing_amplitude(forces: SiteForces, place: int, g: float, omega: float)
     spring = place - len(forces.contacts)
     if spring >= 0 and forces.springs[spring].cubic == 0:
         raise ContinuationError(
-            f"no breather begins at {omega:g} rad/s on a spring without a cubic part: of a harmonic motion its "
+            f"no breather starts at {omega:g} rad/s on a spring without a cubic part: of a harmonic motion its "
             "quadratic force has a mean and a second harmonic alone; give it a cubic part, or begin at another place"
         )
     z = np.zeros((forces.pairs, 2), complex)
@@ -304,7 +304,7 @@ def describing_amplitude(forces: SiteForces, place: int, g: float, omega: float)
     size = forces.amplitude_scale(place, g)
     if balance(size) * balance(LARGEST * size) >= 0:
         raise ContinuationError(
-            f"no breather begins at {omega:g} rad/s: the compliance of its site is {g:.4g} m/N there, and a force "
+            f"no breather starts at {omega:g} rad/s: the compliance of its site is {g:.4g} m/N there, and a force "
             f"that hardens needs a negative one of moderate size; change nnm.start_frequency"
         )
     return float(brentq(balance, size, LARGEST * size, rtol=1e-12))

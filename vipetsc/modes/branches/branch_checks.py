@@ -1,4 +1,4 @@
-"""Checks of a branch: jumps, retracing and the return to the linear mode; its orbits, by its own and by other flows."""
+"""Checks of a branch: jumps, retracing and the return to the linear mode; comparison of its orbits by several flows."""
 
 import itertools
 from collections.abc import Iterator

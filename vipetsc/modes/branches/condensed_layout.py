@@ -39,7 +39,7 @@ class CondensedLayout:
         elongations = branch.column("elongations").reshape(len(points), places)
         axes = "point", "place", "order"
         kept_text = "number of the last harmonic"
-        left_out_text = "estimated size of the harmonics left out, over the motion's"
+        left_out_text = "estimated size of the neglected harmonics over that of the motion"
         return orbit_variables(branch) | {
             "place": variable("place", np.arange(1, places + 1), "1", "contact, then smooth spring"),
             "order": variable("order", orders, "1", "harmonic of the frequency"),

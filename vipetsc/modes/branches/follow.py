@@ -231,7 +231,7 @@ class Follower:
                     self.write(branch)
                     saved = time.monotonic()
                 if stopped:
-                    raise StoppedError(f"stopped on request after point {assessed.index}; resume goes on")
+                    raise StoppedError(f"stopped on request after point {assessed.index}; continue with --resume")
                 before = last
                 last = point
         # A branch that fails or is stopped is checked as well; one that is resumed finds the same jumps again.
@@ -249,11 +249,11 @@ class Follower:
             try:
                 # Read by one rank: the others must not find another file, or none.
                 branch = on_root(self.comm, lambda: read_branch(path))
-                # A branch that is complete is not written again, and its table would stay away.
+                # A branch that is complete is not computed again, and its table would stay away.
                 on_root(self.comm, lambda: restore_table(branch, self.folder))
                 return replace(branch, case=self.case.to_toml(), about=fresh.about, extra=fresh.extra)
             except OSError as error:
-                logger.warning("vipetsc: warning: %s; made again", error)
+                logger.warning("vipetsc: warning: %s; computed again", error)
         return fresh
 
     def _crossing(self, branch: Branch[Any]) -> list[Branch[Any]]:

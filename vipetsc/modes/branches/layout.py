@@ -12,7 +12,7 @@ from vipetsc.modes.branches.regions import quantity, regions, slope_laws, tongue
 from vipetsc.modes.point import QUANTITIES, Point
 from vipetsc.modes.problem import S
 
-REGION = "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 not told"
+REGION = "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 unknown"
 MULTIPLIERS = {
     "multiplier": "largest Floquet multipliers, real part; NaN where fewer converged",
     "multiplier_imaginary": "largest Floquet multipliers, imaginary part",

@@ -30,7 +30,7 @@ class OrbitLayout:
         at_rest = "initial displacement (velocity in m/s for maps from the centre)"
         return orbit_variables(branch) | {
             "dof": variable("dof", np.arange(1, n + 1), "1", "degree of freedom, from 1"),
-            "pair": variable("pair", np.arange(1, pairs + 1), "1", "pair of multipliers, the trivial one left out"),
+            "pair": variable("pair", np.arange(1, pairs + 1), "1", "pair of multipliers, without the trivial one"),
             "initial": variable(("point", "dof"), x, "m", at_rest),
             "tangent": variable(("point", "dof"), tangent[:, :-1], "m", "tangent of the branch: initial values"),
             "tangent_period": variable("point", tangent[:, -1], "s", "tangent of the branch: period"),

@@ -27,12 +27,12 @@ LAYOUT = {
         "", "1", "amplitude: of a wave over the first site's clearance, of a force in N, of a wall in m"
     ),
     "largest": Stored("site", "m", "largest relative displacement"),
-    "share": Stored("way", "1", "energy that leaves or is lost, over what comes in"),
-    "unstable": Stored("", "1", "perturbations that grow (Hill's method); -1: not told"),
+    "share": Stored("way", "1", "outgoing or dissipated energy over the incident energy"),
+    "unstable": Stored("", "1", "number of growing perturbations (Hill's method); -1: unknown"),
     "growth": Stored("", "1", "largest growth rate over the frequency; 0 if none, NaN if not found"),
-    "closed": Stored("site", "1", "share of the time in contact"),
-    "episodes": Stored("", "1", "contact episodes a period"),
-    "truncation": Stored("", "1", "estimated size of the harmonics left out, over those kept"),
+    "closed": Stored("site", "1", "fraction of the time in contact"),
+    "episodes": Stored("", "1", "contact episodes per period"),
+    "truncation": Stored("", "1", "estimated size of the neglected harmonics over those included"),
     "harmonics": Stored("site order", "m", "harmonics Z of w = Re sum Z exp(i k Om t), real part"),
     "harmonics_imaginary": Stored("site order", "m", "harmonics of w, imaginary part"),
 }
@@ -60,7 +60,7 @@ class ResponseLayout:
         up = np.array(sweep_up(branch), int)
         down = np.array(sweep_down(branch), int)
 
-        passed = "points passed if the parameter grows slowly; not neighbours: a jump"
+        passed = "points visited as the parameter increases slowly; a jump where they are not neighbours"
         data = {
             "unknown": variable("unknown", np.arange(xi.shape[1]), "1", "unknown; the last is the parameter"),
             "xi": variable(("point", "unknown"), xi, "1", "unknowns"),
@@ -69,7 +69,7 @@ class ResponseLayout:
             "up": variable("up", np.arange(len(up)), "1", "place on the way up"),
             "down": variable("down", np.arange(len(down)), "1", "place on the way down"),
             "up_point": variable("up", up, "1", passed),
-            "down_point": variable("down", down, "1", "points passed if the parameter falls slowly"),
+            "down_point": variable("down", down, "1", "points visited as the parameter decreases slowly"),
         }
         for name, (dimensions, units, text) in LAYOUT.items():
             data[name] = variable(["point", *dimensions.split()], measure(branch, name), units, text)

@@ -54,9 +54,9 @@ class ResponseMethod(Method[Response]):
         chain = self.case.model().chain
         orders = np.arange(self.case.nfrc.harmonics + 1)
         return {
-            "site": variable("site", np.array(chain.sites) + 1, "1", "cell of the site, from 1"),
+            "site": variable("site", np.array(chain.sites) + 1, "1", "cell of the site, counted from 1"),
             "order": variable("order", orders, "1", "harmonic"),
-            "way": variable("way", np.array(CHANNELS), "1", "where energy goes"),
+            "way": variable("way", np.array(CHANNELS), "1", "destination of the energy"),
             "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
         }
 

@@ -155,7 +155,7 @@ class GuardedSteps:
         return (
             f"step below {self.smallest_step:g} after point {last.index} "
             f"(E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): {verdict.why}; "
-            f"residuals of the last attempt: {residuals}; turn nnm.smallest_step or {verdict.remedy}"
+            f"residuals of the last attempt: {residuals}; change nnm.smallest_step or {verdict.remedy}"
         )
 
 
@@ -204,7 +204,7 @@ class Continuation(Generic[S]):
             yield self.point
             if self.finished:
                 return
-        self.ending = f"{self.rule.points} points reached: raise {self.rule.points_key} and resume to go on"
+        self.ending = f"{self.rule.points} points reached: increase {self.rule.points_key} and resume to continue"
 
     def _next(self) -> S:
         """The next point; raises ContinuationError where no step is short enough."""

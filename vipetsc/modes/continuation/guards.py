@@ -15,11 +15,11 @@ from vipetsc.modes.problem import PeriodicProblem
 # The change that a guard limits, for messages, and the key with its bound.
 GUARDED = {
     "half_trace": ("the half-trace changes too much", "nnm.guards.half_trace"),
-    "contacts": ("more than one contact appears or goes", "nnm.guards.contacts"),
-    "corrector": ("the corrector goes too far", "nnm.guards.corrector"),
+    "contacts": ("more than one contact appears or disappears", "nnm.guards.contacts"),
+    "corrector": ("the corrector moves too far", "nnm.guards.corrector"),
     "turn": ("the branch turns too sharply", "nnm.guards.turn"),
     "turn_relative": ("the branch turns too sharply in the relative chart", "nnm.guards.turn_relative"),
-    "truncation": ("the harmonics left out are too large", "nnm.harmonics or nnm.truncation"),
+    "truncation": ("the neglected harmonics are too large", "nnm.harmonics or nnm.truncation"),
 }
 # A change of these within its bound is no reason to slow down: they do not shrink with the step.
 ALL_OR_NOTHING = {"contacts", "turn_relative", "truncation"}

@@ -136,7 +136,7 @@ class Segment(Generic[S]):
             xi = kind.seek(self.frame, self._guess(0.5 * self.length), self.left, self.right)
             arclength = float(self.frame.tangent @ (xi - self.frame.xi))
             if not 0 < arclength < self.length:
-                raise ArithmeticError("the touch lies outside of the step")
+                raise ArithmeticError("the touch lies outside the step")
         else:
             value = partial(self._value, kind.test, at)
             arclength = brentq(value, 0.0, self.length, xtol=1e-12 * self.length, rtol=1e-14)

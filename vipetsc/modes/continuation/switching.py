@@ -96,8 +96,8 @@ def _first_point(crossing: Crossing, point: Point, amplitude: float) -> Point:
             if repetitions(problem, first) == 1:
                 return first
     why = f"the last attempt, at {step:g}: {attempt.reason}; residuals {attempt.residuals}"
-    remedy = f"raise nnm.tolerance (it was {problem.tolerance:.1g}), or change nnm.switch_amplitude"
-    raise ContinuationError(f"no orbit off the old branch is found at E = {point.energy:.9g} J ({why}): {remedy}")
+    remedy = f"increase nnm.tolerance (now {problem.tolerance:.1g}), or change nnm.switch_amplitude"
+    raise ContinuationError(f"no orbit of a crossing branch is found at E = {point.energy:.9g} J ({why}): {remedy}")
 
 
 def _re_expressed(old: Shooting, point: Point, new: Shooting) -> tuple[np.ndarray, float]:

@@ -81,7 +81,7 @@ def with_multipliers(
         if getattr(error, "ierr", 0) == ONE_RANKS_OWN:
             raise
         if flow.comm.rank == 0:
-            why = "point %d (E = %.9g J) has no multipliers: SLEPc or what is made of its vectors failed: %s"
+            why = "point %d (E = %.9g J) has no multipliers: SLEPc or the evaluation of its vectors failed: %s"
             logger.warning(why, point.index, point.energy, " ".join(str(error).split()))
         return replace(point, multiplier=np.nan)
     return replace(point, multipliers=largest, multiplier=float(np.abs(largest[:, 0]).max(initial=1.0)))

@@ -58,7 +58,7 @@ class TurningSteps:
     def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
         """Message where and why the curve cannot go on, and which key to change."""
         omega, amplitude = self.states.drive(last.xi[-1])
-        remedy = "raise nfrc.harmonics or nfrc.max_newton, or lower nfrc.smallest_step"
+        remedy = "increase nfrc.harmonics or nfrc.max_newton, or decrease nfrc.smallest_step"
         return (
             f"no step from the last good point, {omega:.8g} rad/s at amplitude {amplitude:.6g}: {verdict.why}; {remedy}"
         )
@@ -97,5 +97,5 @@ def _ramp(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
     ramp = SteadyStates(states.case.model_copy(update={"nfrc": below}), states.restitution, omega)
     points = list(Continuation(ramp, first_state(ramp, is_ramp=True), TurningSteps(ramp, MOST_RAMP)))
     if not points or not np.isclose(points[-1].xi[-1] * ramp.parameter.scale, amplitude):
-        raise ContinuationError(f"growing amplitudes do not reach {amplitude:g}: begin nfrc.range or nfrc.fixed lower")
+        raise ContinuationError(f"increasing amplitudes do not reach {amplitude:g}: lower nfrc.range or nfrc.fixed")
     return points[-1].xi[:-1]

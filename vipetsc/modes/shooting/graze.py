@@ -74,7 +74,7 @@ def graze(problem: ShotOrbits, chart: DenseChart, guess: np.ndarray, touch: Touc
             time = time + later
 
             if not (size <= FURTHEST and 0 <= time <= 1.1 * duration):
-                raise ArithmeticError("Newton's method goes astray")
+                raise ArithmeticError("Newton's method diverges")
             if size <= CLOSE:
                 return xi
     except (FlowError, np.linalg.LinAlgError) as error:

@@ -77,7 +77,7 @@ class ShootingFrame(Generic[A]):
     def arc(self, xi: np.ndarray) -> A:
         """The arc from the unknowns ``xi``; raises FlowError where there is none."""
         if not np.all(np.isfinite(xi)) or self.chart.decode(xi)[1] <= 0:
-            raise FlowError("Newton left the domain: the period is not positive")
+            raise FlowError("Newton's method left the domain: the period is not positive")
         return self.problem.arc(*self.chart.decode(xi))
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
@@ -337,7 +337,7 @@ class Shooting(ShootingEquations[Arc]):
         if values[-1] < DEGENERATE * values[0]:
             raise ContinuationError(
                 f"degenerate tangent at E = {start.energy:.6g} J, f = {start.frequency:.9g} Hz: singular values "
-                f"{values}; start elsewhere (nnm.start_energy) or switch branches there"
+                f"{values}; start at another energy (nnm.start_energy) or switch branches there"
             )
         return chart.derivative(xi) @ directions[-1]
 
