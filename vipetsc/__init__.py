@@ -7,6 +7,7 @@
     analyse   the measures of a run: spectra, energies of the pass bands, entropy
     open      result files as xarray datasets
     CaseError raised for an invalid case: key, value and remedy of every problem
+    register  contact laws, dissipation factors, waveforms and figures of a user's module, by name
 
 This example simulates a shorter version of the built-in lattice, and prints the largest speed of each mass in each
 cell:
@@ -23,7 +24,7 @@ All keys, their units and their defaults are in the manual (``vipetsc manual cas
 from importlib import import_module
 
 __version__ = "0.1.0"
-__all__ = ["Case", "CaseError", "Sweep", "analyse", "install_abort_hook", "open", "simulate", "sweep"]
+__all__ = ["Case", "CaseError", "Sweep", "analyse", "install_abort_hook", "open", "register", "simulate", "sweep"]
 
 MODULES = {
     "Case": ("vipetsc.case", "Case"),
@@ -32,6 +33,7 @@ MODULES = {
     "analyse": ("vipetsc.studies.analysis", "analyse"),
     "install_abort_hook": ("vipetsc.parallel", "install_abort_hook"),
     "open": ("vipetsc.io.read", "open_results"),
+    "register": ("vipetsc", "register"),
     "simulate": ("vipetsc.dynamics.run", "simulate"),
     "sweep": ("vipetsc.studies.sweep", "run_sweep"),
 }
@@ -41,6 +43,8 @@ def __getattr__(name: str) -> object:
     """Load a name when it is first used: importing the package must not start PETSc, whose options come first."""
     if name in MODULES:
         module, attribute = MODULES[name]
+        if module == __name__:
+            return import_module(f"{module}.{attribute}")
         return getattr(import_module(module), attribute)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

@@ -1,4 +1,5 @@
 # What type checkers and editors read: the module itself loads these names when they are first used.
+from vipetsc import register as register
 from vipetsc.case import Case as Case
 from vipetsc.case import CaseError as CaseError
 from vipetsc.case import Sweep as Sweep
@@ -9,4 +10,4 @@ from vipetsc.studies.analysis import analyse as analyse
 from vipetsc.studies.sweep import run_sweep as sweep
 
 __version__: str
-__all__ = ["Case", "CaseError", "Sweep", "analyse", "install_abort_hook", "open", "simulate", "sweep"]
+__all__ = ["Case", "CaseError", "Sweep", "analyse", "install_abort_hook", "open", "register", "simulate", "sweep"]

@@ -45,6 +45,22 @@ def cfunc(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]
     return _decorator(numba.cfunc, signature, **options)
 
 
+def users_function(function: Callable[..., Any]) -> Any:
+    """A ``function`` of a user's module, compiled where it is called; nothing is kept of it between runs."""
+    # One that the module has compiled itself has perhaps another model of errors.
+    return numba.njit(error_model="numpy")(getattr(function, "py_func", function))
+
+
+def c_address(function: Callable[..., Any], signature: str) -> int:
+    """The address of a ``function`` as a C function, for the rest of this process; raises NumbaError."""
+    callback = numba.cfunc(signature)(function)
+    _CALLBACKS.append(callback)
+    return int(callback.address or 0)
+
+
+_CALLBACKS: list[Any] = []  # C functions that are called by their addresses, which keep nothing from being freed
+
+
 def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """``compiler`` with ``kernel_cache`` as numba's folder meanwhile; a NUMBA_CACHE_DIR stays the parent."""
 

@@ -28,6 +28,8 @@ FLOORS = (
     "lattice",
     "parallel",
     "compiled",
+    "plugins",
+    "register",
     "progress",
     "process",
     "__init__",

@@ -1,8 +1,7 @@
-"""Compares hardening stops in each room with formulas written out here: the script of ``test_another_law``."""
+"""Compares hardening stops in each room with formulas written out here, for ``test_another_law``."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from vipetsc.contact.law import (
 )
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import Contact
+from vipetsc.plugins import load
 
 K = 2e5
 B = 4e5
@@ -61,7 +61,7 @@ turning.terminal = True
 
 def twins() -> dict:
     """The law on arrays, its compiled twin, and the duration of an impact that both compute."""
-    law = Contact("hardening", K, hardening=B)
+    law = Contact("hardening", K, parameters=(B,))
     x = np.linspace(1e-4, 2e-3, 7)
     on_arrays = [law.elastic_force(x), law.elastic_slope(x), law.elastic_energy(x)]
 
@@ -86,13 +86,15 @@ def twins() -> dict:
     return {"twins": max(differences), "duration": relative(durations, [2 * approach.t[-1]] * 2)}
 
 
+PLUGINS = {"modules": ["stops.py"]}
 LATTICE = {"preset": "four-band", "cells": 12}
-STOPS = {"law": "hardening", "hardening": B, "stiffness": K, "sites": [4, 6], "clearance": D}
+STOPS = {"law": "hardening", "parameters": {"b": B}, "stiffness": K, "sites": [4, 6], "clearance": D}
 
 
 def stopped_run(engine: str, contacts: dict) -> tuple[np.ndarray, dict]:
     """Velocities and statistics of a short run of a lattice with two sites."""
     table = {
+        "plugins": PLUGINS,
         "lattice": LATTICE,
         "contacts": contacts | {"restitution": 0.6},
         "drive": {"amplitude": 300.0, "cycles": 5, "cell": 5},
@@ -106,7 +108,7 @@ def stopped_run(engine: str, contacts: dict) -> tuple[np.ndarray, dict]:
 def engines() -> dict:
     """Both engines' runs, and one with a linear stop of the same stiffness."""
     linear_stops = STOPS | {"law": "bilinear"}
-    del linear_stops["hardening"]
+    del linear_stops["parameters"]
     stepped, by_ts = stopped_run("ts", STOPS)
     exact, by_propagator = stopped_run("propagator", STOPS)
     linear, _ = stopped_run("propagator", linear_stops)
@@ -152,9 +154,12 @@ def normal_modes() -> dict:
     touching = SPRING * D**2 / 2
     highest = 20 * touching
     case = f"""
+[plugins]
+modules = ["stops.py"]
+
 [contacts]
 law = "hardening"
-hardening = {B}
+parameters = {{ b = {B} }}
 stiffness = {K}
 
 [nnm]
@@ -225,7 +230,7 @@ def periodic(omega: float, amplitude: float, chain) -> float:
 def steady() -> dict:
     """The largest |w| of a steady state of ``nfrc`` against a periodic orbit, and how much the stop hardens in it."""
     lattice = {"preset": "four-band", "cells": 2}
-    chain = Case.from_table({"lattice": lattice, "contacts": STOPS | {"sites": [1]}}).model().chain
+    chain = Case.from_table({"plugins": PLUGINS, "lattice": lattice, "contacts": STOPS | {"sites": [1]}}).model().chain
     stiffness = chain.stiffness_matrix().toarray()
     masses = chain.masses()
     lowest = np.sqrt(eigh(stiffness, np.diag(masses), eigvals_only=True)[0])
@@ -233,13 +238,16 @@ def steady() -> dict:
     linear = np.linalg.solve(stiffness - omega**2 * np.diag(masses), np.eye(len(masses))[0])
     touching = D / abs(linear[chain.cell.resonator] - linear[chain.cell.host])
     case = f"""
+[plugins]
+modules = ["stops.py"]
+
 [lattice]
 preset = "four-band"
 cells = 2
 
 [contacts]
 law = "hardening"
-hardening = {STEADY_B}
+parameters = {{ b = {STEADY_B} }}
 stiffness = {SOFT}
 sites = [1]
 clearance = {D}
@@ -268,5 +276,7 @@ harmonics = 31
     return {"steady": abs(float(largest[-1, 0]) / expected - 1), "steady_hardens": STEADY_B * (expected - D) ** 2}
 
 
-found = twins() | engines() | normal_modes() | steady()
-Path("found.json").write_text(json.dumps(found))
+def compare() -> dict:
+    """All comparisons, in a folder with the module ``stops.py``, which the current one is."""
+    load(str(Path("stops.py").resolve()))
+    return twins() | engines() | normal_modes() | steady()

@@ -1,71 +1,27 @@
-"""An elastic law that the manual's chapter *extend* adds is the same in every room that asks for a contact's force.
+"""An elastic law that a module registers is the same in every room that asks for a contact's force.
 
-The chapter's blocks are applied to a copy of the package, whose kernels are compiled anew. In the copy, hardening stops
-F = k x (1 + b x^2) are compared with formulas written out here.
+The module is that of the manual's chapter *extend*: hardening stops F = k x (1 + b x^2), compared with formulas that
+are written out in ``another_law``.
 """
 
 from __future__ import annotations
 
-import json
-import re
-import shutil
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-import vipetsc
-from tests.conftest import clean_environment
+from tests.manual_modules import write_modules
+from tests.verify.another_law import compare
 
-# All of them wait for a copy of the package, whose kernels are compiled with the changed law.
-pytestmark = [pytest.mark.parallel(1), pytest.mark.slow]
-PACKAGE = Path(vipetsc.__file__).parent
-SCRIPT = Path(__file__).with_name("another_law.py")
-
-
-def apply_chapter(package: Path) -> int:
-    """Make the changes of the chapter's ``diff`` blocks in the files of ``package``; returns how many there are."""
-    text = (package / "manual/extend.md").read_text(encoding="utf-8")
-    section = text[text.index("**Another elastic force**") : text.index("A force that depends on more")]
-    path = None
-    count = 0
-    for name, block in re.findall(r"[Ii]n `vipetsc/([\w/]+\.py)`|```diff\n(.*?)```", section, flags=re.DOTALL):
-        if name:
-            path = package / name
-            continue
-
-        # Lines of a block begin with a blank, a minus or a plus.
-        lines = block.splitlines(keepends=True)
-        before = "".join(line[1:] for line in lines if line[0] in " -")
-        after = "".join(line[1:] for line in lines if line[0] in " +")
-        source = path.read_text(encoding="utf-8")
-        assert source.count(before) == 1, f"{path.name} does not have once:\n{before}"
-        path.write_text(source.replace(before, after), encoding="utf-8")
-        count += 1
-    return count
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory) -> dict:
-    """What the script finds in a copy of the package with the chapter's law."""
+    """The differences from the formulas, with the module in the current folder."""
     folder = tmp_path_factory.mktemp("another-law")
-    shutil.copytree(PACKAGE, folder / "vipetsc", ignore=shutil.ignore_patterns("__pycache__"))
-    assert apply_chapter(folder / "vipetsc") == 10
-
-    # Kernels are small here: what optimisation costs is more than it brings.
-    environment = clean_environment() | {"PYTHONPATH": str(folder), "NUMBA_OPT": "1"}
-    ended = subprocess.run(
-        [sys.executable, str(SCRIPT)],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=900,
-        check=False,
-    )
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    return json.loads((folder / "found.json").read_text())
+    write_modules(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        return compare()
 
 
 def test_the_law_on_arrays_and_its_compiled_twin_are_the_formula(found):

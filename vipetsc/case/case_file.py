@@ -12,48 +12,35 @@ import re
 import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from inspect import Parameter, Signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from vipetsc.case.changes import has_more_keys, value_of
 from vipetsc.case.named_files import with_absolute_names
 from vipetsc.case.nearest_type import BRANCH, of_nearest_type
 from vipetsc.case.nesting import DEEPEST, TOO_DEEP, is_deeper
+from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_located, with_parts
 from vipetsc.case.plain import plain_table
+from vipetsc.case.section import Problem as Problem
+from vipetsc.case.section import Section as Section
 from vipetsc.io.names import readable
+from vipetsc.plugins import only
+from vipetsc.register import PartError
 
 if TYPE_CHECKING:
     import xarray as xr
 
 FOLDER = re.compile(r"[^\s./\\-][^/\\]*")
 LARGEST = 1e50
-LONGEST_VALUE = 200  # characters of a value that a message shows
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
 Table = dict[str, Any]  # a parsed TOML table
 Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Problem of a case: the path of the key, its value, and the remedy."""
-
-    key: str
-    value: Any
-    remedy: str
-
-    def __str__(self) -> str:
-        if self.value is None:
-            return f"{self.key}: {self.remedy}"
-        text = repr(self.value)
-        if len(text) > LONGEST_VALUE:
-            text = f"{text[:LONGEST_VALUE]} ..."
-        return f"{self.key} = {text}: {self.remedy}"
 
 
 class CaseError(ValueError):
@@ -67,12 +54,6 @@ class CaseError(ValueError):
     def __str__(self) -> str:
         plural = "s" if len(self.problems) > 1 else ""
         return "\n  ".join([f"{self.source}: {len(self.problems)} problem{plural}", *map(str, self.problems)])
-
-
-class Section(BaseModel):
-    """A table of a case file: strict types, no unknown keys, immutable."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 AnySection = TypeVar("AnySection", bound=Section)
@@ -89,6 +70,7 @@ class CaseFile(Section):
     """
 
     name: str
+    plugins: PluginsTable | None = None
 
     verb: ClassVar[str] = ""
     section: ClassVar[str] = ""
@@ -168,10 +150,23 @@ class CaseFile(Section):
         name = table.get("name", "case")
         problems += _check_name(name)
 
-        fields, wrong = cls.read(table)
+        table, wrong = with_parts(table)
+        plugins: PluginsTable | None = None
+        mistyped: list[Problem] = []
+        if "plugins" in table:
+            plugins, mistyped = read_section(PluginsTable, table["plugins"], "plugins")
+        # Without its modules the case has names that stand for nothing: only the modules are reported.
+        if wrong + mistyped:
+            raise CaseError(problems + wrong + mistyped, source)
+
+        try:
+            with only(module_names(table)):
+                fields, wrong = cls.read(table)
+        except PartError as error:
+            raise CaseError([*problems, Problem("plugins.modules", module_names(table), str(error))], source) from error
         if problems + wrong:
             raise CaseError(problems + wrong, source)
-        return {"name": name, **fields}
+        return {"name": name, "plugins": plugins, **fields}
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -179,7 +174,7 @@ class CaseFile(Section):
         fields: dict[str, Any] = {}
         problems: list[Problem] = []
         for key, field in cls.model_fields.items():
-            if key != "name" and (key in table or field.is_required()):
+            if key not in ("name", "plugins") and (key in table or field.is_required()):
                 kind = next(sections_in(field.annotation))
                 fields[key], wrong = read_section(kind, table.get(key, {}), key)
                 problems += wrong
@@ -196,6 +191,12 @@ class CaseFile(Section):
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterable[Problem]:
         """Problems between keys; those that are not ``valid`` are reported already and hold their defaults."""
         return ()
+
+    def import_plugins(self) -> None:
+        """Import the modules of the case, which another rank may have read; raises CaseError."""
+        problems = missing_parts(self.plugins) if self.plugins else []
+        if problems:
+            raise CaseError(problems, self.name)
 
     def warnings(self) -> list[str]:
         """Warnings of settings that are allowed but probably unintended."""
@@ -262,7 +263,7 @@ def read_toml(path: str | Path) -> Table:
         remedy = f"not a TOML file ({error})"
     else:
         if not is_deeper(table):
-            return with_absolute_names(table, path.parent)
+            return with_located(with_absolute_names(table, path.parent), path.parent)
         remedy = TOO_DEEP
     raise CaseError([Problem(readable(path), None, remedy)])
 

@@ -2,16 +2,18 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from vipetsc.case.case_file import Problem, Valid
+from vipetsc.case.registered import check_factors, check_law, check_law_parameters
 from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable, PerSiteTable
 from vipetsc.lattice import Contact, UnitCell, contact_stiffness
 from vipetsc.lattice.chain import Pair
-from vipetsc.lattice.contact import LEAST_RESTITUTION, PARAMETERS
+from vipetsc.lattice.contact import PARAMETERS, least_restitution, registered_law
 
 MATERIAL = ("modulus", "radius", "poisson")
 SIDES = ("side", "clearance_minus", "precompression")
@@ -70,14 +72,35 @@ def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
         if parameter.law in laws and not is_given:
             yield Problem(path, None, f'missing; needed for the law "{parameter.law}"')
 
+    yield from _check_registered(contacts, laws, count)
     # Without sites the values for all are checked: normal modes need no list of sites.
     names = values_of_sites(contacts, "damping", count) or [contacts.damping]
     restitutions = values_of_sites(contacts, "restitution", count) or [contacts.restitution]
     # None, the default damping, cannot be compared with a name: text orders both.
     for name, restitution in sorted(set(zip(names, restitutions, strict=True)), key=str):
-        if name in ("exact", "flores") and restitution < LEAST_RESTITUTION:
-            remedy = f"the {name} damping increases without bound towards 0; give at least {LEAST_RESTITUTION}"
+        if name and restitution < least_restitution(name):
+            remedy = f"the {name} damping increases without bound towards 0; give at least {least_restitution(name):g}"
             yield Problem(_path_of(contacts, "restitution"), restitution, remedy)
+    yield from check_factors(_path_of(contacts, "damping"), names, restitutions)
+
+
+def _check_registered(contacts: ContactsTable, laws: list[str], count: int) -> Iterator[Problem]:
+    """Problems with the ``laws`` of sites that users' modules register: their parameters, and their formulas."""
+    given = values_of_sites(contacts, "parameters", max(count, 1))
+    wrong = list(check_law_parameters(_path_of(contacts, "parameters"), laws, given))
+    yield from wrong
+    if wrong or not any(registered_law(name) for name in laws):
+        return
+
+    # Of many sites with parameters of their own, the first of each law.
+    first: dict[str, Contact] = {}
+    for law in laws_of_sites(contacts, count) or (contact_of(contacts),):
+        if registered_law(law.law):
+            first.setdefault(law.law, replace(law, stiffness=law.stiffness or 1.0))
+    for name, law in first.items():
+        reason = check_law(law)
+        if reason:
+            yield Problem(_path_of(contacts, "law"), name, reason)
 
 
 def _check_sides(contacts: ContactsTable, count: int) -> Iterator[Problem]:
@@ -153,6 +176,10 @@ def contact_of(contacts: ContactsTable) -> Contact:
 
 def parameters_of(contacts: ContactsTable) -> dict[str, Any]:
     """The values of the parameters that the elastic law of ``contacts`` takes."""
+    registered = registered_law(contacts.law)
+    if registered:
+        given = contacts.parameters or {}
+        return {"parameters": tuple(given[key] for key in registered.parameters)}
     return {key: getattr(contacts, key) for key, about in PARAMETERS.items() if about.law == contacts.law}
 
 

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from vipetsc.case.case_file import Problem, Table, Valid
+from vipetsc.case.registered import check_parameters
 from vipetsc.case.samples import SamplesTable
 from vipetsc.case.schema import LatticeTable, TimeTable
 from vipetsc.case.waveforms import DEFAULT, OneDrive, waveform_of
@@ -61,6 +62,9 @@ def _check_keys(drive: OneDrive, path: str) -> Iterator[Problem]:
     for key in drive.record.needs:
         if key not in given:
             yield Problem(f"{path}.{key}", None, f"missing; needed for the waveform {drive.kind!r}")
+    if drive.record.parameters:
+        owner = f'the waveform "{drive.kind}"'
+        yield from check_parameters(f"{path}.parameters", drive.parameters or {}, drive.record.parameters, owner)
 
     if drive.duration and drive.ramp and drive.ramp > drive.duration / 2 and "ramp" in drive.record.keys:
         yield Problem(f"{path}.ramp", drive.ramp, f"at most half the duration of {drive.duration:g} s")

@@ -4,7 +4,7 @@ Types, bounds and defaults come from the sections, units and texts from ``keys.t
 """
 
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from typing import Any, get_args
@@ -16,8 +16,10 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import Table
 from vipetsc.case.schema import MULTIPLE_OF_PI
 from vipetsc.case.verb_cases import SECTIONS
-from vipetsc.case.waveforms import DEFAULT, WAVEFORMS
-from vipetsc.lattice.contact import PARAMETERS
+from vipetsc.case.waveforms import DEFAULT, WAVEFORMS, waveform_record
+from vipetsc.lattice.contact import PARAMETERS, registered_law
+from vipetsc.plugins import only
+from vipetsc.register import LAW, PARTS, WAVEFORM, Parameter
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 Schema = dict[str, Any]
@@ -48,7 +50,10 @@ def unit_of(path: str, case: Table) -> str:
     """
     drive = case.get("drive", {})
     if path == "drive.amplitude":
-        return "m" if "end" in drive else WAVEFORMS[drive.get("waveform") or DEFAULT].unit
+        return "m" if "end" in drive else _unit_of_waveform(drive.get("waveform") or DEFAULT)
+    parameter = _parameter_of(path, case)
+    if parameter:
+        return parameter.unit
     section, *keys = path.split(".")
     table: type[BaseModel] | None = SECTIONS.get(section)
     for key in keys[:-1]:
@@ -58,6 +63,26 @@ def unit_of(path: str, case: Table) -> str:
     unit, _ = unit_and_text(table.__name__, keys[-1])
     # A phrase says on what the unit depends.
     return "" if " of " in unit or " or " in unit else unit
+
+
+def _unit_of_waveform(name: str) -> str:
+    """Unit of the amplitude of a waveform; that of a force where the module that registers it is not imported."""
+    is_there = name in WAVEFORMS or name in PARTS[WAVEFORM]
+    return waveform_record(name).unit if is_there else "N"
+
+
+def _parameter_of(path: str, case: Table) -> Parameter | None:
+    """The parameter of a registered law or waveform whose key has that ``path``; None for other keys."""
+    section, _, key = path.partition(".parameters.")
+    registered: Mapping[str, Parameter] = {}
+    if section == "contacts":
+        # The law itself may vary: any that takes the key tells its unit.
+        laws = [law for name in PARTS[LAW] if (law := registered_law(name)) and key in law.parameters]
+        registered = laws[0].parameters if laws else {}
+    elif section == "drive":
+        name = case.get("drive", {}).get("waveform") or DEFAULT
+        registered = waveform_record(name).parameters if name in PARTS[WAVEFORM] else {}
+    return registered.get(key)
 
 
 def _table_of(table: type[BaseModel] | None, key: str) -> type[BaseModel] | None:
@@ -71,11 +96,15 @@ def _table_of(table: type[BaseModel] | None, key: str) -> type[BaseModel] | None
     return None
 
 
-def json_schema() -> Schema:
-    """The JSON schema (2020-12) of a case file; units and texts are the ``description`` of each key."""
+def json_schema(modules: Sequence[str] = ()) -> Schema:
+    """The JSON schema (2020-12) of a case file; units and texts are the ``description`` of each key.
+
+    The names of parts are the shipped ones and those of imported ``modules``.
+    """
     of_class = {table.__name__: table for table in SECTIONS.values()}
     # One call for all sections: a class that several sections contain is defined once.
-    _, whole = models_json_schema([(table, "validation") for table in of_class.values()])
+    with only(modules):
+        _, whole = models_json_schema([(table, "validation") for table in of_class.values()])
     classes: Schema = whole["$defs"]
     for name, schema in classes.items():
         for key, item in schema.get("properties", {}).items():
@@ -89,7 +118,7 @@ def json_schema() -> Schema:
         schema["description"] = schema.get("description", "").partition("\n\n")[0].replace("\n", " ").replace("``", "`")
     classes["PetscTable"]["additionalProperties"] = {"type": ["string", "number", "boolean"]}
     # What a sweep takes in turn may be lists or ranges of anything.
-    varied = Case.model_fields.keys() - {"name", "analysis"} | {"disorder"}
+    varied = Case.model_fields.keys() - {"name", "plugins", "analysis"} | {"disorder"}
     classes["SweepTable"]["properties"] |= {key: {"type": "object"} for key in sorted(varied)}
     sections = {key: {"$ref": f"#/$defs/{table.__name__}"} for key, table in SECTIONS.items()}
     named = {"type": "string", "description": texts()["CaseFile"]["name"][1]}

@@ -15,7 +15,7 @@ from vipetsc.case.resolve import build_chain, check_stiffness
 from vipetsc.case.schema import Positive, once
 from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Chain, Contact, UnitCell, waves_at
-from vipetsc.lattice.contact import LEAST_RESTITUTION
+from vipetsc.lattice.contact import least_restitution
 from vipetsc.lattice.modal_compliance import MOST_DOFS
 
 Restitution = Annotated[float, Field(ge=0, le=1)]
@@ -122,11 +122,9 @@ class NfrcCase(Case):
             if nfrc.restitutions and contacts.each and contacts.each.restitution:
                 remedy = "each site has a restitution of its own, contacts.each.restitution; omit one of them"
                 yield Problem("nfrc.restitutions", nfrc.restitutions, remedy)
-            bounded = sections["contacts"].damping in ("exact", "flores")
-            if bounded and (small := [r for r in nfrc.restitutions if r < LEAST_RESTITUTION]):
-                yield Problem(
-                    "nfrc.restitutions", small, f"below {LEAST_RESTITUTION} this damping increases without bound"
-                )
+            least = least_restitution(contacts.damping or "paper")
+            if small := [r for r in nfrc.restitutions if r < least]:
+                yield Problem("nfrc.restitutions", small, f"below {least:g} this damping increases without bound")
             if sections["contacts"].sites in (0, []):
                 yield Problem("contacts.sites", sections["contacts"].sites, "give a cell with a contact")
 

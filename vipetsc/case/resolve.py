@@ -14,7 +14,7 @@ from vipetsc.case.inhomogeneity import cell_variation
 from vipetsc.case.initial import Beginning, InitialTable
 from vipetsc.case.schema import CONTACTS, PRESETS, DampingTable, LatticeTable, TimeTable
 from vipetsc.case.sites import ContactsTable, Span
-from vipetsc.case.waveforms import DEFAULT, SINES
+from vipetsc.case.waveforms import DEFAULT, is_sine
 from vipetsc.lattice import Chain, UnitCell, contact_stiffness, pass_bands
 from vipetsc.lattice.cell import cell_problems, connected_groups
 
@@ -68,7 +68,7 @@ def _preset_drive(defaults: Table, given: Table) -> Table:
     waveform = given.get("waveform", DEFAULT)
     if waveform == DEFAULT:
         return defaults
-    if waveform in SINES:
+    if is_sine(waveform):
         return {key: value for key, value in defaults.items() if key in REPLACES["frequency"]}
     return {}
 

@@ -5,13 +5,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, create_model
 
 from vipetsc.case.case_file import Section
-from vipetsc.case.schema import MOST_SITES, NotNegative, Positive
-from vipetsc.lattice.contact import PARAMETERS, Damping, Law, Parameter
+from vipetsc.case.parts import PartName
+from vipetsc.case.schema import MOST_SITES, Finite, NotNegative, Positive
+from vipetsc.lattice.contact import DAMPINGS, LAWS, PARAMETERS, LawParameter
+from vipetsc.register import DISSIPATION, LAW
 
 Ends = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
 Side = Literal["both", "plus", "minus"]
 Restitution = Annotated[float, Field(ge=0, le=1)]
 Poisson = Annotated[float, Field(gt=-1, le=0.5)]
+Law = Annotated[str, PartName(LAW, LAWS)]
+Damping = Annotated[str, PartName(DISSIPATION, DAMPINGS)]
 
 
 class Span(Section):
@@ -30,7 +34,7 @@ class ClearanceSpan(Section):
     last: Positive
 
 
-def bounded(parameter: Parameter) -> Any:
+def bounded(parameter: LawParameter) -> Any:
     """The type of a value of a law's ``parameter``."""
     return Annotated[float, Field(ge=parameter.least, le=parameter.most)]
 
@@ -72,6 +76,7 @@ class PerSiteTable(ElasticLaws):
     stiffness: list[Positive] | None = None
     restitution: list[Restitution] | None = None
     damping: list[Damping] | None = None
+    parameters: list[dict[str, Finite]] | None = None
     pair: list[Ends] | None = None
     next_cell: list[bool] | None = None
     precompression: list[NotNegative] | None = None
@@ -83,9 +88,10 @@ class ContactsTable(ElasticLaw):
     """Contact law, stiffness (given, or from modulus in Pa, radius in m, Poisson ratio), sites, clearances.
 
     ``damping``: ``paper`` (if left out), which is ``hunt-crossley``, ``exact`` or another by name: see
-    ``vipetsc.lattice.Contact``. ``side``: on which side of w = u_resonator - u_host stops are; ``clearance_minus`` is
-    that of the side -, if it differs. ``pair``: host (0 is ground) and resonator, in the next cell if ``next_cell``;
-    ``precompression``: static indentation in m, from which displacements count. ``each`` has lists over the sites.
+    ``vipetsc.lattice.Contact``. ``parameters`` are those of a law that a module registers. ``side``: on which side of
+    w = u_resonator - u_host stops are; ``clearance_minus`` is that of the side -, if it differs. ``pair``: host (0 is
+    ground) and resonator, in the next cell if ``next_cell``; ``precompression``: static indentation in m, from which
+    displacements count. ``each`` has lists over the sites.
     """
 
     modulus: Positive | None = None
@@ -94,6 +100,7 @@ class ContactsTable(ElasticLaw):
     stiffness: Positive | None = None
     restitution: Restitution = 1.0
     damping: Damping | None = None
+    parameters: dict[str, Finite] | None = None
     sites: Annotated[int, Field(ge=0, le=MOST_SITES)] | list[int] | Span = 0
     clearance: NotNegative | list[NotNegative] | ClearanceSpan | None = None
     clearance_minus: NotNegative | None = None

@@ -82,7 +82,7 @@ class Sweep(CaseFile):
         if isinstance(table.get("time", {}), dict):
             table["time"] = {"engine": "auto"} | table.get("time", {})
         # What is measured is not varied: ``analyse`` measures a sweep again.
-        sections = Case.model_fields.keys() - {"name", "analysis"} | {"disorder"}
+        sections = Case.model_fields.keys() - {"name", "plugins", "analysis"} | {"disorder"}
         varying = {key: section[key] for key in section if key.partition(".")[0] in sections}
         options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
 

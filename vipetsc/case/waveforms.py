@@ -1,20 +1,24 @@
 """The waveforms of a drive, one record each: its keys, its frequency, its description, and the waveform that is built.
 
 A new waveform is one more record in ``WAVEFORMS``, and a field of ``OneDrive`` for each key that no other one has: the
-choices of ``drive.waveform``, the checks of its keys and the schema follow from these.
+choices of ``drive.waveform``, the checks of its keys and the schema follow from these. One of a user's module is a
+record that is built from what the module registers.
 """
 
-from collections.abc import Callable
-from typing import Annotated, Any, Literal, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 from pydantic import Field
 
 from vipetsc.case.case_file import Section
+from vipetsc.case.parts import PartName
 from vipetsc.case.samples import SamplesTable
 from vipetsc.case.schema import Finite, Positive, Wavenumber
 from vipetsc.lattice import ToneBurst, Waveform
 from vipetsc.lattice.drive import impulse, main_frequency, ramped, spline
+from vipetsc.plugins import call
+from vipetsc.register import PARTS, WAVEFORM, Parameter, PartError, WaveformPart, reserve
 
 CYCLES = 30  # of a burst, where they are not given
 RAMP_PERIODS = 10  # of a harmonic drive's ramp, where it is not given
@@ -28,7 +32,8 @@ class WaveformRecord(NamedTuple):
     keys without which there is none, ``takes`` the others that it has; keys of other waveforms are refused. A waveform
     whose wave is chosen by the case has no ``frequency``; of the others ``frequency(drive, highest)`` is the one in
     rad/s that they are about, at most the ``highest`` that the lattice can follow. ``ramp(drive, frequency)`` is the
-    ramp in s where none is given; ``unit`` is the amplitude's.
+    ramp in s where none is given; ``unit`` is the amplitude's. ``parameters`` are numbers of ``[drive.parameters]``
+    that a waveform of a user's module takes.
     """
 
     build: Callable[["OneDrive"], Waveform]
@@ -38,11 +43,12 @@ class WaveformRecord(NamedTuple):
     frequency: Callable[["OneDrive", float], float] | None = None
     ramp: Callable[["OneDrive", float], float] | None = None
     unit: str = "N"
+    parameters: Mapping[str, Parameter] = {}
 
     @property
     def keys(self) -> tuple[str, ...]:
         """The keys of the waveform."""
-        return (*self.needs, *self.takes)
+        return (*self.needs, *self.takes, *(["parameters"] if self.parameters else []))
 
 
 def _build_burst(drive: "OneDrive") -> Waveform:
@@ -152,8 +158,49 @@ WAVEFORMS = {
 """The record of every waveform, by the name that ``drive.waveform`` gives it."""
 
 DEFAULT = "burst"
-SINES = tuple(name for name, record in WAVEFORMS.items() if record.frequency is None)
-"""Waveforms whose frequency the case gives."""
+reserve(WAVEFORM, WAVEFORMS)
+
+
+def waveform_record(name: str) -> WaveformRecord:
+    """The record of a waveform, shipped or of a user's module; raises KeyError if there is none."""
+    if name in WAVEFORMS:
+        return WAVEFORMS[name]
+    part = cast(WaveformPart, PARTS[WAVEFORM][name])
+
+    def numbers(drive: "OneDrive") -> list[float]:
+        given = drive.parameters or {}
+        return [given[key] for key in part.parameters]
+
+    def build(drive: "OneDrive") -> Waveform:
+        built = call(part, part.function, drive, *numbers(drive))
+        if not isinstance(built, get_args(Waveform)):
+            returned = f"the waveform {part.name!r} of {part.file} returns {built!r}"
+            raise PartError(f"{returned}; a waveform of vipetsc.lattice.drive is needed")
+        return cast(Waveform, built)
+
+    def describe(drive: "OneDrive") -> str:
+        given = [f"{key} {value:g}" for key, value in (drive.parameters or {}).items()]
+        return ", ".join([_omega(drive), *given])
+
+    def frequency(drive: "OneDrive", highest: float) -> float:
+        assert part.frequency
+        return float(min(call(part, part.frequency, drive, *numbers(drive)), highest))
+
+    return WaveformRecord(
+        build=build,
+        describe=describe,
+        needs=part.needs,
+        takes=part.takes,
+        frequency=frequency if part.frequency else None,
+        unit=part.unit,
+        parameters=part.parameters,
+    )
+
+
+def is_sine(name: Any) -> bool:
+    """Whether ``name`` is that of a waveform whose frequency the case gives."""
+    is_waveform = isinstance(name, str) and (name in WAVEFORMS or name in PARTS[WAVEFORM])
+    return is_waveform and waveform_record(name).frequency is None
 
 
 class OneDrive(Section):
@@ -162,7 +209,7 @@ class OneDrive(Section):
     ``frequency`` in rad/s, or ``wavenumber`` + ``band``, or ``band`` + ``at``.
     """
 
-    waveform: Literal[tuple(WAVEFORMS)] | None = None  # type: ignore[valid-type]  # names stand in WAVEFORMS alone
+    waveform: Annotated[str, PartName(WAVEFORM, tuple(WAVEFORMS))] | None = None
     amplitude: Finite = 1.0
     cycles: int = Field(CYCLES, ge=1)
     envelope: Literal["paper", "hann"] = "paper"
@@ -170,6 +217,7 @@ class OneDrive(Section):
     duration: Positive | None = None
     bandwidth: Finite | None = None
     samples: SamplesTable | None = None
+    parameters: dict[str, Finite] | None = None
     frequency: Positive | None = None
     wavenumber: Wavenumber | None = None
     band: Annotated[int, Field(ge=1)] | None = None
@@ -186,17 +234,17 @@ class OneDrive(Section):
     @property
     def record(self) -> WaveformRecord:
         """The waveform's record."""
-        return WAVEFORMS[self.kind]
+        return waveform_record(self.kind)
 
     @property
     def is_sine(self) -> bool:
         """Whether the case gives the frequency."""
-        return self.kind in SINES
+        return is_sine(self.kind)
 
     @property
     def foreign(self) -> set[str]:
         """The keys that belong to other waveforms alone."""
-        every = {key for record in WAVEFORMS.values() for key in record.keys}
+        every = {"parameters"} | {key for record in WAVEFORMS.values() for key in record.keys}
         return every - {*self.record.keys}
 
     @property

@@ -17,6 +17,7 @@ from vipetsc.cli.verb import BAD_INPUT, STOPPED
 from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.io.errors import FolderError, ResultFileError
 from vipetsc.parallel import EndedError, StoppedError, StopRequest, all_meet, on_root
+from vipetsc.register import PartError
 
 PATIENCE = 5.0  # s within which stopped ranks must meet; a launcher kills the remaining ranks sooner
 ABOUT_THE_PROGRAM = "-h", "--help", "--version"
@@ -77,7 +78,7 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
         remedy = "; move it away, or start again with --force" if hasattr(options, "force") else ""
         echo(MPI.COMM_WORLD, f"vipetsc: {error}{remedy}", sys.stderr)
         return BAD_INPUT
-    except (CaseError, FolderError) as error:
+    except (CaseError, FolderError, PartError) as error:
         # Every rank gets here: bad input is found on one rank and raised on all.
         echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return BAD_INPUT

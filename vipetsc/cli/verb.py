@@ -23,7 +23,7 @@ from vipetsc.cli.messages import echo, echo_paths, echo_warnings
 from vipetsc.io.folder import FolderKind
 from vipetsc.io.lock import locked
 from vipetsc.io.names import path_named
-from vipetsc.parallel import StopRequest, on_root
+from vipetsc.parallel import StopRequest, on_every_rank, on_root
 
 # 2 is what argparse exits with; EX_TEMPFAIL asks a batch script to queue the job again.
 DONE, FAILED, BAD_INPUT, STOPPED = 0, 1, 2, os.EX_TEMPFAIL
@@ -131,6 +131,8 @@ class StudyVerb(Verb):
         """Compute, draw and report; returns the exit code."""
         # Before anything is written: what is refused leaves no folder behind.
         case = on_root(comm, lambda: self.checked_case(options))
+        # One rank has read the case: the others import what it names.
+        on_every_rank(comm, case.import_plugins)
         folder = options.out or Path("runs") / path_named(f"{case.name}{self.suffix}")
         work = Work(options, folder, comm, stop)
         # On rank 0, since warnings compute the bands of the cell.

@@ -1,7 +1,8 @@
 """The compiled contact force: one law for time stepping, for the propagator and for normal modes.
 
 The docstring of the package derives the formulas. ``vipetsc.lattice.Contact`` is the same law on arrays: force, slope
-and energy of an elastic law are defined there and here, and nowhere else.
+and energy of a shipped elastic law are defined there and here, and nowhere else. A law that a module of a user registers
+is called by the addresses of its compiled functions, which its record holds in this process.
 """
 
 from collections.abc import Sequence
@@ -12,15 +13,25 @@ from numpy.typing import ArrayLike
 
 from vipetsc.compiled import kernel
 from vipetsc.lattice import Contact
-from vipetsc.lattice.contact import PHASES
+from vipetsc.lattice.contact import PHASES, SHALLOWEST, registered_law
+from vipetsc.lattice.registered_law import call_address, compiled_law
+from vipetsc.register import MOST_PARAMETERS
 
 # Smallest approach speed in m/s for an impact's duration: the energy of a slower impact underflows.
 SLOWEST = 1e-100
 # Modes of a site; the sign is the side. Those from PERMANENT on have the force of max(x, 0), without loss.
 FREE, CLOSED, CLIPPED, PERMANENT, RESTING = 0, 1, 2, 3, 4
 
-ELASTIC = np.dtype([(name, np.float64) for name in ("stiffness", "exponent", "duration_factor", "speed_exponent")])
+PARAMETERS = ("first", "second", "third", "fourth")  # of a registered law
+ELASTIC = np.dtype(
+    [(name, np.float64) for name in ("stiffness", "exponent", "duration_factor", "speed_exponent")]
+    + [(name, np.int64) for name in ("force", "slope", "energy")]
+    + [(name, np.float64) for name in PARAMETERS]
+)
 """Parameters of an elastic law: kc in N/m^n, the power n with which the force begins, ``Contact.duration_factor``.
+
+``force``, ``slope`` and ``energy`` are the addresses of a registered law's functions in this process, 0 of a shipped
+one, and what follows are its parameters.
 
 ``speed_exponent`` is that of the speed in an impact's energy, 2: from a record, no compiler makes a product of the
 power. Its last bit differs from the library's now and then, and with it the steps of a chaotic run.
@@ -58,7 +69,12 @@ def elastic_records(laws: Sequence[Contact]) -> np.ndarray:
 
 def _elastic_row(law: Contact) -> tuple[float, ...]:
     """The values of a record of dtype ``ELASTIC``."""
-    return law.stiffness, law.onset_exponent, law.duration_factor, 2.0
+    shipped = law.stiffness, law.onset_exponent, law.duration_factor, 2.0
+    registered = registered_law(law.law)
+    if registered is None:
+        return *shipped, 0, 0, 0, *[0.0] * MOST_PARAMETERS
+    padding = [0.0] * (MOST_PARAMETERS - len(law.parameters))
+    return *shipped, *compiled_law(registered), *law.parameters, *padding
 
 
 def create_contacts(
@@ -126,11 +142,21 @@ def resting_side(site: Any) -> int:
 
 
 @kernel
+def _registered(function: int, law: Any, x: float) -> float:
+    """The value of a registered law's ``function``, an address, at the indentation x in m."""
+    # The type of an intrinsic does not show its first argument.
+    return call_address(function, x, law.stiffness, law.first, law.second, law.third, law.fourth)  # type: ignore[call-arg]
+
+
+@kernel
 def elastic_force_and_slope(law: Any, x: float) -> tuple[float, float]:
     """f in N and df/dx in N/m at the indentation x in m, continued as an odd function to x < 0.
 
     ``law`` is a record of dtype ``ELASTIC``.
     """
+    if law.force != 0:
+        depth = abs(x)
+        return np.copysign(_registered(law.force, law, depth), x), _registered(law.slope, law, depth)
     if law.exponent == 1.0:
         return law.stiffness * x, law.stiffness
     slope = law.stiffness * law.exponent * abs(x) ** (law.exponent - 1.0)
@@ -140,6 +166,8 @@ def elastic_force_and_slope(law: Any, x: float) -> tuple[float, float]:
 @kernel
 def elastic_force(law: Any, x: float) -> float:
     """The force of ``elastic_force_and_slope``; Hertz's by a square root, which is five times as fast as a power."""
+    if law.force != 0:
+        return np.copysign(_registered(law.force, law, abs(x)), x)
     if law.exponent == 1.5:
         return law.stiffness * (x * np.sqrt(abs(x)))
     return elastic_force_and_slope(law, x)[0]
@@ -150,6 +178,8 @@ def elastic_energy(law: Any, x: float) -> float:
     """The integral of f in J from 0 to the indentation x in m; zero for x <= 0."""
     if x <= 0.0:
         return 0.0
+    if law.force != 0:
+        return _registered(law.energy, law, x)
     if law.exponent == 1.5:
         return law.stiffness * x * x * np.sqrt(x) / 2.5
     if law.exponent == 1.0:
@@ -175,7 +205,7 @@ def impact_time(site: Any, speed: float) -> float:
 
     # Newton's method from beyond the turning point comes down on it: the energy of a hardening force is convex.
     energy = 0.5 * site.reduced_mass * speed * speed
-    depth = 1.0
+    depth = SHALLOWEST
     while elastic_energy(law, depth) < energy:
         depth *= 2.0
     step = depth

@@ -30,7 +30,7 @@ from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import RUN, claimed, provenance
 from vipetsc.io.read import open_results
 from vipetsc.io.store import RunFolder, RunMemory, RunOutput
-from vipetsc.parallel import StopRequest, install_abort_hook
+from vipetsc.parallel import StopRequest, install_abort_hook, on_every_rank
 from vipetsc.process import compiling
 
 if TYPE_CHECKING:
@@ -152,11 +152,13 @@ def simulate(
     target = memory if folder is None else folder
     if isinstance(target, RunMemory) and resume:
         raise ValueError("a run in memory cannot be resumed")
+    ranks = target.comm if isinstance(target, RunOutput) else comm
+    on_every_rank(ranks, case.import_plugins)
     case = with_database(case)
     check_options(case)
     model = case.model()
     kind, refusal = select_engine(case, model)
-    check_memory(model, case.output, kind.name, target.comm if isinstance(target, RunOutput) else comm)
+    check_memory(model, case.output, kind.name, ranks)
 
     # The guard first: the others see only samples that it accepts.
     watching: list[type[Observer]] = [Guard, *observers, Ledger]

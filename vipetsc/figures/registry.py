@@ -31,12 +31,14 @@ from vipetsc.figures import (
     transfer,
     transfer_curves,
 )
+from vipetsc.figures.registered import registered_figures
 from vipetsc.figures.style import Drawing, draw_each, rc_style, save
 from vipetsc.figures.sweep_members import Files, Sweeps, table
 from vipetsc.io import branch_kinds
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
+from vipetsc.register import FIGURE, reserve
 
 NUMBER = re.compile(r"\d[\d.e+-]*")
 MOST_WARNINGS = 4  # below a picture
@@ -142,6 +144,14 @@ _SPECS = (
     FigureSpec("compared_curves", OPTIMUM, optimum.compared_curves),
 )
 FIGURES: Mapping[str, FigureSpec] = {spec.name: spec for spec in _SPECS}
+reserve(FIGURE, FIGURES)
+
+
+def figures_of(source: str, folders: Sequence[Path]) -> dict[str, FigureSpec]:
+    """Return the figures of ``source`` by name, those of modules among them that the results in ``folders`` name."""
+    registered, _ = registered_figures(source, folders)
+    specs = {name: spec for name, spec in FIGURES.items() if spec.source == source}
+    return specs | {name: FigureSpec(name, source, function) for name, function in registered.items()}
 
 
 def figure_names(source: str, names: Sequence[str] | None = None, folders: Sequence[Path] = ()) -> list[str]:
@@ -149,7 +159,7 @@ def figure_names(source: str, names: Sequence[str] | None = None, folders: Seque
 
     The measures in the ``folders`` of sweeps are names of figures too; by default those that most readers look at.
     """
-    specified = [name for name, spec in FIGURES.items() if spec.source == source]
+    specified = [*figures_of(source, folders)]
     measures: dict[str, str] = {}
     if source == SWEEP:
         for folder in with_ensemble(folders):
@@ -165,7 +175,9 @@ def figure_names(source: str, names: Sequence[str] | None = None, folders: Seque
             (nearest,) = difflib.get_close_matches(name, valid, n=1, cutoff=0) or valid[:1]
             holder = source if source == BRANCHES else f"a {source}"
             listed = ", ".join(valid)
-            raise KeyError(f"no figure {name!r} of {holder}; did you mean {nearest!r}? There are {listed}")
+            _, missing = registered_figures(source, folders)
+            reason = f"; a module of the case cannot be used: {missing}" if missing else ""
+            raise KeyError(f"no figure {name!r} of {holder}; did you mean {nearest!r}? There are {listed}{reason}")
     return list(names)
 
 
@@ -237,7 +249,8 @@ def drawings(
     chosen = figure_names(source, names, folders)
     if source == SWEEP:
         return _sweep_drawings(chosen, folders, files, by_name=names is not None)
-    specs = [FIGURES[name] for name in chosen]
+    named = figures_of(source, folders)
+    specs = [named[name] for name in chosen]
     if source == PAPER:
         ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
         return itertools.chain.from_iterable(specified_drawings(spec, ensembles, files) for spec in specs)
@@ -252,12 +265,10 @@ def _sweep_drawings(names: Sequence[str], folders: Sequence[Path], files: Files,
     """Yield the pages of measures and what the other figures offer, each with a stem of its own."""
     ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
     used: dict[str, int] = {}
+    specs = figures_of(SWEEP, folders)
     for name in names:
-        spec = FIGURES.get(name)
-        if spec and spec.source == SWEEP:
-            offered = specified_drawings(spec, ensembles, files)
-        else:
-            offered = _measure_drawings(name, ensembles, by_name)
+        spec = specs.get(name)
+        offered = specified_drawings(spec, ensembles, files) if spec else _measure_drawings(name, ensembles, by_name)
         for drawing in offered:
             used[drawing.stem] = used.get(drawing.stem, 0) + 1
             count = used[drawing.stem]
@@ -278,7 +289,9 @@ def _measure_drawings(name: str, ensembles: Sequence[xr.Dataset], by_name: bool)
 
 def specified_drawings(spec: FigureSpec, ensembles: Sequence[xr.Dataset], files: Files) -> Iterator[Drawing]:
     """Yield what the function of ``spec`` offers of the sweeps that take its measure."""
-    measured = [ensemble for ensemble in ensembles if spec.measure in table(ensemble)["sweep"]["measures"]]
+    measured = [
+        ensemble for ensemble in ensembles if not spec.measure or spec.measure in table(ensemble)["sweep"]["measures"]
+    ]
     sweeps = Sweeps(measured, files)
     for offered in spec.function(sweeps):
         stem = f"{spec.name}-{offered.stem}" if offered.stem else spec.name

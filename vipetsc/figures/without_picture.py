@@ -9,11 +9,11 @@ from vipetsc.figures import measure_pages, transfer_curves
 from vipetsc.figures.registry import (
     BRANCH,
     BRANCHES,
-    FIGURES,
     OVER_BRANCHES,
     RUN,
     SWEEP,
     figure_names,
+    figures_of,
     of_one_name,
     point_count,
     run_and_analysis,
@@ -38,8 +38,9 @@ def reasons_without_pictures(
     with Files() as files:
         if source == RUN:
             run, analysis = run_and_analysis(folders[0], files)
-            for name in figure_names(source, names):
-                without = FIGURES[name].without
+            specs = figures_of(source, folders)
+            for name in figure_names(source, names, folders):
+                without = specs[name].without
                 reasons[name] = without(run, analysis) if without else ""
         elif source == BRANCHES:
             paths = sorted(folders[0].glob("branch-*.h5"))
@@ -57,11 +58,12 @@ def _reasons_of_sweeps(folders: Sequence[Path], names: Sequence[str] | None) -> 
     if len(with_ensemble(folders)) < len(folders) and names is None:
         expected.add(OVER_BRANCHES)
     reasons: dict[str, str] = {}
+    specs = figures_of(SWEEP, folders)
     with Files() as files:
         ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
         for name in figure_names(SWEEP, names, folders):
-            spec = FIGURES.get(name)
-            if spec and spec.source == SWEEP:
+            spec = specs.get(name)
+            if spec:
                 if name in expected and not any(specified_drawings(spec, ensembles, files)):
                     unrelated = transfer_curves.curves_left_out(folders) if name == OVER_BRANCHES else ""
                     reasons[name] = unrelated or f"needs {spec.needs}"

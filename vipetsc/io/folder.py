@@ -201,12 +201,18 @@ def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference |
     differing = []
     for key in then | now:
         if then.get(key) != now.get(key) and key.partition(".")[0] != kind.free:
-            values = [shorten(str(case.get(key, "nothing")), 60) for case in (then, now)]
+            values = [_shown(case.get(key, "nothing")) for case in (then, now)]
             differing.append(f"{key} = {values[0]} there, {values[1]} here")
     if not differing:
         return None
     more = f"; and {len(differing) - MOST_NAMED} more" if len(differing) > MOST_NAMED else ""
     return f"contains another {kind.noun}: {'; '.join(differing[:MOST_NAMED])}{more}; {remedy}"
+
+
+def _shown(value: Any) -> str:
+    """A value as a message shows it; of one long word, such as a hash, its beginning."""
+    text = str(value)
+    return f"{text[:16]}..." if len(text) > 60 and " " not in text else shorten(text, 60)
 
 
 def _text_of(path: Path) -> str:

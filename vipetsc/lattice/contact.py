@@ -3,48 +3,69 @@
 With w = u_resonator - u_host, the clearance D, the elastic force f of the indentation x, and the dissipation factor g,
 the contact force is F = [f((w - D)_+) - f((-w - D)_+)] g, restoring: -F on the resonator, +F on the host.
 
-Everything about an elastic law on arrays stands here: its name and parameters with the texts that case files show,
-force, slope, energy, and the duration of an impact. ``vipetsc.contact.law`` is its compiled twin.
+Everything about a shipped elastic law on arrays stands here: its name and parameters with the texts that case files
+show, force, slope, energy, and the duration of an impact. ``vipetsc.contact.law`` is its compiled twin. Laws and
+dissipation factors of users' modules are those of ``vipetsc.register``, by name.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-Law = Literal["hertz", "bilinear", "power"]
+from vipetsc.register import DISSIPATION, LAW, PARTS, DissipationPart, LawPart, reserve
+
+LAWS = ("hertz", "bilinear", "power")
+"""Shipped laws: the force of each is one power of the indentation."""
+DAMPINGS = ("paper", "exact", "hunt-crossley", "lankarani-nikravesh", "flores")
+"""Names of shipped factors of dissipation."""
 Adhesion = Literal["allow", "clip"]
-Damping = Literal["paper", "exact", "hunt-crossley", "lankarani-nikravesh", "flores"]
-LEAST_RESTITUTION = 0.05  # where the damping grows without bound towards 0
+LEAST_RESTITUTION: Mapping[str, float] = {"exact": 0.05, "flores": 0.05}  # their damping grows without bound towards 0
 
 # The power of the indentation with which the force of a law begins; that of "power" is its parameter.
-ONSET_EXPONENTS: Mapping[Law, float] = {"hertz": 1.5, "bilinear": 1.0}
-# Laws whose force is that power all along.
-POWER_LAWS = ("hertz", "bilinear", "power")
+ONSET_EXPONENTS: Mapping[str, float] = {"hertz": 1.5, "bilinear": 1.0}
 # Phases at which the duration of an impact is summed; relative errors are below 1e-5 where f begins as x^1.5.
 PHASES = 32
+# Depth in m from which the deepest indentation of an impact is sought: a force may overflow far beyond it.
+SHALLOWEST = 1e-15
 
 
-class Parameter(NamedTuple):
+class LawParameter(NamedTuple):
     """A number that one elastic ``law`` takes in addition to its stiffness.
 
     It is a field of ``Contact`` and the key of that name in ``[contacts]``. ``unit`` and ``text`` describe the key in
     the manual; a case file may give values from ``least`` to ``most``.
     """
 
-    law: Law
+    law: str
     unit: str
     text: str
     least: float
     most: float
 
 
-def parameter(law: Law, unit: str, text: str, least: float, most: float) -> dict[str, Parameter]:
-    """Metadata of a field of ``Contact`` that is a parameter of an elastic law."""
-    return {"parameter": Parameter(law, unit, text, least, most)}
+def parameter(law: str, unit: str, text: str, least: float, most: float) -> dict[str, LawParameter]:
+    """Metadata of a field of ``Contact`` that is a parameter of a shipped elastic law."""
+    return {"parameter": LawParameter(law, unit, text, least, most)}
+
+
+def registered_law(name: str) -> LawPart | None:
+    """The law that a user's module registers by that ``name``; None for a shipped one."""
+    return cast(LawPart | None, PARTS[LAW].get(name))
+
+
+def registered_factor(name: str) -> DissipationPart | None:
+    """The dissipation factor that a user's module registers by that ``name``; None for a shipped one."""
+    return cast(DissipationPart | None, PARTS[DISSIPATION].get(name))
+
+
+def least_restitution(factor: str) -> float:
+    """The smallest restitution that the dissipation ``factor`` of that name takes."""
+    registered = registered_factor(factor)
+    return registered.least_restitution if registered else LEAST_RESTITUTION.get(factor, 0.0)
 
 
 def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
@@ -69,18 +90,19 @@ class Contact:
 
     ``adhesion``: "allow" lets g become negative (a pull at fast separation), "clip" keeps g >= 0. ``approach_floor``:
     smallest |w'_minus| in m/s used in g; a grazing onset would make g unbounded. ``factor`` names the damping c in
-    g = 1 + c w'/w'_minus.
+    g = 1 + c w'/w'_minus. ``parameters`` are those of a law that a user's module registers, in its order.
     """
 
-    law: Law
+    law: str
     stiffness: float
     restitution: float = 1.0
     adhesion: Adhesion = "allow"
     approach_floor: float = 0.0
-    factor: Damping = "paper"
+    factor: str = "paper"
     exponent: float | None = field(
         default=None, metadata=parameter("power", "", "for the law power: n in F = k x^n", least=1, most=10)
     )
+    parameters: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         # So that ``exponent`` is a number for whoever computes with a law, not only for the law that takes it.
@@ -95,6 +117,9 @@ class Contact:
     @property
     def onset_exponent(self) -> float:
         """The power of the indentation with which the force begins; raises KeyError for a law that there is not."""
+        registered = registered_law(self.law)
+        if registered:
+            return registered.onset_exponent
         if self.law != "power":
             return ONSET_EXPONENTS[self.law]
         if self.exponent is None:
@@ -104,22 +129,38 @@ class Contact:
     def elastic_force(self, x: ArrayLike) -> np.ndarray:
         """f in N at the indentation ``x`` in m; zero for x <= 0."""
         x = np.maximum(x, 0.0)
+        if self.law not in LAWS:
+            return self._registered_values("force", x)
         return self.stiffness * x**self.onset_exponent
 
     def elastic_slope(self, x: ArrayLike) -> np.ndarray:
         """df/dx in N/m at the indentation ``x`` in m; for x <= 0 that of a contact that has just closed."""
         x, n = np.maximum(x, 0.0), self.onset_exponent
+        if self.law not in LAWS:
+            return self._registered_values("slope", x)
         return n * self.stiffness * x ** (n - 1)
 
     def elastic_energy(self, x: ArrayLike) -> np.ndarray:
         """The integral of f in J from 0 to the indentation ``x`` in m; zero for x <= 0."""
         x, n = np.maximum(x, 0.0), self.onset_exponent
+        if self.law not in LAWS:
+            return self._registered_values("energy", x)
         return self.stiffness * x ** (n + 1) / (n + 1)
+
+    def _registered_values(self, name: str, x: np.ndarray) -> np.ndarray:
+        """Force, slope or energy, by ``name``, of a law that a user's module registers."""
+        # Imported here: who reads a case needs no compiler.
+        from vipetsc.lattice.registered_law import compiled_law, evaluate
+
+        law = registered_law(self.law)
+        if law is None:
+            raise KeyError(f"no law {self.law!r}; the module that registers it is not imported")
+        return evaluate(getattr(compiled_law(law), name), self.stiffness, self.parameters, x)
 
     @property
     def duration_factor(self) -> float:
         """Duration of an impact without loss over depth/speed (Johnson 1985, sec. 11.4); 0 if f is no power of x."""
-        if self.law not in POWER_LAWS:
+        if self.law not in LAWS:
             return 0.0
         n = self.onset_exponent
         # Integral of dx / sqrt(1 - x^(n+1)) over [0, 1]: pi/2 for n = 1, 1.4716 for n = 3/2.
@@ -137,7 +178,7 @@ class Contact:
             n = self.onset_exponent
             return float((n + 1) * energy / self.stiffness) ** (1 / (n + 1))
 
-        x = 1.0
+        x = SHALLOWEST
         while self.elastic_energy(x) < energy:
             x *= 2
         # From beyond the root Newton's method comes down to it without a bracket: the energy is convex.
@@ -168,6 +209,9 @@ class Contact:
         Dyn. 25 (2011) 357. ``exact``: the one whose impact has the restitution r.
         """
         e = self.restitution
+        registered = registered_factor(self.factor)
+        if registered:
+            return float(registered.function(e))
         if self.factor == "lankarani-nikravesh":
             return 0.75 * (1 - e**2)
         if self.factor == "flores":
@@ -210,7 +254,10 @@ class Contact:
         return self.elastic_energy(np.abs(np.asarray(w, float)) - clearance)
 
 
-PARAMETERS: Mapping[str, Parameter] = {
+PARAMETERS: Mapping[str, LawParameter] = {
     item.name: item.metadata["parameter"] for item in fields(Contact) if "parameter" in item.metadata
 }
 """The parameters of elastic laws, by the names of their fields of ``Contact``, which are their keys in case files."""
+
+reserve(LAW, LAWS)
+reserve(DISSIPATION, DAMPINGS)

@@ -3,6 +3,7 @@
 import argparse
 import itertools
 import json
+from typing import Any
 
 from mpi4py import MPI
 
@@ -30,11 +31,21 @@ def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 
 
 def schema(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Print the JSON schema of case files."""
-    from vipetsc.case.keys import json_schema
-
-    echo(comm, on_root(comm, lambda: json.dumps(json_schema(), indent=2)))
+    """Print the JSON schema of case files, with the names that modules register which a case names."""
+    echo(comm, on_root(comm, lambda: json.dumps(schema_of(options.case), indent=2)))
     return DONE
+
+
+def schema_of(path: str | None) -> dict[str, Any]:
+    """The schema of the case file ``path`` and of others that name the same modules; raises CaseError."""
+    from vipetsc.case.case_file import read_toml
+    from vipetsc.case.keys import json_schema
+    from vipetsc.case.parts import module_names, with_parts
+
+    table, problems = with_parts(read_toml(path) if path else {})
+    if problems:
+        raise CaseError(problems, str(path))
+    return json_schema(module_names(table))
 
 
 def completion(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
@@ -60,6 +71,9 @@ SCHEMA = PlainVerb(
     name="schema",
     text="print the JSON schema of case files, for editors",
     example="schema > vipetsc.schema.json",
+    arguments=(
+        argument("case", nargs="?", metavar="CASE", help="a case file, whose [plugins] register names that it may use"),
+    ),
     function=schema,
     is_answer=True,
 )

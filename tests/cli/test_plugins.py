@@ -1,0 +1,267 @@
+"""Parts of users' modules: the modules of the manual's chapter *extend* in a run, and the cases that are refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from tests.conftest import set_words
+from tests.manual_modules import write_modules
+from vipetsc import Case, CaseError, Sweep, open, plugins, sweep
+from vipetsc.case.keys import json_schema
+from vipetsc.lattice import Contact
+from vipetsc.lattice.drive import Pieces
+
+RATE = 4e5
+CASE = f"""
+[plugins]
+modules = ["stops.py", "factors.py", "pulses.py", "pictures.py"]
+
+[lattice]
+preset = "four-band"
+cells = 12
+
+[contacts]
+law = "hardening"
+stiffness = 2e5
+parameters = {{ b = {RATE} }}
+damping = "herbert-mcwhannell"
+restitution = 0.6
+sites = [4, 6]
+clearance = 1e-3
+
+[drive]
+waveform = "ricker"
+amplitude = 500.0
+frequency = 1000.0
+parameters = {{ delay = 0.01 }}
+
+[time]
+end = 0.03
+engine = "propagator"
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """The modules of the chapter, and a case that uses all of them."""
+    folder = tmp_path_factory.mktemp("plugins")
+    write_modules(folder)
+    (folder / "case.toml").write_text(CASE)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def out(folder, tmp_path_factory) -> Path:
+    """The folder of a run of the case, which is started elsewhere."""
+    from vipetsc.cli.main import main
+
+    out = tmp_path_factory.mktemp("results") / "out"
+    assert main(["run", str(folder / "case.toml"), "--out", str(out), "--quiet"], {}) == 0
+    return out
+
+
+def test_a_run_uses_and_records_the_parts(folder, out):
+    """The case in the results has every part with module and hash, and the registered figure is drawn."""
+    with open(out / "run.h5") as run:
+        case = Case.of(run)
+        law = case.model().contact
+        assert len(run["impacts/onset"]) > 4
+    assert law == Contact("hardening", 2e5, restitution=0.6, factor="herbert-mcwhannell", parameters=(RATE,))
+    assert law.damping == pytest.approx(6 * 0.4 / (0.2**2 + 3))
+
+    parts = case.plugins.parts
+    expected = {"law": ("hardening", "stops.py"), "dissipation": ("herbert-mcwhannell", "factors.py"),
+                "waveform": ("ricker", "pulses.py")}  # fmt: skip
+    assert parts.keys() == expected.keys()
+    for kind, (name, file) in expected.items():
+        record = parts[kind][name]
+        assert record.module == str(folder / file)
+        assert record.sha256 == hashlib.sha256((folder / file).read_bytes()).hexdigest()
+    assert (out / "figures/kinetic.png").stat().st_size > 5000
+
+
+def test_the_waveform_is_the_formula(folder):
+    """The registered waveform is Ricker's wavelet about its delay, with the amplitude of the case."""
+    waveform = Case.load(folder / "case.toml").model().drive
+    assert isinstance(waveform, Pieces)
+    t = np.linspace(0.002, 0.018, 33)
+    phase = (1000.0 * (t - 0.01) / 2) ** 2
+    assert waveform.force(t) == pytest.approx(500.0 * (1 - 2 * phase) * np.exp(-phase), abs=1e-2)
+
+
+def edited_copy(out: Path, target: Path, before: str, after: str) -> Path:
+    """A copy of the results' case in ``target`` with a changed text."""
+    text = (out / "case.toml").read_text()
+    assert before in text
+    target.mkdir()
+    (target / "case.toml").write_text(text.replace(before, after))
+    (target / "run.h5").write_bytes((out / "run.h5").read_bytes())
+    return target
+
+
+def test_results_of_another_source_are_not_gone_on_with(folder, out, tmp_path, in_process):
+    """A folder whose law has another hash is refused by a sentence with the hash, and stays as it is."""
+    digest = hashlib.sha256((folder / "stops.py").read_bytes()).hexdigest()
+    old = edited_copy(out, tmp_path / "old", digest, "0" * 64)
+    ended = in_process("run", folder / "case.toml", "--out", old, "--resume")
+    assert ended.returncode == 2
+    assert f"plugins.parts.law.hardening.sha256 = {'0' * 16}... there, {digest[:16]}... here" in ended.stderr
+    assert {path.name for path in old.iterdir() if path.name[0] != "."} == {"case.toml", "run.h5"}
+
+
+def test_a_changed_source_is_warned_of_where_results_are_read(folder, out, caplog):
+    """Reading a case with another hash warns once and names the part."""
+    digest = hashlib.sha256((folder / "factors.py").read_bytes()).hexdigest()
+    text = (out / "case.toml").read_text().replace(digest, "0" * 64)
+    for _ in range(2):
+        assert Case.from_toml(text).plugins.parts["dissipation"]["herbert-mcwhannell"].sha256 == digest
+    warned = [line for line in caplog.messages if "has changed" in line]
+    assert warned == [
+        f"vipetsc: {folder / 'factors.py'} has changed since the case was resolved that used it: dissipation"
+        " herbert-mcwhannell"
+    ]
+
+
+def test_a_source_that_changes_within_a_process_is_refused(folder, tmp_path):
+    """Python has imported the earlier source: its results would be recorded with the hash of the later one."""
+    (tmp_path / "stop.py").write_text((folder / "stops.py").read_text().replace('"hardening"', '"changing"'))
+    table = {"plugins": {"modules": [str(tmp_path / "stop.py")]}}
+    Case.from_table(table)
+    with (tmp_path / "stop.py").open("a") as file:
+        file.write("# changed\n")
+    with pytest.raises(CaseError, match="has changed since this process imported it"):
+        Case.from_table(table)
+
+
+@pytest.mark.parametrize(("file", "needed"), [("stops.py", True), ("pulses.py", True), ("pictures.py", False)])
+def test_results_need_the_modules_of_their_physics(out, file, needed, caplog):
+    """Results whose law or waveform is not there are not read; a module of figures alone may be missing."""
+    text = (out / "case.toml").read_text().replace(f"/{file}", f"/gone-{file}")
+    if needed:
+        with pytest.raises(CaseError, match=rf"gone-{file}, which registers parts of this case"):
+            Case.from_toml(text)
+    else:
+        assert Case.from_toml(text).contacts.law == "hardening"
+        assert "its parts are left out" in caplog.text
+
+
+def test_moved_results_take_the_module_of_the_current_folder(folder, out, monkeypatch):
+    """Where the recorded path does not exist, a file of that name in the current folder is taken."""
+    text = (out / "case.toml").read_text().replace(str(folder), "/elsewhere")
+    with pytest.raises(CaseError, match="there is no file /elsewhere/stops"):
+        Case.from_toml(text)
+    monkeypatch.chdir(folder)
+    assert Case.from_toml(text).plugins.modules[0] == str(folder / "stops.py")
+
+
+def test_names_are_those_of_the_modules_that_a_case_names(folder):
+    """A part that another case has imported is unknown in a case that does not name its module."""
+    Case.load(folder / "case.toml")
+    others = [str(folder / name) for name in ("factors.py", "pulses.py")]
+    with pytest.raises(CaseError, match="'hardening': must be 'hertz', 'bilinear' or 'power'; plugins"):
+        Case.load(folder / "case.toml", [f"plugins.modules={others}"])
+    with pytest.raises(CaseError, match="did you mean 'hardening'"):
+        Case.load(folder / "case.toml", ["contacts.law=hardenin"])
+
+
+def test_the_schema_of_a_case_has_the_names_of_its_modules(folder, in_process):
+    """``schema CASE`` allows the registered names, the schema of all cases does not."""
+    table = tomllib.loads(CASE)
+    jsonschema.validate(table, json.loads(in_process("schema", folder / "case.toml").stdout))
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(table, json_schema())
+
+
+@pytest.mark.parametrize(
+    ("source", "sentence"),
+    [
+        (None, "there is no file"),
+        ("x = 1 / 0\n", r"cannot be imported: ZeroDivisionError: division by zero \(\S+part.py, line 1\)"),
+        ("raise SystemExit(3)\n", "cannot be imported: SystemExit: 3"),
+        ("import no_such_module\n", "ModuleNotFoundError: No module named 'no_such_module'"),
+        ("x = 1\n", "registers nothing"),
+        ("from vipetsc import register\nregister.figure('printed')(print)\n", "is no function written in Python"),
+        (
+            "from vipetsc import register\n\n@register.dissipation_factor('exact')\ndef c(r):\n    return 0\n",
+            "there is a dissipation 'exact' of vipetsc already",
+        ),
+        (
+            "from vipetsc import register\n\n@register.dissipation_factor('half')\ndef c():\n    return 0\n",
+            r"c of the dissipation factor 'half' must take \(restitution\)",
+        ),
+    ],
+)
+def test_a_module_that_cannot_be_used_is_refused(source, sentence, tmp_path, in_process):
+    """A missing or failing module is one problem with its file and line; exit code 2, and nothing is written."""
+    if source is not None:
+        (tmp_path / "part.py").write_text(source)
+    (tmp_path / "case.toml").write_text('[plugins]\nmodules = ["part.py"]\n')
+    ended = in_process("run", tmp_path / "case.toml", "--out", tmp_path / "out")
+    assert ended.returncode == 2
+    assert "1 problem\n  plugins.modules[1] = " in ended.stderr
+    with pytest.raises(CaseError, match=sentence):
+        Case.load(tmp_path / "case.toml")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_module_that_fails_halfway_leaves_no_parts(tmp_path):
+    """What it had registered before it failed is no part."""
+    text = "from vipetsc import register\n\n@register.dissipation_factor('halfway')\ndef c(r):\n    return 0\n\n1 / 0\n"
+    (tmp_path / "part.py").write_text(text)
+    with pytest.raises(CaseError, match="line 7"):
+        Case.from_table({"plugins": {"modules": [str(tmp_path / "part.py")]}})
+    assert "halfway" not in plugins.registered("dissipation")
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ("plugins={}", "plugins.modules: missing"),
+        ("plugins.modules=stops.py", "must be a valid list"),
+        ("plugins.module=['stops.py']", "unknown key; did you mean plugins.modules"),
+        ("contacts.parameters.b=", r'contacts.parameters.b: missing; needed for the law "hardening" \(1/m\^2\)'),
+        ("contacts.parameters.b=-1.0", r"parameters.b = -1.0: must be from 0 to 1e\+50 \(1/m\^2\)"),
+        ("contacts.parameters.c=1.0", 'contacts.parameters.c = 1.0: the law "hardening" takes b'),
+        ("contacts.law=bilinear", 'contacts.parameters.b = 400000.0: the law "bilinear" takes no parameters'),
+        ("drive.parameters=", 'drive.parameters.delay: missing; needed for the waveform "ricker"'),
+        ("drive.waveform=harmonic", "drive.parameters: does not apply to the waveform 'harmonic'"),
+        ("drive.duration=1.0", "drive.duration: does not apply to the waveform 'ricker'"),
+        ("nfrc.range=[0.5,2.0]", "this verb is about one burst or harmonic"),
+    ],
+)
+def test_keys_of_parts_are_checked(folder, change, sentence):
+    """Parameters are those of the part, within its bounds; other verbs refuse a waveform that they are not about."""
+    from vipetsc.case.verb_cases import load_every
+
+    with pytest.raises(CaseError, match=sentence):
+        load_every(folder / "case.toml", [change])
+
+
+def test_a_sweep_varies_laws_and_their_parameters(folder):
+    """Laws vary together with their parameters; a stop that does not harden is the linear one."""
+    table = tomllib.loads(CASE)
+    table["plugins"]["modules"] = [str(folder / name) for name in table["plugins"]["modules"]]
+    varied = {
+        "zip": [["contacts.law", "contacts.parameters"]],
+        "contacts": {"law": ["bilinear", "hardening", "hardening"], "parameters": [{}, {"b": 0.0}, {"b": RATE}]},
+    }
+    ensemble = sweep(Sweep(**table, sweep=varied)).dataset
+    linear, unhardened, hardened = ensemble["ibtet"].values
+    assert unhardened == pytest.approx(linear, rel=1e-6)
+    assert abs(hardened / linear - 1) > 1e-3
+    assert "[plugins.parts.law.hardening]" in ensemble.attrs["case"]
+
+
+@pytest.mark.mpirun
+def test_two_ranks_have_the_bits_of_one(folder, out, tmp_path, on_ranks):
+    """The registered law, compiled on each rank, gives the bits of one rank."""
+    on_ranks(2, "run", folder / "case.toml", "--out", tmp_path / "two", *set_words("output.figures=false"))
+    with open(out / "run.h5") as one, open(tmp_path / "two/run.h5") as two:
+        assert np.array_equal(one["velocity"], two["velocity"])

@@ -1,0 +1,191 @@
+"""The section ``[plugins]``: modules of the user's, which register laws, waveforms and other parts by name.
+
+The resolved case records every part on which numbers depend, with the version of its module and the SHA-256 of its
+source, so that every result carries them and one that was begun with another source is not gone on with.
+"""
+
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+from vipetsc import plugins, register
+from vipetsc.case.section import Problem, Section
+from vipetsc.process import launched_rank
+
+logger = logging.getLogger(__name__)
+PHYSICS = (register.LAW, register.DISSIPATION, register.WAVEFORM)  # kinds without which a case has no meaning
+NAMING = ("contacts", "drive", "sweep")  # sections whose keys may name a part
+
+
+class PartTable(Section):
+    """A part that a module registers, as the resolved case records it."""
+
+    module: str
+    version: str
+    sha256: str
+
+
+class PluginsTable(Section):
+    """Modules that register parts: files (.py), entry points of the group `vipetsc.plugins`, or importable modules.
+
+    ``parts`` are recorded when the case is read, by their kind and name.
+    """
+
+    modules: list[str] = Field([], min_length=1)
+    parts: dict[str, dict[str, PartTable]] | None = None
+
+
+@dataclass(frozen=True)
+class PartName:
+    """Type of a key whose value names a part of a ``kind``: a ``shipped`` one, or one of the modules of the case."""
+
+    kind: str
+    shipped: tuple[str, ...]
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """The names that the key may have."""
+        return (*self.shipped, *plugins.registered(self.kind))
+
+    def _check(self, value: Any) -> str:
+        if isinstance(value, str) and value in self.choices:
+            return value
+        names = [repr(name) for name in self.choices]
+        expected = f"{', '.join(names[:-1])} or {names[-1]}"
+        # The type is that of pydantic's choices of names, whose message this is.
+        message = "Input should be {expected}; plugins.modules names modules that register others"
+        raise PydanticCustomError("literal_error", message, {"expected": expected})
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """The check of a value; names are looked up when it is called."""
+        return core_schema.no_info_plain_validator_function(self._check)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """The names at this moment."""
+        return {"enum": list(self.choices), "type": "string"}
+
+
+def module_names(table: Mapping[str, Any]) -> list[str]:
+    """The modules that a parsed case names; none where the key is not as it should be."""
+    section = table.get("plugins")
+    names = section.get("modules") if isinstance(section, dict) else None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        return []
+    return names
+
+
+def with_located(table: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """``table`` with the whole paths of files of modules, which its case file names from its ``folder``."""
+    names = module_names(table)
+    if not names:
+        return table
+    return table | {"plugins": table["plugins"] | {"modules": [plugins.located(name, folder) for name in names]}}
+
+
+def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
+    """``table`` with a record of the parts of its modules, which are imported, and what is wrong with these.
+
+    A resolved case may lack modules on which its physics does not depend: a warning says so, and the record stays.
+    """
+    names = module_names(table)
+    if not names:
+        section = table.get("plugins")
+        is_empty = isinstance(section, dict) and "modules" not in section
+        return table, [Problem("plugins.modules", None, "missing; name files or modules")] if is_empty else []
+
+    table = with_located(table, Path())
+    earlier = table["plugins"].get("parts")
+    recorded = earlier if isinstance(earlier, dict) else {}
+    parts: dict[str, dict[str, Any]] = {}
+    problems = []
+    for number, name in enumerate(module_names(table)):
+        try:
+            rows = _record(name)
+        except plugins.PluginError as error:
+            rows = _rows_of(recorded, name)
+            if earlier is None or any(kind in PHYSICS and part in _texts(table) for kind, part, _ in rows):
+                problems.append(Problem(f"plugins.modules[{number + 1}]", names[number], str(error)))
+            else:
+                _warn(f"{name}: {error}; its parts are left out")
+        for kind, part, row in rows:
+            parts.setdefault(kind, {})[part] = row
+
+    changed: dict[str, list[str]] = {}
+    for kind, part, row in _all_rows(recorded):
+        now = parts.get(kind, {}).get(part)
+        if now and now.get("sha256") != row.get("sha256"):
+            changed.setdefault(now["module"], []).append(f"{kind} {part}")
+    for name, which in changed.items():
+        _warn(f"{name} has changed since the case was resolved that used it: {', '.join(which)}")
+    return table | {"plugins": table["plugins"] | {"parts": parts}}, problems
+
+
+def missing_parts(table: PluginsTable) -> list[Problem]:
+    """Problems with importing the modules of a resolved case, as on another rank, to the sources that it records."""
+    problems = []
+    for number, name in enumerate(table.modules, 1):
+        try:
+            rows = _record(name)
+        except plugins.PluginError as error:
+            problems.append(Problem(f"plugins.modules[{number}]", name, str(error)))
+            continue
+        for kind, part, row in rows:
+            recorded = (table.parts or {}).get(kind, {}).get(part)
+            if recorded and recorded.sha256 != row["sha256"]:
+                problems.append(Problem(f"plugins.modules[{number}]", name, "differs from rank to rank"))
+                break
+    return problems
+
+
+def _record(name: str) -> list[tuple[str, str, dict[str, str]]]:
+    """Kind, name and record of the parts of the module ``name`` on which numbers depend; raises PluginError."""
+    plugin = plugins.load(name)
+    rows = []
+    for part in plugin.parts:
+        if part.kind not in plugins.NEVER_RESULTS:
+            row = {"module": name, "version": plugin.version, "sha256": part.sha256}
+            rows.append((part.kind, part.name, row))
+    return rows
+
+
+def _all_rows(recorded: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Kind, name and record of all parts of a resolved table; what is no record is left to the check of types."""
+    for kind, parts in recorded.items():
+        for part, row in parts.items() if isinstance(parts, dict) else ():
+            if isinstance(row, dict):
+                yield kind, part, row
+
+
+def _rows_of(recorded: Mapping[str, Any], name: str) -> list[tuple[str, str, dict[str, Any]]]:
+    """Those of the module ``name``; a file may have been recorded elsewhere."""
+    return [row for row in _all_rows(recorded) if Path(str(row[2].get("module"))).name == Path(name).name]
+
+
+def _texts(table: Mapping[str, Any]) -> set[str]:
+    """All texts in the sections of a case that may name parts."""
+    texts = set()
+    waiting = [table.get(section) for section in NAMING]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, dict):
+            waiting += value.values()
+        elif isinstance(value, list):
+            waiting += value
+        elif isinstance(value, str):
+            texts.add(value)
+    return texts
+
+
+_WARNED: set[str] = set()
+
+
+def _warn(text: str) -> None:
+    """Warn once, on one rank: a file's case is read many times."""
+    if text not in _WARNED and not launched_rank():
+        logger.warning("vipetsc: %s", text)
+    _WARNED.add(text)

@@ -1,0 +1,102 @@
+"""Laws and factors that users' modules register: what is wrong with their parameters, and with their formulas."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vipetsc.case.section import Problem
+from vipetsc.lattice import Contact
+from vipetsc.lattice.contact import registered_factor, registered_law
+from vipetsc.register import Parameter
+
+# Indentations in m at which the formulas of a law are compared with each other, and those of its onset.
+DEPTHS = np.geomspace(1e-6, 1e-3, 7)
+ONSET = np.array([1e-9, 1e-8])
+CLOSE = 1e-5  # relative difference of a derivative from a difference quotient
+
+
+def check_parameters(
+    path: str, given: Mapping[str, float], parameters: Mapping[str, Parameter], owner: str
+) -> Iterator[Problem]:
+    """Problems with numbers ``given`` at a ``path`` for the ``parameters`` of an ``owner``, as 'the law "stop"'."""
+    for key in given.keys() - parameters.keys():
+        remedy = f"{owner} takes {', '.join(parameters) or 'no parameters'}"
+        yield Problem(f"{path}.{key}", given[key], remedy)
+    for key, about in parameters.items():
+        value = given.get(key)
+        unit = f" ({about.unit})" if about.unit else ""
+        if value is None:
+            yield Problem(f"{path}.{key}", None, f"missing; needed for {owner}{unit}")
+        elif not about.least <= value <= about.most:
+            yield Problem(f"{path}.{key}", value, f"must be from {about.least:g} to {about.most:g}{unit}")
+
+
+def check_law_parameters(
+    path: str, laws: Sequence[str], given: Sequence[Mapping[str, float] | None]
+) -> Iterator[Problem]:
+    """Problems with the parameters ``given`` for the ``laws`` (site,) of sites, at a ``path``."""
+    every: dict[str, Parameter] = {}
+    for name in laws:
+        law = registered_law(name)
+        every |= law.parameters if law else {}
+    names = ", ".join(f'"{name}"' for name in dict.fromkeys(laws))
+    pairs = {(name, tuple(sorted((values or {}).items()))) for name, values in zip(laws, given, strict=True)}
+
+    problems: dict[str, Problem] = {}
+    for name, values in sorted(pairs):
+        law = registered_law(name)
+        numbers = dict(values)
+        # What another site's law takes may stand in the section for all.
+        taken = law.parameters if law else {}
+        relevant = {key: value for key, value in numbers.items() if key in taken or key not in every}
+        owner = f'the law "{name}"' if law else f"the law {names}"
+        for problem in check_parameters(path, relevant, taken, owner):
+            problems.setdefault(problem.key, problem)
+    yield from problems.values()
+
+
+def check_law(law: Contact) -> str:
+    """What is wrong with the formulas of a registered ``law`` with its parameters; empty if nothing is."""
+    try:
+        force, slope, energy = law.elastic_force(DEPTHS), law.elastic_slope(DEPTHS), law.elastic_energy(DEPTHS)
+        at_rest = [float(law.elastic_force(0.0)), float(law.elastic_energy(0.0)), float(law.elastic_slope(0.0))]
+        onset = law.elastic_force(ONSET)
+    except ValueError as error:
+        return str(error)
+
+    values = [*force, *slope, *energy, *at_rest, *onset]
+    if not np.isfinite(values).all():
+        return f"its force, slope or energy is no number at some x from 0 to {DEPTHS[-1]:g} m"
+    if at_rest[0] != 0 or at_rest[1] != 0:
+        return f"its force and energy at x = 0 are {at_rest[0]:g} and {at_rest[1]:g}; both must be 0"
+    if not ((force > 0).all() and (slope >= 0).all()):
+        return "its force must be positive for x > 0, and must not fall"
+
+    step = 1e-5 * DEPTHS
+    quotient = (law.elastic_force(DEPTHS + step) - law.elastic_force(DEPTHS - step)) / (2 * step)
+    work = (law.elastic_energy(DEPTHS + step) - law.elastic_energy(DEPTHS - step)) / (2 * step)
+    for name, stated, expected in (("slope", slope, quotient), ("energy's derivative", force, work)):
+        worst = int(np.argmax(np.abs(stated / expected - 1)))
+        if not abs(stated[worst] / expected[worst] - 1) < CLOSE:
+            values_there = f"{stated[worst]:.6g}, not {expected[worst]:.6g}"
+            if name == "slope":
+                return f"its slope at x = {DEPTHS[worst]:.3g} m is {values_there} as the differences of its force"
+            return f"its force at x = {DEPTHS[worst]:.3g} m is {values_there} as the differences of its energy"
+
+    power = float(np.log10(onset[1] / onset[0]))
+    if abs(power - law.onset_exponent) > 0.05:
+        return f"its force begins as x^{power:.3g}, and onset_exponent is {law.onset_exponent:g}"
+    return ""
+
+
+def check_factors(path: str, names: Iterable[str], restitutions: Iterable[float]) -> Iterator[Problem]:
+    """Problems with what registered factors of these ``names`` give for ``restitutions`` (site,)."""
+    for name, restitution in sorted(set(zip(names, restitutions, strict=True)), key=str):
+        factor = registered_factor(name or "")
+        if factor is None or restitution < factor.least_restitution:
+            continue
+        value: Any = factor.function(restitution)
+        if not (isinstance(value, int | float | np.number) and np.isfinite(value) and value >= 0):
+            remedy = f"gives c = {value!r} for the restitution {restitution:g}; a number from 0 is needed"
+            yield Problem(path, name, remedy)

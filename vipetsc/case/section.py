@@ -1,0 +1,31 @@
+"""What every section of a case file is: a strict table; and what is wrong with one."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+LONGEST_VALUE = 200  # characters of a value that a message shows
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Problem of a case: the path of the key, its value, and the remedy."""
+
+    key: str
+    value: Any
+    remedy: str
+
+    def __str__(self) -> str:
+        if self.value is None:
+            return f"{self.key}: {self.remedy}"
+        text = repr(self.value)
+        if len(text) > LONGEST_VALUE:
+            text = f"{text[:LONGEST_VALUE]} ..."
+        return f"{self.key} = {text}: {self.remedy}"
+
+
+class Section(BaseModel):
+    """A table of a case file: strict types, no unknown keys, immutable."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)

@@ -1,0 +1,83 @@
+"""Elastic laws of users' modules, compiled: C functions, which shipped kernels call by their addresses.
+
+No kernel is compiled anew for a law: the addresses stand in the record of a contact, in this process alone. DOLFINx
+passes the kernels of users' forms to its assemblers likewise.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from vipetsc.compiled import c_address, kernel, users_function
+from vipetsc.register import MOST_PARAMETERS, LawPart
+
+SIGNATURE = "float64(float64, float64, float64, float64, float64, float64)"
+
+
+class CompiledLaw(NamedTuple):
+    """Addresses of the C functions of a law: of x in m, the stiffness k, and four parameters."""
+
+    force: int
+    slope: int
+    energy: int
+
+
+@cache
+def compiled_law(part: LawPart) -> CompiledLaw:
+    """The compiled functions of a law; raises ValueError for one that numba cannot compile."""
+    addresses = [_address(function, len(part.parameters)) for function in (part.force, part.slope, part.energy)]
+    return CompiledLaw(*addresses)
+
+
+def _address(function: Callable[..., float], count: int) -> int:
+    """The address of a ``function`` of x, k and ``count`` parameters, as a C function of ``SIGNATURE``."""
+    compiled = users_function(function)
+
+    def call(x, k, a, b, c, d):  # type: ignore[no-untyped-def]
+        return compiled(x, k, *(a, b, c, d)[:count])
+
+    try:
+        return c_address(call, SIGNATURE)
+    # Errors of numba have several classes without a common one.
+    except Exception as error:
+        name = getattr(function, "py_func", function).__name__
+        lines = [line for line in str(error).splitlines() if line.strip()]
+        reason = next((line for line in lines if not line.startswith(("Failed in", "During"))), "")
+        raise ValueError(f"numba cannot compile its function {name}: {reason}") from error
+
+
+def evaluate(address: int, stiffness: float, parameters: tuple[float, ...], x: np.ndarray) -> np.ndarray:
+    """Values of the function at an ``address`` at each indentation ``x`` in m."""
+    numbers = np.zeros(1 + MOST_PARAMETERS)
+    numbers[0] = stiffness
+    numbers[1 : 1 + len(parameters)] = parameters
+    given = np.ascontiguousarray(x, float)
+    values = np.empty_like(given)
+    _fill(address, numbers, given.reshape(-1), values.reshape(-1))
+    return values
+
+
+@intrinsic
+def call_address(typing_context, address, x, k, a, b, c, d):  # type: ignore[no-untyped-def]
+    """Call the C function of ``SIGNATURE`` at an ``address``."""
+    signature = types.float64(types.int64, *[types.float64] * 6)
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        double = ir.DoubleType()
+        function = ir.FunctionType(double, [double] * 6)
+        pointer = builder.inttoptr(arguments[0], function.as_pointer())
+        return builder.call(pointer, arguments[1:])
+
+    return signature, generate
+
+
+@kernel
+def _fill(address: int, numbers: np.ndarray, x: np.ndarray, values: np.ndarray) -> None:
+    """Set ``values`` to those of the function at an ``address``; ``numbers`` are k and the parameters."""
+    for i in range(x.size):
+        values[i] = call_address(address, x[i], numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])  # type: ignore[call-arg]

@@ -1,0 +1,183 @@
+"""Modules of users, which register parts (``vipetsc.register``): how they are located, imported and told apart.
+
+A module is named by a file ending in ``.py``, by an entry point of the group ``vipetsc.plugins``, or as Python imports
+it, in this order, as pytest takes the name behind ``-p``. What is installed is imported only where a case names it.
+"""
+
+import importlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from hashlib import sha256
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from vipetsc import register
+from vipetsc.register import PARTS, PartError, RegisteredPart
+
+GROUP = "vipetsc.plugins"  # of entry points
+NEVER_RESULTS = (register.FIGURE,)  # kinds of parts on which no number depends
+
+
+class PluginError(Exception):
+    """A module that cannot be used; the message says why."""
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """An imported module: its ``name`` in a case, its ``version``, the Python ``modules`` that register its parts."""
+
+    name: str
+    version: str
+    modules: frozenset[str]
+
+    @property
+    def parts(self) -> list[RegisteredPart]:
+        """The parts of the module, by kind and name."""
+        every = [part for parts in PARTS.values() for part in parts.values() if part.modules & self.modules]
+        return sorted(every, key=lambda part: (part.kind, part.name))
+
+
+_PLUGINS: dict[str, Plugin] = {}
+_NAMED: ContextVar[tuple[str, ...] | None] = ContextVar("named", default=None)
+
+
+@contextmanager
+def only(names: Sequence[str]) -> Iterator[None]:
+    """Let ``registered`` list the parts of the modules ``names`` alone within the block, those that a case names."""
+    token = _NAMED.set(tuple(names))
+    try:
+        yield
+    finally:
+        _NAMED.reset(token)
+
+
+def registered(kind: str) -> tuple[str, ...]:
+    """Names of the registered parts of a ``kind``: of the modules that the case at hand names, else of all."""
+    named = _NAMED.get()
+    if named is None:
+        return tuple(PARTS[kind])
+    plugins = [_PLUGINS[name] for name in named if name in _PLUGINS]
+    return tuple(part.name for plugin in plugins for part in plugin.parts if part.kind == kind)
+
+
+def call(part: RegisteredPart, function: Callable[..., Any], *arguments: Any) -> Any:
+    """The value of a ``function`` of a ``part``; raises PartError for whatever it raises."""
+    try:
+        return function(*arguments)
+    except Exception as error:
+        raise PartError(f"the {part.kind} {part.name!r} of {part.file} fails: {_reason(error, part.file)}") from error
+
+
+def is_file(name: str) -> bool:
+    """Whether the ``name`` of a module is that of a file."""
+    return name.endswith(".py")
+
+
+def located(name: str, folder: Path) -> str:
+    """The ``name`` of a module as it is from everywhere: of a file its whole path, which may begin at ``folder``.
+
+    A file that is not there, as where results have been moved, may lie in the working directory.
+    """
+    if not is_file(name):
+        return name
+    path = (folder / name).resolve()
+    here = Path(path.name).resolve()
+    return str(here if here.is_file() and not path.is_file() else path)
+
+
+def load(name: str) -> Plugin:
+    """Import the module ``name`` once; raises PluginError if it fails, has changed since, or registers nothing."""
+    plugin = _PLUGINS.get(name)
+    if plugin is None:
+        plugin = _imported(name)
+        _PLUGINS[name] = plugin
+
+    for part in plugin.parts:
+        if Path(part.file).is_file() and register.file_digest(part.file) != part.sha256:
+            raise PluginError(f"{part.file} has changed since this process imported it; start Python anew")
+    return plugin
+
+
+def _imported(name: str) -> Plugin:
+    """The module ``name``, imported."""
+    earlier = _every_module()
+    entry = None if is_file(name) else next(iter(metadata.entry_points(group=GROUP, name=name)), None)
+    try:
+        installed = entry.module if entry else name
+        module = _from_file(Path(name)) if is_file(name) else importlib.import_module(installed)
+    except PluginError:
+        raise
+    # SystemExit: a script that ends its process, imported by mistake.
+    except (Exception, SystemExit) as error:
+        _forget(_every_module() - earlier)
+        raise PluginError(f"cannot be imported: {_reason(error, name)}") from error
+
+    # What it imports may register parts, and an earlier import may have registered its own.
+    within = {other for other in _every_module() if f"{other}.".startswith(f"{module.__name__}.")}
+    plugin = Plugin(name, _version(module, entry), frozenset(within | (_every_module() - earlier)))
+    if not plugin.parts:
+        raise PluginError("registers nothing; see the chapter extend of the manual")
+    return plugin
+
+
+def _from_file(path: Path) -> ModuleType:
+    """The module in a file, under a name of its own: files of one name in two folders are two modules."""
+    if not path.is_file():
+        raise PluginError(f"there is no file {path}, which registers parts of this case")
+    name = f"vipetsc_plugin_{sha256(str(path).encode()).hexdigest()[:8]}_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _every_module() -> set[str]:
+    """The modules of Python that register parts."""
+    return {module for parts in PARTS.values() for part in parts.values() for module in part.modules}
+
+
+def _forget(modules: set[str]) -> None:
+    """Remove the parts of ``modules``: one that failed halfway leaves none."""
+    for parts in PARTS.values():
+        for part in list(parts.values()):
+            part.modules.difference_update(modules)
+            if not part.modules:
+                del parts[part.name]
+
+
+def _reason(error: BaseException, file: str) -> str:
+    """An ``error`` in one line, with the last line of ``file``, else of any file outside this package, before it."""
+    text = f"{type(error).__name__}: {error}".rstrip(": ").replace("\n", " ")
+    ours = str(Path(__file__).parent)
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(ours)]
+    frames = [frame for frame in frames if frame.filename == file] or frames[-1:]
+    # Python's machinery of imports is no file.
+    if not frames or frames[-1].filename.startswith("<"):
+        return text
+    return f"{text} ({frames[-1].filename}, line {frames[-1].lineno})"
+
+
+def _version(module: ModuleType, entry: metadata.EntryPoint | None) -> str:
+    """The version that a module states, else that of its distribution; empty without one."""
+    stated = getattr(module, "__version__", "")
+    if stated:
+        return str(stated)
+    if entry is not None and entry.dist is not None:
+        return entry.dist.version
+    try:
+        return metadata.version(module.__name__.partition(".")[0])
+    except (metadata.PackageNotFoundError, ValueError):
+        return ""
