@@ -1,7 +1,7 @@
 """The compiled contact force: one law for time stepping, for the propagator and for normal modes.
 
 The docstring of the package derives the formulas. ``vipetsc.lattice.Contact`` is the same law on arrays: force, slope
-and energy of a shipped elastic law are defined there and here, and nowhere else. A law that a module of a user registers
+and energy of a shipped elastic law are defined there and here, and nowhere else. A law that a user's module registers
 is called by the addresses of its compiled functions, which its record holds in this process.
 """
 
