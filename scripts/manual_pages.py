@@ -142,7 +142,7 @@ def put(path: Path, text: str, home: Path) -> None:
 
 
 def add_static(folder: Path) -> None:
-    """Put what pages load into the ``_static`` of ``folder``: MathJax, and the style of formulas and wide tables."""
+    """Put what pages load into the ``_static`` of ``folder``: MathJax, and the style of code."""
     package = find_spec("sphinx-mathjax-offline")
     if package is None or package.origin is None:
         raise ModuleNotFoundError("pages with formulas need the package sphinx-mathjax-offline (the extra manual)")

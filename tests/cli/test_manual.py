@@ -56,10 +56,12 @@ def browser(tmp_path_factory):
         yield opened
 
 
-# Elements beyond the window's right edge, but for those that scroll by themselves.
+# Elements beyond the window's right edge, but for those in a box that scrolls by itself.
 WIDE = """
-return [...document.querySelectorAll('article *')].filter(e => e.getBoundingClientRect().right > innerWidth + 1
-    && !e.closest('.table-wrapper, .highlight, div.math')).map(e => e.tagName + e.textContent.slice(0, 40));
+const scrolls = e => e && (getComputedStyle(e).overflowX === 'auto' || scrolls(e.parentElement.closest('article *')));
+return (window.MathJax ? MathJax.startup.promise : Promise.resolve()).then(() =>
+    [...document.querySelectorAll('article *')].filter(e => e.getBoundingClientRect().right > innerWidth + 1
+        && !scrolls(e)).map(e => e.tagName + e.textContent.slice(0, 40)));
 """
 
 
