@@ -335,7 +335,7 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAx
 
     without_value = int((measure.values.isnull() & ~measure.failed).sum())
     if without_value:
-        lines.append(f"{without_value} of {measure.values.size} have no value")
+        lines.append(f"{without_value} of {measure.values.size} values are missing")
 
     panels = _by_place(measure, roles.panels)
     page = MeasurePage(measure.label, lines, list(_by_place(measure, roles.curves)) if roles.curves else [])

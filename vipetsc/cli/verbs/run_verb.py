@@ -94,9 +94,11 @@ def run_rows(case: Case, ranks: int) -> Rows:
     drive_words = f"{drive_end:.6g} s" if drive_end < np.inf else "no end"
     noun = "burst" if all(drive.kind == DEFAULT for _, drive in case.drive.every) else "drive"
 
-    # Doubles: fields at every stride-th sample, and what each site has dissipated at all samples. The rest is small.
+    # Doubles: fields at every stride-th sample; at all samples, the losses of each site, perhaps its force,
+    # and three quantities of each point. The rest is small.
     columns = len(recorded_cells(case.output, chain.cells)) * chain.cell.dofs * len(case.output.fields)
-    size = 8 * (columns * -(-model.samples // case.output.stride) + len(chain.sites) * model.samples)
+    every_sample = len(chain.sites) * (2 if case.output.forces else 1) + 3 * len(case.output.points or [])
+    size = 8 * (columns * -(-model.samples // case.output.stride) + every_sample * model.samples)
     writer = "parallel" if written_together(model, case.output, ranks) else "gather"
     free = shutil.disk_usage(".").free
 
@@ -118,6 +120,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
         ("waves at Om", ("; ".join(waves) or "none: the frequency is in a gap") if omega else ""),
         (f"{noun}, end", f"{drive_words}, {model.end:.6g} s") if model.is_driven else ("end", f"{model.end:.6g} s"),
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
+        ("points", ", ".join(f"{p.name} (cell {p.cell}, mass {p.mass})" for p in case.output.points or [])),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
         ("engine", f"{cost.engine}: {cost.note}" if cost.note else cost.engine),
         ("disk", f"{size / 2**20:.4g} MiB ({writer}), twice that during the run; {free / 2**30:.4g} GiB free here"),
