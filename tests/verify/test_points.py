@@ -307,7 +307,7 @@ def test_export_writes_histories_forces_and_numbers(tmp_path):
         ({"points": [{"name": "a", "cell": 25}]}, "output.points[1].cell = 25: the lattice has the cells 1 to 24"),
         ({"points": [{"name": "a", "cell": 2, "mass": 5}]}, "output.points[1].mass = 5: a cell has the masses 1 to 4"),
         ({"points": [{"name": "a", "cell": 2}] * 2}, "output.points[2].name = 'a': names another point"),
-        ({"points": [{"name": "a b", "cell": 2}]}, "output.points[1].name"),
+        ({"points": [{"name": "a b", "cell": 2}], "transmission": [["a", "b"]]}, "output.points[1].name"),
         ({"points": [{"name": "a", "cell": 2}], "transmission": [["a", "b"]]}, "b: no point of that name"),
         ({"transmission": [["a", "b"]]}, "a, b: no point of that name in output.points; there are none"),
         ({"points": [{"name": "a", "cell": 2}], "transmission": [["a", "a"]]}, "names one point twice"),

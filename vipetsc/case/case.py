@@ -135,7 +135,7 @@ class Case(CaseFile):
 
         yield from _check_undriven(sections, valid)
         length = lattice.cells if valid("lattice.cells") else None
-        yield from _check_output(sections["output"], length, cell)
+        yield from _check_output(sections["output"], length, cell, valid)
         problems = list(check_drives(drive, lattice, cell, length, valid))
         yield from problems
         # Only of drives that are sound, since waves are computed for it.
@@ -331,12 +331,14 @@ def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]
         )
 
 
-def _check_output(output: OutputTable, cells: int | None, cell: UnitCell | None) -> Iterator[Problem]:
+def _check_output(output: OutputTable, cells: int | None, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:
     """The window and the points are within the lattice's ``cells``, its masses those of the ``cell``; None: invalid."""
     window = output.window
     if window is not None and cells is not None and not 1 <= window[0] <= window[1] <= cells:
         yield Problem("output.window", window, f"must be [first, last] within cells 1 to {cells}")
-    yield from check_points(output.points or [], output.transmission or [], cells, cell.dofs if cell else None)
+    if valid("output.points"):
+        dofs = cell.dofs if cell else None
+        yield from check_points(output.points or [], output.transmission or [], cells, dofs)
 
 
 def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:

@@ -63,8 +63,9 @@ def convergence(optimum: xr.Dataset) -> Figure:
     """Draw the values of all designs, in their order or over both objectives, and what else became of them."""
     options = OptimiseCase.of(optimum).options
     objectives = options.objective
-    sought = [*objectives, *(options.constraint or [])]
-    figure = style.new_figure(style.PAGE, 2.8, "; ".join(table.describe() for table in sought))
+    sought = [objective.describe() for objective in objectives]
+    sought += [constraint.describe() for constraint in options.constraint or []]
+    figure = style.new_figure(style.PAGE, 2.8, "; ".join(sought))
     values, others = figure.subplots(1, 2)
     if len(objectives) == 1:
         _draw_one_objective(values, optimum, objectives[0])
