@@ -34,6 +34,7 @@ MANUAL = ROOT / "vipetsc/manual"
 CHAPTERS = ("own-lattice", "files", "measures", "modal", "engines", "python")
 # One session in this order: later pages go on with files of earlier ones.
 GUIDE = [ROOT / "README.md", *(MANUAL / f"{name}.md" for name in CHAPTERS)]
+CASE_NAME = re.compile(r"# (\S+\.toml)(, added)?\n")
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", flags=re.M | re.S)
 # Chapters with commands or code that the session does not type, and why.
 NOT_TYPED = {
@@ -56,7 +57,11 @@ def session() -> str:
             script.append(f": {page.name}")
 
             if language == "toml":
-                name, added = re.match(r"# (\S+\.toml)(, added)?\n", text).groups()
+                named = CASE_NAME.match(text)
+                # An excerpt without the name of a file is not typed.
+                if not named:
+                    continue
+                name, added = named.groups()
                 script.append(f"cat {'>>' if added else '>'} {name} <<'END'\n{text}END")
             elif language == "python":
                 script.append(f"python - <<'END'\n{text}END")
@@ -232,10 +237,10 @@ def sections() -> dict[str, str]:
     """
     excerpts = {}
     for page in sorted(MANUAL.glob("*.md")):
-        if page in GUIDE or page.stem == "extend":
+        if page.stem == "extend":
             continue
         for number, (language, text) in enumerate(BLOCK.findall(page.read_text(encoding="utf-8"))):
-            if language == "toml":
+            if language == "toml" and not (page in GUIDE and CASE_NAME.match(text)):
                 excerpts[f"{page.stem}-{number}"] = text
     return excerpts
 
