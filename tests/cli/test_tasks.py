@@ -201,7 +201,7 @@ def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put
     assert "ibtet: without the branches of runs/branch; --fig ibtet_backbone draws both" in printed
 
     # A branch that is too short for a comparison is refused with the key that lengthens it.
-    typed("nnm rest.toml --out runs/short --set output.figures=false --set nnm.energy=[0.0,0.003]")
+    typed("nnm rest.toml --out runs/short --set output.figures=false --set nnm.energy=[0.0,0.05]")
     refused = in_process("plot", "runs/rest", "runs/short", "--fig", "ibtet_backbone", cwd=tmp_path)
     assert refused.returncode == 2
     assert "of 3 needed; follow the branch to more energy (nnm.energy)" in refused.stderr
