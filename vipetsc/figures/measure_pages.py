@@ -264,7 +264,7 @@ def _common_axes(measure: Measure, others: Sequence[Measure]) -> CommonAxes | No
     return CommonAxes(
         values=np.concatenate([part.values.ravel() for part in parts]),
         x=np.concatenate([place.x.positions for place in places]),
-        y=np.concatenate([place.y.positions for place in places if place.y] or [[0.0]]),
+        y=np.concatenate([place.y.positions for place in places if place.y] or [np.zeros(1)]),
     )
 
 

@@ -170,7 +170,7 @@ def _draw_ledger(axes: Axes, run: xr.Dataset) -> None:
         mean = ", mean"
 
     given = "initial energy and work" if case.initial else "work of the drive"
-    curves = [
+    curves: list[tuple[str, xr.DataArray, str, Any]] = [
         (given, run["energy/work"], style.BLACK, "-"),
         ("kinetic + potential", stored, style.BLUE, "-"),
         (f"kinetic{mean}", parts["energy/kinetic"], style.SKY, "-"),
