@@ -170,6 +170,8 @@ def _entropy(facet: Facet, average: str) -> Figure:
         _draw_other_readings(lower, facet.ensemble, row, average)
         _draw_log_panel(lower, curve, average, size=2.2)
 
+    for axes in grid[0]:
+        axes.set_xlabel("A (N)")
     panels.label_panels(grid)
     figure.supylabel("Normalised entropy")
     _add_legend(figure, grid, columns=3 if len(facet.rows) > 4 else 2)
