@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 
@@ -156,3 +157,31 @@ def test_a_tap_on_a_phone_shows_the_picture_on_the_whole_screen(page):
     assert shown[1] >= 2 * shown[2] == 2 * shown[3]
     assert not browser.ask(session, look + "l.click(); return d.open;")
     assert browser.measure(session)["errors"] == []
+
+
+@pytest.mark.browser
+@NEEDED
+def test_a_full_report_is_printed_on_less_than_forty_pages(page, tmp_path):
+    """Seventy-four pictures of half a page's height."""
+    path, browser = page
+    with rc_style():
+        figure = new_figure(7, 5)
+        figure.subplots().plot(*POINTS)
+        picture = save(figure, tmp_path / "fig99-high.png")
+    figures = [
+        PaperFigure(f"fig{k}", f"Fig. {k}", "A high picture", "In a few words. " * 20, (), ()) for k in range(37)
+    ]
+    contents = ReportContents(
+        note="",
+        claims=[],
+        pictures=[(figure, [picture, picture]) for figure in figures],
+        statistics={},
+        versions={"date": ""},
+        cpu={"steps": {}},
+    )
+    write_report(tmp_path / "report.html", contents)
+    session = browser.open(tmp_path / "report.html", 1280, 900)
+    printed = base64.b64decode(browser.call(f"{session}/print", {}))
+    pages = len(re.findall(rb"/Type\s*/Page\b", printed))
+    # A quarter of a page is the most that a picture takes, and claims take eight pages.
+    assert 1 < pages <= 32

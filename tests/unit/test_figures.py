@@ -20,6 +20,7 @@ from vipetsc.figures.style import SCREEN, new_figure, rc_style, save
 from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures
 from vipetsc.lattice import Chain, Spring, UnitCell, diatomic, four_band
+from vipetsc.lattice.chain import Pair
 from vipetsc.spectra import kinetic_energy
 from vipetsc.studies.reanalysis import measure_run
 
@@ -267,6 +268,23 @@ def test_a_file_that_is_no_run_is_not_measured(tmp_path):
     with pytest.raises(ValueError, match="not a run"):
         measure_run(tmp_path)
     assert not (tmp_path / "analysis.h5").exists()
+
+
+def test_a_lone_mass_is_drawn_with_what_its_contacts_join():
+    """Of beads the next one, of a mass on the ground the ground: neither cell is blank."""
+    cell = UnitCell(masses=(0.01,), springs=(), host=0, resonator=0)
+    texts = []
+    for pairs in ((), (Pair(0, 0, next_cell=True),), (Pair(-1, 0),)):
+        with rc_style():
+            axes = new_figure(5, 2).subplots()
+            draw_unit_cell(axes, cell, pairs)
+        texts.append([text.get_text() for text in axes.texts])
+    lone, bead, grounded = texts
+    assert "contact, Δ" not in lone
+    assert "contact, Δ" in bead
+    assert bead.count("$m_{1}$") == 2
+    assert "contact, Δ" in grounded
+    assert grounded.count("$m_{1}$") == 1
 
 
 # Five masses, of which two are tied to the next cell, and a chain with a pair of masses apart from it.

@@ -13,6 +13,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+from tests.readable import complaints
 from vipetsc.case import Case
 from vipetsc.case.keys import unit_of
 from vipetsc.case.sweep import coordinate
@@ -399,3 +400,34 @@ def test_a_case_is_named_by_what_applies_to_it(table, name):
     case = Case.from_table({"name": "tried"} | table)
     assert Labels.of(case).member == name
     assert Labels.of(case, "drive.ramp 2 s").page.endswith("drive.ramp 2 s")
+
+
+def test_pages_of_several_sweeps_have_common_axes():
+    """Curves and maps of another sweep, of larger values over higher amplitudes, have the same limits and colours."""
+    higher = {"drive.amplitude": [8.0, 16.0, 32.0, 64.0, 128.0, 256.0]}
+    for axes in ([RESTITUTIONS], [CLEARANCES]):
+        sweeps = [ensemble_of(*axes, AMPLITUDES), ensemble_of(*axes, higher)]
+        sweeps[1]["ibtet"] *= 7
+        figures = []
+        for ensemble, other in (sweeps, sweeps[::-1]):
+            (drawing,) = measure_pages(ensemble, "ibtet", "name", [other])
+            figures.append(drawing.draw())
+        first, second = (panels(figure)[0] for figure in figures)
+        np.testing.assert_allclose(first.get_xlim(), second.get_xlim())
+        np.testing.assert_allclose(first.get_ylim(), second.get_ylim())
+        meshes = [shape for page in (first, second) for shape in page.collections if isinstance(shape, QuadMesh)]
+        assert len({mesh.get_clim() for mesh in meshes}) <= 1
+
+
+def test_pages_can_be_read(tmp_path):
+    """No text outside the page or over other text, of curves, of maps, of panels and with long names."""
+    for axes in (
+        [AMPLITUDES],
+        [RESTITUTIONS, AMPLITUDES],
+        [CLEARANCES, THREE],
+        [LAWS, SITES, RESTITUTIONS, AMPLITUDES],
+    ):
+        for drawing in measure_pages(ensemble_of(*axes), "ibtet"):
+            figure = drawing.draw()
+            save(figure, tmp_path / "page.json")
+            assert complaints(figure) == []

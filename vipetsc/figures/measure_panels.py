@@ -215,7 +215,8 @@ def draw_maps(
         _draw_contours(axes, x.positions[x_order], y.positions[y_order], values, norm, most)
         label_positions(axes.yaxis, y, PANEL_HEIGHT)
         if common:
-            axes.update_datalim([(common.x.min(), common.y.min()), (common.x.max(), common.y.max())])
+            axes.set_xlim(cell_edges(np.unique(common.x), x.scale)[[0, -1]])
+            axes.set_ylim(cell_edges(np.unique(common.y), y.scale)[[0, -1]])
 
     if ring:
         at = x.positions[ring.x], y.positions[ring.y]

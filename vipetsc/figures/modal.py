@@ -139,7 +139,7 @@ def _draw_matrix(axes: Axes, rows: list[str], columns: list[str], percent: np.nd
     axes.set_yticks(range(len(rows)), rows, fontsize=6 if is_long else 8)
     axes.tick_params(length=0)
     axes.grid(visible=False)
-    axes.set(title="Transferred by each site (% of the work)", ylabel="Contact site (cell)")
+    axes.set(title="Transferred by site (% of work)", ylabel="Contact site (cell)")
 
 
 def _in_cell(value: float, is_wide: bool) -> str:

@@ -42,6 +42,7 @@ SEGMENTS = {
     "dispersion_after": SegmentLook("Output segment", "white"),
 }
 OUTLINE = [withStroke(linewidth=3.4, foreground=style.BLACK)]  # seen on bright and dark places of a map
+TEXT_OUTLINE = [withStroke(linewidth=1.4, foreground=style.BLACK)]
 ROOM = 1e4  # of a spectrum's axis above its peak, for the time history
 GAPS = (style.DASHED, (0, (1, 1.5)), (0, (4, 1.5, 1, 1.5)), (0, (6, 3)))
 MOST_COLUMNS = 4  # of dispersions
@@ -127,7 +128,7 @@ def _mark_segments(axes: Axes, member: MemberRun) -> None:
         line = {"color": segment.colour, "lw": 2.2, "solid_capstyle": "butt", "path_effects": OUTLINE}
         axes.plot([0.98, 0.98], [low + 1, high - 1], transform=across, **line)
         name = segment.label.split()[0].lower()
-        text = {"color": segment.colour, "rotation": 90, "ha": "right", "va": "center", "path_effects": OUTLINE}
+        text = {"color": segment.colour, "rotation": 90, "ha": "right", "va": "center", "path_effects": TEXT_OUTLINE}
         axes.text(0.955, 0.5 * (low + high), name, transform=across, **text)
 
 
@@ -161,7 +162,7 @@ def _draw_spectra(axes: Axes, member: MemberRun, velocity: np.ndarray) -> None:
     inset.margins(x=0)
     inset.tick_params(labelsize=5, pad=1)
     inset.set_ylabel("m/s", fontsize=5.5, labelpad=0)
-    inset.set_xlabel("s", fontsize=5.5, labelpad=-4, loc="right")
+    inset.set_xlabel("time (s)", fontsize=5.5, labelpad=0)
 
 
 class CaseFolder(NamedTuple):
@@ -247,6 +248,11 @@ def _dispersion_panels(heading: str, shown: Sequence[DispersionPanel], columns: 
 
     for axes in grid.flat[len(shown) :]:
         axes.set_axis_off()
+    if columns == MOST_COLUMNS:
+        # Narrow panels have no room for it.
+        figure.supxlabel(panels.KAPPA)
+        for axes in grid.flat:
+            axes.set_xlabel("")
     if len(shown) > 1:
         panels.label_panels(grid if len(shown) == grid.size else grid.flat[: len(shown)])
     panels.colour_bar(image, grid, "Energy per bin / maximum", aspect=35)

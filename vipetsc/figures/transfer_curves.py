@@ -73,7 +73,8 @@ def columns_of_laws(shown: Sequence[TransferCurve], ylabel: str, panel: Callable
     figure = style.new_figure(width, 2.9, Labels.of(shown[0].case, varied).page)
     grid = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     for tag, axes, curve in zip(ascii_lowercase, grid, shown, strict=False):
-        axes.set_title(f"({tag}) {panel(axes, curve)}")
+        title = panel(axes, curve)
+        axes.set_title(f"({tag}) {title}" if len(shown) > 1 else title)
     grid[0].set_ylabel(ylabel)
     return figure
 
@@ -201,7 +202,7 @@ def curves_left_out(folders: Iterable[Path]) -> str:
         if path.exists():
             with open_netcdf(path, "backbone", ("case",)) as file:
                 sentences += json.loads(file.attrs.get("left_out", "[]"))
-    return "; ".join(sentences)
+    return "; ".join(dict.fromkeys(sentences))
 
 
 def _groups(values: Mapping[Any, Any]) -> list[dict[str, Any]]:
@@ -336,9 +337,8 @@ def _regimes(folders: Sequence[Path], files: Files, labels: Labels, curve: Trans
     transfer.set(xscale="log", yscale="log", xlabel="Amplitude of the drive (N)", ylabel="Inter-band transfer (1)")
     transfer.margins(x=0.08, y=0.12)
     transfer.set_title("(a) Transfer to higher bands")
-    right.supxlabel("Displacement $u$ (mm)")
+    right.supxlabel("Displacement $u$ (mm)\nblue: resonator, red and dashed: host")
     right.supylabel(r"Velocity $\dot u$ (m/s)")
-    right.legend(handles=panels[0].get_lines(), loc="lower right", ncols=2)
     return figure
 
 
@@ -346,6 +346,6 @@ def _draw_portrait(axes: Axes, motion: ContactMotion) -> None:
     """Draw velocity over displacement in mm, the host on top of the resonator."""
     displacement = 1e3 * motion.displacement
     axes.plot(displacement[:, 1], motion.velocity[:, 1], color=style.BLUE, lw=0.5, label="resonator")
-    axes.plot(displacement[:, 0], motion.velocity[:, 0], color=style.RED, lw=0.5, label="host")
+    axes.plot(displacement[:, 0], motion.velocity[:, 0], color=style.RED, lw=0.5, ls=style.DASHED, label="host")
     centre_axes(axes, displacement, motion.velocity)
     axes.tick_params(labelsize=6, pad=1.5)
