@@ -163,7 +163,7 @@ def test_a_tap_on_a_phone_shows_the_picture_on_the_whole_screen(page):
 @NEEDED
 def test_a_full_report_is_printed_on_less_than_forty_pages(page, tmp_path):
     """Seventy-four pictures of half a page's height."""
-    path, browser = page
+    _, browser = page
     with rc_style():
         figure = new_figure(7, 5)
         figure.subplots().plot(*POINTS)
