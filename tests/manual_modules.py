@@ -14,7 +14,7 @@ MODULE = re.compile(r"file `(\w+\.py)`:\n\n```python\n(.*?)^```$", flags=re.M | 
 def write_modules(folder: Path, chapter: Path = CHAPTER) -> list[str]:
     """Write every module that the chapter shows into ``folder``; returns their names."""
     modules = MODULE.findall(chapter.read_text(encoding="utf-8"))
-    assert len(modules) == 4
+    assert len(modules) == 5
     for name, text in modules:
         (folder / name).write_text(text, encoding="utf-8")
     return [name for name, _ in modules]

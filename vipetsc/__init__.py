@@ -7,7 +7,7 @@
     analyse   the measures of a run: spectra, energies of the pass bands, entropy
     open      result files as xarray datasets
     CaseError raised for an invalid case: key, value and remedy of every problem
-    register  contact laws, dissipation factors, waveforms and figures of a user's module, by name
+    register  contact laws, dissipation factors, waveforms, measures and figures of a user's module, by name
 
 This example simulates a shorter version of the built-in lattice, and prints the largest speed of each mass in each
 cell:

@@ -89,6 +89,17 @@ class WaveformPart(RegisteredPart):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class MeasurePart(RegisteredPart):
+    """A number that is measured of a run: see ``measure``."""
+
+    function: Callable[[Any], float | None]
+    unit: str
+    text: str
+    power: float | None = None
+    kind = MEASURE
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FigurePart(RegisteredPart):
     """A figure: see ``figure``."""
 
@@ -214,6 +225,22 @@ def waveform(
             **_origin(name, function),
         )
         _add(part)
+        return function
+
+    return add
+
+
+def measure(name: str, *, unit: str, text: str, power: float | None = None) -> Callable[[Function], Function]:
+    """Register the decorated function as a measure of runs, which ``run``, ``sweep``, ``optimise`` and ``export`` take.
+
+    It takes a ``vipetsc.spectra.measures.RunRecord`` and returns a number in ``unit``, None where the run has no such
+    thing, NaN where it has but no value; ``text`` describes it. Without contact it is proportional to the amplitude to
+    the ``power``: sweeps then scale a linear run for members without contact. Raises ValueError if the name is taken.
+    """
+
+    def add(function: Function) -> Function:
+        _check_arguments(function, ("record",), f"of the measure {name!r}")
+        _add(MeasurePart(function=function, unit=unit, text=text, power=power, **_origin(name, function)))
         return function
 
     return add

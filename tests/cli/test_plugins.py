@@ -21,7 +21,7 @@ from vipetsc.lattice.drive import Pieces
 RATE = 4e5
 CASE = f"""
 [plugins]
-modules = ["stops.py", "factors.py", "pulses.py", "pictures.py"]
+modules = ["stops.py", "factors.py", "pulses.py", "durations.py", "pictures.py"]
 
 [lattice]
 preset = "four-band"
@@ -73,12 +73,16 @@ def test_a_run_uses_and_records_the_parts(folder, out):
         case = Case.of(run)
         law = case.model().contact
         assert len(run["impacts/onset"]) > 4
+        longest = float((run["impacts/separation"] - run["impacts/onset"]).max())
+    with open(out / "analysis.h5") as analysis:
+        assert float(analysis["longest_contact"]) == longest
+        assert analysis["longest_contact"].attrs["units"] == "s"
     assert law == Contact("hardening", 2e5, restitution=0.6, factor="herbert-mcwhannell", parameters=(RATE,))
     assert law.damping == pytest.approx(6 * 0.4 / (0.2**2 + 3))
 
     parts = case.plugins.parts
     expected = {"law": ("hardening", "stops.py"), "dissipation": ("herbert-mcwhannell", "factors.py"),
-                "waveform": ("ricker", "pulses.py")}  # fmt: skip
+                "waveform": ("ricker", "pulses.py"), "measure": ("longest_contact", "durations.py")}  # fmt: skip
     assert parts.keys() == expected.keys()
     for kind, (name, file) in expected.items():
         record = parts[kind][name]
@@ -140,9 +144,11 @@ def test_a_source_that_changes_within_a_process_is_refused(folder, tmp_path):
         Case.from_table(table)
 
 
-@pytest.mark.parametrize(("file", "needed"), [("stops.py", True), ("pulses.py", True), ("pictures.py", False)])
+@pytest.mark.parametrize(
+    ("file", "needed"), [("stops.py", True), ("pulses.py", True), ("durations.py", False), ("pictures.py", False)]
+)
 def test_results_need_the_modules_of_their_physics(out, file, needed, caplog):
-    """Results whose law or waveform is not there are not read; a module of figures alone may be missing."""
+    """Results whose law or waveform is not there are not read; a module of measures or figures alone may be missing."""
     text = (out / "case.toml").read_text().replace(f"/{file}", f"/gone-{file}")
     if needed:
         with pytest.raises(CaseError, match=rf"gone-{file}, which registers parts of this case"):
@@ -252,7 +258,9 @@ def test_a_sweep_varies_laws_and_their_parameters(folder):
         "zip": [["contacts.law", "contacts.parameters"]],
         "contacts": {"law": ["bilinear", "hardening", "hardening"], "parameters": [{}, {"b": 0.0}, {"b": RATE}]},
     }
+    varied["measures"] = ["transfer", "motion"]
     ensemble = sweep(Sweep(**table, sweep=varied)).dataset
+    assert (ensemble["longest_contact"] > 0).all()
     linear, unhardened, hardened = ensemble["ibtet"].values
     assert unhardened == pytest.approx(linear, rel=1e-6)
     assert abs(hardened / linear - 1) > 1e-3

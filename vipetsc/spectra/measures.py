@@ -6,12 +6,16 @@ has a value for each of these, under a name of its own: ``peak_velocity/tip``, `
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from vipetsc.plugins import call, only, registered
+from vipetsc.register import MEASURE, PARTS, MeasurePart, reserve
 from vipetsc.spectra import histories
 from vipetsc.spectra.histories import History, SteadyAmplitude, SteadyDrive
 
@@ -144,10 +148,27 @@ def register(measure: RunMeasure) -> RunMeasure:
     return measure
 
 
+def every_measure() -> dict[str, RunMeasure]:
+    """The shipped measures by name, and those that modules register: of the case that is read, else of all imported."""
+    measures = dict(MEASURES)
+    for name in registered(MEASURE):
+        part = PARTS[MEASURE][name]
+        assert isinstance(part, MeasurePart)
+        measures[name] = RunMeasure(name, part.unit, part.text, partial(call, part, part.function), power=part.power)
+    return measures
+
+
+def _foreign(run: xr.Dataset) -> set[str]:
+    """The registered measures of modules that the case of a ``run`` does not name."""
+    case = tomllib.loads(run.attrs.get("case", ""))
+    with only(case.get("plugins", {}).get("modules", [])):
+        return {*PARTS[MEASURE]} - {*registered(MEASURE)}
+
+
 def measures_of(points: Sequence[str], pairs: Sequence[Sequence[str]]) -> dict[str, RunMeasure]:
     """The measures, by name, of a run with these ``points`` and ``pairs`` of them."""
     expanded: dict[str, RunMeasure] = {}
-    for measure in MEASURES.values():
+    for measure in every_measure().values():
         for one in _expanded(measure, points, pairs):
             expanded[one.name] = one
     return expanded
@@ -167,21 +188,22 @@ def _expanded(measure: RunMeasure, points: Sequence[str], pairs: Sequence[Sequen
 
 def row_of(name: str) -> tuple[str, str, str]:
     """Dimension, unit and text of the measure ``name``, perhaps of points; raises KeyError if there is none."""
-    if name in MEASURES:
-        return MEASURES[name].row
+    measures = every_measure()
+    if name in measures:
+        return measures[name].row
     base, _, points = name.partition("/")
-    return MEASURES[base].at(*points.split(JOINT)).row
+    return measures[base].at(*points.split(JOINT)).row
 
 
 def is_measure(name: str) -> bool:
     """Whether ``name`` is a measure, perhaps of points."""
     base, _, points = name.partition("/")
-    return name in MEASURES or (bool(points) and base in MEASURES and MEASURES[base].over != "run")
+    return name in every_measure() or (bool(points) and base in MEASURES and MEASURES[base].over != "run")
 
 
 def _of_name(name: str) -> RunMeasure:
     """The measure ``name``, perhaps of points, for all of them."""
-    return MEASURES.get(name) or MEASURES[name.partition("/")[0]]
+    return every_measure().get(name) or MEASURES[name.partition("/")[0]]
 
 
 def power_of(name: str) -> float:
@@ -191,7 +213,7 @@ def power_of(name: str) -> float:
 
 def can_be_scaled() -> bool:
     """Whether every measure that sweeps take of the motion is proportional to a power of the amplitude."""
-    return all(measure.power is not None for measure in MEASURES.values() if measure.group == "motion")
+    return all(measure.power is not None for measure in every_measure().values() if measure.group == "motion")
 
 
 def group_of(name: str) -> Group:
@@ -202,8 +224,9 @@ def group_of(name: str) -> Group:
 def take(record: RunRecord, groups: Collection[str]) -> dict[str, Any]:
     """The values by name of the measures of these ``groups`` that the run of ``record`` has."""
     values = {}
+    foreign = _foreign(record.run)
     for name, measure in measures_of([*record.points], record.pairs).items():
-        if measure.of is None or measure.group not in groups:
+        if measure.of is None or measure.group not in groups or name in foreign:
             continue
         value = measure.of(record)
         if value is not None:
@@ -336,3 +359,5 @@ STANDARD = (
 )
 for standard in STANDARD:
     register(standard)
+
+reserve(MEASURE, MEASURES)
