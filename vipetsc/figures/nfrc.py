@@ -7,41 +7,50 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures import panels, style
 from vipetsc.io.netcdf import open_netcdf
 
+# Label, colour, and the line by which they differ in grey.
 ENERGIES = {
-    "transmitted": ("T, transmitted", style.BLUE),
-    "reflected": ("R, reflected", style.SKY),
-    "upper": ("U, other harmonics", style.VERMILION),
-    "lost": ("L, dissipated in contacts", style.ORANGE),
+    "transmitted": ("T, transmitted", style.BLUE, "-"),
+    "reflected": ("R, reflected", style.SKY, style.DASHED),
+    "upper": ("U, other harmonics", style.VERMILION, style.DOTTED),
+    "lost": ("L, dissipated in contacts", style.ORANGE, "-."),
 }
 FOLD = 1  # of the variable ``kind``
 
 
 def frequency_response(paths: Sequence[Path]) -> Figure:
-    """Draw displacement over amplitude or frequency, and below it fractions of the energy; a column for each file."""
+    """Draw displacement over amplitude or frequency, and below it phases or fractions of the energy; a column a file.
+
+    Phases are drawn of a force over its frequency, as experiments show a response, fractions where there are some.
+    """
     branches = []
     for path in paths:
         with open_netcdf(path, "branch", ("share", "unstable", "over")) as file:
             branches.append(file.load())
 
+    rows = [_draw_displacement]
+    nfrc = NfrcCase.of(branches[0]).nfrc
+    if nfrc.source == "force" and nfrc.over == "frequency":
+        rows.append(_draw_phase)
     # A steady state that takes up no energy, in a finite lattice without losses, has nothing to divide by.
-    has_energies = any(np.isfinite(branch["share"].values).any() for branch in branches)
-    rows = 2 if has_energies else 1
+    if any(np.nan_to_num(branch["share"].values).any() for branch in branches):
+        rows.append(_draw_energies)
+
     width = style.COLUMN if len(branches) == 1 else style.PAGE
-    figure = style.new_figure(width, 2.3 * rows)
-    columns = figure.subplots(rows, len(branches), sharex="col", squeeze=False).T
+    figure = style.new_figure(width, 2.3 * len(rows))
+    columns = figure.subplots(len(rows), len(branches), sharex="col", squeeze=False).T
 
     for column, branch in zip(columns, branches, strict=True):
-        _draw_displacement(column[0], branch)
-        if has_energies:
-            _draw_energies(column[1], branch)
+        for axes, draw in zip(column, rows, strict=True):
+            draw(axes, branch)
         column[-1].set_xlabel(_parameter_label(branch))
         column[0].set_title(str(branch.attrs["name"]))
-    if rows * len(branches) > 1:
+    if columns.size > 1:
         panels.label_panels(columns.T)
     return figure
 
@@ -50,9 +59,10 @@ def _parameter_label(branch: xr.Dataset) -> str:
     """Return what the horizontal axis shows, with its unit."""
     if branch.attrs["over"] == "frequency":
         return "frequency (rad/s)"
-    if NfrcCase.of(branch).nfrc.source == "wave":
+    case = NfrcCase.of(branch)
+    if case.nfrc.source == "wave":
         return "amplitude of the wave / clearance"
-    return "amplitude (N)"
+    return "amplitude of the wall (m)" if case.drive.end else "amplitude (N)"
 
 
 def _parameter(branch: xr.Dataset) -> np.ndarray:
@@ -64,7 +74,13 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     """Draw the first site: stable states as a line, unstable ones dashed, slow sweeps broad; thin lines for others."""
     parameter = _parameter(branch)
     stable = branch["unstable"].values == 0
-    relative = branch["largest"].values / branch["clearance"].values  # (point, site)
+    # Contacts that touch at rest have no clearance to compare with.
+    clearance = branch["clearance"].values
+    label = "largest |w| / clearance"
+    relative = branch["largest"].values / np.where(clearance > 0, clearance, 1.0)  # (point, site)
+    if not np.all(clearance > 0):
+        label = "largest |w| (mm)"
+        relative = 1e3 * branch["largest"].values
     size = relative[:, 0]
 
     for number, other in enumerate(relative.T[1:]):
@@ -90,8 +106,23 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     if folds.size:
         look = {"ms": 3.5, "mfc": "white", "mec": style.VERMILION, "ls": "none"}
         axes.plot(parameter[folds], size[folds], "o", label="fold", **look)
-    axes.set_ylabel("largest |w| / clearance")
+    axes.set_ylabel(label)
     axes.legend(fontsize=6, loc="best")
+
+
+def _draw_phase(axes: Axes, branch: xr.Dataset) -> None:
+    """Draw the phase of the first site's fundamental behind the drive; unstable states thin."""
+    parameter = _parameter(branch)
+    stable = branch["unstable"].values == 0
+    fundamental = branch["harmonics"].values[:, 0, 1] + 1j * branch["harmonics_imaginary"].values[:, 0, 1]
+    lag = -np.degrees(np.unwrap(np.angle(fundamental)))
+    # The first state lags by less than a turn.
+    lag -= 360 * np.floor((lag[0] + 180) / 360)
+
+    axes.plot(parameter, lag, color=style.BLACK, lw=0.6, ls="--")
+    axes.plot(parameter, np.where(stable, lag, np.nan), color=style.BLACK, lw=1.3)
+    axes.set_ylabel("phase lag (degrees)")
+    axes.yaxis.set_major_locator(MultipleLocator(90))
 
 
 def _draw_energies(axes: Axes, branch: xr.Dataset) -> None:
@@ -99,12 +130,12 @@ def _draw_energies(axes: Axes, branch: xr.Dataset) -> None:
     parameter = _parameter(branch)
     stable = branch["unstable"].values == 0
     for i, name in enumerate(branch["way"].values.astype(str)):
-        label, colour = ENERGIES[name]
+        label, colour, line = ENERGIES[name]
         fraction = branch["share"].values[:, i]
         # Of a finite lattice only the losses are computed: no wave leaves it.
         if np.isfinite(fraction).any():
-            axes.plot(parameter, fraction, color=colour, lw=0.6, ls="--")
-            axes.plot(parameter, np.where(stable, fraction, np.nan), color=colour, lw=1.4, label=label)
+            axes.plot(parameter, fraction, color=colour, lw=0.5, ls=line)
+            axes.plot(parameter, np.where(stable, fraction, np.nan), color=colour, lw=1.4, ls=line, label=label)
 
     axes.set(ylabel="fraction of the energy", ylim=(-0.02, 1.04))
     if axes.get_legend_handles_labels()[0]:
