@@ -25,6 +25,7 @@ CELLS = {
 LARGEST_RESIDUAL = 1e-8  # of the ledger, over the work of the drive
 MOST_OF_A_RECORD = 0.05  # that a mean over two periods of the drive may take
 REFINE = 10  # points of a phase portrait drawn for each sample
+COLOURS = 256  # of the map by which time is drawn in a phase portrait
 
 
 def without_spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
@@ -278,9 +279,12 @@ def phase(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 def _draw_portrait(axes: Axes, motion: Motion, time: np.ndarray, first_contact: int) -> LineCollection:
     """Draw velocity over displacement in mm, coloured by ``time`` from sample ``first_contact`` on, grey before."""
     points = np.stack([1e3 * motion.u, motion.v], axis=1)
-    segments = np.stack([points[:-1], points[1:]], axis=1)[first_contact:]
-    look = {"cmap": "viridis", "lw": 0.4, "rasterized": True}
-    by_time = LineCollection(list(segments), array=time[first_contact:-1], **look)
+
+    # A line for each of the map's colours: a segment for each of a hundred thousand samples takes seconds.
+    edges = np.linspace(first_contact, len(time) - 1, COLOURS + 1).astype(int)
+    begins, ends = edges[:-1], edges[1:]
+    lines = [points[begin : end + 1] for begin, end in zip(begins, ends, strict=True) if end > begin]
+    by_time = LineCollection(lines, array=time[begins[ends > begins]], cmap="viridis", lw=0.4, rasterized=True)
     axes.add_collection(by_time)
     axes.plot(*points[: first_contact + 1].T, color=style.GREY, lw=0.4, rasterized=True)
     centre_axes(axes, points[:, 0], points[:, 1])
