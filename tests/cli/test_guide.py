@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from mpi4py import MPI
@@ -50,26 +51,48 @@ NOT_TYPED = {
 
 
 def session() -> str:
-    """Return all blocks in order as one script for bash, which ends at the first command that fails."""
+    """Return all blocks in order as one script for bash, which ends at the first command that fails.
+
+    Blocks of Python that follow one another are run by one interpreter, each in a namespace of its own: to load the
+    package for each of them takes longer than what they do.
+    """
     script = ["set -ex"]
+    waiting: list[str] = []
+    for number, (page, language, text) in enumerate(blocks()):
+        # An excerpt of a case file without the name of a file is not typed.
+        named = CASE_NAME.match(text)
+        if language == "toml" and not named:
+            continue
+
+        script.append(f": {page.name}")
+        if language == "python":
+            waiting.append(f"block-{number}.py")
+            script.append(f"cat > block-{number}.py <<'END'\n{text}END")
+            continue
+
+        script += run_together(waiting)
+        waiting = []
+        if language == "toml":
+            name, added = named.groups()
+            script.append(f"cat {'>>' if added else '>'} {name} <<'END'\n{text}END")
+        else:
+            assert language == "sh", language
+            # The tests would come back here.
+            script.append(re.sub(r"^scripts/test .*\n", "", text, flags=re.M))
+    return "\n".join(script + run_together(waiting))
+
+
+def blocks() -> Iterator[tuple[Path, str, str]]:
+    """Yield page, language and text of the guide's blocks that name a language."""
     for page in GUIDE:
         for language, text in filter(all, BLOCK.findall(page.read_text(encoding="utf-8"))):
-            script.append(f": {page.name}")
+            yield page, language, text
 
-            if language == "toml":
-                named = CASE_NAME.match(text)
-                # An excerpt without the name of a file is not typed.
-                if not named:
-                    continue
-                name, added = named.groups()
-                script.append(f"cat {'>>' if added else '>'} {name} <<'END'\n{text}END")
-            elif language == "python":
-                script.append(f"python - <<'END'\n{text}END")
-            else:
-                assert language == "sh", language
-                # The tests would come back here.
-                script.append(re.sub(r"^scripts/test .*\n", "", text, flags=re.M))
-    return "\n".join(script)
+
+def run_together(files: list[str]) -> list[str]:
+    """Return the command that runs Python ``files`` one after the other, if there are any."""
+    runner = "import runpy, sys; [runpy.run_path(name, run_name='__main__') for name in sys.argv[1:]]"
+    return [f'python -c "{runner}" {" ".join(files)}'] if files else []
 
 
 @pytest.fixture(scope="module")
