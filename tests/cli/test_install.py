@@ -16,6 +16,7 @@ import pytest
 
 import vipetsc as package
 from tests.conftest import clean_environment, set_words
+from tests.manual_modules import write_modules
 from vipetsc.__main__ import BUILT_FOR_MPI
 
 ROOT = Path(package.__file__).parents[1]
@@ -141,6 +142,27 @@ def test_the_wheel_runs_away_from_the_source(site, tmp_path):
     call(sys.executable, "tiny_paper.py", "paper", "fig01", "C8", "C10", cwd=tmp_path, site=site)
     for path in ("design/design.h5", "scattering/ensemble.h5", "report.html"):
         assert (tmp_path / "paper" / path).exists()
+
+
+def test_an_installed_package_registers_a_law(site, tmp_path):
+    """With the wheel, a package names the manual's law by an entry point: its version and hash are in the results."""
+    write_modules(tmp_path, site / "vipetsc/manual/extend.md")
+    about = site / "stops_of_a_user-1.2.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: stops-of-a-user\nVersion: 1.2\n")
+    (about / "entry_points.txt").write_text("[vipetsc.plugins]\nusers-stops = stops_of_a_user\n")
+    source = (tmp_path / "stops.py").read_bytes()
+    (site / "stops_of_a_user.py").write_bytes(source)
+
+    laws = set_words(
+        "plugins.modules=['users-stops']",
+        "contacts={law='hardening',stiffness=2e5,parameters={b=4e5},sites=[6,12],clearance=1e-4}",
+    )
+    call(site / "bin/vipetsc", "run", *laws, *TINY, cwd=tmp_path, site=site)
+    case = tomllib.loads((tmp_path / "runs/four-band/case.toml").read_text(encoding="utf-8"))
+    record = {"module": "users-stops", "version": "1.2", "sha256": hashlib.sha256(source).hexdigest()}
+    assert case["plugins"]["parts"] == {"law": {"hardening": record}}
+    assert case["contacts"]["law"] == "hardening"
 
 
 def test_what_pip_cannot_bring_is_named(site, tmp_path):
