@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import vipetsc as package
+from vipetsc import plugins
 from vipetsc.case import Case, CaseError, Sweep
 from vipetsc.cli.verbs.verb_list import VERBS
 
@@ -15,8 +16,9 @@ EXAMPLES = Path(package.__file__).parent / "examples"
 SAMPLES = '[lattice]\npreset = "four-band"\n[drive]\nwaveform = "samples"\namplitude = 8.0\n'
 
 
-def test_every_case_file_is_listed_with_its_verb_and_a_sentence(in_process):
-    """The list has a line for each file: its name, a verb that reads it, a whole sentence."""
+def test_every_case_file_is_listed_with_its_verb_and_a_sentence(in_process, monkeypatch):
+    """The list has a line for each file: its name, a verb that reads it, a whole sentence; no module is imported."""
+    monkeypatch.delattr(plugins, "load")
     ended = in_process("examples", "--quiet")
     assert ended.returncode == 0
     *lines, remedy = ended.stdout.splitlines()
@@ -47,6 +49,22 @@ def test_a_copied_case_reads_its_data_wherever_it_is_and_wherever_it_is_called(i
         samples = Case.load(name).drive.samples
         assert (samples.sha256, samples.time, samples.value) == (shipped.sha256, shipped.time, shipped.value)
         assert samples.file == str(tmp_path / "mine/waveform.csv")
+
+
+def test_a_copied_case_has_its_modules(in_process, tmp_path, monkeypatch):
+    """The module that a case names is copied with it, without being imported, and is the one that the copy uses."""
+    with monkeypatch.context() as context:
+        context.delattr(plugins, "load")
+        assert in_process("examples", "own-law", "--out", tmp_path / "mine", cwd=tmp_path).returncode == 0
+    assert {path.name for path in (tmp_path / "mine").iterdir()} == {"own-law.toml", "own_law.py"}
+
+    copied = Case.load(tmp_path / "mine/own-law.toml")
+    shipped = Case.load(EXAMPLES / "own-law.toml")
+    assert copied.plugins.parts["law"]["rubber-stop"].module == str(tmp_path / "mine/own_law.py")
+    assert copied.contacts == shipped.contacts
+    # As the comment in the case says: an indentation of 1.6 mm doubles the stiffness.
+    law = copied.model().contact
+    assert law.elastic_force(4e5**-0.5) == pytest.approx(2 * 2e5 * 4e5**-0.5)
 
 
 def test_a_file_that_differs_is_replaced_on_request_alone(in_process, tmp_path):

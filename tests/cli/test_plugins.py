@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -12,13 +14,16 @@ import numpy as np
 import pytest
 
 from tests.conftest import set_words
-from tests.manual_modules import write_modules
+from tests.manual_modules import CHAPTER, write_modules
 from vipetsc import Case, CaseError, Sweep, open, plugins, sweep
 from vipetsc.case.keys import json_schema
+from vipetsc.io.export import write_curves
 from vipetsc.lattice import Contact
 from vipetsc.lattice.drive import Pieces
 
+EXAMPLE = CHAPTER.parents[1] / "examples/own-law.toml"
 RATE = 4e5
+SWEEP = re.compile(r"^```toml\n(\[sweep\].*?)^```$", flags=re.M | re.S)
 CASE = f"""
 [plugins]
 modules = ["stops.py", "factors.py", "pulses.py", "durations.py", "pictures.py"]
@@ -89,6 +94,36 @@ def test_a_run_uses_and_records_the_parts(folder, out):
         assert record.module == str(folder / file)
         assert record.sha256 == hashlib.sha256((folder / file).read_bytes()).hexdigest()
     assert (out / "figures/kinetic.png").stat().st_size > 5000
+
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["case"]["plugins"] == case.plugins.model_dump()
+    assert summary["measures"]["longest_contact"] == longest
+
+
+def test_a_registered_measure_is_exported(out):
+    """The CSV of a run's numbers has a row of it, with its unit and text."""
+    write_curves(out)
+    with open(out / "analysis.h5") as analysis:
+        longest = float(analysis["longest_contact"])
+    with (out / "curves/analysis-measures.csv").open(newline="") as file:
+        rows = {row["measure"]: row for row in csv.DictReader(file)}
+    row = rows["longest_contact"]
+    assert float(row.pop("value")) == longest
+    assert {"s", "duration of the longest contact"} <= set(row.values())
+
+
+def test_validate_lists_the_parts_that_a_case_uses(folder, in_process):
+    """Each part has a row with its kind, its module and the version; a law that the case does not use has none."""
+    shown = in_process("validate", folder / "case.toml", "--set", "contacts.damping=exact").stdout
+    rows = re.findall(r"^  (\w+) +(\S+), registered by (\S+?)(?:, version (\S+))?$", shown, flags=re.M)
+    assert {(kind, name): (module, version) for kind, name, module, version in rows} == {
+        ("law", "hardening"): (str(folder / "stops.py"), ""),
+        ("waveform", "ricker"): (str(folder / "pulses.py"), ""),
+        ("measure", "longest_contact"): (str(folder / "durations.py"), ""),
+        ("figure", "kinetic"): (str(folder / "pictures.py"), ""),
+    }
+    example = in_process("validate", EXAMPLE).stdout
+    assert f"  law          rubber-stop, registered by {EXAMPLE.with_name('own_law.py')}, version 1.0\n" in example
 
 
 def test_the_waveform_is_the_formula(folder):
@@ -251,19 +286,20 @@ def test_keys_of_parts_are_checked(folder, change, sentence):
 
 
 def test_a_sweep_varies_laws_and_their_parameters(folder):
-    """Laws vary together with their parameters; a stop that does not harden is the linear one."""
+    """Laws vary together with their parameters, as in the chapter; a stop that does not harden is the linear one."""
     table = tomllib.loads(CASE)
     table["plugins"]["modules"] = [str(folder / name) for name in table["plugins"]["modules"]]
-    varied = {
-        "zip": [["contacts.law", "contacts.parameters"]],
-        "contacts": {"law": ["bilinear", "hardening", "hardening"], "parameters": [{}, {"b": 0.0}, {"b": RATE}]},
-    }
+    varied = tomllib.loads(SWEEP.search(CHAPTER.read_text(encoding="utf-8"))[1])["sweep"]
+    assert varied["contacts"]["parameters"] == [{}, {"b": 1e5}, {"b": RATE}]
+    # One more than the chapter has, which is the linear stop.
+    varied["contacts"]["law"].append("hardening")
+    varied["contacts"]["parameters"].append({"b": 0.0})
     varied["measures"] = ["transfer", "motion"]
     ensemble = sweep(Sweep(**table, sweep=varied)).dataset
     assert (ensemble["longest_contact"] > 0).all()
-    linear, unhardened, hardened = ensemble["ibtet"].values
+    linear, little, hardened, unhardened = ensemble["ibtet"].values
     assert unhardened == pytest.approx(linear, rel=1e-6)
-    assert abs(hardened / linear - 1) > 1e-3
+    assert abs(hardened / linear - 1) > abs(little / linear - 1) > 1e-4
     assert "[plugins.parts.law.hardening]" in ensemble.attrs["case"]
 
 

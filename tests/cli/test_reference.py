@@ -17,6 +17,7 @@ from vipetsc.case import keys
 from vipetsc.case.case_file import CaseError, read_section, sections_in
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.verb_cases import SECTIONS, load_every
+from vipetsc.cli.verbs.reference_verbs import schema_of
 from vipetsc.cli.verbs.verb_list import VERBS
 
 ROOT = Path(package.__file__).parents[1]
@@ -73,8 +74,8 @@ def test_a_refused_key_names_those_of_the_schema():
 
 @pytest.mark.parametrize("path", CASES, ids=lambda path: path.stem)
 def test_the_schema_takes_every_case_file(path):
-    """Every case file in ``runs`` and of the paper is valid by the schema, as an editor would check it."""
-    jsonschema.validate(tomllib.loads(path.read_text(encoding="utf-8")), keys.json_schema())
+    """Every case file in ``runs`` and of the paper is valid by its schema, as an editor would check it."""
+    jsonschema.validate(tomllib.loads(path.read_text(encoding="utf-8")), schema_of(str(path)))
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ import tomli_w
 from pydantic import BaseModel
 
 from vipetsc.case import Case, CaseError, CaseFile
+from vipetsc.case.parts import with_located
 from vipetsc.case.verb_cases import SECTIONS, load_every
 from vipetsc.cli.verbs.verb_list import verb_of
 from vipetsc.dynamics import simulate
@@ -84,7 +85,10 @@ class Verdict:
 
 def parents() -> dict[str, dict[str, Any]]:
     """Return the tables that are spoilt, by name."""
-    files = {path.stem: tomllib.loads(path.read_text(encoding="utf-8")) for path in sorted(EXAMPLES.glob("*.toml"))}
+    files = {}
+    for path in sorted(EXAMPLES.glob("*.toml")):
+        # A spoilt file lies elsewhere: without its modules it would be refused whatever else is in it.
+        files[path.stem] = with_located(tomllib.loads(path.read_text(encoding="utf-8")), EXAMPLES)
     return {"builtin": copy.deepcopy(Case.builtin_table), "own": OWN} | files
 
 

@@ -16,6 +16,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 from vipetsc import plugins, register
 from vipetsc.case.section import Problem, Section
 from vipetsc.process import launched_rank
+from vipetsc.register import RegisteredPart
 
 logger = logging.getLogger(__name__)
 PHYSICS = (register.LAW, register.DISSIPATION, register.WAVEFORM)  # kinds without which a case has no meaning
@@ -79,6 +80,11 @@ def module_names(table: Mapping[str, Any]) -> list[str]:
     return names
 
 
+def relative_modules(table: Mapping[str, Any]) -> list[str]:
+    """The relative names of the files of modules that a parsed case names."""
+    return [name for name in module_names(table) if plugins.is_file(name) and not Path(name).is_absolute()]
+
+
 def with_located(table: dict[str, Any], folder: Path) -> dict[str, Any]:
     """``table`` with the whole paths of files of modules, which its case file names from its ``folder``."""
     names = module_names(table)
@@ -125,14 +131,35 @@ def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
     return table | {"plugins": table["plugins"] | {"parts": parts}}, problems
 
 
+def parts_in_use(table: Mapping[str, Any]) -> list[tuple[plugins.Plugin, RegisteredPart]]:
+    """The parts that a resolved case uses, with their modules: what it names, and all measures and figures.
+
+    A module that is not there is left out: results can be read without those of measures and figures.
+    """
+    texts = _texts(table)
+    used = []
+    for name in module_names(table):
+        try:
+            plugin = plugins.load(name)
+        except plugins.PluginError:
+            continue
+        for part in plugin.parts:
+            if part.kind not in PHYSICS or part.name in texts:
+                used.append((plugin, part))
+    return used
+
+
 def missing_parts(table: PluginsTable) -> list[Problem]:
     """Problems with importing the modules of a resolved case, as on another rank, to the sources that it records."""
     problems = []
+    # Modules that all other ranks have imported may be missing on one: the message says where.
+    rank = launched_rank()
+    where = "" if rank is None else f"on rank {rank}: "
     for number, name in enumerate(table.modules, 1):
         try:
             rows = _record(name)
         except plugins.PluginError as error:
-            problems.append(Problem(f"plugins.modules[{number}]", name, str(error)))
+            problems.append(Problem(f"plugins.modules[{number}]", name, f"{where}{error}"))
             continue
         for kind, part, row in rows:
             recorded = (table.parts or {}).get(kind, {}).get(part)

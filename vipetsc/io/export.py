@@ -17,6 +17,8 @@ MOST_ROWS = 1_000_000  # of a table
 MOST_NUMBERS = 20_000_000  # of a table with a column for each point or site
 ANALYSIS = "analysis.h5"
 FIELDS = "displacement", "velocity"
+# Of the designs of a search, by the dimension whose labels say what each column is.
+OF_DESIGNS = {"parameter": "variable", "value": "objective", "constrained": "constraint"}
 HEAD = '<Xdmf Version="3.0"><Domain><Grid Name="run" GridType="Collection" CollectionType="Temporal">\n'
 TAIL = "</Grid></Domain></Xdmf>\n"
 
@@ -87,6 +89,7 @@ def write_curves(path: Path) -> list[Path]:
     """Write the curves of the results in ``path`` as CSV files to ``curves/`` in their folder.
 
     Variables over the same dimensions are one table, with a row a point, their coordinates first, units in the head.
+    That of the designs of a search has a column for each variable, objective and constraint.
     Of a run with ``analysis.h5`` beside it there is a table of its numbers, ``analysis-measures.csv``, and where they
     were recorded ``run-points.csv`` and ``run-forces.csv``, with a column for each point and site. Fields and maps,
     over other dimensions than the axes of a sweep, are left out. Raises as ``open_results``.
@@ -103,7 +106,7 @@ def write_curves(path: Path) -> list[Path]:
         for dims, names in groups.items():
             if np.prod([data.sizes[dim] for dim in dims]) > MOST_ROWS:
                 continue
-            table = data[names]
+            table = data[names].assign(_columns_of_designs(data, dims))
             foreign = [name for name, item in table.coords.items() if not set(item.dims) <= set(dims)]
             over = "members" if dims == axes else "-".join(dims)
             stem = f"{source.stem}-{over}".replace("/", "-")
@@ -119,6 +122,18 @@ def write_curves(path: Path) -> list[Path]:
         if numbers["measure"]:
             written.append(_write_columns(measured.parent / "curves" / f"{measured.stem}-measures.csv", numbers))
     return written
+
+
+def _columns_of_designs(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
+    """Variables, objectives and constraints over the designs of a search, by their labels; none of other ``dims``."""
+    columns = {}
+    for name, label in OF_DESIGNS.items():
+        if name not in data or data[name].dims != (*dims, label):
+            continue
+        units = data["unit"].values if label == "variable" else ["1"] * data.sizes[label]
+        for text, unit, values in zip(data[label].values, units, data[name].values.T, strict=True):
+            columns[str(text)] = xr.DataArray(values, dims=dims, attrs={"units": unit})
+    return columns
 
 
 def _write_wide(run: xr.Dataset, source: Path) -> list[Path]:

@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from vipetsc.case import CaseError, Problem
 from vipetsc.case.named_files import relative_names
+from vipetsc.case.parts import relative_modules
 from vipetsc.cli.arguments import argument
 from vipetsc.cli.messages import echo, echo_paths
 from vipetsc.cli.verb import DONE, PlainVerb
@@ -39,7 +40,7 @@ def examples(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> 
     shipped = on_root(comm, shipped_examples)
     if not (options.name or options.all or options.out or options.force):
         echo(comm, _listed(shipped.values()))
-        echo(comm, "vipetsc examples NAME copies a case file, with the data that it reads, into the current folder")
+        echo(comm, "vipetsc examples NAME copies a case file, with the files that it names, into the current folder")
         return DONE
 
     chosen = on_root(comm, lambda: _chosen(shipped, list(shipped) if options.all else options.name))
@@ -90,7 +91,7 @@ def _chosen(shipped: dict[str, Example], names: list[str]) -> list[Example]:
 
 
 def copy_examples(chosen: Iterable[Example], folder: Path, *, force: bool = False) -> list[Path]:
-    """Copy case files and the data files that they read into ``folder``; on one rank.
+    """Copy case files, and the data files and modules that they read, into ``folder``; on one rank.
 
     Returns the copies. Raises FolderError, with nothing written, where another file of the name is in the folder and
     ``force`` is not given, and where ``folder`` is a file.
@@ -98,8 +99,9 @@ def copy_examples(chosen: Iterable[Example], folder: Path, *, force: bool = Fals
     contents: dict[Path, bytes] = {}
     for example in chosen:
         case_file = FOLDER / f"{example.name}.toml"
-        data = relative_names(tomllib.loads(case_file.read_text(encoding="utf-8")))
-        for path in (case_file, *(case_file.parent / name for name in data)):
+        table = tomllib.loads(case_file.read_text(encoding="utf-8"))
+        needed = [*relative_names(table), *relative_modules(table)]
+        for path in (case_file, *(case_file.parent / name for name in needed)):
             # What is not shipped is left by another command, as a branch whose motion begins a run.
             if path.exists():
                 contents[folder / path.relative_to(FOLDER)] = path.read_bytes()

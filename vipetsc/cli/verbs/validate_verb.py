@@ -1,13 +1,15 @@
 """The verb ``validate``: checks a case for each verb whose section it contains, and prints the resulting numbers."""
 
 import argparse
+import tomllib
 
 from mpi4py import MPI
 
 import numpy as np
 
-from vipetsc.case import Case
+from vipetsc.case import Case, CaseFile
 from vipetsc.case.disorder import DisorderTable, values_of
+from vipetsc.case.parts import parts_in_use
 from vipetsc.case.verb_cases import disorder_of, load_every
 from vipetsc.cli.arguments import CASE, SET
 from vipetsc.cli.messages import echo
@@ -33,6 +35,7 @@ def report_of(options: argparse.Namespace, ranks: int) -> str:
     for case in cases:
         check_options(case)
         rows += verb_of(case).table(case, ranks)
+        rows += part_rows(case)
         warnings += case.warnings()
     disorder = disorder_of(options.case, options.set, cases)
     if disorder:
@@ -42,6 +45,15 @@ def report_of(options: argparse.Namespace, ranks: int) -> str:
     lines = [table([*dict.fromkeys(rows)])]
     lines += [f"warning: {warning}" for warning in dict.fromkeys(warnings)]
     return "\n".join(lines)
+
+
+def part_rows(case: CaseFile) -> Rows:
+    """A row for each registered part that a case uses: its name and kind, its module and the version of that."""
+    rows = []
+    for plugin, part in parts_in_use(tomllib.loads(case.to_toml())):
+        version = f", version {plugin.version}" if plugin.version else ""
+        rows.append((part.kind, f"{part.name}, registered by {plugin.name}{version}"))
+    return rows
 
 
 def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> Rows:

@@ -1,0 +1,124 @@
+"""Studies with copies of Hertz's law and of the paper's factor, which a module registers: the results of the originals.
+
+Both cases name the module, so that a search may have its measure as the objective; only the names of law and factor
+differ.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.conftest import datasets, search_table
+from tests.one_site import law_case, prediction_case
+from vipetsc.case.optimise import OptimiseCase
+from vipetsc.io.export import write_curves
+from vipetsc.studies.one_site import make_law
+from vipetsc.studies.optimum_search import run_search
+from vipetsc.studies.prediction import predict
+
+pytestmark = pytest.mark.slow
+
+COPIES = """
+from vipetsc import register
+
+
+def force(x, k):
+    return k * x**1.5
+
+
+def slope(x, k):
+    return 1.5 * k * x**0.5
+
+
+def energy(x, k):
+    return k * x**2.5 / 2.5
+
+
+register.elastic_law("hertz-copy", force, slope, energy, onset_exponent=1.5)
+
+
+@register.dissipation_factor("paper-copy")
+def damping(restitution):
+    return 1.5 * (1 - restitution)
+
+
+@register.measure("lost_fraction", unit="1", text="energy lost in contacts over the work of the drive")
+def lost_fraction(record):
+    return float(record.run["energy/dissipated"][-1] / record.run["energy/work"][-1])
+"""
+LAWS = {"shipped": ("hertz", "paper"), "registered": ("hertz-copy", "paper-copy")}
+# A search that looks for the smallest value of the registered measure.
+SEARCH = {"objective": [{"measure": "lost_fraction", "goal": "minimise"}]}
+
+
+def law(folder: Path, **sections: dict[str, Any]) -> Path:
+    """The scattering law of one site."""
+    make_law(law_case(**sections), folder, MPI.COMM_SELF)
+    return folder / "law.h5"
+
+
+def prediction(folder: Path, **sections: dict[str, Any]) -> Path:
+    """A prediction at one amplitude, without simulations to compare with."""
+    predict(prediction_case(predict={"points": 16, "amplitudes": [600.0], "simulate": False}, **sections), folder)
+    return folder / "prediction.h5"
+
+
+def search(folder: Path, **sections: dict[str, Any]) -> Path:
+    """A search for clearances of two sites."""
+    run_search(OptimiseCase.from_table(search_table(16, [4, 9], optimise=SEARCH, **sections)), folder, MPI.COMM_SELF)
+    return folder / "optimum.h5"
+
+
+def results(study: Callable[..., Path], folder: Path) -> list[Path]:
+    """The files of a ``study`` with the shipped and with the registered law."""
+    (folder / "copies.py").write_text(COPIES)
+    files = []
+    for name, (elastic, factor) in LAWS.items():
+        contacts = {"law": elastic, "damping": factor, "restitution": 0.7}
+        modules = {"modules": [str(folder / "copies.py")]}
+        files.append(study(folder / name, contacts=contacts, plugins=modules))
+    return files
+
+
+def assert_same_to_rounding(shipped: Path, registered: Path) -> None:
+    """All numbers of two files agree to rounding, which the differences of later contacts magnify."""
+    first = datasets(shipped)
+    second = datasets(registered)
+    assert first.keys() == second.keys()
+    for name, values in first.items():
+        if values.dtype != object:
+            scale = np.nanmax(np.abs(values), initial=1e-300)
+            assert second[name] == pytest.approx(values, rel=1e-9, abs=1e-9 * scale, nan_ok=True), name
+
+
+@pytest.mark.parametrize("study", [law, prediction])
+def test_a_registered_law_has_the_response_of_the_shipped_one(study, tmp_path):
+    """The scattering law of one site, and several sites composed from it, lose energy as with the originals."""
+    shipped, registered = results(study, tmp_path)
+    assert_same_to_rounding(shipped, registered)
+    lost = datasets(registered)["dissipated" if study is law else "predicted/dissipated"]
+    assert lost.max() > 0.01
+
+
+def test_a_search_has_a_registered_measure_as_its_objective(tmp_path):
+    """The objective is the energy that the search itself measures as dissipated, and the CSV of the designs has it."""
+    shipped, registered = results(search, tmp_path)
+    assert_same_to_rounding(shipped, registered)
+
+    found = datasets(registered)
+    assert found["value"][:, 0] == pytest.approx(found["dissipated"], rel=1e-12)
+    assert found["dissipated"].min() < 0.9 * found["dissipated"][0]
+
+    write_curves(registered)
+    with (registered.parent / "curves/optimum-design.csv").open(newline="") as file:
+        rows = [*csv.DictReader(file)]
+    assert [float(row["1: lost_fraction"]) for row in rows] == found["value"][:, 0].tolist()
+    assert [float(row["clearance 2 (m)"]) for row in rows] == found["parameter"][:, 1].tolist()
