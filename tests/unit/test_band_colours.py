@@ -16,11 +16,13 @@ BANDS = (1, 2, 3, 4)
 X = np.array([1.0, 2.0, 4.0])
 
 
-def prediction() -> Figure:
-    energies = np.full((3, 4), 0.2)
-    data = {"predicted/bands": (("amplitude", "band"), energies), "predicted/upper": ("amplitude", energies[:, 0])}
-    data |= {"predicted/dissipated": ("amplitude", energies[:, 0]), "sites/cell": ("site", [5])}
-    data |= {"predicted/z": (("amplitude", "site"), X[:, None])}
+def prediction(level: float = 0.2) -> Figure:
+    energies = np.full((3, 4), level)
+    data = {"sites/cell": ("site", [5, 9, 12])}
+    for kind in ("predicted", "simulated"):
+        data |= {f"{kind}/bands": (("amplitude", "band"), energies)}
+        data |= {f"{kind}/{name}": ("amplitude", energies[:, 0]) for name in ("upper", "dissipated")}
+    data |= {"predicted/z": (("amplitude", "site"), np.outer(X, [1.0, 1.1, 1.2]))}
     about = {"drive_band": 2, "onset_amplitude": 1.0}
     return predicted_energies.prediction(xr.Dataset(data, {"amplitude": X, "band": [*BANDS]}, about))
 
@@ -54,6 +56,49 @@ def test_bands_have_their_colours_by_name(make):
     lines = [line for axes in figure.get_axes() for line in axes.lines if line.get_label().startswith("band ")]
     colours = {line.get_label(): to_hex(line.get_color()).upper() for line in lines}
     assert colours == {f"band {band}": style.band_colour(band) for band in BANDS}
+
+
+@pytest.mark.parametrize("make", [prediction, law])
+def test_curves_of_a_panel_differ_in_grey(make):
+    """By their dashes or their marks, and in any case by more than their colours."""
+    with style.rc_style():
+        figure = make()
+    for axes in figure.get_axes():
+        named = [line for line in axes.lines if not line.get_label().startswith("_")]
+        looks = {(line.get_marker(), str(line._dash_pattern)) for line in named}
+        assert len(looks) == len(named) > 1 or axes.get_legend() is None
+
+    # Simulated points have no lines to differ by.
+    points = [line for axes in figure.get_axes() for line in axes.lines if line.get_linestyle() == "None"]
+    of_bands = [line.get_marker() for line in points if line.get_color() != style.BLACK]
+    assert len(set(of_bands)) == len(of_bands)
+
+
+def test_backward_energies_differ_from_forward_ones_in_grey():
+    with style.rc_style():
+        by_band = law().get_axes()[1]
+    assert [line.get_marker() for line in by_band.lines] == ["None", "o"] * len(BANDS)
+
+
+@pytest.mark.parametrize("level", [1.0, 0.2, 1e-3])
+def test_legends_of_a_prediction_touch_nothing(level, tmp_path):
+    """Energies as large as the work and as small as the axes show lie below the legends, all along the axes."""
+    with style.rc_style():
+        figure = prediction(level)
+        style.save(figure, tmp_path / "prediction.json")
+    boxes = [(axes, axes.get_legend().get_window_extent()) for axes in figure.get_axes() if axes.get_legend()]
+    assert len(boxes) == 3
+    for axes, box in boxes:
+        drawn = [axes.transData.transform(line.get_xydata()) for line in axes.lines if len(line.get_xydata()) == len(X)]
+        assert box.y0 > max(points[:, 1].max() for points in drawn)
+        assert box.x1 < axes.bbox.x1
+
+
+def test_the_amplitude_of_first_contact_is_apart_from_the_frame():
+    with style.rc_style():
+        low, high = prediction().get_axes()[0].get_xlim()
+    assert low < 0.99 * X[0]
+    assert high > 1.01 * X[-1]
 
 
 @pytest.mark.parametrize("make", [panels.band_diagram, runs.bands])

@@ -183,3 +183,18 @@ def test_samples_among_the_waves_raise_no_question(tmp_path):
     push = {"waveform": "samples", "samples": samples, "frequency": 100.0}
     pushed = Case(lattice={"cells": 60}, contacts={"sites": 0}, drive=push, time={"end": 0.1})
     assert not [sentence for sentence in pushed.warnings() if "samples:" in sentence]
+
+
+def test_a_run_that_ends_within_its_burst_or_ramp():
+    """Of a harmonic drive, which goes on for ever, no end is missed but that of its ramp of ten periods."""
+    (burst,) = (sentence for sentence in warnings_of(time={"end": 0.01}) if "before the end" in sentence)
+    assert "time.end = 0.01 s is before the end of the burst, at 0.0368" in burst
+
+    def endless(end: float) -> list[str]:
+        drive = {"waveform": "harmonic", "frequency": 1000.0, "amplitude": 1.0}
+        table = {"lattice": {"preset": "four-band", "cells": 60}, "drive": drive, "time": {"end": end}}
+        sentences = Case.from_table({"name": "endless"} | table).warnings()
+        return [sentence for sentence in sentences if "before the end" in sentence]
+
+    assert endless(0.08) == []
+    assert endless(0.06) == ["time.end = 0.06 s is before the end of the drive's ramp, at 0.0628319 s"]

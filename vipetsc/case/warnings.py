@@ -146,9 +146,10 @@ def length_warnings(model: Model) -> Iterator[str]:
                 f" cells, and resolve wavenumbers to {2 * pi / cells:.3g} rad/cell;"
                 f" {WAVELENGTHS * wavelength:.0f} cells or more resolve the wave"
             )
-    # A drive that goes on has no end.
-    if model.end <= drive.settled < np.inf:
-        yield f"time.end = {model.end:.6g} s is before the end of the burst"
+    if model.end <= drive.settled:
+        # A drive that goes on has no end but that of its ramp.
+        part = "burst" if np.isfinite(drive.duration) else "drive's ramp"
+        yield f"time.end = {model.end:.6g} s is before the end of the {part}, at {drive.settled:.6g} s"
 
 
 def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:

@@ -1,6 +1,7 @@
 """The scattering law of one site: energies over z, those of bands and directions, and the onset from close by."""
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -10,14 +11,18 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from vipetsc.figures import panels, style
 
-ENERGIES = {
-    "transmitted": ("T, transmitted", style.BLUE),
-    "reflected": ("R, reflected", style.SKY),
-    "upper": ("U, upper bands", style.VERMILION),
-    "dissipated": ("L, dissipated", style.ORANGE),
+# Colours, and the line by which curves differ in grey.
+ENERGIES: dict[str, dict[str, Any]] = {
+    "transmitted": {"label": "T, transmitted", "color": style.BLUE, "ls": "-"},
+    "reflected": {"label": "R, reflected", "color": style.SKY, "ls": style.DASHED},
+    "upper": {"label": "U, upper bands", "color": style.VERMILION, "ls": style.DOTTED},
+    "dissipated": {"label": "L, dissipated", "color": style.ORANGE, "ls": "-."},
 }
 FLOOR = 1e-5  # of the energy that arrives, which a logarithmic axis shows
-DASHES = {"forward": "-", "backward": "--"}
+MARKS: dict[str, dict[str, Any]] = {
+    "forward": {},
+    "backward": {"marker": "o", "ms": 3, "mfc": "white", "mew": 0.7, "markevery": 0.1},
+}
 FEW_DECADES = 20  # largest z up to which 2 and 5 are labelled between the powers of ten
 
 
@@ -33,15 +38,14 @@ def law(data: xr.Dataset) -> Figure:
     z = data["z"].values
     figure = style.new_figure(style.PAGE, 2.9)
     all_energies, by_band, onset = figure.subplots(1, 3)
-    for name, (label, colour) in ENERGIES.items():
-        _draw_curve(all_energies, z, _curve(data, name), colour, label=label)
+    for name, look in ENERGIES.items():
+        _draw_curve(all_energies, z, _curve(data, name), look)
     _draw_bands(by_band, data)
     for name in ("transmitted", "upper"):
-        label, colour = ENERGIES[name]
-        _draw_curve(onset, z - 1, _curve(data, name), colour, label=label)
+        _draw_curve(onset, z - 1, _curve(data, name), ENERGIES[name])
     efficiency = data["efficiency"].values
     positive = np.where(efficiency > 0, efficiency, np.nan)
-    onset.plot(z - 1, positive, color=style.BLACK, lw=1.2, label="U/(1 - T)")
+    onset.plot(z - 1, positive, color=style.BLACK, lw=1.2, ls=style.DASHED, label="U/(1 - T)")
 
     for axes in (all_energies, by_band):
         axes.set(xscale="log", xlabel="z = linear displacement / clearance", xlim=(0.9, z[-1]))
@@ -53,7 +57,7 @@ def law(data: xr.Dataset) -> Figure:
     onset.set(xscale="log", xlabel="z - 1", xlim=(max((z[1] - 1) / 2, 1e-4), 3), ylim=(0, 1.02))
 
     all_energies.set_title("T + R + U + L + other bands = 1", fontsize=8)
-    by_band.set_title("by band; dashed: backward", fontsize=8)
+    by_band.set_title("by band; circles: backward", fontsize=8)
     matched = float(data.attrs["matched_z"])
     if np.isfinite(matched):
         for axes, at in ((all_energies, matched), (by_band, matched), (onset, matched - 1)):
@@ -62,9 +66,9 @@ def law(data: xr.Dataset) -> Figure:
         onset.set_title(f"z* = {matched:.3g}, T = {transmitted:.3g}", fontsize=8)
 
     panels.label_panels([all_energies, by_band, onset])
-    all_energies.legend(fontsize=6, loc="center right")
-    by_band.legend(fontsize=6, loc="lower left", ncols=2)
-    onset.legend(fontsize=6, loc="center left", bbox_to_anchor=(0.0, 0.45))
+    all_energies.legend(fontsize=6, loc="center right", handlelength=style.DASHES_SEEN)
+    by_band.legend(fontsize=6, loc="lower left", ncols=2, handlelength=style.DASHES_SEEN)
+    onset.legend(fontsize=6, loc="center left", bbox_to_anchor=(0.0, 0.45), handlelength=style.DASHES_SEEN)
     return figure
 
 
@@ -73,21 +77,20 @@ def _curve(data: xr.Dataset, name: str) -> LawCurve:
 
 
 def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
-    """Draw what leaves in every band (a colour), forward (full) and backward (dashed)."""
+    """Draw what leaves in every band (a colour and a line), forward, and backward with circles."""
     z = data["z"].values
     bands = data["band"].values.tolist()
     directions = data["direction"].values.tolist()
     for i, number in enumerate(bands):
-        colour = style.band_colour(number)
-        for direction, dashes in DASHES.items():
+        for direction, marks in MARKS.items():
             j = directions.index(direction)
             value = data["share"].values[:, i, j]
             curve = LawCurve(np.where(value > FLOOR, value, np.nan), data["share_scatter"].values[:, i, j])
-            label = f"band {number}" if direction == "forward" else ""
-            _draw_curve(axes, z, curve, colour, dashes, label)
+            label = f"band {number}" if direction == "forward" else None
+            _draw_curve(axes, z, curve, {"label": label, **style.band_look(number), **marks})
 
 
-def _draw_curve(axes: Axes, x: np.ndarray, curve: LawCurve, colour: str, dashes: str = "-", label: str = "") -> None:
+def _draw_curve(axes: Axes, x: np.ndarray, curve: LawCurve, look: Mapping[str, Any]) -> None:
     """Draw a curve with its scatter, one deviation up and down."""
-    axes.plot(x, curve.value, color=colour, ls=dashes, lw=1.0, label=label or None)
-    axes.fill_between(x, curve.value - curve.scatter, curve.value + curve.scatter, color=colour, alpha=0.25, lw=0)
+    axes.plot(x, curve.value, lw=1.0, **look)
+    axes.fill_between(x, curve.value - curve.scatter, curve.value + curve.scatter, color=look["color"], alpha=0.25, lw=0)

@@ -12,6 +12,10 @@ from vipetsc.figures import panels, style
 LEAST = 1e-4  # of the work, the smallest energy shown
 MOST_SITES = 6  # with a name in the legend
 LOOKS: dict[str, dict[str, Any]] = {"predicted": {"lw": 1.2}, "simulated": {"ls": "", "marker": "o", "ms": 3.2}}
+MARKERS = "os^Dvp"  # of the simulated energies of bands, which differ in grey as the lines do
+ROW = 0.075  # height of a legend's row, as a fraction of the height of the axes
+SIDES = 0.04  # left and right of all amplitudes, as a fraction of their range in logarithms
+MARGIN = 0.04  # above and below a legend together
 
 
 def prediction(data: xr.Dataset) -> Figure:
@@ -26,23 +30,24 @@ def prediction(data: xr.Dataset) -> Figure:
     _draw_total(transferred, data, name)
     transferred.set(title=title, ylabel="Energy at the end / work", xscale="log", yscale="log")
     transferred.set_ylim(max(LEAST, _least(data, name) / 1.5), None)
+    _put_legend_above(transferred, columns=2)
 
     _draw_total(dissipated, data, "dissipated")
     dissipated.set(title="Dissipated", ylabel="Energy / work", ylim=(0, None))
 
     _draw_bands(every_band, data)
     every_band.set(title="Every band", ylabel="Energy at the end / work", yscale="log", ylim=(LEAST, 1.5))
+    _put_legend_above(every_band, columns=4)
 
-    for site, z in zip(data["sites/cell"].values, data["predicted/z"].values.T, strict=True):
-        label = f"cell {site}" if data.sizes["site"] <= MOST_SITES else None
-        sites.plot(data["amplitude"].values, z, lw=0.9, label=label)
+    _draw_sites(sites, data)
     sites.set(title="Wave that arrives at the sites", ylabel="Displacement / clearance", yscale="log")
+    if sites.get_legend_handles_labels()[0]:
+        _put_legend_above(sites, columns=3)
 
+    onset = float(data.attrs["onset_amplitude"])
     for axes in grid.flat:
-        axes.axvline(float(data.attrs["onset_amplitude"]), color=style.GREY, lw=0.7, ls=style.DOTTED)
-    for axes in (transferred, every_band, sites):
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(loc="best", fontsize=6.5, framealpha=0.8)
+        axes.axvline(onset, color=style.GREY, lw=0.7, ls=style.DOTTED)
+    _show_amplitudes(transferred, np.append(data["amplitude"].values, onset))
     for axes in grid[1]:
         axes.set_xlabel("Amplitude (N); dotted: first contact")
 
@@ -64,14 +69,41 @@ def _draw_total(axes: Axes, data: xr.Dataset, name: str) -> None:
 
 
 def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
-    """Draw the energy of every band in its colour, predicted and simulated; the lines have the labels."""
+    """Draw the energy of every band in its colour, predicted and simulated, with both under one label."""
+    amplitude = data["amplitude"].values
     for i, band in enumerate(data["band"].values):
-        of_band = {"predicted": style.band_look(int(band)), "simulated": {"color": style.band_colour(int(band))}}
-        for kind, look in LOOKS.items():
-            if f"{kind}/bands" in data:
-                values = data[f"{kind}/bands"].values[:, i]
-                label = f"band {band}" if kind == "predicted" else None
-                axes.plot(data["amplitude"].values, values, label=label, **of_band[kind] | look)
+        look = style.band_look(int(band)) | LOOKS["predicted"]
+        points = {"color": look["color"]} | LOOKS["simulated"] | {"marker": MARKERS[i % len(MARKERS)]}
+        axes.plot(amplitude, data["predicted/bands"].values[:, i], **look)
+        if "simulated/bands" in data:
+            axes.plot(amplitude, data["simulated/bands"].values[:, i], **points)
+            look |= {"marker": points["marker"], "ms": points["ms"]}
+        axes.plot([], [], label=f"band {band}", **look)
+
+
+def _draw_sites(axes: Axes, data: xr.Dataset) -> None:
+    """Draw the wave that arrives at every site; few sites have names, and lines that differ in grey."""
+    few = data.sizes["site"] <= MOST_SITES
+    for i, (site, z) in enumerate(zip(data["sites/cell"].values, data["predicted/z"].values.T, strict=True)):
+        label = f"cell {site}" if few else None
+        line = style.BAND_DASHES[i] if few else "-"
+        axes.plot(data["amplitude"].values, z, lw=0.9, ls=line, label=label)
+
+
+def _show_amplitudes(axes: Axes, amplitudes: np.ndarray) -> None:
+    """Give a logarithmic axis limits apart from all that it shows: a line on the frame of the axes is not seen."""
+    shown = amplitudes[amplitudes > 0]
+    margin = (shown.max() / shown.min()) ** SIDES
+    axes.set_xlim(shown.min() / margin, shown.max() * margin)
+
+
+def _put_legend_above(axes: Axes, columns: int) -> None:
+    """Put the legend of logarithmic ``axes`` above all that they show, which their limits make room for."""
+    entries = len(axes.get_legend_handles_labels()[0])
+    room = MARGIN + ROW * -(-entries // columns)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high * (high / low) ** (room / (1 - room)))
+    axes.legend(loc="upper left", ncols=columns, columnspacing=0.8, handlelength=style.DASHES_SEEN)
 
 
 def _least(data: xr.Dataset, name: str) -> float:

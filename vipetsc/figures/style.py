@@ -42,6 +42,7 @@ PALE = "#DDDDDD"
 RED = "#CC0000"
 DASHED = (0, (4, 2))
 DOTTED = (0, (1, 2))
+DASHES_SEEN = 2.4  # length of a line in a legend, in letters' heights, that shows which dashes it has
 
 # Pass bands, from the lowest; beyond the sixth they come round. The dashes are for greyscale print.
 BAND_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)

@@ -1,0 +1,180 @@
+"""Pages of inter-band transfer from files that are put together here: curves over branches, and lone dispersions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.figure import Figure
+
+from vipetsc.case import Case, Sweep
+from vipetsc.figures import registry, transfer
+from vipetsc.figures.registry import FIGURES, specified_drawings
+from vipetsc.figures.style import Drawing, rc_style
+from vipetsc.figures.sweep_members import Files, MemberRun, Sweeps
+from vipetsc.io.netcdf import write_netcdf
+from vipetsc.io.read import open_ensemble
+from vipetsc.studies import backbone
+from vipetsc.studies.backbone import Initiation, relate_folders
+
+AMPLITUDES = np.geomspace(1.0, 1000.0, 8)
+RESTITUTIONS = [0.3, 0.9]
+ONSET = 2.0  # N
+GRAZING = 0.03  # J
+SWEEP = {
+    "lattice": {"cells": 20},
+    "contacts": {"sites": [9], "clearance": 1e-3},
+    "sweep": {"contacts": {"restitution": RESTITUTIONS}, "drive": {"amplitude": AMPLITUDES.tolist()}},
+}
+
+
+@pytest.fixture(autouse=True)
+def style():
+    with rc_style():
+        yield
+
+
+def transfer_of(restitution: float) -> np.ndarray:
+    """A transfer that falls as 1/A^2 from the onset on, larger by the restitution."""
+    falling = restitution * (ONSET / AMPLITUDES) ** 2
+    return np.where(AMPLITUDES < ONSET, 1e-8, falling)
+
+
+def write_sweep(folder: Path) -> None:
+    """Write the ensemble of a sweep over two restitutions and eight amplitudes into ``folder``."""
+    dims = ("restitution", "amplitude")
+    number = np.arange(len(RESTITUTIONS) * len(AMPLITUDES)).reshape(len(RESTITUTIONS), -1)
+    episodes = np.tile(np.where(AMPLITUDES < ONSET, 0.0, 4.0), (len(RESTITUTIONS), 1))
+    data = {
+        "status": (dims, np.zeros_like(number, np.int8)),
+        "ibtet": (dims, np.stack([transfer_of(restitution) for restitution in RESTITUTIONS])),
+        "work": (dims, np.tile(AMPLITUDES**2, (len(RESTITUTIONS), 1))),
+        "contact_episodes": (dims, episodes),
+    }
+    coords = {
+        "restitution": ("restitution", RESTITUTIONS, {"long_name": "contacts.restitution", "units": "1"}),
+        "amplitude": ("amplitude", AMPLITUDES, {"long_name": "drive.amplitude", "units": "N"}),
+    }
+    case = Sweep.from_table(SWEEP).to_toml()
+    write_netcdf(folder / "ensemble.h5", xr.Dataset(data, coords, {"case": case}))
+
+
+def write_branch(folder: Path) -> None:
+    """Write a branch of the Hertz law whose slope falls as 1/E in region III."""
+    energy = GRAZING * np.concatenate([[0.1, 1.0], np.geomspace(1.001, 1e7, 40)])
+    region = np.select([energy <= GRAZING, energy < 1.2 * GRAZING], [1, 2], 3)
+    with h5py.File(folder / backbone.BRANCH, "w") as file:
+        file["energy"] = energy
+        file["region"] = region
+        file["slope"] = np.where(region == 1, 0.0, 700.0 / energy)
+        file["contacts"] = (region > 1).astype(int)
+        file["kind"] = np.zeros(len(energy), np.int8)
+        file.attrs["case"] = '[lattice]\nreading = "printed"\n[contacts]\nlaw = "hertz"\n'
+
+
+def test_curves_of_two_values_of_a_key_are_both_laid_over_the_branch(tmp_path, monkeypatch):
+    """They differ in neither law, reading, sites nor cycles: each has a page, named by the key and its value."""
+    sweep, branch = tmp_path / "sweep", tmp_path / "branch"
+    for folder, write in ((sweep, write_sweep), (branch, write_branch)):
+        folder.mkdir()
+        write(folder)
+    initiation = Initiation(amplitude=ONSET, energy=ONSET**2, onset=ONSET)
+    monkeypatch.setattr(backbone, "initiation_of", lambda folder, case: initiation)
+    assert relate_folders([sweep, branch]) == [sweep / "backbone.h5"]
+
+    with Files() as files:
+        sweeps = Sweeps([open_ensemble(sweep)], files)
+        pages = {drawing.stem: drawing.draw() for drawing in FIGURES["ibtet_backbone"].function(sweeps)}
+    assert len(pages) == len(RESTITUTIONS)
+    for (stem, figure), restitution in zip(pages.items(), RESTITUTIONS, strict=True):
+        assert stem.endswith(f"contacts.restitution-{restitution}")
+        assert f"contacts.restitution {restitution}" in figure._suptitle.get_text()
+        (axes,) = figure.axes
+        (lattice,) = [line for line in axes.lines if line.get_label() == "lattice"]
+        np.testing.assert_allclose(lattice.get_ydata(), transfer_of(restitution), rtol=1e-12)
+
+
+def member_of(folder: str, amplitude: float, restitution: float) -> MemberRun:
+    """A member with a spectrum of one bin a wavenumber, with a warning that names it."""
+    case = Case.load(
+        overrides=[
+            "lattice.cells=20",
+            "contacts.sites=[9]",
+            f"contacts.restitution={restitution}",
+            f"drive.amplitude={amplitude}",
+        ]
+    )
+    spectrum = xr.DataArray(
+        np.outer(np.arange(1.0, 6.0), np.ones(9)),
+        {"wavenumber": np.linspace(0, np.pi, 5), "frequency": np.linspace(0, 3000.0, 9)},
+    )
+    about = {"warnings": json.dumps([f"the run {folder}"])}
+    analysis = xr.Dataset({"dispersion": spectrum, "ibtet": 0.01 * amplitude})
+    varied = f"contacts.restitution {restitution}"
+    return MemberRun(Path(folder), case, case.model(), xr.Dataset(attrs=about), analysis, varied)
+
+
+class MembersInMemory(Files):
+    """Members by their folders, as `Files` gives those that it has opened."""
+
+    def __init__(self, *members: MemberRun) -> None:
+        super().__init__()
+        self._opened = {member.folder: member for member in members}
+
+
+def dispersions(monkeypatch, *members: MemberRun) -> list[Drawing]:
+    monkeypatch.setattr(transfer, "transfer_members", lambda sweeps: iter(members))
+    sweep = xr.Dataset(attrs={"case": "[sweep]\nmeasures = ['transfer']", "warnings": json.dumps(["of the sweep"])})
+    return list(specified_drawings(FIGURES["transfer_dispersions"], [sweep], MembersInMemory(*members)))
+
+
+def titles(figure: Figure) -> list[str]:
+    panels = [axes for axes in figure.axes if axes.axison and axes.get_label() != "<colorbar>"]
+    return [" ".join(axes.get_title(loc="left").split()) for axes in panels]
+
+
+def test_members_alone_share_a_page_of_dispersions_and_warn_of_themselves(monkeypatch):
+    """Two amplitudes of one restitution have a page of theirs, the lone ones of two others a page together."""
+    members = [member_of("a", 10, 0.5), member_of("b", 20, 0.5), member_of("c", 10, 0.7), member_of("d", 30, 0.9)]
+    table, page = dispersions(monkeypatch, *members)
+    assert table.stem.endswith("contacts.restitution-0.5")
+    assert page.stem == "transfer_dispersions-members-1-to-2"
+
+    figures = [table.draw(), page.draw()]
+    assert titles(figures[0]) == ["(a) Hertz, 10 N", "(b) Hertz, 20 N"]
+    assert [title.rpartition("contacts.")[2] for title in titles(figures[1])] == [
+        "restitution 0.7, 10 N",
+        "restitution 0.9, 30 N",
+    ]
+    # Sentences that differ in numbers alone would be one: these differ in letters.
+    assert [figure.get_label().splitlines() for figure in figures] == [
+        ["the run a", "the run b"],
+        ["the run c", "the run d"],
+    ]
+
+
+def test_one_member_alone_has_a_page_of_its_name(monkeypatch):
+    (page,) = dispersions(monkeypatch, member_of("a", 10, 0.5))
+    assert page.stem.endswith("contacts.restitution-0.5")
+    assert len(titles(page.draw())) == 1
+
+
+def test_a_page_of_more_lone_members_goes_on_on_the_next(monkeypatch):
+    monkeypatch.setattr(transfer, "MOST_PANELS", 2)
+    members = [member_of(letter, 10, restitution) for letter, restitution in zip("abc", (0.5, 0.7, 0.9), strict=True)]
+    stems = [page.stem for page in dispersions(monkeypatch, *members)]
+    assert stems[0] == "transfer_dispersions-members-1-to-2"
+    assert stems[1].endswith("contacts.restitution-0.9")
+
+
+def test_a_page_without_members_has_the_warnings_of_its_sweeps():
+    """What shows all of the sweeps warns of all of them."""
+    sweep = xr.Dataset(attrs={"case": "[sweep]\nmeasures = ['transfer']", "warnings": json.dumps(["of the sweep"])})
+    spec = registry.FigureSpec("a_figure", registry.SWEEP, lambda sweeps: iter([Drawing("", Figure)]))
+    with Files() as files:
+        (drawing,) = specified_drawings(spec, [sweep], files)
+    assert drawing.draw().get_label() == "of the sweep"
