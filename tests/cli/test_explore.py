@@ -150,6 +150,8 @@ def test_panels_have_full_names_of_their_own(page):
 def test_a_tap_on_a_phone_shows_the_picture_on_the_whole_screen(page):
     path, browser = page
     session = browser.open(path, 390, 844)
+    # Until then the page has no image without a picture.
+    assert browser.measure(session)["broken"] == []
     tap = "document.querySelector('figure img').dispatchEvent(new PointerEvent('click', {pointerType: 'touch'}));"
     look = "const d = document.querySelector('dialog'), l = d.querySelector('img');"
     shown = browser.ask(session, tap + look + "return [d.open, l.offsetWidth, d.clientWidth, innerWidth];")

@@ -14,6 +14,7 @@ from scipy.integrate import trapezoid
 from tests.readable import complaints
 from vipetsc.case import Case
 from vipetsc.figures.lattice_strip import draw_lattice
+from vipetsc.figures.log_ticks import label_log_axis
 from vipetsc.figures.registry import BRANCHES, draw, draw_bands, drawings, figure_names
 from vipetsc.figures.schematics import draw_unit_cell
 from vipetsc.figures.style import SCREEN, new_figure, rc_style, save
@@ -381,6 +382,14 @@ def test_logarithmic_axes_have_three_labels_or_more(low, ratio, tmp_path):
         axes.loglog([low, low * ratio], [low, low * ratio])
         save(figure, tmp_path / "ranges.json")
         assert complaints(figure) == []
+
+
+def test_a_decade_without_room_for_a_label_has_a_tick():
+    """Labels at 0.001, 0.1 and 1 alone would be read as evenly spaced."""
+    axis = new_figure(2, 2).subplots().xaxis
+    label_log_axis(axis, 6e-4, 5.0, length=1.2)
+    assert axis.get_majorticklocs().tolist() == [0.001, 0.1, 1.0]
+    assert axis.get_minorticklocs().tolist() == [0.01]
 
 
 def test_a_long_heading_takes_lines(tmp_path):

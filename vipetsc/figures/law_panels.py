@@ -93,4 +93,6 @@ def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
 def _draw_curve(axes: Axes, x: np.ndarray, curve: LawCurve, look: Mapping[str, Any]) -> None:
     """Draw a curve with its scatter, one deviation up and down."""
     axes.plot(x, curve.value, lw=1.0, **look)
-    axes.fill_between(x, curve.value - curve.scatter, curve.value + curve.scatter, color=look["color"], alpha=0.25, lw=0)
+    low = curve.value - curve.scatter
+    high = curve.value + curve.scatter
+    axes.fill_between(x, low, high, color=look["color"], alpha=0.25, lw=0)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 LEAST_TICKS = 3
 MOST_TICKS = 8
@@ -51,9 +51,11 @@ def has_room(positions: np.ndarray, texts: Sequence[str], length: float, is_hori
 def label_log_axis(axis: Axis, low: float, high: float, length: float) -> None:
     """Label round numbers between ``low`` and ``high`` on a logarithmic ``axis`` on which they span ``length`` inches.
 
-    They are thinned where there is no room, as long as three are left.
+    They are thinned where there is no room, as long as three are left; the others stay as minor ticks, for three of
+    four are not evenly spaced.
     """
     ticks = log_ticks(low, high)
+    without_label = set(ticks)
     is_horizontal = axis.axis_name == "x"
     while len(ticks) > LEAST_TICKS:
         texts = [MARKUP.sub("", tick_text(tick)) for tick in ticks]
@@ -62,7 +64,9 @@ def label_log_axis(axis: Axis, low: float, high: float, length: float) -> None:
         ticks = ticks[::2] if len(ticks) >= 2 * LEAST_TICKS - 1 else [ticks[0], ticks[len(ticks) // 2], ticks[-1]]
     axis.set_major_locator(FixedLocator(ticks))
     axis.set_major_formatter(FuncFormatter(lambda value, _: tick_text(value)))
-    axis.set_minor_locator(NullLocator())
+    without_label -= set(ticks)
+    axis.set_minor_locator(FixedLocator(sorted(without_label)))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def label_log_axes(figure: Figure) -> None:

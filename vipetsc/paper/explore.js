@@ -165,7 +165,7 @@ function names(all) {
 const viewer = document.querySelector("dialog");
 
 function show(image, fx, fy) {
-  const large = viewer.querySelector("img"), width = Math.max(2.5 * viewer.ownerDocument.documentElement.clientWidth, image.naturalWidth);
+  const large = viewer.querySelector("img") || make("img", {}, viewer), width = Math.max(2.5 * viewer.ownerDocument.documentElement.clientWidth, image.naturalWidth);
   large.src = image.src;
   large.alt = image.alt;
   large.style.width = `${width}px`;
