@@ -165,7 +165,8 @@ function names(all) {
 const viewer = document.querySelector("dialog");
 
 function show(image, fx, fy) {
-  const large = viewer.querySelector("img") || make("img", {}, viewer), width = Math.max(2.5 * viewer.ownerDocument.documentElement.clientWidth, image.naturalWidth);
+  // Before the button, which it would cover.
+  const large = viewer.querySelector("img") || viewer.insertBefore(make("img"), viewer.firstChild), width = Math.max(2.5 * viewer.ownerDocument.documentElement.clientWidth, image.naturalWidth);
   large.src = image.src;
   large.alt = image.alt;
   large.style.width = `${width}px`;
