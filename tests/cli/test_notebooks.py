@@ -68,7 +68,7 @@ def test_its_cells_run(path, monkeypatch, tmp_path, capsys):
 
     printed = capsys.readouterr().out
     if path.stem == "own-lattice":
-        assert "meets the" in printed
+        assert "returns to the site" in printed
         assert 0.2 < names["dissipated"] < 0.5
     elif path.stem == "sweep-heat-map":
         assert names["fraction"].shape == (5, 6)

@@ -150,7 +150,7 @@ def test_bad_cases_write_nothing(on_ranks, case, tmp_path, ranks):
 @pytest.mark.parametrize("name", ["clearances", "amplitudes", "band", "gate"])
 def test_the_cases_in_runs_are_valid(in_process, name):
     """Each search in ``runs`` is valid, with the number of its designs."""
-    done = in_process("validate", f"runs/optimise-{name}.toml")
+    done = in_process("validate", f"runs/examples/optimise-{name}.toml")
 
     assert done.returncode == 0, done.stderr
     assert "designs of" in done.stdout

@@ -55,7 +55,7 @@ fields = true
 [sweep.drive]
 frequency = [800.0, 900.0, 1000.0]
 """
-PAGES = ("bands_share", "contact_episodes", "dissipated_fraction", "ibtet", "upper_share_at_end")
+PAGES = ("bands_share", "contact_episodes", "dissipated_fraction", "ibtet", "largest_force", "upper_share_at_end")
 
 
 def sweep(folder: Path, case: str, *changes: str) -> Path:
@@ -128,7 +128,10 @@ def test_an_own_cell_under_a_harmonic_drive_has_pages_over_its_frequency(tmp_pat
 def test_what_is_zero_for_every_member_is_said_and_drawn_on_request(tmp_path, capsys):
     out = sweep(tmp_path, BURST, "sweep.contacts.clearance=[1.0, 2.0, 3.0]")
     assert main(["plot", str(out)]) == 0
-    assert "no picture of contact_episodes, dissipated_fraction: 0 for every member" in capsys.readouterr().err
+    assert (
+        "no picture of contact_episodes, dissipated_fraction, largest_force: 0 for every member"
+        in capsys.readouterr().err
+    )
     assert main(["plot", str(out), "--fig", "contact_episodes"]) == 0
     assert "contact_episodes-over-contacts.clearance-contacts.restitution.png" in drawn(out)
 

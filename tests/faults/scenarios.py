@@ -209,6 +209,7 @@ SCENARIOS = {
         Scenario("bands", RUN, f"bands {OUT}"),
         Scenario("bands-modes", RUN, f"bands {OUT} --modes 2 --near 300"),
         Scenario("validate", SWEEP, "validate {case}"),
+        Scenario("schema", RUN, "schema {case}"),
         Scenario("examples", "", "examples waveform own-law --out {out}"),
         Scenario("paper", "", "paper --quick --out {out}", ranks=2),
     )

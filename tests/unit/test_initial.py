@@ -163,7 +163,7 @@ def test_members_of_a_sweep_begin_in_motion():
         ({"kind": "mode", "energy": 1e-3}, "initial.number", "one of number and near"),
         ({"kind": "mode", "number": 97, "energy": 1.0}, "initial.number", "has 96 modes"),
         ({"kind": "mode", "number": 3}, "initial.amplitude", "one of amplitude and energy"),
-        ({"kind": "mode", "number": 3, "amplitude": 1e-3, "width": 3.0}, "initial.width", "another kind"),
+        ({"kind": "mode", "number": 3, "amplitude": 1e-3, "width": 3.0}, "initial.width", "does not apply"),
         (PACKET | {"amplitude": 1e-3}, "initial.amplitude", "one of"),
         (PACKET | {"band": 5}, "initial.band", "has 4 bands"),
         (PACKET | {"cell": 25}, "initial.cell", "1 to 24"),
@@ -199,7 +199,7 @@ def test_scattering_laws_and_searches_begin_at_rest():
         LawCase.from_table(TABLE | {"initial": PACKET, "drive": {"amplitude": 1.0}, "law": {}})
     contacts = {"sites": [6], "clearance": 1e-3}
     search = {"variables": {"clearance": [1e-4, 1e-2]}}
-    with pytest.raises(CaseError, match="lattice at rest"):
+    with pytest.raises(CaseError, match="starts at rest"):
         OptimiseCase.from_table(TABLE | {"initial": PACKET, "contacts": contacts, "optimise": search})
 
 
@@ -242,7 +242,7 @@ def test_a_run_may_begin_with_an_orbit_of_a_branch(branch):
     assert u[1, 3] == pytest.approx(15e-4)
 
 
-@pytest.mark.parametrize(("key", "message"), [({"orbit": 3}, "from 1 to 2, not 3"), ({"time": 0.1}, "no such thing")])
+@pytest.mark.parametrize(("key", "message"), [({"orbit": 3}, "from 1 to 2, not 3"), ({"time": 0.1}, "no such sample")])
 def test_an_orbit_that_a_branch_does_not_hold_is_refused(branch, key, message):
     with pytest.raises(CaseError, match=message):
         case_with(initial={"kind": "file", "path": str(branch)} | key)

@@ -283,5 +283,5 @@ def test_every_run_with_velocities_has_a_movie(shape, tmp_path):
         assert np.ptp(stage.frame(1)) > 0
         # One cell has no wave along the lattice, of which bands would be shown.
         if shape == "single cell":
-            with pytest.raises(ValueError, match="side by side"):
+            with pytest.raises(ValueError, match="contiguous cells"):
                 movie_frames(run, None, Shot())

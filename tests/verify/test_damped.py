@@ -278,7 +278,7 @@ def test_a_loss_by_bands_is_resolved_to_dashpots():
 
     # No dashpots meet the loss in both bands.
     flat = small_case(lattice={"damping": {"loss": {"1": 0.02, "2": 0.02}}})
-    assert any("band 1 0.00" in sentence and "asked 0.02" in sentence for sentence in flat.warnings())
+    assert any("band 1 0.00" in sentence and "requested 0.02" in sentence for sentence in flat.warnings())
 
 
 @pytest.mark.parametrize("damping", [

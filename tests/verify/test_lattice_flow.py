@@ -182,7 +182,7 @@ def test_a_dissipative_contact_cannot_be_closed_at_the_start():
 def test_contacts_that_always_act_are_refused():
     chain = Chain(four_band("calibrated"), CELLS, "fixed", (5,), (0.0,), pairs=(Pair(0, 0, next_cell=True),))
     flow = LatticeFlow(chain, Contact("hertz", 1e6), MPI.COMM_SELF)
-    with pytest.raises(FlowError, match="touch or are pressed"):
+    with pytest.raises(FlowError, match="touch or are precompressed"):
         flow.arc(np.zeros((2 * DOFS, CELLS)), PERIOD)
 
 

@@ -1,10 +1,30 @@
 """Measures on sampled fields, in plain numpy and scipy: Fourier, wavelets, band energies, entropy, power laws."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from vipetsc.spectra.band_energies import Parts, front_arrival, ibtet, part_energies, part_maps
 from vipetsc.spectra.directions import band_envelopes, by_direction, wave_energies
-from vipetsc.spectra.entropies import Entropy, averages, entropy, local_entropy
 from vipetsc.spectra.fits import FEWEST, PowerLaw, doubt, normalised, power_law
 from vipetsc.spectra.fourier import TAPER, Dispersion, dispersion, kinetic_energy, ridge, taper, wavenumber_content
-from vipetsc.spectra.modal_energies import ModalParts, upper_share
 from vipetsc.spectra.pooling import block_means, block_sums, blocks
-from vipetsc.spectra.wavelet import BINS, Nodes, filter_bank, inverse, padded_length, partition, transform
+
+if TYPE_CHECKING:
+    from vipetsc.spectra.entropies import Entropy, averages, entropy, local_entropy
+    from vipetsc.spectra.modal_energies import ModalParts, upper_share
+    from vipetsc.spectra.wavelet import BINS, Nodes, filter_bank, inverse, padded_length, partition, transform
+
+# Their compiled kernels take half a second to load, and a case that is only checked needs the names of measures alone.
+COMPILED = {
+    "entropies": ("Entropy", "averages", "entropy", "local_entropy"),
+    "modal_energies": ("ModalParts", "upper_share"),
+    "wavelet": ("BINS", "Nodes", "filter_bank", "inverse", "padded_length", "partition", "transform"),
+}
+
+
+def __getattr__(name: str) -> object:
+    """Load a name of a module with compiled kernels when it is first used."""
+    for module, names in COMPILED.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
