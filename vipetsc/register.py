@@ -20,7 +20,12 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
-LAW, DISSIPATION, WAVEFORM, MEASURE, FIGURE = "law", "dissipation", "waveform", "measure", "figure"
+# The kinds of parts.
+LAW = "law"
+DISSIPATION = "dissipation"
+WAVEFORM = "waveform"
+MEASURE = "measure"
+FIGURE = "figure"
 NAME = re.compile(r"[A-Za-z][\w-]*")
 MOST_PARAMETERS = 4  # of an elastic law: its compiled functions take so many numbers besides x and k
 

@@ -14,6 +14,7 @@ import xarray as xr
 
 import vipetsc
 from tests.cli.test_python import my_lattice
+from tests.faults.scenarios import NFRC
 from vipetsc.case import Case
 
 # The lattice of the README with the fast engine; pictures are asked for where they are looked at.
@@ -95,19 +96,6 @@ clearance = [3e-4, 3e-3]
 
 [[optimise.objective]]
 measure = "ibtet"
-"""
-RESPONSE = """
-[lattice]
-preset = "four-band"
-
-[contacts]
-sites = [100]
-clearance = 1.8e-3
-
-[nfrc]
-restitutions = [1.0, 0.7]
-range = [0.97, 1.01]
-harmonics = 5
 """
 
 
@@ -324,7 +312,7 @@ def test_a_breather(typed, put, tmp_path):
 @pytest.mark.slow
 def test_a_frequency_response(typed, put, tmp_path):
     """Steady states over the frequency, of conservative and of lossy stops, as a table."""
-    put("response.toml", RESPONSE)
+    put("response.toml", NFRC)
     typed("nfrc response.toml --set output.figures=false\nexport runs/response")
     curves = {
         restitution: table(tmp_path / f"runs/response/curves/branch-r{restitution}-1023.27-point.csv")

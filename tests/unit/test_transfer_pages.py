@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.figure import Figure
 
+from tests.hertz_branch import write_branch
 from vipetsc.case import Case, Sweep
 from vipetsc.figures import registry, transfer
 from vipetsc.figures.registry import FIGURES, specified_drawings
@@ -24,7 +24,6 @@ from vipetsc.studies.backbone import Initiation, relate_folders
 AMPLITUDES = np.geomspace(1.0, 1000.0, 8)
 RESTITUTIONS = [0.3, 0.9]
 ONSET = 2.0  # N
-GRAZING = 0.03  # J
 SWEEP = {
     "lattice": {"cells": 20},
     "contacts": {"sites": [9], "clearance": 1e-3},
@@ -63,25 +62,14 @@ def write_sweep(folder: Path) -> None:
     write_netcdf(folder / "ensemble.h5", xr.Dataset(data, coords, {"case": case}))
 
 
-def write_branch(folder: Path) -> None:
-    """Write a branch of the Hertz law whose slope falls as 1/E in region III."""
-    energy = GRAZING * np.concatenate([[0.1, 1.0], np.geomspace(1.001, 1e7, 40)])
-    region = np.select([energy <= GRAZING, energy < 1.2 * GRAZING], [1, 2], 3)
-    with h5py.File(folder / backbone.BRANCH, "w") as file:
-        file["energy"] = energy
-        file["region"] = region
-        file["slope"] = np.where(region == 1, 0.0, 700.0 / energy)
-        file["contacts"] = (region > 1).astype(int)
-        file["kind"] = np.zeros(len(energy), np.int8)
-        file.attrs["case"] = '[lattice]\nreading = "printed"\n[contacts]\nlaw = "hertz"\n'
-
-
 def test_curves_of_two_values_of_a_key_are_both_laid_over_the_branch(tmp_path, monkeypatch):
     """They differ in neither law, reading, sites nor cycles: each has a page, named by the key and its value."""
-    sweep, branch = tmp_path / "sweep", tmp_path / "branch"
-    for folder, write in ((sweep, write_sweep), (branch, write_branch)):
-        folder.mkdir()
-        write(folder)
+    sweep = tmp_path / "sweep"
+    sweep.mkdir()
+    write_sweep(sweep)
+    branch = tmp_path / "branch"
+    branch.mkdir()
+    write_branch(branch, largest=1e7)
     initiation = Initiation(amplitude=ONSET, energy=ONSET**2, onset=ONSET)
     monkeypatch.setattr(backbone, "initiation_of", lambda folder, case: initiation)
     assert relate_folders([sweep, branch]) == [sweep / "backbone.h5"]

@@ -17,7 +17,9 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, WaveCompliance
 from vipetsc.lattice.chain import Pair
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.response.steady import Response, SteadyStates, stops_of
+from vipetsc.modes.branches.responses import ResponseMethod
+from vipetsc.modes.response.condensation import stops_of
+from vipetsc.modes.response.steady import Response, SteadyStates
 from vipetsc.modes.response.steps import first_state
 
 pytestmark = pytest.mark.parallel(1)
@@ -29,7 +31,7 @@ TWO_MASSES: dict[str, Any] = {
         "cells": 2,
         "cell": {
             "masses": [1.0],
-            "springs": [{"start": 1, "end": 1, "stiffness": 1.0, "next_cell": True}],
+            "springs": [{"start": 1, "end": 1, "stiffness": 1.5, "next_cell": True}],
             "contact": [1, 1],
         },
         "damping": {"mass": 0.06},
@@ -37,7 +39,7 @@ TWO_MASSES: dict[str, Any] = {
     "contacts": {"law": "bilinear", "stiffness": 20.0, "restitution": 1.0, "sites": [1], "clearance": 0.8},
     "drive": {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "end": "left"},
     "time": {"end": 10.0},
-    "nfrc": {"source": "force", "over": "frequency", "range": [0.8, 1.9], "fixed": [0.2], "harmonics": 41},
+    "nfrc": {"source": "force", "over": "frequency", "range": [1.0, 2.3], "fixed": [0.2], "harmonics": 41},
 }
 TWO_MASSES["contacts"] |= {"pair": [0, 1], "side": "plus"}
 
@@ -151,7 +153,8 @@ def test_what_follows_from_the_lattice_is_filled_in():
         ("nfrc", {"source": "wave", "over": "amplitude"}, "nfrc.source", "decayed before it arrives"),
         ("nfrc", {"infinite": True}, "nfrc.infinite", "absorbing ends"),
         ("nfrc", {"symmetric": True}, "nfrc.symmetric", "even harmonics"),
-        ("lattice", {"cells": 4000}, "lattice.cells", "at most 3000"),
+        ("lattice", {"cells": 4000}, "lattice.cells", "at most 1000"),
+        ("contacts", {"clearance": 0.0}, "contacts.clearance", "touched at every amplitude"),
     ],
 )
 def test_what_has_no_response_is_refused_with_its_reason(section, values, key, reason):
@@ -245,7 +248,7 @@ def test_a_force_that_touches_nothing_has_the_linear_response(two_masses):
     for point in quiet[::10]:
         omega, amplitude = states.drive(point.xi[-1])
         dynamic = chain.stiffness_matrix().toarray() + 1j * omega * chain.damping_rows(0, 2).toarray()
-        u = np.linalg.solve(dynamic - omega**2 * np.eye(2), [amplitude * 1.0, 0.0])
+        u = np.linalg.solve(dynamic - omega**2 * np.eye(2), [amplitude * 1.5, 0.0])
         np.testing.assert_allclose(point.measured.harmonics[0, 1], u[0], rtol=1e-8)
 
 
@@ -253,11 +256,7 @@ def test_a_force_that_touches_nothing_has_the_linear_response(two_masses):
 def test_a_lossy_run_settles_into_the_response():
     """A run with restitution 0.6 from rest comes to the amplitudes of the response at its frequency."""
     table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"restitution": 0.6}}
-    frequency = 1.02
-    options = {"over": "amplitude", "range": [0.02, 0.2], "fixed": [frequency], "harmonics": 61}
-    case = NfrcCase.from_table(table | {"nfrc": {"source": "force"} | options})
-    states = SteadyStates(case, 0.6, frequency)
-
+    frequency = 1.25
     period = 2 * np.pi / frequency
     run = run_of(
         Case.from_table(
@@ -271,12 +270,27 @@ def test_a_lossy_run_settles_into_the_response():
     w = run["displacement"].values[-64:, 0, 0]
     settled = np.fft.rfft(w) / 32
 
-    case = NfrcCase.from_table(table | {"nfrc": {"source": "force"} | options | {"range": [0.2, 0.3]}})
-    states = SteadyStates(case, 0.6, frequency)
+    options = {"source": "force", "over": "amplitude", "range": [0.2, 0.3], "fixed": [frequency], "harmonics": 61}
+    states = SteadyStates(NfrcCase.from_table(table | {"nfrc": options}), 0.6, frequency)
     measured = states.measured(first_state(states).xi)
     assert measured.episodes == 1
     assert measured.unstable == 0
     np.testing.assert_allclose(np.abs(measured.harmonics[0, 1:4]), np.abs(settled[1:4]), rtol=2e-4)
+
+
+def test_curves_of_a_case_have_one_compliance():
+    """The modes of a lattice are computed once, and not anew for each curve."""
+    nfrc = TWO_MASSES["nfrc"] | {"fixed": [0.1, 0.2], "restitutions": [1.0, 0.7]}
+    method = ResponseMethod(NfrcCase.from_table(TWO_MASSES | {"nfrc": nfrc}), MPI.COMM_SELF)
+    assert len({id(method.problem(job).compliance) for job in range(4)}) == 1
+
+
+def test_a_pressed_contact_is_refused_a_loss():
+    contacts = TWO_MASSES["contacts"] | {"clearance": 0.0, "precompression": 0.3}
+    nfrc = TWO_MASSES["nfrc"] | {"restitutions": [1.0, 0.7]}
+    with pytest.raises(CaseError, match="no approach velocity") as caught:
+        NfrcCase.from_table(TWO_MASSES | {"contacts": contacts, "nfrc": nfrc})
+    assert [problem.key for problem in caught.value.problems] == ["nfrc.restitutions"]
 
 
 def test_a_contact_that_is_pressed_at_rest_pulls_as_far_as_it_is_pressed():
@@ -289,7 +303,7 @@ def test_a_contact_that_is_pressed_at_rest_pulls_as_far_as_it_is_pressed():
 
     states = SteadyStates(case, 1.0, 0.01)
     point = states.measured(first_state(states).xi)
-    stiffness = np.array([[2.0 + 20.0, -1.0], [-1.0, 2.0]])
+    stiffness = np.array([[3.0 + 20.0, -1.5], [-1.5, 3.0]])
     dynamic = stiffness + 0.8j * 0.06 * np.eye(2) - 0.8**2 * np.eye(2)
     assert point.closed[0] == 1.0
-    np.testing.assert_allclose(point.harmonics[0, 1], np.linalg.solve(dynamic, [0.01, 0.0])[0], rtol=1e-8)
+    np.testing.assert_allclose(point.harmonics[0, 1], np.linalg.solve(dynamic, [0.01 * 1.5, 0.0])[0], rtol=1e-8)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
+from tests.hertz_branch import GRAZING, write_branch
 from vipetsc.case import Case, Sweep
 from vipetsc.figures import runs, transfer_curves
 from vipetsc.figures.panels import block_means
@@ -19,12 +20,11 @@ from vipetsc.figures.sweep_members import Files, MemberRun, Sweeps
 from vipetsc.figures.transfer import closing_error
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import curves, member_folder, open_ensemble, open_run, select, whole_members
-from vipetsc.studies.backbone import BRANCH, initiation_of, relate_folders
+from vipetsc.studies.backbone import initiation_of, relate_folders
 from vipetsc.studies.sweep import run_sweep
 
 NAMES = ("transfer", "transfer_dispersions", "band_energies", "ibtet", "ibtet_backbone", "phase_regimes")
 AMPLITUDES = [1.0, 2.0, 30.0, 60.0, 120.0, 240.0, 500.0]
-GRAZING = 0.03
 TABLE = {
     "lattice": {"preset": "four-band", "reading": "calibrated", "cells": 20},
     "contacts": {"sites": 1},
@@ -49,15 +49,7 @@ def reduced(tmp_path_factory):
 
     # A branch with a law of exponent -1 in region III.
     branch = tmp_path_factory.mktemp("branch")
-    energy = GRAZING * np.concatenate([[0.1, 1.0], np.geomspace(1.001, 1e6, 60)])
-    region = np.select([energy <= GRAZING, energy < 1.2 * GRAZING, energy < 1e5], [1, 2, 3], 4)
-    with h5py.File(branch / BRANCH, "w") as file:
-        file["energy"] = energy
-        file["region"] = region
-        file["slope"] = np.where(region == 1, 0.0, 700.0 / energy)
-        file["contacts"] = (region > 1).astype(int)
-        file["kind"] = np.zeros(len(energy), np.int8)
-        file.attrs["case"] = '[lattice]\nreading = "printed"\n[contacts]\nlaw = "hertz"\n'
+    write_branch(branch, largest=1e6, last_region=1e5)
 
     assert relate_folders([folder, branch]) == [folder / "backbone.h5"]
     return folder

@@ -168,7 +168,15 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     if nfrc.symmetric and gaps:
         remedy = "contacts that differ on their two sides make even harmonics; omit it"
         yield Problem("nfrc.symmetric", True, remedy)
-    if nfrc.source == "wave" and min((min(gap) for gap in gaps), default=min(chain.clearances)) <= 0:
+    stops = gaps or [(clearance, clearance) for clearance in chain.clearances]
+    smallest = min(min(gap) for gap in stops)
+    if smallest < 0 and any(restitution < 1 for restitution in nfrc.restitutions):
+        remedy = "a contact that is pressed together has no approach velocity: its restitution must be 1"
+        yield Problem("nfrc.restitutions", nfrc.restitutions, remedy)
+    if any(0 in gap for gap in stops):
+        remedy = "curves begin with a state without contact, and such a stop is touched at every amplitude"
+        yield Problem("contacts.clearance", 0.0, f"{remedy}; give a clearance or a precompression")
+    if nfrc.source == "wave" and smallest < 0:
         remedy = "a wave's amplitude counts in clearances, and a contact has none; a force can be given"
         yield Problem("nfrc.source", "wave", remedy)
     if not needs_modes(chain):

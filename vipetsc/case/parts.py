@@ -7,6 +7,7 @@ source, so that every result carries them and one that was begun with another so
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -208,11 +209,8 @@ def _texts(table: Mapping[str, Any]) -> set[str]:
     return texts
 
 
-_WARNED: set[str] = set()
-
-
+@cache
 def _warn(text: str) -> None:
-    """Warn once, on one rank: a file's case is read many times."""
-    if text not in _WARNED and not launched_rank():
+    """Warn on one rank, and once of each ``text``: a file's case is read many times."""
+    if not launched_rank():
         logger.warning("vipetsc: %s", text)
-    _WARNED.add(text)

@@ -59,17 +59,21 @@ def check_law_parameters(
 def check_law(law: Contact) -> str:
     """What is wrong with the formulas of a registered ``law`` with its parameters; empty if nothing is."""
     try:
-        force, slope, energy = law.elastic_force(DEPTHS), law.elastic_slope(DEPTHS), law.elastic_energy(DEPTHS)
-        at_rest = [float(law.elastic_force(0.0)), float(law.elastic_energy(0.0)), float(law.elastic_slope(0.0))]
+        force = law.elastic_force(DEPTHS)
+        slope = law.elastic_slope(DEPTHS)
+        energy = law.elastic_energy(DEPTHS)
+        force_at_rest = float(law.elastic_force(0.0))
+        slope_at_rest = float(law.elastic_slope(0.0))
+        energy_at_rest = float(law.elastic_energy(0.0))
         onset = law.elastic_force(ONSET)
     except ValueError as error:
         return str(error)
 
-    values = [*force, *slope, *energy, *at_rest, *onset]
+    values = [*force, *slope, *energy, force_at_rest, slope_at_rest, energy_at_rest, *onset]
     if not np.isfinite(values).all():
         return f"its force, slope or energy is no number at some x from 0 to {DEPTHS[-1]:g} m"
-    if at_rest[0] != 0 or at_rest[1] != 0:
-        return f"its force and energy at x = 0 are {at_rest[0]:g} and {at_rest[1]:g}; both must be 0"
+    if force_at_rest != 0 or energy_at_rest != 0:
+        return f"its force and energy at x = 0 are {force_at_rest:g} and {energy_at_rest:g}; both must be 0"
     if not ((force > 0).all() and (slope >= 0).all()):
         return "its force must be positive for x > 0, and must not fall"
 

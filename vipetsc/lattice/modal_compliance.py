@@ -26,7 +26,7 @@ from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.chain import Chain
 
-MOST_DOFS = 3000  # masses of a lattice whose modes are all computed: minutes, and 600 MB of vectors
+MOST_DOFS = 1000  # masses of a lattice whose modes are all computed: a minute with dashpots, and 100 MB
 RIGID = 1e-12  # squared frequencies, or losses of a mode, below this fraction of the largest are none
 UNMOVED = 1e-10  # a rigid motion whose relative displacements are below this fraction of the largest moves no pair
 # Error over the largest compliance that is accepted of the sum over poles: near critical damping two of them are

@@ -93,8 +93,8 @@ def _phasor(time: np.ndarray, values: np.ndarray, frequency: float, harmonics: i
 
 def transmission(source: np.ndarray, receiver: np.ndarray) -> float:
     """The rms of the ``receiver`` (t,) over that of the ``source`` (t,); NaN where the source does not move."""
-    below = rms(source)
-    return rms(receiver) / below if below else np.nan
+    source_rms = rms(source)
+    return rms(receiver) / source_rms if source_rms else np.nan
 
 
 def transmission_by_part(
@@ -124,6 +124,6 @@ def transmission_by_part(
         bounds = np.searchsorted(frequency, edges)
         energies.append(np.array([squares[low:high].sum() for low, high in pairwise(bounds)]))
 
-    below, above = energies
-    has_source = below > SILENT * below.sum()
-    return np.sqrt(np.divide(above, below, out=np.full(len(below), np.nan), where=has_source))
+    of_source, of_receiver = energies
+    has_source = of_source > SILENT * of_source.sum()
+    return np.sqrt(np.divide(of_receiver, of_source, out=np.full(len(of_source), np.nan), where=has_source))

@@ -136,18 +136,6 @@ class RunMeasure(NamedTuple):
         )
 
 
-MEASURES: dict[str, RunMeasure] = {}
-"""All measures by name, in the order in which files hold them."""
-
-
-def register(measure: RunMeasure) -> RunMeasure:
-    """Add a ``measure`` to the registry and return it; raises ValueError if its name is taken."""
-    if measure.name in MEASURES:
-        raise ValueError(f"measure {measure.name}: there is one of that name")
-    MEASURES[measure.name] = measure
-    return measure
-
-
 def every_measure() -> dict[str, RunMeasure]:
     """The shipped measures by name, and those that modules register: of the case that is read, else of all imported."""
     measures = dict(MEASURES)
@@ -267,17 +255,17 @@ def _band_transmission(record: RunRecord, source: str, receiver: str) -> np.ndar
     time = record.points[source].time
     if len(time) < 2:
         return None
-    below, above = _velocities(record, source, receiver)
+    before, after = _velocities(record, source, receiver)
     goes_on = record.drive is not None and record.drive.stop > time[-1]
-    return histories.transmission_by_part(below, above, float(time[1] - time[0]), record.edges, goes_on=goes_on)
+    return histories.transmission_by_part(before, after, float(time[1] - time[0]), record.edges, goes_on=goes_on)
 
 
 def _steady_transmission(record: RunRecord, source: str, receiver: str) -> float | None:
-    below = record.settled(source, "velocity")
-    above = record.settled(receiver, "velocity")
-    if below is None or above is None:
+    of_source = record.settled(source, "velocity")
+    of_receiver = record.settled(receiver, "velocity")
+    if of_source is None or of_receiver is None:
         return None
-    return above / below if below else np.nan
+    return of_receiver / of_source if of_source else np.nan
 
 
 def _of_points(kind: str, quantity: str) -> RunMeasure:
@@ -326,13 +314,7 @@ STANDARD = (
     RunMeasure(
         "bands/modal_energy", "J", "energy of the linear modes in a part at the end", dimension=PART, group="transfer"
     ),
-    RunMeasure(
-        "bands/share",
-        "1",
-        "mean fraction of the energy in a pass band or gap after the wave's arrival",
-        dimension=PART,
-        group="transfer",
-    ),
+    RunMeasure("bands/share", "1", MEAN_SHARE, dimension=PART, group="transfer"),
     RunMeasure("largest_force", "N", "largest contact force of all impacts", _largest_force, power=0.0),
     *(_of_points(kind, quantity) for kind in ("peak", "rms", "steady") for quantity in QUANTITIES),
     RunMeasure(
@@ -357,7 +339,7 @@ STANDARD = (
         power=0.0,
     ),
 )
-for standard in STANDARD:
-    register(standard)
+MEASURES: dict[str, RunMeasure] = {measure.name: measure for measure in STANDARD}
+"""The shipped measures by name, in the order in which files hold them."""
 
 reserve(MEASURE, MEASURES)

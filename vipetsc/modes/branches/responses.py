@@ -13,6 +13,7 @@ from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.method import Method
 from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem
+from vipetsc.modes.response.condensation import compliance_of
 from vipetsc.modes.response.steady import Response, SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
 
@@ -32,6 +33,7 @@ class ResponseMethod(Method[Response]):
     def __init__(self, case: NfrcCase, comm: MPI.Comm) -> None:
         super().__init__(case, comm)
         self.curves = case.curves()
+        self.compliance = compliance_of(case)
 
     @staticmethod
     def jobs(case: Any) -> list[int]:
@@ -67,7 +69,7 @@ class ResponseMethod(Method[Response]):
     def problem(self, job: int) -> SteadyStates:
         """The equations of a curve."""
         _, restitution, fixed = self.curves[job]
-        return SteadyStates(self.case, restitution, fixed)
+        return SteadyStates(self.case, restitution, fixed, compliance=self.compliance)
 
     def start(self, problem: PeriodicProblem[Response], job: int) -> Response:
         """The state at the beginning of the range."""

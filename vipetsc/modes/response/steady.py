@@ -20,13 +20,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.case.nfrc import NfrcCase, needs_modes
+from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import IncidentWave, ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import SiteForces, Stops
+from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.hill import Hill
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, Solution, SpecialKind
+from vipetsc.modes.response.condensation import compliance_of, driven_points, stops_of
 
 # Relative step of a difference in frequency.
 SLOPE = 1e-6
@@ -229,27 +230,26 @@ class SteadyEquations(ABC):
 
 
 class SteadyStates(SteadyEquations):
-    """Steady states of the sites of a case with a ``restitution`` and the other parameter ``fixed`` (``NfrcTable``)."""
+    """Steady states of the sites of a case with a ``restitution`` and the other parameter ``fixed`` (``NfrcTable``).
 
-    def __init__(self, case: NfrcCase, restitution: float, fixed: float) -> None:
-        model = case.model()
+    ``compliance`` is that of the case, if it has been computed already.
+    """
+
+    def __init__(
+        self,
+        case: NfrcCase,
+        restitution: float,
+        fixed: float,
+        compliance: WaveCompliance | ModalCompliance | None = None,
+    ) -> None:
         options = case.nfrc
         self.case = case
         self.options = options
         self.restitution = restitution
         self.wave = options.source == "wave"
         self.forces = SiteForces(stops_of(case, restitution))
-
-        # A wall acts on each mass that a spring ties to it, by that spring's stiffness times its motion.
-        self.points: tuple[tuple[int, int], ...] = ()
-        if not self.wave:
-            self.points = tuple((drive.cell, drive.mass) for drive in model.drives)
-        self.weights = np.array([drive.stiffness or 1.0 for drive in model.drives])[: len(self.points)]
-        self.compliance: WaveCompliance | ModalCompliance
-        if needs_modes(model.chain):
-            self.compliance = ModalCompliance(model.chain, self.points)
-        else:
-            self.compliance = WaveCompliance(model.chain, bool(options.infinite), self.points)
+        self.points, self.weights = driven_points(case)
+        self.compliance = compliance_of(case) if compliance is None else compliance
 
         # Latest linear motions by frequency, and the latest determinant: neighbours on a curve over the amplitude.
         self._motions: dict[float, LinearMotion] = {}
@@ -377,13 +377,6 @@ class SteadyStates(SteadyEquations):
                     powers[2] += self.compliance.outgoing(k * omega, forces[:, k]).sum()
         powers[3] = loss * (omega / (2 * np.pi))
         return powers / given if given > 0 else np.full(4, np.nan)
-
-
-def stops_of(case: NfrcCase, restitution: float) -> list[Stops]:
-    """The law and the stops of each site of a ``case``, with a ``restitution``."""
-    model = case.model()
-    gaps = model.gaps or [(clearance, clearance) for clearance in model.chain.clearances]
-    return [Stops(law, plus, minus) for law, (plus, minus) in zip(case.laws(restitution), gaps, strict=True)]
 
 
 def _largest(z: np.ndarray) -> np.ndarray:

@@ -94,7 +94,9 @@ def _touches(states: SteadyStates, linear: np.ndarray) -> bool:
 def _ramp(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
     """Scaled harmonics of the state at ``omega`` to which growing amplitudes lead."""
     below = states.options.model_copy(update={"over": "amplitude", "range": [1e-3 * amplitude, amplitude]})
-    ramp = SteadyStates(states.case.model_copy(update={"nfrc": below}), states.restitution, omega)
+    ramp = SteadyStates(
+        states.case.model_copy(update={"nfrc": below}), states.restitution, omega, compliance=states.compliance
+    )
     points = list(Continuation(ramp, first_state(ramp, is_ramp=True), TurningSteps(ramp, MOST_RAMP)))
     if not points or not np.isclose(points[-1].xi[-1] * ramp.parameter.scale, amplitude):
         raise ContinuationError(f"increasing amplitudes do not reach {amplitude:g}: lower nfrc.range or nfrc.fixed")

@@ -1,0 +1,49 @@
+"""A case of ``nfrc`` condensed onto its contacts: their stops, the masses that the drive acts on, the compliance."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.case.nfrc import NfrcCase, needs_modes
+from vipetsc.lattice import ModalCompliance, WaveCompliance
+from vipetsc.modes.balance.harmonics import Stops
+
+
+class DrivenPoints(NamedTuple):
+    """The masses on which a drive acts, as (cell, mass) from 0, and the force in N on each for the amplitude 1."""
+
+    places: tuple[tuple[int, int], ...]
+    weights: np.ndarray
+
+
+def driven_points(case: NfrcCase) -> DrivenPoints:
+    """The driven masses of a ``case``; none under an incident wave.
+
+    A wall acts on each mass that a spring ties to it, with that spring's stiffness times its motion.
+    """
+    if case.nfrc.source == "wave":
+        return DrivenPoints((), np.empty(0))
+    drives = case.model().drives
+    return DrivenPoints(
+        places=tuple((drive.cell, drive.mass) for drive in drives),
+        weights=np.array([drive.stiffness or 1.0 for drive in drives]),
+    )
+
+
+def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
+    """The compliance of the lattice of a ``case`` between its contacts and driven masses.
+
+    That of modes costs up to a minute at its first call: curves of one case are computed with one.
+    """
+    chain = case.model().chain
+    places = driven_points(case).places
+    if needs_modes(chain):
+        return ModalCompliance(chain, places)
+    return WaveCompliance(chain, bool(case.nfrc.infinite), places)
+
+
+def stops_of(case: NfrcCase, restitution: float) -> list[Stops]:
+    """The law and the stops of each site of a ``case``, with a ``restitution``."""
+    model = case.model()
+    gaps = model.gaps or [(clearance, clearance) for clearance in model.chain.clearances]
+    return [Stops(law, plus, minus) for law, (plus, minus) in zip(case.laws(restitution), gaps, strict=True)]
