@@ -306,4 +306,6 @@ def test_a_contact_that_is_pressed_at_rest_pulls_as_far_as_it_is_pressed():
     stiffness = np.array([[3.0 + 20.0, -1.5], [-1.5, 3.0]])
     dynamic = stiffness + 0.8j * 0.06 * np.eye(2) - 0.8**2 * np.eye(2)
     assert point.closed[0] == 1.0
+    # The static load balances the contact's force at rest: the mean displacement is none.
+    assert abs(point.harmonics[0, 0]) < 1e-12
     np.testing.assert_allclose(point.harmonics[0, 1], np.linalg.solve(dynamic, [0.01 * 1.5, 0.0])[0], rtol=1e-8)
