@@ -32,6 +32,22 @@ if MPI.COMM_WORLD.rank == 1:
 simulate(Case.from_table({"time": {"end": 0.01}}), "out")
 """
 
+# Rank 1 waits for rank 0 in a collective of the job, as rank 0 waits for it at the end of the job.
+FAILS_IN_THE_MIDST_OF_A_JOB = """
+from mpi4py import MPI
+from vipetsc.parallel import StopRequest, install_abort_hook, on_every_rank
+from vipetsc.studies.pool import TaskPool
+install_abort_hook()
+comm = MPI.COMM_WORLD
+
+def work(job):
+    if comm.rank == 0:
+        raise MemoryError("no room for the job")
+    on_every_rank(comm, lambda: None)
+
+TaskPool(comm, comm, StopRequest()).run([1], work)
+"""
+
 
 def run_script(text: str, folder: Path, ranks: int) -> subprocess.CompletedProcess:
     """Run a Python script on several ranks."""
@@ -58,3 +74,13 @@ def test_a_rank_of_a_script_that_raises_ends_all(tmp_path):
     assert ended.returncode == 1
     assert "rank 1: " in ended.stderr
     assert "cannot go on" in ended.stderr
+
+
+@pytest.mark.mpirun
+def test_a_rank_that_fails_in_the_midst_of_a_job_of_several_ends_all(tmp_path):
+    """The end of a job on one rank is not taken for a collective of the job on another: the error itself is printed."""
+    ended = run_script(FAILS_IN_THE_MIDST_OF_A_JOB, tmp_path, ranks=2)
+
+    assert ended.returncode == 1
+    assert "no room for the job" in ended.stderr
+    assert "TypeError" not in ended.stderr

@@ -29,6 +29,9 @@ STOPPED = 75
 # What a call may end with; mpirun, which a kill or the signal itself may end, has codes of its own.
 CODES = {"sigterm": {0, STOPPED}, "sigkill": {128 + signal.SIGKILL}}
 OF_MPIRUN = {"sigterm": {128 + signal.SIGTERM, 1}, "sigkill": {-signal.SIGKILL}}
+# An exception may be dealt with: a file that cannot be read may be another's, or made again, and the linear run of a
+# sweep whose own job failed is made by the first member that needs it.
+CODES_AT_PHASES = {"read": {0, 1, 2}, "member": {0, 1}}
 Task = dict[str, Any]
 Record = dict[str, Any]
 
@@ -234,8 +237,7 @@ def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> li
     elif ended["since"] > allowed:
         wrong.append(f"all ranks ended after {ended['since']:.0f} s")
 
-    # A file that cannot be read may be another's, or made again.
-    codes = CODES.get(kind, {0, 1, 2} if task.get("phase") == "read" else {1})
+    codes = CODES.get(kind, CODES_AT_PHASES.get(task.get("phase"), {1}))
     if "delay" in task:
         codes = codes | OF_MPIRUN[kind]
     if ended["code"] not in codes:

@@ -94,6 +94,8 @@ class TaskPool:
         """Draw ``jobs`` with this team and do them, until none are left or one ends all. Collective."""
         drawn = SharedCounter(self.comm)
         ended = SharedCounter(self.comm)
+        # Of its own: on the communicator of the job, a rank whose job failed would meet the others in the midst of it.
+        meeting = self.team.Dup()
         # Many small jobs are drawn together: a draw and its broadcast may take longer than one of them.
         block = max(len(jobs) * self.team.size // (BLOCKS * self.comm.size), 1)
         leads = self.team.rank == 0
@@ -114,7 +116,7 @@ class TaskPool:
                 break
 
             begin = time.perf_counter()
-            last = self._do(jobs[number], work, fail)
+            last = self._do(jobs[number], work, fail, meeting)
             self.busy += time.perf_counter() - begin
             if last.ending > Ending.FAILED:
                 break
@@ -133,10 +135,11 @@ class TaskPool:
         wait_for_all(self.comm)
         drawn.free()
         ended.free()
+        meeting.Free()
         return TeamReport(last, done)
 
-    def _do(self, job: Job, work: Callable[[Job], None], fail: Callable[[Job, str], None]) -> JobEnd:
-        """Do a ``job`` with the whole team.
+    def _do(self, job: Job, work: Callable[[Job], None], fail: Callable[[Job, str], None], meeting: MPI.Comm) -> JobEnd:
+        """Do a ``job`` with the whole team, whose ranks agree on its end on the communicator ``meeting``.
 
         A rank that fails alone leaves the others in the midst of it, where they wait for ever: its exception is raised.
         """
@@ -152,14 +155,14 @@ class TaskPool:
             end = self._judge(error)
 
         # Non-blocking: a rank whose job failed must be able to give up waiting for its team.
-        met = self.team.Ibarrier()
+        met = meeting.Ibarrier()
         since = time.monotonic()
         while not met.Test():
             if failure and time.monotonic() - since > PATIENCE:
                 raise failure
             time.sleep(1e-3)
 
-        end = max(self.team.allgather(end))
+        end = max(meeting.allgather(end))
         if end.ending == Ending.FAILED:
             try:
                 on_root(self.team, lambda: fail(job, end.reason))
