@@ -116,7 +116,7 @@ def test_every_kind_of_branch_has_a_figure_and_no_two_figures_one_name():
 def test_the_axis_of_a_response_names_what_drives_the_sites(options, label):
     case = NfrcCase.from_table({"lattice": {"preset": "four-band"}, "contacts": {"sites": 1}, "nfrc": options})
     branch = xr.Dataset(attrs={"over": case.nfrc.over, "case": case.to_toml()})
-    assert nfrc._parameter_label(branch) == label
+    assert nfrc.parameter_label(branch) == label
 
 
 def put_condensed_branch(path: Path, points: int) -> None:

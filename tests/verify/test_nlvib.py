@@ -19,7 +19,7 @@ from vipetsc.lattice import Contact
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces, Stops
 from vipetsc.modes.balance.hill import Hill
-from vipetsc.modes.response.steady import ContinuationParameter, LinearMotion, SteadyEquations
+from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
 
 K = np.array([[1.0, -1.0], [-1.0, 2.0]])
 STOP = 100.0

@@ -8,40 +8,21 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from tests.conftest import run_of
+from tests.rigs import OUTPUT, TWO_MASSES, after_a_period, followed, multipliers
 from tests.steady_states import motion_at
 from vipetsc.case import Case, CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, WaveCompliance
 from vipetsc.lattice.chain import Pair
-from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.responses import ResponseMethod
 from vipetsc.modes.response.condensation import stops_of
-from vipetsc.modes.response.steady import Response, SteadyStates
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 
 pytestmark = pytest.mark.parallel(1)
-
-# Two masses of 1 kg between walls, of which the first one meets a stop of the table; the left wall shakes.
-TWO_MASSES: dict[str, Any] = {
-    "name": "rig",
-    "lattice": {
-        "cells": 2,
-        "cell": {
-            "masses": [1.0],
-            "springs": [{"start": 1, "end": 1, "stiffness": 1.5, "next_cell": True}],
-            "contact": [1, 1],
-        },
-        "damping": {"mass": 0.06},
-    },
-    "contacts": {"law": "bilinear", "stiffness": 20.0, "restitution": 1.0, "sites": [1], "clearance": 0.8},
-    "drive": {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "end": "left"},
-    "time": {"end": 10.0},
-    "nfrc": {"source": "force", "over": "frequency", "range": [1.0, 2.3], "fixed": [0.2], "harmonics": 41},
-}
-TWO_MASSES["contacts"] |= {"pair": [0, 1], "side": "plus"}
 
 # Ten cells whose masses and springs scatter, with dashpots to the ground and sites that differ in all they can.
 TEN_CELLS: dict[str, Any] = {
@@ -72,62 +53,6 @@ TEN_CELLS["contacts"]["each"] = {
     "pair": [[1, 2], [0, 1], [1, 1]],
     "next_cell": [False, False, True],
 }
-
-
-def rate_of(states: SteadyStates, omega: float, amplitude: float):
-    """The equations of motion of a lattice with elastic contacts, from its matrices: y' = f(t, y), y = (u, u')."""
-    chain = states.case.model().chain
-    stiffness = chain.stiffness_matrix().tocsr()
-    damping = chain.damping_rows(0, chain.cells)
-    masses = chain.masses()
-    n = len(masses)
-    d = chain.cell.dofs
-
-    drive = np.zeros(n)
-    for (cell, mass), weight in zip(states.points, states.weights, strict=True):
-        drive[cell * d + mass] += weight * amplitude
-    joins = []
-    for site, pair, stops in zip(chain.sites, chain.contact_pairs, states.forces.contacts, strict=True):
-        host = site * d + pair.host if pair.host >= 0 else None
-        joins.append((host, (site + pair.next_cell) % chain.cells * d + pair.resonator, stops))
-
-    def rate(t: float, y: np.ndarray) -> np.ndarray:
-        u, v = y[:n], y[n:]
-        force = drive * np.cos(omega * t) - stiffness @ u - damping @ v
-        for host, resonator, stops in joins:
-            w = u[resonator] - (0.0 if host is None else u[host])
-            push = stops.law.elastic_force(w - stops.plus) - stops.law.elastic_force(-w - stops.minus) - stops.load
-            force[resonator] -= push
-            if host is not None:
-                force[host] += push
-        return np.concatenate([v, force / masses])
-
-    return rate
-
-
-def after_a_period(states: SteadyStates, point: Response, state: np.ndarray) -> np.ndarray:
-    """The ``state`` (displacements, velocities) a period later, by SciPy."""
-    omega, amplitude = states.drive(point.xi[-1])
-    rate = rate_of(states, omega, amplitude)
-    period = 2 * np.pi / omega
-    return solve_ivp(rate, (0, period), state, "DOP853", rtol=1e-10, atol=1e-12, max_step=period / 100).y[:, -1]
-
-
-def multipliers(states: SteadyStates, point: Response, state: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Floquet multipliers of the motion through ``state``, by differences of the map of a period."""
-    step = 1e-6
-    columns = []
-    for direction in np.eye(len(state)):
-        columns.append((after_a_period(states, point, state + step * direction) - end) / step)
-    return np.linalg.eigvals(np.array(columns).T)
-
-
-def followed(case: NfrcCase, folder):
-    """The only curve of a case, and its equations."""
-    folder.mkdir(exist_ok=True)
-    (curve,) = follow_all(case, folder, MPI.COMM_SELF)
-    _, restitution, fixed = case.curves()[0]
-    return SteadyStates(case, restitution, fixed), curve.points
 
 
 @pytest.fixture(scope="module")
@@ -264,6 +189,7 @@ def test_a_lossy_run_settles_into_the_response():
                 **{key: table[key] for key in ("name", "lattice", "contacts")},
                 "drive": table["drive"] | {"amplitude": 0.2, "frequency": frequency},
                 "time": {"end": 90 * period, "sample_interval": period / 64, "rtol": 1e-10},
+                "output": OUTPUT,
             }
         )
     )
@@ -271,11 +197,20 @@ def test_a_lossy_run_settles_into_the_response():
     settled = np.fft.rfft(w) / 32
 
     options = {"source": "force", "over": "amplitude", "range": [0.2, 0.3], "fixed": [frequency], "harmonics": 61}
-    states = SteadyStates(NfrcCase.from_table(table | {"nfrc": options}), 0.6, frequency)
+    states = SteadyStates(NfrcCase.from_table(table | {"nfrc": options, "output": OUTPUT}), 0.6, frequency)
     measured = states.measured(first_state(states).xi)
     assert measured.episodes == 1
     assert measured.unstable == 0
     np.testing.assert_allclose(np.abs(measured.harmonics[0, 1:4]), np.abs(settled[1:4]), rtol=2e-4)
+
+    # What is recorded of named masses and of the lossy contact in the last period has the same peaks.
+    # A peak lies between samples, of which there are 64 in a period.
+    for quantity, error in (("displacement", 2e-3), ("velocity", 4e-3), ("acceleration", 4e-2)):
+        recorded = np.abs(run[f"points/{quantity}"].values[-64:]).max(axis=0)
+        np.testing.assert_allclose(measured.outputs[f"peak_{quantity}"], recorded, rtol=error)
+    assert measured.outputs["largest_force"] == pytest.approx(run["impacts/force"].values[-1], rel=5e-3)
+    speeds = np.sqrt(np.mean(run["points/velocity"].values[-64:] ** 2, axis=0))
+    assert measured.outputs["transmission"] == pytest.approx(speeds[1] / speeds[0], rel=1e-3)
 
 
 def test_curves_of_a_case_have_one_compliance():

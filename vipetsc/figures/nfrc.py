@@ -48,14 +48,14 @@ def frequency_response(paths: Sequence[Path]) -> Figure:
     for column, branch in zip(columns, branches, strict=True):
         for axes, draw in zip(column, rows, strict=True):
             draw(axes, branch)
-        column[-1].set_xlabel(_parameter_label(branch))
+        column[-1].set_xlabel(parameter_label(branch))
         column[0].set_title(str(branch.attrs["name"]))
     if columns.size > 1:
         panels.label_panels(columns.T)
     return figure
 
 
-def _parameter_label(branch: xr.Dataset) -> str:
+def parameter_label(branch: xr.Dataset) -> str:
     """Return what the horizontal axis shows, with its unit."""
     if branch.attrs["over"] == "frequency":
         return "frequency (rad/s)"
@@ -65,14 +65,15 @@ def _parameter_label(branch: xr.Dataset) -> str:
     return "amplitude of the wall (m)" if case.drive.end else "amplitude (N)"
 
 
-def _parameter(branch: xr.Dataset) -> np.ndarray:
+def parameter_of(branch: xr.Dataset) -> np.ndarray:
+    """Return the parameter (point,) that varies along a curve."""
     values: np.ndarray = branch[str(branch.attrs["over"])].values
     return values
 
 
 def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     """Draw the first site: stable states as a line, unstable ones dashed, slow sweeps broad; thin lines for others."""
-    parameter = _parameter(branch)
+    parameter = parameter_of(branch)
     stable = branch["unstable"].values == 0
     # Contacts that touch at rest have no clearance to compare with.
     clearance = branch["clearance"].values
@@ -102,17 +103,22 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
         dashed = np.where(~stable | before | after, size, np.nan)
         axes.plot(parameter, dashed, color=style.BLACK, lw=0.9, ls="--", label="unstable")
 
-    folds = np.nonzero(branch["kind"].values == FOLD)[0]
-    if folds.size:
-        look = {"ms": 3.5, "mfc": "white", "mec": style.VERMILION, "ls": "none"}
-        axes.plot(parameter[folds], size[folds], "o", label="fold", **look)
+    draw_folds(axes, branch, size, label="fold")
     axes.set_ylabel(label)
     axes.legend(fontsize=6, loc="best")
 
 
+def draw_folds(axes: Axes, branch: xr.Dataset, values: np.ndarray, label: str | None = None) -> None:
+    """Draw a ring at each fold of a curve that shows ``values`` (point,)."""
+    folds = np.nonzero(branch["kind"].values == FOLD)[0]
+    if folds.size:
+        look = {"ms": 3.5, "mfc": "white", "mec": style.VERMILION, "ls": "none"}
+        axes.plot(parameter_of(branch)[folds], values[folds], "o", label=label, **look)
+
+
 def _draw_phase(axes: Axes, branch: xr.Dataset) -> None:
     """Draw the phase of the first site's fundamental behind the drive; unstable states thin."""
-    parameter = _parameter(branch)
+    parameter = parameter_of(branch)
     stable = branch["unstable"].values == 0
     fundamental = branch["harmonics"].values[:, 0, 1] + 1j * branch["harmonics_imaginary"].values[:, 0, 1]
     lag = -np.degrees(np.unwrap(np.angle(fundamental)))
@@ -127,7 +133,7 @@ def _draw_phase(axes: Axes, branch: xr.Dataset) -> None:
 
 def _draw_energies(axes: Axes, branch: xr.Dataset) -> None:
     """Draw T, R, U and L over the parameter; unstable states thin."""
-    parameter = _parameter(branch)
+    parameter = parameter_of(branch)
     stable = branch["unstable"].values == 0
     for i, name in enumerate(branch["way"].values.astype(str)):
         label, colour, line = ENERGIES[name]

@@ -25,6 +25,7 @@ from vipetsc.figures import (
     nfrc,
     optimum,
     predicted_energies,
+    response_outputs,
     runs,
     scattering,
     schematics,
@@ -70,7 +71,7 @@ class FigureSpec(NamedTuple):
     ``function`` is (run, analysis or None) -> Figure of a run, (data) -> Figure of a source in ``FILES``, (paths) ->
     Figure of branches. Of sweeps it is (sweeps) -> iterator of Drawing, called with those sweeps that take ``measure``;
     the stem of such a drawing follows the figure's name, and ``needs`` says what a sweep must hold for it.
-    ``without`` is (run, analysis or None) -> the reason why a run has no such picture, empty where it has one.
+    ``without`` is (run, analysis or None), or (branch), -> the reason why there is no such picture, or an empty text.
     """
 
     name: str
@@ -78,7 +79,7 @@ class FigureSpec(NamedTuple):
     function: Callable[..., Any]
     measure: str = ""
     needs: str = ""
-    without: Callable[[xr.Dataset, xr.Dataset | None], str] | None = None
+    without: Callable[..., str] | None = None
 
 
 def branch(paths: Sequence[Path]) -> Figure:
@@ -133,6 +134,7 @@ _SPECS = (
     FigureSpec(OVER_BRANCHES, SWEEP, transfer_curves.ibtet_backbone, measure="transfer", needs=BRANCHES_TOO),
     FigureSpec("phase_regimes", SWEEP, transfer_curves.phase_regimes, measure="transfer", needs=WHOLE_MEMBERS),
     FigureSpec(BRANCH, BRANCHES, branch),
+    FigureSpec("outputs", BRANCHES, response_outputs.response_outputs, without=response_outputs.without_outputs),
     FigureSpec("deflections", DESIGN, cost_maps.deflections),
     FigureSpec("cost_maps", DESIGN, cost_maps.cost_maps),
     FigureSpec("dispersion_against_lambda", DESIGN, partial(cost_maps.dispersions, along="lambda", other="eta")),
@@ -300,14 +302,18 @@ def specified_drawings(spec: FigureSpec, ensembles: Sequence[xr.Dataset], files:
 
 def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files) -> Iterator[Drawing]:
     """Yield one drawing a branch of the first folder, next to the branches of its name in the other folders."""
-    for spec, first in itertools.product(specs, sorted(folders[0].glob("branch-*.h5"))):
+    for first, spec in itertools.product(sorted(folders[0].glob("branch-*.h5")), specs):
         paths = of_one_name(folders, first.name)
         if not all(point_count(path) for path in paths):
             continue
-        stem = first.stem
-        if len(folders) > 1:
-            stem = stem.replace("branch", "branches", 1)
         branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
+        if spec.without and any(spec.without(branch) for branch in branches):
+            continue
+        stem = first.stem
+        if spec.without:
+            stem = stem.replace(BRANCH, spec.name, 1)
+        elif len(folders) > 1:
+            stem = stem.replace(BRANCH, "branches", 1)
         yield Drawing(stem, warned(partial(spec.function, paths), *branches))
 
 

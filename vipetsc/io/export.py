@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.io.atomic import atomic_write, write_text
+from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.chunks import FORCES, MOTION
 from vipetsc.io.read import field_time, open_results, open_run
 
@@ -19,6 +20,8 @@ ANALYSIS = "analysis.h5"
 FIELDS = "displacement", "velocity"
 # Of the designs of a search, by the dimension whose labels say what each column is.
 OF_DESIGNS = {"parameter": "variable", "value": "objective", "constrained": "constraint"}
+# Of frequency responses, the dimensions whose labels name the columns of a table.
+OF_RESPONSES = {"way", "site", "location", "pair", "wall"}
 HEAD = '<Xdmf Version="3.0"><Domain><Grid Name="run" GridType="Collection" CollectionType="Temporal">\n'
 TAIL = "</Grid></Domain></Xdmf>\n"
 
@@ -89,7 +92,8 @@ def write_curves(path: Path) -> list[Path]:
     """Write the curves of the results in ``path`` as CSV files to ``curves/`` in their folder.
 
     Variables over the same dimensions are one table, with a row a point, their coordinates first, units in the head.
-    That of the designs of a search has a column for each variable, objective and constraint.
+    That of the designs of a search has a column for each variable, objective and constraint, that of a frequency
+    response one for each named mass, contact and wall.
     Of a run with ``analysis.h5`` beside it there is a table of its numbers, ``analysis-measures.csv``, and where they
     were recorded ``run-points.csv`` and ``run-forces.csv``, with a column for each point and site. Fields and maps,
     over other dimensions than the axes of a sweep, are left out. Raises as ``open_results``.
@@ -106,7 +110,7 @@ def write_curves(path: Path) -> list[Path]:
         for dims, names in groups.items():
             if np.prod([data.sizes[dim] for dim in dims]) > MOST_ROWS:
                 continue
-            table = data[names].assign(_columns_of_designs(data, dims))
+            table = data[names].assign(_columns_of_designs(data, dims) | _columns_of_responses(data, dims))
             foreign = [name for name, item in table.coords.items() if not set(item.dims) <= set(dims)]
             over = "members" if dims == axes else "-".join(dims)
             stem = f"{source.stem}-{over}".replace("/", "-")
@@ -133,6 +137,18 @@ def _columns_of_designs(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr
         units = data["unit"].values if label == "variable" else ["1"] * data.sizes[label]
         for text, unit, values in zip(data[label].values, units, data[name].values.T, strict=True):
             columns[str(text)] = xr.DataArray(values, dims=dims, attrs={"units": unit})
+    return columns
+
+
+def _columns_of_responses(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
+    """Variables of a frequency response over its points by mass, contact or wall; none of other results or ``dims``."""
+    columns: dict[str, xr.DataArray] = {}
+    if dims != ("point",) or data.attrs.get("branch_kind") != RESPONSES:
+        return columns
+    for name, item in data.data_vars.items():
+        if len(item.dims) == 2 and item.dims[1] in OF_RESPONSES:
+            for label, values in zip(data[item.dims[1]].values, item.values.T, strict=True):
+                columns[f"{name}/{label}"] = xr.DataArray(values, dims=dims, attrs={"units": item.attrs["units"]})
     return columns
 
 

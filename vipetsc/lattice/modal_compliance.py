@@ -116,12 +116,17 @@ class ModalCompliance:
         signed = np.concatenate([-given[:pairs], given[pairs:]])
         force = self.loads[:, : len(signed)] @ signed
 
+        # Only the masses in the cells are computed: a state has a field for each of its harmonics.
         poles = self._poles
-        u = poles.output @ ((poles.input @ force) / (1j * omega - poles.poles))
+        dofs = self.chain.cell.dofs
+        rows = (np.atleast_1d(cells)[:, None] * dofs + np.arange(dofs)).ravel()
+        _, columns, _, _ = self._parts
+        u = poles.output[rows] @ ((columns[:, : len(signed)] @ signed) / (1j * omega - poles.poles))
         moved = poles.rigid.T @ force
-        if np.any(moved):
-            u = u - poles.rigid @ moved / omega**2
-        return np.asarray(u.reshape(self.chain.cells, -1)[np.atleast_1d(cells)])
+        # The mean position of a lattice that is free to move is arbitrary.
+        if np.any(moved) and omega != 0:
+            u = u - poles.rigid[rows] @ moved / omega**2
+        return np.asarray(u.reshape(-1, dofs))
 
     @cached_property
     def _parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -248,10 +248,11 @@ class Follower:
         if self.resume and on_root(self.comm, path.exists):
             try:
                 # Read by one rank: the others must not find another file, or none.
-                branch = on_root(self.comm, lambda: read_branch(path))
+                stored = on_root(self.comm, lambda: read_branch(path))
+                branch = replace(stored, case=fresh.case, about=fresh.about, extra=fresh.extra)
                 # A branch that is complete is not computed again, and its table would stay away.
                 on_root(self.comm, lambda: restore_table(branch, self.folder))
-                return replace(branch, case=self.case.to_toml(), about=fresh.about, extra=fresh.extra)
+                return branch
             except OSError as error:
                 logger.warning("vipetsc: warning: %s; computed again", error)
         return fresh

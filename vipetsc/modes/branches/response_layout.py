@@ -10,7 +10,7 @@ from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.kinds import stored_kinds
 from vipetsc.modes.branches.layout import Table
 from vipetsc.modes.branches.sweeps import ParameterSweep, swept, with_stable_folds
-from vipetsc.modes.response.steady import Measures, Response
+from vipetsc.modes.response.state import Measures, Response
 
 
 class Stored(NamedTuple):
@@ -37,9 +37,38 @@ LAYOUT = {
     "harmonics_imaginary": Stored("site order", "m", "harmonics of w, imaginary part"),
 }
 
+OUTPUTS = {
+    "peak_displacement": Stored("location", "m", "largest displacement"),
+    "peak_velocity": Stored("location", "m/s", "largest velocity"),
+    "peak_acceleration": Stored("location", "m/s2", "largest acceleration"),
+    "first_displacement": Stored("location", "m", "first harmonic of the displacement"),
+    "first_velocity": Stored("location", "m/s", "first harmonic of the velocity"),
+    "first_acceleration": Stored("location", "m/s2", "first harmonic of the acceleration"),
+    "lag": Stored("location", "degree", "phase of the first harmonic of the displacement behind the drive"),
+    "location_harmonics": Stored("location order", "m", "harmonics of the displacement, real part"),
+    "location_harmonics_imaginary": Stored("location order", "m", "harmonics of the displacement, imaginary part"),
+    "transmission": Stored("pair", "1", "rms velocity of the second location over that of the first"),
+    "steady_transmission": Stored("pair", "1", "first harmonic at the second location over that at the first"),
+    "largest_force": Stored("site", "N", "largest contact force"),
+    "first_force": Stored("site", "N", "first harmonic of the contact force"),
+    "force_lag": Stored("site", "degree", "phase of the first harmonic of the contact force behind the drive"),
+    "largest_wall_force": Stored("wall", "N", "largest force on the wall"),
+    "first_wall_force": Stored("wall", "N", "first harmonic of the force on the wall"),
+    "wall_force_lag": Stored("wall", "degree", "phase of the first harmonic of the force on the wall behind the drive"),
+}
+"""What ``[output]`` asks for; a file has those that its case asked for."""
+
+
+def outputs_of(branch: Branch[Response]) -> dict[str, Stored]:
+    """The outputs that the states of a curve have."""
+    present = branch.points[0].measured.outputs if branch.points else {}
+    return {name: stored for name, stored in OUTPUTS.items() if name in present}
+
 
 def measure(branch: Branch[Response], stored: str) -> np.ndarray:
-    """A measure of every state, by its name in the file."""
+    """A measure or an output of every state, by its name in the file."""
+    if stored in OUTPUTS:
+        return np.array([p.measured.outputs[stored] for p in branch.points])
     if stored == "harmonics":
         return np.array([p.measured.harmonics.real for p in branch.points])
     if stored == "harmonics_imaginary":
@@ -71,7 +100,7 @@ class ResponseLayout:
             "up_point": variable("up", up, "1", passed),
             "down_point": variable("down", down, "1", "points visited as the parameter decreases slowly"),
         }
-        for name, (dimensions, units, text) in LAYOUT.items():
+        for name, (dimensions, units, text) in (LAYOUT | outputs_of(branch)).items():
             data[name] = variable(["point", *dimensions.split()], measure(branch, name), units, text)
         return data
 
@@ -82,12 +111,15 @@ class ResponseLayout:
     def table(self, branch: Branch[Response]) -> Table:
         """The table of a curve for CSV, without harmonics."""
         count = len(branch.points)
-        columns = {}
-        for name, stored in LAYOUT.items():
+        columns: dict[str, list[Any]] = {}
+        for name, stored in (LAYOUT | outputs_of(branch)).items():
             if "order" in stored.dimensions:
                 continue
             values = measure(branch, name).reshape(count, -1)
-            if values.shape[1] == 1:
+            if name in OUTPUTS and stored.dimensions != "site":
+                labels = branch.extra[stored.dimensions].values
+                columns |= {f"{name}/{label}": column.tolist() for label, column in zip(labels, values.T, strict=True)}
+            elif values.shape[1] == 1:
                 columns[name] = values[:, 0].tolist()
             else:
                 columns |= {f"{name}_{i}": column.tolist() for i, column in enumerate(values.T, 1)}
@@ -115,6 +147,7 @@ class ResponseLayout:
                 episodes=int(row["episodes"]),
                 truncation=float(row["truncation"]),
                 harmonics=_complex(row["harmonics"], row["harmonics_imaginary"]),
+                outputs={name: data[name].values[i] for name in OUTPUTS if name in data},
             )
             points.append(
                 Response(

@@ -14,8 +14,11 @@ from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.method import Method
 from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem
 from vipetsc.modes.response.condensation import compliance_of
-from vipetsc.modes.response.steady import Response, SteadyStates
+from vipetsc.modes.response.outputs import WALLS
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
+from vipetsc.spectra.measures import JOINT
 
 # Where energy goes that comes in.
 CHANNELS = "transmitted", "reflected", "upper", "lost"
@@ -52,15 +55,25 @@ class ResponseMethod(Method[Response]):
         )
 
     def _axes(self) -> Variables:
-        """Sites, harmonics and channels, which the variables of states have for dimensions."""
+        """What variables of states have for dimensions: sites, harmonics, channels, and what [output] names."""
         chain = self.case.model().chain
         orders = np.arange(self.case.nfrc.harmonics + 1)
-        return {
+        axes = {
             "site": variable("site", np.array(chain.sites) + 1, "1", "cell of the site, counted from 1"),
             "order": variable("order", orders, "1", "harmonic"),
             "way": variable("way", np.array(CHANNELS), "1", "destination of the energy"),
             "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
         }
+        output = self.case.output
+        if output.points:
+            names = np.array([point.name for point in output.points])
+            axes["location"] = variable("location", names, "1", "named mass, see output.points in the case")
+        if output.transmission:
+            pairs = np.array([JOINT.join(pair) for pair in output.transmission])
+            axes["pair"] = variable("pair", pairs, "1", "locations of a transmission, from - to")
+        if output.forces and self.case.lattice.ends == "fixed" and not self.case.nfrc.infinite:
+            axes["wall"] = variable("wall", np.array(WALLS), "1", "wall at an end of the lattice")
+        return axes
 
     def name(self, job: int) -> str:
         """The name of a curve."""

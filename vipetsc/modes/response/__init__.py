@@ -3,4 +3,5 @@
 ``steady`` has their equations, on those of harmonic balance; ``nfrc`` follows the curves of a case and writes them.
 """
 
-from vipetsc.modes.response.steady import Response, SteadyStates
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.steady import SteadyStates

@@ -4,7 +4,8 @@ import numpy as np
 
 from vipetsc.modes.continuation.arclength import Continuation, Geometry, Verdict
 from vipetsc.modes.problem import Attempt, ContinuationError
-from vipetsc.modes.response.steady import Response, SteadyStates
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.steady import SteadyStates
 
 # Largest angle in rad between tangents, and correction over the step, of a step that is accepted.
 TURN = 0.25

@@ -1,0 +1,96 @@
+"""Cases of frequency responses of what stands on a table, and their time integration by SciPy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.steady import SteadyStates
+
+# Two masses of 1 kg between walls, of which the first one meets a stop of the table; the left wall shakes.
+TWO_MASSES: dict[str, Any] = {
+    "name": "rig",
+    "lattice": {
+        "cells": 2,
+        "cell": {
+            "masses": [1.0],
+            "springs": [{"start": 1, "end": 1, "stiffness": 1.5, "next_cell": True}],
+            "contact": [1, 1],
+        },
+        "damping": {"mass": 0.06},
+    },
+    "contacts": {"law": "bilinear", "stiffness": 20.0, "restitution": 1.0, "sites": [1], "clearance": 0.8},
+    "drive": {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "end": "left"},
+    "time": {"end": 10.0},
+    "nfrc": {"source": "force", "over": "frequency", "range": [1.0, 2.3], "fixed": [0.2], "harmonics": 41},
+}
+TWO_MASSES["contacts"] |= {"pair": [0, 1], "side": "plus"}
+
+OUTPUT: dict[str, Any] = {
+    "points": [{"name": "near", "cell": 1}, {"name": "far", "cell": 2}],
+    "transmission": [["near", "far"]],
+    "forces": True,
+}
+
+
+def rate_of(states: SteadyStates, omega: float, amplitude: float):
+    """The equations of motion of a lattice with elastic contacts, from its matrices: y' = f(t, y), y = (u, u')."""
+    chain = states.case.model().chain
+    stiffness = chain.stiffness_matrix().tocsr()
+    damping = chain.damping_rows(0, chain.cells)
+    masses = chain.masses()
+    n = len(masses)
+    d = chain.cell.dofs
+
+    drive = np.zeros(n)
+    for (cell, mass), weight in zip(states.points, states.weights, strict=True):
+        drive[cell * d + mass] += weight * amplitude
+    joins = []
+    for site, pair, stops in zip(chain.sites, chain.contact_pairs, states.forces.contacts, strict=True):
+        host = site * d + pair.host if pair.host >= 0 else None
+        joins.append((host, (site + pair.next_cell) % chain.cells * d + pair.resonator, stops))
+
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        u, v = y[:n], y[n:]
+        force = drive * np.cos(omega * t) - stiffness @ u - damping @ v
+        for host, resonator, stops in joins:
+            w = u[resonator] - (0.0 if host is None else u[host])
+            push = stops.law.elastic_force(w - stops.plus) - stops.law.elastic_force(-w - stops.minus) - stops.load
+            force[resonator] -= push
+            if host is not None:
+                force[host] += push
+        return np.concatenate([v, force / masses])
+
+    return rate
+
+
+def after_a_period(states: SteadyStates, point: Response, state: np.ndarray) -> np.ndarray:
+    """The ``state`` (displacements, velocities) a period later, by SciPy."""
+    omega, amplitude = states.drive(point.xi[-1])
+    rate = rate_of(states, omega, amplitude)
+    period = 2 * np.pi / omega
+    return solve_ivp(rate, (0, period), state, "DOP853", rtol=1e-10, atol=1e-12, max_step=period / 100).y[:, -1]
+
+
+def multipliers(states: SteadyStates, point: Response, state: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Floquet multipliers of the motion through ``state``, by differences of the map of a period."""
+    step = 1e-6
+    columns = []
+    for direction in np.eye(len(state)):
+        columns.append((after_a_period(states, point, state + step * direction) - end) / step)
+    return np.linalg.eigvals(np.array(columns).T)
+
+
+def followed(case: NfrcCase, folder):
+    """The only curve of a case, and its equations."""
+    folder.mkdir(exist_ok=True)
+    (curve,) = follow_all(case, folder, MPI.COMM_SELF)
+    _, restitution, fixed = case.curves()[0]
+    return SteadyStates(case, restitution, fixed), curve.points

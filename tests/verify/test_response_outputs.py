@@ -1,0 +1,149 @@
+"""Motion of named masses and forces along frequency responses, against time integration; their files and pictures."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import vipetsc
+from tests.conftest import assert_same_bits, datasets
+from tests.rigs import OUTPUT, TWO_MASSES, followed, rate_of
+from tests.steady_states import motion_at, nfrc_case
+from vipetsc.case.case_file import CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.figures.registry import draw
+from vipetsc.io.export import write_curves
+from vipetsc.modes.branches.files import read_branch
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.response_layout import OUTPUTS
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import first_state
+
+pytestmark = pytest.mark.parallel(1)
+
+SAMPLES = 1024
+
+
+@pytest.fixture(scope="module")
+def curve(tmp_path_factory) -> Path:
+    """The folder of a short curve of two masses whose motion is output."""
+    folder = tmp_path_factory.mktemp("outputs") / "rig"
+    nfrc = TWO_MASSES["nfrc"] | {"range": [1.2, 1.3], "harmonics": 9, "points": 6}
+    followed(NfrcCase.from_table(TWO_MASSES | {"nfrc": nfrc, "output": OUTPUT}), folder)
+    return folder
+
+
+def test_outputs_are_those_of_the_motion_by_time_integration():
+    """A period of SciPy's from a state in contact: peaks, first harmonics, phases, forces of the stop and the walls."""
+    frequency = 1.25
+    options = {"source": "force", "over": "amplitude", "range": [0.2, 0.3], "fixed": [frequency], "harmonics": 121}
+    states = SteadyStates(NfrcCase.from_table(TWO_MASSES | {"nfrc": options, "output": OUTPUT}), 1.0, frequency)
+    state = first_state(states)
+    measured = states.measured(state.xi)
+    assert measured.episodes == 1
+    outputs = measured.outputs
+
+    period = 2 * np.pi / frequency
+    times = period / SAMPLES * np.arange(SAMPLES)
+    u, v = motion_at(states, state.xi, np.arange(2))
+    rate = rate_of(states, frequency, 0.2)
+    begin = np.concatenate([u.ravel(), v.ravel()])
+    y = solve_ivp(rate, (0, period), begin, "DOP853", t_eval=times, rtol=1e-10, atol=1e-12, max_step=period / 100).y
+    acceleration = np.array([rate(t, column)[2:] for t, column in zip(times, y.T, strict=True)]).T
+
+    for name, history in (("displacement", y[:2]), ("velocity", y[2:]), ("acceleration", acceleration)):
+        error = 1e-2 if name == "acceleration" else 1e-4
+        np.testing.assert_allclose(outputs[f"peak_{name}"], np.abs(history).max(axis=1), rtol=error)
+        first = np.fft.rfft(history)[:, 1] / (SAMPLES / 2)
+        np.testing.assert_allclose(outputs[f"first_{name}"], np.abs(first), rtol=1e-4)
+    lag = -np.degrees(np.angle(np.fft.rfft(y[:2])[:, 1])) % 360
+    np.testing.assert_allclose(outputs["lag"], lag, atol=0.01)
+
+    force = 20.0 * np.maximum(y[0] - 0.8, 0)
+    assert outputs["largest_force"] == pytest.approx(force.max(), rel=1e-4)
+    assert outputs["first_force"] == pytest.approx(np.abs(np.fft.rfft(force)[1]) / (SAMPLES / 2), rel=1e-3)
+    walls = 1.5 * np.array([y[0] - 0.2 * np.cos(frequency * times), y[1]])
+    np.testing.assert_allclose(outputs["largest_wall_force"], np.abs(walls).max(axis=1), rtol=1e-4)
+    lag = -np.degrees(np.angle(np.fft.rfft(walls)[:, 1])) % 360
+    np.testing.assert_allclose(outputs["wall_force_lag"], lag, atol=0.01)
+
+
+def test_a_wave_moves_named_masses_of_an_infinite_lattice_as_its_shape_says():
+    """Below contact the wave passes: host and resonator of the site differ by its amplitude, other cells by phase."""
+    case = nfrc_case(harmonics=3, range=[0.9, 0.95])
+    names = [("host", 10, 1), ("resonator", 10, 2), ("later", 14, 2)]
+    points = [{"name": name, "cell": cell, "mass": mass} for name, cell, mass in names]
+    cell = case.model().chain.cell
+    points[0]["mass"], points[1]["mass"] = cell.host + 1, cell.resonator + 1
+    points[2]["mass"] = cell.resonator + 1
+    table = {key: getattr(case, key).model_dump(by_alias=True, exclude_none=True) for key in ("lattice", "contacts")}
+    nfrc = case.nfrc.model_dump(exclude_none=True)
+    states = SteadyStates(NfrcCase.from_table(table | {"nfrc": nfrc, "output": {"points": points}}), 1.0, 1023.27)
+
+    measured = states.measured(first_state(states).xi)
+    outputs = measured.outputs
+    u = (outputs["location_harmonics"] + 1j * outputs["location_harmonics_imaginary"])[:, 1]
+    assert u[1] - u[0] == pytest.approx(measured.harmonics[0, 1], rel=1e-9)
+    assert outputs["first_displacement"][2] == pytest.approx(outputs["first_displacement"][1], rel=1e-9)
+    wave = states.linear_motion(1023.27).wave
+    assert u[2] / u[1] == pytest.approx(wave.factor**4, rel=1e-9)
+    assert outputs["peak_velocity"] == pytest.approx(1023.27 * outputs["first_displacement"], rel=1e-4)
+
+
+def test_files_name_the_masses(curve):
+    """Table, ``vipetsc.open``, export and picture have the outputs under the names of the case."""
+    (path,) = curve.glob("branch-*.h5")
+    with vipetsc.open(path) as data:
+        assert set(data["location"].values) == {"near", "far"}
+        peak = data["peak_velocity"].sel(location="far").values
+        assert data["largest_force"].attrs["units"] == "N"
+        share = data["share"].sel(way="lost").values
+    rows = list(csv.DictReader(path.with_suffix(".csv").open()))
+    assert [float(row["peak_velocity/far"]) for row in rows] == peak.tolist()
+    assert {"transmission/near-far", "largest_force", "wall_force_lag/left"} <= rows[0].keys()
+
+    (table,) = (table for table in write_curves(path) if table.stem.endswith("-point"))
+    columns = list(csv.DictReader(table.open()))
+    assert [float(row["peak_velocity/far (m/s)"]) for row in columns] == peak.tolist()
+    assert [float(row["share/lost"]) for row in columns] == share.tolist()
+
+    assert [picture.stem.partition("-")[0] for picture in draw("branches", [curve])] == ["branch", "outputs"]
+
+
+def test_a_curve_with_outputs_goes_on_to_the_same_bits(curve, tmp_path):
+    (path,) = curve.glob("branch-*.h5")
+    case = NfrcCase.from_toml(read_branch(path).case)
+    few = case.model_copy(update={"nfrc": case.nfrc.model_copy(update={"points": 3})})
+    follow_all(few, tmp_path, MPI.COMM_SELF)
+    table = (tmp_path / path.name).with_suffix(".csv")
+    table.unlink()
+    follow_all(case, tmp_path, MPI.COMM_SELF, resume=True)
+    assert_same_bits(datasets(path), datasets(tmp_path / path.name))
+    assert table.read_text() == path.with_suffix(".csv").read_text()
+
+    # The table of a complete curve is written from its file.
+    table.unlink()
+    follow_all(case, tmp_path, MPI.COMM_SELF, resume=True)
+    assert table.read_text() == path.with_suffix(".csv").read_text()
+
+
+def test_a_case_without_output_has_none(tmp_path):
+    nfrc = TWO_MASSES["nfrc"] | {"harmonics": 3, "points": 2}
+    _, points = followed(NfrcCase.from_table(TWO_MASSES | {"nfrc": nfrc}), tmp_path / "rig")
+    assert points[0].measured.outputs == {}
+    (path,) = (tmp_path / "rig").glob("*.h5")
+    with vipetsc.open(path) as data:
+        assert not OUTPUTS.keys() & data.variables.keys()
+    assert [picture.stem.partition("-")[0] for picture in draw("branches", [tmp_path / "rig"])] == ["branch"]
+
+
+def test_a_point_outside_is_refused():
+    output = {"points": [{"name": "tip", "cell": 3}]}
+    with pytest.raises(CaseError, match="the lattice has the cells 1 to 2"):
+        NfrcCase.from_table(TWO_MASSES | {"output": output})

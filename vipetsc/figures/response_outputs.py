@@ -1,0 +1,100 @@
+"""Motion of named masses and forces along a nonlinear frequency-response curve, as experiments draw them."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
+
+from vipetsc.figures import panels, style
+from vipetsc.figures.nfrc import draw_folds, parameter_label, parameter_of
+from vipetsc.io.netcdf import open_netcdf
+
+# Labels of the rows of the page by the quantities that they show.
+AMPLITUDES = {"displacement": "displacement (m)", "velocity": "velocity (m/s)", "acceleration": "acceleration (m/s²)"}
+# Lines by which locations differ in grey.
+DASHES = ("-", style.DASHED, "-.", style.DOTTED)
+
+
+def without_outputs(branch: xr.Dataset) -> str:
+    """Return why a ``branch`` has no such page; empty where it has one."""
+    if "lag" in branch or "largest_force" in branch:
+        return ""
+    return "needs [output] points or forces = true in the case of nfrc"
+
+
+def response_outputs(paths: Sequence[Path]) -> Figure:
+    """Draw amplitudes and phase of the named masses, and forces, over amplitude or frequency; a column a file."""
+    curves = []
+    for path in paths:
+        with open_netcdf(path, "branch", ("unstable", "over")) as file:
+            curves.append(file.load())
+
+    rows: list[Callable[[Axes, xr.Dataset], None]] = []
+    if "lag" in curves[0]:
+        rows += [partial(_draw_amplitude, quantity=quantity) for quantity in AMPLITUDES]
+        rows.append(_draw_lag)
+    if "largest_force" in curves[0]:
+        rows.append(_draw_forces)
+
+    width = style.COLUMN if len(curves) == 1 else style.PAGE
+    figure = style.new_figure(width, 1.45 * len(rows) + 0.3)
+    columns = figure.subplots(len(rows), len(curves), sharex="col", squeeze=False).T
+    for column, curve in zip(columns, curves, strict=True):
+        for axes, draw in zip(column, rows, strict=True):
+            draw(axes, curve)
+        column[-1].set_xlabel(parameter_label(curve))
+        column[0].set_title(str(curve.attrs["name"]))
+    if columns.size > 1:
+        panels.label_panels(columns.T)
+    return figure
+
+
+def _draw_amplitude(axes: Axes, curve: xr.Dataset, quantity: str) -> None:
+    """Draw the largest value of a ``quantity`` at each location, and its first harmonic thin."""
+    for number, name in enumerate(curve["location"].values.astype(str)):
+        _draw_states(axes, curve, curve[f"peak_{quantity}"].values[:, number], number, label=name)
+        first = curve[f"first_{quantity}"].values[:, number]
+        axes.plot(parameter_of(curve), first, color=style.band_colour(number + 1), lw=0.4, alpha=0.7)
+    axes.set_ylabel(AMPLITUDES[quantity])
+    if quantity == "displacement":
+        axes.plot([], [], color=style.GREY, lw=0.4, label="first harmonic")
+        axes.legend(fontsize=6, loc="best")
+
+
+def _draw_lag(axes: Axes, curve: xr.Dataset) -> None:
+    """Draw the phase of each location's first harmonic behind the drive."""
+    for number in range(curve.sizes["location"]):
+        lag = np.degrees(np.unwrap(np.radians(curve["lag"].values[:, number])))
+        _draw_states(axes, curve, lag, number)
+    axes.set_ylabel("phase lag (degrees)")
+    axes.yaxis.set_major_locator(MultipleLocator(90))
+
+
+def _draw_forces(axes: Axes, curve: xr.Dataset) -> None:
+    """Draw the largest force of each contact, and of the lattice on each wall."""
+    number = 0
+    for site, force in zip(curve["site"].values, curve["largest_force"].values.T, strict=True):
+        _draw_states(axes, curve, force, number, label=f"contact of cell {site}")
+        number += 1
+    if "largest_wall_force" in curve:
+        for wall, force in zip(curve["wall"].values.astype(str), curve["largest_wall_force"].values.T, strict=True):
+            _draw_states(axes, curve, force, number, label=f"{wall} wall")
+            number += 1
+    axes.set_ylabel("largest force (N)")
+    axes.legend(fontsize=6, loc="best")
+
+
+def _draw_states(axes: Axes, curve: xr.Dataset, values: np.ndarray, number: int, label: str | None = None) -> None:
+    """Draw ``values`` over the parameter: stable states broad, unstable ones thin; rings at folds."""
+    colour = style.band_colour(number + 1)
+    parameter = parameter_of(curve)
+    stable = curve["unstable"].values == 0
+    axes.plot(parameter, values, color=colour, lw=0.5, ls="--")
+    dash = DASHES[number % len(DASHES)]
+    axes.plot(parameter, np.where(stable, values, np.nan), color=colour, lw=1.3, ls=dash, label=label)
+    draw_folds(axes, curve, values)

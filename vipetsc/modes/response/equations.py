@@ -1,0 +1,168 @@
+"""The equations of steady states under a harmonic drive, and the frames in which continuation follows them."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.lattice import IncidentWave
+from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
+from vipetsc.modes.newton import DenseNewton
+from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind
+from vipetsc.modes.response.state import Response
+
+# Relative step of a difference in frequency.
+SLOPE = 1e-6
+
+
+class LinearMotion(NamedTuple):
+    """Harmonics (pairs, K + 1) in m that a drive of amplitude 1 alone makes at the sites; its wave if it is one."""
+
+    harmonics: np.ndarray
+    wave: IncidentWave | None
+
+
+class ContinuationParameter(NamedTuple):
+    """Parameter of a curve, "amplitude" or "frequency", the value of the other one, and the parameter's unit."""
+
+    over: str
+    fixed: float
+    scale: float
+
+
+class SteadyFrame:
+    """Steady states at and near one state, with its unknowns and tangent, and the ``shift`` of its compliance."""
+
+    def __init__(self, equations: "SteadyEquations", xi: np.ndarray, tangent: np.ndarray) -> None:
+        self.equations = equations
+        self.xi = xi
+        self.tangent = tangent
+        self.shift = equations.balance.shift(equations.drive(xi[-1])[0])
+
+    def encode(self, point: Response) -> np.ndarray:
+        """The unknowns of another state."""
+        return point.xi
+
+    def direction(self, point: Response) -> np.ndarray:
+        """The curve's direction at another state."""
+        return point.tangent
+
+    def residual(self, xi: np.ndarray) -> np.ndarray:
+        """The residual (n,), which vanishes at a steady state, over the clearance."""
+        return self.equations.residual(xi, self.shift)
+
+    def jacobian(self, xi: np.ndarray) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual."""
+        return self.equations.jacobian(xi, self.shift)
+
+    def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
+        """Newton's method from ``guess`` for the state at an ``arclength`` along the tangent."""
+        # The plane is that of the predictor, whose rounding the first residual then does not see.
+        predicted = self.xi + arclength * self.tangent
+        return self.solve(guess, self.tangent, self.tangent @ predicted)
+
+    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
+        """Newton's method for the state with row . xi = value; not converged after an ArithmeticError."""
+        equations = self.equations
+        try:
+            return equations.newton.solve(self, guess, row, value, equations.tolerance)
+        except ArithmeticError as error:
+            return Attempt(False, str(error), [], guess, left_domain=True)
+
+    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
+        """The unit tangent at a state, on the side of the frame's own."""
+        right = np.zeros(len(xi))
+        right[-1] = 1
+        direction = np.linalg.solve(np.vstack([self.jacobian(xi), self.tangent]), right)
+        return np.asarray(direction / np.linalg.norm(direction))
+
+    def measures(self, attempt: Attempt, direction: np.ndarray) -> Response:
+        """The state that an attempt has converged to, without measures, which are computed once it is accepted."""
+        return Response(xi=attempt.xi, tangent=direction)
+
+
+class SteadyEquations(ABC):
+    """Steady states under a drive that alone makes the ``linear_motion``; unknowns are over the ``clearance``."""
+
+    has_half_traces = False
+    guards: frozenset[str] = frozenset()
+
+    def __init__(
+        self,
+        balance: HarmonicBalance,
+        clearance: float,
+        parameter: ContinuationParameter,
+        tolerance: float,
+        max_newton: int,
+    ) -> None:
+        self.balance = balance
+        self.clearance = clearance
+        self.parameter = parameter
+        self.tolerance = tolerance
+        self.newton = DenseNewton(balance.size + 1, max_newton)
+
+    @abstractmethod
+    def linear_motion(self, omega: float) -> LinearMotion:
+        """The motion of the linear lattice at ``omega`` in rad/s; raises FlowError where there is no such drive."""
+
+    def drive(self, p: float) -> tuple[float, float]:
+        """Frequency (rad/s) and amplitude at the scaled parameter ``p``."""
+        over, fixed, scale = self.parameter
+        return (fixed, p * scale) if over == "amplitude" else (p * scale, fixed)
+
+    def residual(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """The residual (n,) of the harmonics, which vanishes at a steady state, over the clearance."""
+        omega, amplitude = self.drive(xi[-1])
+        if not omega > 0:
+            raise FlowError("the frequency is not positive")
+        x = xi[:-1] * self.clearance
+        linear = amplitude * self.linear_motion(omega).harmonics
+        return self.balance.residual(x, omega, shift, linear) / self.clearance
+
+    def jacobian(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """The derivative (n, n + 1) of the ``residual``."""
+        omega, amplitude = self.drive(xi[-1])
+        jacobian, column = self.balance.derivative(xi[:-1] * self.clearance, omega, shift)
+        if self.parameter.over == "amplitude":
+            # The residual is linear in the amplitude: the drive's term for the amplitude 1.
+            column = self._drive_term(omega, 1.0, shift)
+        else:
+            ends = [omega * (1 + sign * SLOPE) for sign in (1, -1)]
+            after, before = (self._drive_term(end, amplitude, shift) for end in ends)
+            column = column + (after - before) / (ends[0] - ends[1])
+        return np.column_stack([jacobian, column * self.parameter.scale / self.clearance])
+
+    def _drive_term(self, omega: float, amplitude: float, shift: np.ndarray) -> np.ndarray:
+        """The part (n,) of the residual that is due to the drive, in m: the residual at rest."""
+        rest = np.zeros(self.balance.size)
+        return self.balance.residual(rest, omega, shift, amplitude * self.linear_motion(omega).harmonics)
+
+    def frame(self, point: Response, chart: str = "auto") -> SteadyFrame:
+        """The frame at a state; there is one ``chart``."""
+        return SteadyFrame(self, point.xi, point.tangent)
+
+    def first_tangent(self, start: Response, direction: int) -> np.ndarray:
+        """Tangent at the first state, along which the parameter grows (``direction`` 1) or falls (-1)."""
+        along_parameter = np.eye(len(start.xi))[-1] * direction
+        return SteadyFrame(self, start.xi, along_parameter).tangent_at(start.xi)
+
+    def turn(self, before: Response, after: Response) -> float:
+        """Angle between the tangents of two states in relative units: that of the step, which is judged anyway."""
+        return 0.0
+
+    def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
+        """Folds in the parameter."""
+        yield SpecialKind("fold", lambda point: float(point.tangent[-1]))
+
+    def at(self, guess: np.ndarray, p: float) -> np.ndarray:
+        """Unknowns of the state at the scaled parameter ``p`` near ``guess``; raises ContinuationError."""
+        along_parameter = np.eye(self.balance.size + 1)[-1]
+        begin = np.append(guess[:-1], p)
+        attempt = SteadyFrame(self, begin, along_parameter).solve(begin, along_parameter, p)
+        if not attempt.converged:
+            over = self.parameter.over
+            omega, amplitude = self.drive(p)
+            value = amplitude if over == "amplitude" else omega
+            raise ContinuationError(f"no solution at {over} {value:.6g}: {attempt.reason}")
+        return attempt.xi

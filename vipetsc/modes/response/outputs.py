@@ -1,0 +1,212 @@
+"""What ``[output]`` asks for of a steady state: motion of named masses, forces of contacts and on walls.
+
+The harmonics F_k of the contact forces and of the drive give those of every displacement, U_k = G(k Om) F_k; velocity
+and acceleration follow by factors i k Om. Peaks are those of the sum of all harmonics; those of contact forces are
+taken along each contact episode from the law itself.
+"""
+
+import cmath
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.lattice import Chain, ModalCompliance, WaveCompliance
+from vipetsc.modes.balance.harmonics import Episode, Stops
+from vipetsc.spectra.measures import QUANTITIES
+
+# Samples a harmonic of the period in which a largest value is looked for, and those of a contact episode.
+SAMPLES_A_HARMONIC = 16
+SAMPLES_AN_EPISODE = 129
+WALLS = "left", "right"
+
+
+class HarmonicMotion(NamedTuple):
+    """A steady state in harmonics: ``omega`` in rad/s, the drive's ``amplitude`` in its unit.
+
+    ``relative`` (pairs, K + 1) are the displacements of the pairs in m, ``forces`` (pairs, K + 1) those on them in N,
+    without the static load of contacts that are pressed at rest; ``driving`` (driven masses,) are forces in N at Om;
+    ``episodes`` are the contact episodes. ``incident`` (cells, dofs) in m is an incident wave at the named cells.
+    """
+
+    omega: float
+    amplitude: float
+    relative: np.ndarray
+    forces: np.ndarray
+    driving: np.ndarray
+    episodes: Sequence[Episode]
+    incident: np.ndarray | float = 0.0
+
+
+class ResponseOutputs:
+    """What ``[output]`` of a ``case`` asks for: ``points``, pairs of them (``transmission``), ``forces``.
+
+    ``cells`` are those, from 0, of the named masses and, for the forces on walls, of the two ends.
+    """
+
+    def __init__(self, case: NfrcCase, compliance: WaveCompliance | ModalCompliance, contacts: Sequence[Stops]) -> None:
+        output = case.output
+        self.compliance = compliance
+        self.contacts = tuple(contacts)
+        self.wants_forces = bool(output.forces)
+        names = [point.name for point in output.points or []]
+        self.pairs = [(names.index(source), names.index(receiver)) for source, receiver in output.transmission or []]
+
+        chain = compliance.chain
+        self.walls: list[WallSprings] = []
+        if self.wants_forces and not case.nfrc.infinite and chain.ends == "fixed":
+            self.walls = [wall_springs(chain, wall) for wall in WALLS]
+        self._moved = case.drive.end
+        self._masses = [(point.cell - 1, point.mass - 1) for point in output.points or []]
+        self.cells = sorted({cell for cell, _ in self._masses} | {wall.cell for wall in self.walls})
+
+    def of(self, motion: HarmonicMotion) -> dict[str, np.ndarray]:
+        """The values of a steady state by their names in its file (``branches.response_layout``)."""
+        values: dict[str, np.ndarray] = {}
+        field = self._field(motion) if self.cells else np.empty(0)
+        if self._masses:
+            places = [(self.cells.index(cell), mass) for cell, mass in self._masses]
+            values |= self._motion(motion, np.array([field[:, cell, mass] for cell, mass in places]))
+        if self.wants_forces:
+            peaks = [
+                largest_force(stops, relative, [e for e in motion.episodes if e.pair == pair], motion.omega)
+                for pair, (stops, relative) in enumerate(zip(self.contacts, motion.relative, strict=False))
+            ]
+            first = motion.forces[: len(self.contacts), 1]
+            values |= {"largest_force": np.array(peaks), "first_force": magnitude(first), "force_lag": lag(first)}
+        if self.walls:
+            values |= self._on_walls(motion, field)
+        return values
+
+    def _field(self, motion: HarmonicMotion) -> np.ndarray:
+        """Harmonics (order, cells, dofs) in m of the displacements in the named cells."""
+        orders = motion.forces.shape[1]
+        field = np.zeros((orders, len(self.cells), self.compliance.chain.cell.dofs), complex)
+        for order in range(orders):
+            acting = motion.forces[:, order]
+            if order == 1:
+                acting = np.append(acting, motion.driving)
+            # Orders that a symmetric motion does not have are not solved for in vain.
+            if np.any(acting):
+                field[order] = self.compliance.field(order * motion.omega, acting, self.cells)
+        field[1] += motion.incident
+        return field
+
+    def _motion(self, motion: HarmonicMotion, harmonics: np.ndarray) -> dict[str, np.ndarray]:
+        """Peaks, first harmonics and phases of named masses from their ``harmonics`` (masses, K + 1) in m."""
+        rate = 1j * motion.omega * np.arange(harmonics.shape[1])
+        values = {"location_harmonics": harmonics.real, "location_harmonics_imaginary": harmonics.imag}
+        # Each quantity is the derivative by time of the one before.
+        for power, quantity in enumerate(QUANTITIES):
+            series = harmonics * rate**power
+            values[f"peak_{quantity}"] = peaks(series)
+            values[f"first_{quantity}"] = magnitude(series[:, 1])
+        values["lag"] = lag(harmonics[:, 1])
+        if self.pairs:
+            # The mean square of a velocity is the sum of those of its harmonics.
+            speed = magnitude(harmonics * rate)
+            rms = np.sqrt((speed**2).sum(axis=1) / 2)
+            source, receiver = np.array(self.pairs).T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                values["transmission"] = rms[receiver] / rms[source]
+                values["steady_transmission"] = speed[receiver, 1] / speed[source, 1]
+        return values
+
+    def _on_walls(self, motion: HarmonicMotion, field: np.ndarray) -> dict[str, np.ndarray]:
+        """Peaks, first harmonics and phases of the forces on the two walls, from the ``field`` of ``cells``."""
+        forces = []
+        for name, wall in zip(WALLS, self.walls, strict=True):
+            u = field[:, self.cells.index(wall.cell)][:, wall.masses]
+            rate = 1j * motion.omega * np.arange(len(u))[:, None]
+            force = (wall.stiffness * u + wall.damping * rate * u).sum(axis=1)
+            if name == self._moved:
+                force[1] -= wall.stiffness.sum() * motion.amplitude
+            forces.append(force)
+        harmonics = np.array(forces)
+        return {
+            "largest_wall_force": peaks(harmonics),
+            "first_wall_force": magnitude(harmonics[:, 1]),
+            "wall_force_lag": lag(harmonics[:, 1]),
+        }
+
+
+class WallSprings(NamedTuple):
+    """Springs between a wall and the ``masses`` (spring,) of a ``cell``, both from 0, in N/m and N s/m."""
+
+    cell: int
+    masses: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+
+
+def wall_springs(chain: Chain, wall: str) -> WallSprings:
+    """The springs of a lattice with fixed ends to its ``wall``, "left" or "right"."""
+    # A spring between cells belongs to the left one: those to the left wall to the cell before the first one.
+    is_left = wall == "left"
+    owner = -1 if is_left else chain.cells - 1
+    numbers = [number for number, spring in enumerate(chain.cell.springs) if spring.next_cell]
+    springs = [chain.cell.springs[number] for number in numbers]
+    coefficients = chain.coefficients(owner, owner + 1)
+    return WallSprings(
+        cell=0 if is_left else chain.cells - 1,
+        masses=np.array([spring.end if is_left else spring.start for spring in springs], int),
+        stiffness=coefficients.stiffness[0, numbers],
+        damping=coefficients.damping[0, numbers],
+    )
+
+
+def largest_values(harmonics: np.ndarray) -> np.ndarray:
+    """Largest sample (rows,) in magnitude of the motions with the ``harmonics`` (rows, K + 1) over a period."""
+    return np.abs(_samples(harmonics)).max(axis=1)
+
+
+def peaks(harmonics: np.ndarray) -> np.ndarray:
+    """Largest magnitude (rows,) of the motions with the ``harmonics`` (rows, K + 1) over a period.
+
+    A parabola through the largest sample and its two neighbours corrects what lies between samples.
+    """
+    size = np.abs(_samples(harmonics))
+    highest = np.argmax(size, axis=1)
+    rows = np.arange(len(size))
+    top = size[rows, highest]
+    before = size[rows, highest - 1]
+    after = size[rows, (highest + 1) % size.shape[1]]
+    bend = np.maximum(2 * top - before - after, np.finfo(float).tiny)
+    return np.asarray(top + (after - before) ** 2 / (8 * bend))
+
+
+def _samples(harmonics: np.ndarray) -> np.ndarray:
+    """Samples (rows, samples) over a period of Re sum Z_k exp(i k Om t) with the ``harmonics`` Z (rows, K + 1)."""
+    half = SAMPLES_A_HARMONIC // 2 * harmonics.shape[1]
+    padded = np.pad(harmonics, ((0, 0), (0, half - harmonics.shape[1]))) * np.where(np.arange(half), 0.5, 1)
+    return np.fft.irfft(padded, axis=1, norm="forward")
+
+
+def largest_force(stops: Stops, relative: np.ndarray, episodes: Sequence[Episode], omega: float) -> float:
+    """Largest force in N of a contact whose displacement has the harmonics ``relative`` (K + 1,) in m."""
+    largest = 0.0
+    orders = np.arange(len(relative))
+    for episode in episodes:
+        phases = episode.onset + episode.length * np.linspace(0, 1, SAMPLES_AN_EPISODE)
+        turns = np.exp(1j * np.outer(phases, orders))
+        displacement = episode.side * (turns @ relative).real
+        velocity = episode.side * omega * (turns @ (1j * orders * relative)).real
+
+        clearance = stops.plus if episode.side > 0 else stops.minus
+        force = stops.law.elastic_force(displacement - clearance)
+        if stops.law.damping:
+            force = force * stops.law.dissipation_factor(velocity, episode.approach)
+        largest = max(largest, float(np.abs(force).max()))
+    return largest
+
+
+def magnitude(phasors: np.ndarray) -> np.ndarray:
+    """Magnitude of each of ``phasors``, in the same bits wherever they lie in memory, which ``np.abs`` does not have."""
+    return np.hypot(phasors.real, phasors.imag)
+
+
+def lag(phasors: np.ndarray) -> np.ndarray:
+    """Phase in degrees, from 0 to 360, by which each of ``phasors`` is behind the drive; NaN where it is zero."""
+    radians = np.array([cmath.phase(phasor) for phasor in phasors.tolist()])
+    return np.where(phasors != 0, np.mod(-np.degrees(radians), 360.0), np.nan)

@@ -1,0 +1,49 @@
+"""A steady state on a curve, with the measures that its file holds."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.modes.problem import Solution
+
+
+class Measures(NamedTuple):
+    """Measures of a steady state (``branches.response_layout`` has units and texts).
+
+    ``fractions`` (4,) of the energy that comes in are transmitted, reflected, at higher harmonics, and lost;
+    ``harmonics`` (site, order) complex in m; ``unstable`` perturbations grow, the fastest at ``growth`` over Om.
+    ``outputs`` are what ``[output]`` of the case asks for, by the names in the file (``outputs``).
+    """
+
+    frequency: float
+    amplitude: float
+    largest: np.ndarray
+    fractions: np.ndarray
+    unstable: int
+    growth: float
+    closed: np.ndarray
+    episodes: int
+    truncation: float
+    harmonics: np.ndarray
+    outputs: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Response(Solution):
+    """A steady state: unknowns ``xi``, the last of which is the parameter, and the unit ``tangent``."""
+
+    xi: np.ndarray
+    tangent: np.ndarray = field(default_factory=lambda: np.empty(0))
+    index: int = 0
+    step: float = 0.0
+    next_step: float = np.nan
+    kind: str = "regular"
+    measures: Measures | None = None
+
+    @property
+    def measured(self) -> Measures:
+        """The measures, which every state has before it is written to a file."""
+        assert self.measures is not None
+        return self.measures
