@@ -74,6 +74,43 @@ def test_outputs_are_those_of_the_motion_by_time_integration():
     np.testing.assert_allclose(outputs["wall_force_lag"], lag, atol=0.01)
 
 
+def test_walls_hold_the_masses_that_are_tied_to_them():
+    """In a cell of two masses the left wall holds the second one, the right wall the first one; no contact is met."""
+    springs = [
+        {"start": 1, "end": 2, "stiffness": 1.5, "next_cell": True, "damping": 0.05},
+        {"start": 1, "end": 2, "stiffness": 0.7},
+    ]
+    table = TWO_MASSES | {
+        "lattice": {"cells": 3, "cell": {"masses": [1.0, 0.4], "springs": springs, "contact": [1, 2]}},
+        "contacts": {"law": "bilinear", "stiffness": 20.0, "restitution": 1.0, "sites": [1], "clearance": 50.0},
+        "drive": {"waveform": "harmonic", "amplitude": 0.1, "frequency": 0.9, "cell": 2, "mass": 1},
+        "nfrc": TWO_MASSES["nfrc"] | {"range": [0.9, 1.0], "harmonics": 3},
+        "output": {"points": [{"name": "inner", "cell": 2, "mass": 2}], "forces": True},
+    }
+    states = SteadyStates(NfrcCase.from_table(table), 1.0, 0.2)
+    outputs = states.measured(first_state(states).xi).outputs
+
+    chain = states.case.model().chain
+    dynamic = chain.stiffness_matrix().toarray() + 0.9j * chain.damping_rows(0, 3).toarray()
+    u = np.linalg.solve(dynamic - 0.81 * np.diag(chain.masses()), 0.2 * np.eye(6)[2])
+    assert outputs["first_displacement"] == pytest.approx(abs(u[3]), rel=1e-9)
+    expected = abs(1.5 + 0.9j * 0.05) * np.abs([u[1], u[4]])
+    np.testing.assert_allclose(outputs["first_wall_force"], expected, rtol=1e-9)
+
+
+def test_a_lossy_stop_has_the_same_force_on_either_side():
+    """With the stop on the other side the motion is the mirror image, half a period later."""
+    options = {"source": "force", "over": "amplitude", "range": [0.2, 0.3], "fixed": [1.25], "harmonics": 31}
+    forces = []
+    for side in ("plus", "minus"):
+        contacts = TWO_MASSES["contacts"] | {"restitution": 0.6, "side": side}
+        case = NfrcCase.from_table(TWO_MASSES | {"contacts": contacts, "nfrc": options, "output": OUTPUT})
+        states = SteadyStates(case, 0.6, 1.25)
+        forces.append(states.measured(first_state(states).xi).outputs["largest_force"][0])
+    assert forces[0] > 1
+    assert forces[1] == pytest.approx(forces[0], rel=1e-8)
+
+
 def test_a_wave_moves_named_masses_of_an_infinite_lattice_as_its_shape_says():
     """Below contact the wave passes: host and resonator of the site differ by its amplitude, other cells by phase."""
     case = nfrc_case(harmonics=3, range=[0.9, 0.95])
