@@ -10,12 +10,16 @@ from tests.conftest import assert_same_bits, datasets
 from tests.steady_states import nfrc_case
 from vipetsc.modes.branches.follow import follow_all
 
+CELLS = {"family": {"contacts": {"sites": [[10], [11]]}}}
+
 
 @pytest.mark.parallel([2, 3])
-def test_curves_are_the_same_on_any_number_of_ranks(folder):
-    """Two restitutions are two curves: ranks work on different ones, and one of three has none."""
+@pytest.mark.parametrize("kind", ["restitutions", "family"])
+def test_curves_are_the_same_on_any_number_of_ranks(kind, folder):
+    """Two restitutions, or two members of a family, are two curves: ranks work on different ones, and one has none."""
     comm = MPI.COMM_WORLD
-    case = nfrc_case(harmonics=3, restitutions=[1.0, 0.7], range=[0.999, 1.0005], first_step=1e-3, points=3)
+    options = {"harmonics": 3, "range": [0.999, 1.0005], "first_step": 1e-3, "points": 3}
+    case = nfrc_case(**options, restitutions=[1.0, 0.7]) if kind == "restitutions" else nfrc_case(**options, **CELLS)
     together = folder / "together"
     alone = folder / "alone"
     if comm.rank == 0:
@@ -29,5 +33,6 @@ def test_curves_are_the_same_on_any_number_of_ranks(folder):
     assert len(curves) == (2 if comm.rank == 0 else 0)
     if comm.rank == 0:
         follow_all(case, alone, MPI.COMM_SELF)
-        for name, *_ in case.curves():
-            assert_same_bits(datasets(together / f"branch-{name}.h5"), datasets(alone / f"branch-{name}.h5"))
+        for curve in case.every_curve():
+            name = f"branch-{curve.name}.h5"
+            assert_same_bits(datasets(together / name), datasets(alone / name))

@@ -22,6 +22,7 @@ import tomli_w
 from pydantic import ValidationError
 
 from vipetsc.case.changes import has_more_keys, value_of
+from vipetsc.case.changes import put as put
 from vipetsc.case.named_files import with_absolute_names
 from vipetsc.case.nearest_type import BRANCH, of_nearest_type
 from vipetsc.case.nesting import DEEPEST, TOO_DEEP, is_deeper
@@ -299,24 +300,6 @@ def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[
         else:
             problems += [replace(p, key=f"--set {p.key}") for p in put(table, path, value)]
     return table, problems
-
-
-def put(table: Table, path: str, value: Any) -> list[Problem]:
-    """Set the key ``path`` ("a.b.c") of ``table`` in place, or remove it (None); returns the problem if this fails."""
-    *parents, key = path.split(".")
-    section: Any = table
-    for parent in parents:
-        section = section.setdefault(parent, {}) if isinstance(section, dict) else section
-    if not isinstance(section, dict):
-        return [Problem(path, value, f"{'.'.join(parents)} is a value, not a section")]
-    if value is None and key not in section:
-        return [Problem(path, None, "is not in the case, so that it cannot be removed")]
-
-    if value is None:
-        del section[key]
-    else:
-        section[key] = value
-    return []
 
 
 def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySection, list[Problem]]:

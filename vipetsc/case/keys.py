@@ -3,6 +3,7 @@
 Types, bounds and defaults come from the sections, units and texts from ``keys.toml``; a test compares the two.
 """
 
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
@@ -22,6 +23,7 @@ from vipetsc.plugins import only
 from vipetsc.register import LAW, PARTS, WAVEFORM, Parameter
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
+INDEX = re.compile(r"\[\d+\]")  # of an entry of a list in a path
 Schema = dict[str, Any]
 
 
@@ -54,7 +56,7 @@ def unit_of(path: str, case: Table) -> str:
     parameter = _parameter_of(path, case)
     if parameter:
         return parameter.unit
-    section, *keys = path.split(".")
+    section, *keys = INDEX.sub("", path).split(".")
     table: type[BaseModel] | None = SECTIONS.get(section)
     for key in keys[:-1]:
         table = _table_of(table, key)
@@ -201,7 +203,8 @@ def _kind(item: Schema) -> str:
     if item.get("type") == "array":
         return f"list of {_count(item)}{_kind(item['items'])}"
     if item.get("type") == "object":
-        return f"table of {_kind(item['additionalProperties'])}"
+        values = item["additionalProperties"]
+        return "table" if values is True else f"table of {_kind(values)}"
     if "pattern" in item:
         return "text as described"
 

@@ -3,13 +3,16 @@
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
+import tomli_w
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Problem, Section, Table, Valid
 from vipetsc.case.contacts import gaps_of_sites
+from vipetsc.case.family import FamilyMember, family_of
 from vipetsc.case.names import distinct
 from vipetsc.case.resolve import build_chain, check_stiffness
 from vipetsc.case.schema import Positive, once
@@ -27,7 +30,8 @@ class NfrcTable(Section):
     With ``drive.end`` the force is that of the wall, which moves. ``over`` the amplitude (of a wave: the relative
     displacement that it alone would make at the first site, over the clearance there; of a force: N; of a wall: m) or
     the frequency (rad/s), within the ``range`` [low, high]: a curve for each of the others in ``fixed`` (frequencies:
-    by default the drive's) and each of the ``restitutions`` (by default that of ``[contacts]``). The lattice is
+    by default the drive's) and each of the ``restitutions`` (by default that of ``[contacts]``), and of these for each
+    combination of the values of further keys in ``family``, which are lists or ranges as in ``[sweep]``. The lattice is
     ``infinite``, or ends where its cells do: always if it has dashpots, cells that differ, or contacts between other
     masses than the cell's pair. ``harmonics`` is the number of the last one; motions that are not ``symmetric``
     (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too. Steps are in units
@@ -42,6 +46,7 @@ class NfrcTable(Section):
     range: list[Positive] = Field([0.5, 2.0], min_length=2, max_length=2)
     fixed: Annotated[list[Positive], AfterValidator(once)] = Field([])
     restitutions: Annotated[list[Restitution], AfterValidator(once)] = Field([])
+    family: dict[str, Any] | None = None
     harmonics: int = Field(41, ge=1, le=2000)
     symmetric: bool | None = None
     points: int = Field(1000, ge=1)
@@ -57,10 +62,29 @@ class NfrcTable(Section):
         return 1 if self.direction == "forward" else -1
 
 
+class ResponseCurve(NamedTuple):
+    """A curve of a case: the ``name`` of its files, its ``case`` without a family, and where it is followed.
+
+    ``restitution`` is that of all sites, ``fixed`` the value of the parameter that does not vary along the curve;
+    ``member`` is the number (from 0) of its case in the family, ``values`` are those of the family's keys.
+    """
+
+    name: str
+    case: "NfrcCase"
+    restitution: float
+    fixed: float
+    member: int
+    values: dict[str, Any]
+
+
 class NfrcCase(Case):
-    """A case of the verb ``nfrc``: that of a run with the section ``[nfrc]``."""
+    """A case of the verb ``nfrc``: that of a run with the section ``[nfrc]``.
+
+    With ``nfrc.family`` its sections are those of the first member, and ``table`` is what it was read from.
+    """
 
     nfrc: NfrcTable
+    table: Table | None = None
 
     verb = section = "nfrc"
     kept_by_resume: ClassVar[str] = "the case with which its curves were started, except nfrc.points"
@@ -71,6 +95,8 @@ class NfrcCase(Case):
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The resolved sections, and everything that is wrong with them."""
+        if isinstance(table.get("nfrc"), dict) and "family" in table["nfrc"]:
+            return cls._read_family(table)
         sections, problems = super().read(table)
         if problems:
             return sections, problems
@@ -97,6 +123,22 @@ class NfrcCase(Case):
             fastest = max(waves_at(cell, first), key=lambda wave: wave[2], default=None)
             nfrc = nfrc.model_copy(update={"band": fastest and fastest[0]})
         return sections | {"nfrc": nfrc}, list(_check_waves(nfrc, cell))
+
+    @classmethod
+    def _read_family(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
+        """The resolved sections of the first member, and everything that is wrong with the first invalid one."""
+        family, problems = family_of(table)
+        if problems:
+            return {}, problems
+
+        read = []
+        for member in family.members:
+            sections, problems = cls.read(member.table)
+            if problems:
+                return sections, [replace(p, remedy=f"{p.remedy} (with {member})") for p in problems]
+            read.append(sections)
+        nfrc = read[0]["nfrc"].model_copy(update={"family": family.table["nfrc"]["family"]})
+        return read[0] | {"nfrc": nfrc, "table": family.table}, []
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
@@ -135,7 +177,16 @@ class NfrcCase(Case):
     def physics(self) -> "NfrcCase":
         """The part of the case that a resumed curve must keep: all except the number of points."""
         nfrc = self.nfrc.model_copy(update={"points": 1})
-        return self.model_copy(update={"nfrc": nfrc})
+        return self.model_copy(update={"nfrc": nfrc, "table": None})
+
+    def to_toml(self) -> str:
+        """The resolved case as TOML; of a family what it was read from, since other keys may follow from its keys."""
+        if self.table is None:
+            return super().to_toml()
+        table = self.table | {"name": self.name, "nfrc": self.table["nfrc"] | {"points": self.nfrc.points}}
+        if self.plugins:
+            table["plugins"] = self.plugins.model_dump(by_alias=True, exclude_none=True)
+        return tomli_w.dumps(table)
 
     @property
     def frequency(self) -> float:
@@ -150,8 +201,24 @@ class NfrcCase(Case):
             return laws
         return [replace(law, restitution=restitution) for law in laws]
 
+    @cached_property
+    def _members(self) -> list[tuple[FamilyMember, "NfrcCase"]]:
+        if self.table is None:
+            return [(FamilyMember("", {}, {}), self)]
+        family, _ = family_of(self.table | {"nfrc": self.table["nfrc"] | {"points": self.nfrc.points}})
+        return [(member, NfrcCase.from_table(member.table | {"name": self.name})) for member in family.members]
+
+    def every_curve(self) -> list[ResponseCurve]:
+        """The curves of all members of the family; of a case without one its own."""
+        curves = []
+        for number, (member, case) in enumerate(self._members):
+            for name, restitution, fixed in case.curves():
+                whole = f"{member.name}-{name}" if member.name else name
+                curves.append(ResponseCurve(whole, case, restitution, fixed, number, member.values))
+        return curves
+
     def curves(self) -> list[tuple[str, float, float]]:
-        """Name, restitution and the fixed parameter of every curve."""
+        """Name, restitution and the fixed parameter of the curves of the case itself, or of the first member."""
         restitutions = zip(distinct(self.nfrc.restitutions), self.nfrc.restitutions, strict=True)
         fixed = zip(distinct(self.nfrc.fixed), self.nfrc.fixed, strict=True)
         return [(f"r{of_r}-{of_f}", r, f) for (of_r, r), (of_f, f) in itertools.product(restitutions, fixed)]

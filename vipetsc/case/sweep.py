@@ -5,7 +5,7 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -15,18 +15,14 @@ import tomli_w
 from pydantic import Field
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import LARGEST, CaseError, CaseFile, Problem, Section, Table, put, read_section
-from vipetsc.case.disorder import SEED
+from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.html import first_few, html_table
 from vipetsc.case.schema import number
+from vipetsc.case.varied import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
 
-MOST_MEMBERS = 1_000_000
 # Members whose cases are resolved to check a sweep before it begins, and sites that they have together.
 MOST_TRIED = 1_000
 MOST_TRIED_SITES = 200_000
-DIGITS = 12  # of numbers that a range is meant to meet
-ROUNDINGS = 8  # by which a value of a range may miss such a number
-Values = dict[str, tuple[Any, ...]]  # the values of each key; an axis has those of keys that vary together
 
 
 class SweepTable(Section):
@@ -87,16 +83,16 @@ class Sweep(CaseFile):
         options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
 
         values: Values = {}
-        for key, value in _leaves(varying):
+        for key, value in leaves(varying):
             try:
-                values[key] = _values(value)
+                values[key] = values_in(value)
             except ValueError as error:
                 problems.append(Problem(f"sweep.{key}", value, str(error)))
         if not varying:
             remedy = "contains no key that varies; give one, as in [sweep.drive] amplitude = [1.0, 2.0]"
             problems.append(Problem("sweep", None, remedy))
 
-        axes, wrong = _axes(values, options.zip)
+        axes, wrong = axes_of(values, options.zip)
         count = math.prod(len(next(iter(axis.values()))) for axis in axes)
         if count > MOST_MEMBERS:
             wrong.append(Problem("sweep", None, f"makes {count} members; at most {MOST_MEMBERS}, so split it"))
@@ -231,10 +227,7 @@ class Sweep(CaseFile):
 
     def names(self) -> dict[str, str]:
         """A short name for every key that varies: its last part, or all of it where that is not unique."""
-        keys = [key for axis in self.axes for key in axis]
-        short = {key: key.removesuffix(".count").rpartition(".")[2] for key in keys}
-        common = {name for name in short.values() if list(short.values()).count(name) > 1}
-        return {key: key.replace(".", "_") if name in common else name for key, name in short.items()}
+        return short_names([key for axis in self.axes for key in axis])
 
 
 def _site_count(table: Table) -> int:
@@ -246,78 +239,6 @@ def _site_count(table: Table) -> int:
     if isinstance(sites, list):
         return len(sites)
     return sites if isinstance(sites, int) else 0
-
-
-def _leaves(tree: Table, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Keys as "a.b.c" with their values; a range is one value."""
-    for key, value in tree.items():
-        # The seed may be { count = n } alone, which is a range and no table.
-        if isinstance(value, dict) and not value.keys() & {"log", "linear"} and path + key != SEED:
-            yield from _leaves(value, f"{path}{key}.")
-        else:
-            yield path + key, value
-
-
-def _values(value: Any) -> tuple[Any, ...]:
-    """The values of a list or a range, of seeds from 0 for a count alone; raises ValueError with the remedy."""
-    if isinstance(value, list) and value:
-        return tuple(value)
-    if isinstance(value, dict) and value.keys() == {"count"} and type(value["count"]) is int and value["count"] > 0:
-        return tuple(range(min(value["count"], MOST_MEMBERS + 1)))  # one more than allowed is refused as a sweep
-
-    remedy = "give a list of values, { log = [first, last], count = n } or { linear = [first, last], count = n }"
-    if not isinstance(value, dict) or len(value) != 2 or "count" not in value:
-        raise ValueError(remedy)
-    # What is left is checked step by step, so that the message is about the first thing that is wrong.
-    (kind,) = value.keys() - {"count"}
-    ends = value[kind]
-    count = value["count"]
-    if not (isinstance(ends, list) and len(ends) == 2 and all(type(end) in (int, float) for end in ends)):
-        raise ValueError(remedy)
-    if type(count) is not int or not 1 <= count <= MOST_MEMBERS:
-        raise ValueError(f"{remedy}, n from 1 to {MOST_MEMBERS}")
-    if not all(abs(end) <= LARGEST for end in ends):
-        raise ValueError(f"the ends of a range must be numbers up to {LARGEST:g}")
-    if kind == "log" and min(ends) <= 0:
-        raise ValueError("the ends of a log range must be positive")
-
-    first, last = map(float, ends)
-    spaced = np.geomspace if kind == "log" else np.linspace
-    return tuple(_without_rounding(value, max(abs(first), abs(last))) for value in spaced(first, last, count).tolist())
-
-
-def _without_rounding(value: float, largest: float) -> float:
-    """The decimal number that a ``value`` of a range is but for its rounding (5 for 4.999999999999999), or itself.
-
-    ``largest`` is the magnitude of the range's larger end, to which sums of a linear range round.
-    """
-    rounding = ROUNDINGS * np.finfo(float).eps
-    if abs(value) <= rounding * largest:
-        return 0.0
-    decimal = float(f"{value:.{DIGITS}g}")
-    # Other values keep their bits, and with them the names of members.
-    return decimal if math.isclose(value, decimal, rel_tol=rounding) else value
-
-
-def _axes(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], list[Problem]]:
-    """Axes of a sweep, each a key or a group of keys that vary together, and the problems with the groups."""
-    problems: list[Problem] = []
-    group_of: dict[str, tuple[str, ...]] = {}
-    for group in groups:
-        lengths = {key: len(values[key]) for key in group if key in values}
-        missing = [key for key in group if key not in values]
-        if missing:
-            problems.append(Problem("sweep.zip", missing, f"not among the keys that vary: {', '.join(values)}"))
-        elif len(set(lengths.values())) > 1:
-            problems.append(Problem("sweep.zip", lengths, "keys that vary together need the same number of values"))
-        elif group_of.keys() & set(group):
-            problems.append(Problem("sweep.zip", group, "a key can be in one group only"))
-        group_of |= dict.fromkeys(group, tuple(group))
-    if problems:
-        return (), problems
-
-    axes = dict.fromkeys(group_of.get(key, (key,)) for key in values)
-    return tuple({key: values[key] for key in keys} for keys in axes), []
 
 
 def coordinate(values: Iterable[Any]) -> np.ndarray:

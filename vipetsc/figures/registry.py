@@ -25,6 +25,7 @@ from vipetsc.figures import (
     nfrc,
     optimum,
     predicted_energies,
+    response_family,
     response_outputs,
     runs,
     scattering,
@@ -71,7 +72,8 @@ class FigureSpec(NamedTuple):
     ``function`` is (run, analysis or None) -> Figure of a run, (data) -> Figure of a source in ``FILES``, (paths) ->
     Figure of branches. Of sweeps it is (sweeps) -> iterator of Drawing, called with those sweeps that take ``measure``;
     the stem of such a drawing follows the figure's name, and ``needs`` says what a sweep must hold for it.
-    ``without`` is (run, analysis or None), or (branch), -> the reason why there is no such picture, or an empty text.
+    ``without`` is (run, analysis or None), or (branches), -> the reason why there is no such picture, or an empty text.
+    ``together``: one picture shows all branches of all folders.
     """
 
     name: str
@@ -80,6 +82,7 @@ class FigureSpec(NamedTuple):
     measure: str = ""
     needs: str = ""
     without: Callable[..., str] | None = None
+    together: bool = False
 
 
 def branch(paths: Sequence[Path]) -> Figure:
@@ -135,6 +138,9 @@ _SPECS = (
     FigureSpec("phase_regimes", SWEEP, transfer_curves.phase_regimes, measure="transfer", needs=WHOLE_MEMBERS),
     FigureSpec(BRANCH, BRANCHES, branch),
     FigureSpec("outputs", BRANCHES, response_outputs.response_outputs, without=response_outputs.without_outputs),
+    FigureSpec(
+        "responses", BRANCHES, response_family.response_family, without=response_family.without_family, together=True
+    ),
     FigureSpec("deflections", DESIGN, cost_maps.deflections),
     FigureSpec("cost_maps", DESIGN, cost_maps.cost_maps),
     FigureSpec("dispersion_against_lambda", DESIGN, partial(cost_maps.dispersions, along="lambda", other="eta")),
@@ -301,20 +307,32 @@ def specified_drawings(spec: FigureSpec, ensembles: Sequence[xr.Dataset], files:
 
 
 def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files) -> Iterator[Drawing]:
-    """Yield one drawing a branch of the first folder, next to the branches of its name in the other folders."""
-    for first, spec in itertools.product(sorted(folders[0].glob("branch-*.h5")), specs):
-        paths = of_one_name(folders, first.name)
-        if not all(point_count(path) for path in paths):
-            continue
-        branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
-        if spec.without and any(spec.without(branch) for branch in branches):
-            continue
-        stem = first.stem
-        if spec.without:
-            stem = stem.replace(BRANCH, spec.name, 1)
-        elif len(folders) > 1:
-            stem = stem.replace(BRANCH, "branches", 1)
-        yield Drawing(stem, warned(partial(spec.function, paths), *branches))
+    """Yield drawings of the branches of the first folder, next to those of their names in the others; then of all."""
+    for first in sorted(folders[0].glob("branch-*.h5")):
+        for spec in specs:
+            if not spec.together:
+                yield from _branch_drawing(spec, of_one_name(folders, first.name), len(folders), files)
+
+    every = [path for folder in folders for path in sorted(folder.glob("branch-*.h5")) if point_count(path)]
+    for spec in specs:
+        if spec.together:
+            for drawing in _branch_drawing(spec, every, len(folders), files):
+                yield drawing._replace(stem=spec.name)
+
+
+def _branch_drawing(spec: FigureSpec, paths: Sequence[Path], folders: int, files: Files) -> Iterator[Drawing]:
+    """Yield the drawing of the branches in ``paths``, from so many ``folders``; none where it has nothing to show."""
+    if not all(point_count(path) for path in paths):
+        return
+    branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
+    if spec.without and spec.without(branches):
+        return
+    stem = paths[0].stem if paths else ""
+    if spec.without:
+        stem = stem.replace(BRANCH, spec.name, 1)
+    elif folders > 1:
+        stem = stem.replace(BRANCH, "branches", 1)
+    yield Drawing(stem, warned(partial(spec.function, paths), *branches))
 
 
 def point_count(path: Path) -> int:

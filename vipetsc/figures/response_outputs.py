@@ -20,9 +20,9 @@ AMPLITUDES = {"displacement": "displacement (m)", "velocity": "velocity (m/s)", 
 DASHES = ("-", style.DASHED, "-.", style.DOTTED)
 
 
-def without_outputs(branch: xr.Dataset) -> str:
-    """Return why a ``branch`` has no such page; empty where it has one."""
-    if "lag" in branch or "largest_force" in branch:
+def without_outputs(branches: Sequence[xr.Dataset]) -> str:
+    """Return why some ``branches`` have no such page; empty where they have one."""
+    if all("lag" in branch or "largest_force" in branch for branch in branches):
         return ""
     return "needs [output] points or forces = true in the case of nfrc"
 

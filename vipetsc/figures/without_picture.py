@@ -1,6 +1,7 @@
 """Why something has no picture: what cannot be drawn is no file, and a sentence says so."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import xarray as xr
@@ -21,6 +22,7 @@ from vipetsc.figures.registry import (
     with_ensemble,
 )
 from vipetsc.figures.sweep_members import Files
+from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble
 
 
@@ -49,6 +51,14 @@ def reasons_without_pictures(
                 reasons[path.stem] = "" if has_points else "no point of the branch was computed"
             if paths and all(reasons.values()):
                 reasons = {BRANCH: "no branch has a point"}
+            specs = figures_of(source, folders)
+            for name in names or ():
+                spec = specs.get(name)
+                if spec and spec.without:
+                    branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
+                    of_branch = [branches] if spec.together else [[branch] for branch in branches]
+                    missing = [spec.without(shown) for shown in of_branch]
+                    reasons[name] = missing[0] if all(missing) else ""
     return {name: reason for name, reason in reasons.items() if reason}
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vipetsc.case import NnmCase
+from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.cli.arguments import CASE, OF_STUDIES, case_with
 from vipetsc.cli.case_rows import lattice_rows
@@ -105,7 +106,7 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
         fixed_unit = amplitude_unit
 
     low, high = options.range
-    count = len(case.curves())
+    count = len(case.every_curve())
     parity = "odd only" if options.symmetric else "even and odd"
 
     lattice = dict(lattice_rows(case))
@@ -117,7 +118,17 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
         ("driven by", excitation),
         (f"at {fixed}", f"{first_few([f'{value:.6g}' for value in options.fixed])} {fixed_unit}"),
         ("restitution", first_few([f"{restitution:g}" for restitution in options.restitutions])),
+        *_family_rows(case),
         ("harmonics", f"up to {options.harmonics}, {parity}; at most {options.points} points per curve"),
+    ]
+
+
+def _family_rows(case: NfrcCase) -> Rows:
+    """The keys that vary in the family, and their values."""
+    table = case.table or {}
+    return [
+        (f"{key}{f' ({unit})' if (unit := unit_of(key, table)) else ''}", first_few([f"{value}" for value in values]))
+        for key, values in (case.nfrc.family or {}).items()
     ]
 
 

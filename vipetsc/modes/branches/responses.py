@@ -10,6 +10,7 @@ import numpy as np
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
+from vipetsc.lattice import ModalCompliance, WaveCompliance
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.method import Method
 from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem
@@ -35,54 +36,40 @@ class ResponseMethod(Method[Response]):
 
     def __init__(self, case: NfrcCase, comm: MPI.Comm) -> None:
         super().__init__(case, comm)
-        self.curves = case.curves()
-        self.compliance = compliance_of(case)
+        self.curves = case.every_curve()
+        # The latest compliance by the number of its member: the curves of a member follow each other.
+        self._compliance: tuple[int, WaveCompliance | ModalCompliance] | None = None
 
     @staticmethod
     def jobs(case: Any) -> list[int]:
         """Numbers of a case's curves."""
-        return list(range(len(case.curves())))
+        return list(range(len(case.every_curve())))
 
     def new_branch(self, name: str) -> Branch[Response]:
         """A curve without states."""
+        curve = next(curve for curve in self.curves if curve.name == name)
+        about: dict[str, Any] = {"over": curve.case.nfrc.over, "restitution": curve.restitution}
+        if curve.values:
+            about["family"] = curve.values
         return Branch(
             name=name,
-            case=self.case.to_toml(),
-            dofs=len(self.case.model().chain.sites),
+            case=curve.case.to_toml(),
+            dofs=len(curve.case.model().chain.sites),
             kind=self.kind,
-            about={"over": self.case.nfrc.over},
-            extra=self._axes(),
+            about=about,
+            extra=_axes(curve.case),
         )
-
-    def _axes(self) -> Variables:
-        """What variables of states have for dimensions: sites, harmonics, channels, and what [output] names."""
-        chain = self.case.model().chain
-        orders = np.arange(self.case.nfrc.harmonics + 1)
-        axes = {
-            "site": variable("site", np.array(chain.sites) + 1, "1", "cell of the site, counted from 1"),
-            "order": variable("order", orders, "1", "harmonic"),
-            "way": variable("way", np.array(CHANNELS), "1", "destination of the energy"),
-            "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
-        }
-        output = self.case.output
-        if output.points:
-            names = np.array([point.name for point in output.points])
-            axes["location"] = variable("location", names, "1", "named mass, see output.points in the case")
-        if output.transmission:
-            pairs = np.array([JOINT.join(pair) for pair in output.transmission])
-            axes["pair"] = variable("pair", pairs, "1", "locations of a transmission, from - to")
-        if output.forces and self.case.lattice.ends == "fixed" and not self.case.nfrc.infinite:
-            axes["wall"] = variable("wall", np.array(WALLS), "1", "wall at an end of the lattice")
-        return axes
 
     def name(self, job: int) -> str:
         """The name of a curve."""
-        return self.curves[job][0]
+        return self.curves[job].name
 
     def problem(self, job: int) -> SteadyStates:
         """The equations of a curve."""
-        _, restitution, fixed = self.curves[job]
-        return SteadyStates(self.case, restitution, fixed, compliance=self.compliance)
+        curve = self.curves[job]
+        if self._compliance is None or self._compliance[0] != curve.member:
+            self._compliance = curve.member, compliance_of(curve.case)
+        return SteadyStates(curve.case, curve.restitution, curve.fixed, compliance=self._compliance[1])
 
     def start(self, problem: PeriodicProblem[Response], job: int) -> Response:
         """The state at the beginning of the range."""
@@ -98,3 +85,25 @@ class ResponseMethod(Method[Response]):
         """The state with its measures."""
         assert isinstance(problem, SteadyStates)
         return replace(point, measures=problem.measured(point.xi))
+
+
+def _axes(case: NfrcCase) -> Variables:
+    """What variables of states have for dimensions: sites, harmonics, channels, and what [output] names."""
+    chain = case.model().chain
+    orders = np.arange(case.nfrc.harmonics + 1)
+    axes = {
+        "site": variable("site", np.array(chain.sites) + 1, "1", "cell of the site, counted from 1"),
+        "order": variable("order", orders, "1", "harmonic"),
+        "way": variable("way", np.array(CHANNELS), "1", "destination of the energy"),
+        "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
+    }
+    output = case.output
+    if output.points:
+        names = np.array([point.name for point in output.points])
+        axes["location"] = variable("location", names, "1", "named mass, see output.points in the case")
+    if output.transmission:
+        pairs = np.array([JOINT.join(pair) for pair in output.transmission])
+        axes["pair"] = variable("pair", pairs, "1", "locations of a transmission, from - to")
+    if output.forces and case.lattice.ends == "fixed" and not case.nfrc.infinite:
+        axes["wall"] = variable("wall", np.array(WALLS), "1", "wall at an end of the lattice")
+    return axes

@@ -202,7 +202,7 @@ def largest_force(stops: Stops, relative: np.ndarray, episodes: Sequence[Episode
 
 
 def magnitude(phasors: np.ndarray) -> np.ndarray:
-    """Magnitude of each of ``phasors``, in the same bits wherever they lie in memory, which ``np.abs`` does not have."""
+    """Magnitude of each of ``phasors``; other than of ``np.abs`` its bits do not depend on where they lie in memory."""
     return np.hypot(phasors.real, phasors.imag)
 
 

@@ -1,0 +1,92 @@
+"""Families of frequency-response curves: keys of a case that vary from curve to curve (``[nfrc.family]``)."""
+
+import copy
+import itertools
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from vipetsc.case.case_file import Problem, Table, put
+from vipetsc.case.names import distinct
+from vipetsc.case.varied import Values, leaves, short_names, values_in
+
+MOST_MEMBERS = 1000
+SECTIONS = ("lattice", "contacts", "disorder", "drive")  # whose keys may vary
+PLAIN = re.compile(r"\w[\w.+-]*")  # a text that can be a part of a file's name
+
+
+class FamilyMember(NamedTuple):
+    """One case of a family: the ``name`` of its files, the ``values`` of the keys that vary, and its ``table``."""
+
+    name: str
+    values: dict[str, Any]
+    table: Table
+
+    def __str__(self) -> str:
+        return ", ".join(f"{key} = {value}" for key, value in self.values.items())
+
+
+class Family(NamedTuple):
+    """The ``members`` of a family, and the ``table`` of its case with every range of ``[nfrc.family]`` written out."""
+
+    members: list[FamilyMember]
+    table: Table
+
+
+def family_of(table: Table) -> tuple[Family, list[Problem]]:
+    """The family of a ``table`` with ``[nfrc.family]``, and what is wrong with that section.
+
+    Each key takes each of its values with each of those of the others; the last key varies fastest. Values are lists or
+    ranges, as in ``[sweep]``.
+    """
+    section = table["nfrc"]["family"]
+    given = dict(leaves(section)) if isinstance(section, dict) else {}
+    if not given:
+        remedy = "give keys of the case with their values, as in: [nfrc.family] contacts.clearance = [1e-4, 2e-4]"
+        return Family([], table), [Problem("nfrc.family", section, remedy)]
+
+    values: Values = {}
+    problems: list[Problem] = []
+    for key, value in given.items():
+        if key.partition(".")[0] not in SECTIONS:
+            problems.append(Problem(f"nfrc.family.{key}", value, f"only keys of {', '.join(SECTIONS)} can vary"))
+            continue
+        try:
+            values[key] = values_in(value)
+        except ValueError as error:
+            problems.append(Problem(f"nfrc.family.{key}", value, str(error)))
+
+    combinations = list(itertools.islice(itertools.product(*values.values()), MOST_MEMBERS + 1))
+    if len(combinations) > MOST_MEMBERS:
+        problems.append(Problem("nfrc.family", None, f"has more than {MOST_MEMBERS} members; give fewer values"))
+    if problems:
+        return Family([], table), problems
+
+    expanded = copy.deepcopy(table)
+    expanded["nfrc"]["family"] = {key: list(of_key) for key, of_key in values.items()}
+    names = [_texts(key, of_key) for key, of_key in values.items()]
+    members = []
+    for parts, combination in zip(itertools.product(*names), combinations, strict=True):
+        member = copy.deepcopy(table)
+        del member["nfrc"]["family"]
+        chosen = dict(zip(values, combination, strict=True))
+        for key, value in chosen.items():
+            problems += put(member, key, copy.deepcopy(value))
+        members.append(FamilyMember("-".join(_named(values, parts)), chosen, member))
+    return Family(members, expanded), problems
+
+
+def _named(values: Values, texts: Sequence[str]) -> list[str]:
+    """The parts of a file's name: the last word of each key, and the text of its value."""
+    short = short_names(list(values))
+    return [f"{re.sub(r'[][]', '', name)}-{text}" for name, text in zip(short.values(), texts, strict=True)]
+
+
+def _texts(key: str, values: Sequence[Any]) -> list[str]:
+    """A text for each value of a ``key``, of which no two are equal; numbers of values that are no plain text."""
+    if all(type(value) in (int, float) for value in values) and len(set(values)) == len(values):
+        return distinct(values)
+    texts = [value if isinstance(value, str) else "" for value in values]
+    if all(PLAIN.fullmatch(text) for text in texts) and len(set(texts)) == len(texts):
+        return texts
+    return [f"no-{number}" for number in range(1, len(values) + 1)]

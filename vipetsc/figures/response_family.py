@@ -1,0 +1,156 @@
+"""All frequency-response curves of a folder on common axes: the keys by which they differ are the legend."""
+
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
+
+from vipetsc.case.keys import unit_of
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.sweep import coordinate
+from vipetsc.figures import panels, style
+from vipetsc.figures.nfrc import draw_folds, parameter_label, parameter_of
+from vipetsc.figures.swept_axes import SweptKey
+from vipetsc.io.branch_kinds import RESPONSES, branch_kind
+from vipetsc.io.netcdf import open_netcdf
+
+MOST_LOCATIONS = 4  # that have a row of their own
+MOST_CURVES = 24  # of a legend; others have no line in it
+LEGEND_LINE = 0.13  # inches of a legend's line
+
+
+def without_family(curves: Sequence[xr.Dataset]) -> str:
+    """Return why some branches have no common picture; empty where they have one."""
+    if len(curves) < 2 or any(branch_kind(curve) != RESPONSES for curve in curves):
+        return "needs several curves of nfrc"
+    if len({str(curve.attrs["over"]) for curve in curves}) > 1:
+        return "needs curves over the same parameter"
+    return ""
+
+
+def response_family(paths: Sequence[Path]) -> Figure:
+    """Draw the curves in ``paths`` over amplitude or frequency on common axes.
+
+    Rows are the largest relative displacement of the first site, the largest displacement of each named mass that all
+    curves have, and the phase of the first site's fundamental under a force over its frequency.
+    """
+    curves = []
+    for path in paths:
+        with open_netcdf(path, "branch", ("unstable", "over")) as file:
+            curves.append(file.load())
+
+    rows: list[Callable[[xr.Dataset], np.ndarray]] = [_relative]
+    labels = ["largest |w| (m)"]
+    for name in _common_locations(curves)[:MOST_LOCATIONS]:
+        rows.append(partial(_displacement, name=name))
+        labels.append(f"displacement\nof {name} (m)")
+    nfrc = NfrcCase.of(curves[0]).nfrc
+    has_phase = nfrc.source == "force" and nfrc.over == "frequency"
+    if has_phase:
+        rows.append(_lag)
+        labels.append("phase lag (degrees)")
+
+    names = legend_of(curves)
+    height = 1.7 * len(rows) + 0.3
+    legend_height = 0.1 + LEGEND_LINE * min(len(curves), MOST_CURVES)
+    figure = style.new_figure(1.3 * style.COLUMN, height + legend_height)
+    upper, lower = figure.subfigures(2, 1, height_ratios=[height, legend_height])
+    column = upper.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+    colours = _colours(len(curves))
+    for axes, values_of, label in zip(column, rows, labels, strict=True):
+        for curve, name, colour in zip(curves, names, colours, strict=True):
+            _draw_curve(axes, curve, values_of(curve), name, colour)
+        axes.set_ylabel(label)
+    if has_phase:
+        column[-1].yaxis.set_major_locator(MultipleLocator(90))
+    column[-1].set_xlabel(parameter_label(curves[0]))
+    handles, texts = column[0].get_legend_handles_labels()
+    lower.legend(handles[:MOST_CURVES], texts[:MOST_CURVES], loc="center", fontsize=6)
+    if len(rows) > 1:
+        panels.label_panels(column)
+    return figure
+
+
+def legend_of(curves: Sequence[xr.Dataset]) -> list[str]:
+    """Return a text for each of ``curves``: the keys that differ among them, with values and units."""
+    keys = [_keys_of(curve) for curve in curves]
+    parts: list[list[str]] = [[] for _ in curves]
+    # In the order of the first curve; a key that all have with one value says nothing.
+    for path in dict.fromkeys(path for of_curve in keys for path in of_curve):
+        values = [of_curve.get(path, ("", ""))[0] for of_curve in keys]
+        if len({repr(value) for value in values}) == 1:
+            continue
+        unit = next(of_curve[path][1] for of_curve in keys if path in of_curve)
+        texts = SweptKey(path, unit, coordinate(values)).texts
+        for part, text in zip(parts, texts, strict=True):
+            part.append(text)
+    return [", ".join(part) or str(curve.attrs["name"]) for part, curve in zip(parts, curves, strict=True)]
+
+
+def _keys_of(curve: xr.Dataset) -> dict[str, tuple[Any, str]]:
+    """Return what makes a curve one of several: value and unit by the path of the key."""
+    case = NfrcCase.of(curve)
+    table = case.model_dump(by_alias=True, exclude_none=True)
+    family = json.loads(curve.attrs.get("family", "{}"))
+    keys = {path: (value, unit_of(path, table)) for path, value in family.items()}
+    # The amplitude or frequency that does not vary is that of all points.
+    fixed = "frequency" if curve.attrs["over"] == "amplitude" else "amplitude"
+    unit = "rad/s"
+    if fixed == "amplitude":
+        unit = "clearances" if case.nfrc.source == "wave" else unit_of("drive.amplitude", table)
+    keys[fixed] = (float(curve[fixed].values[0]), unit)
+    keys["restitution"] = (float(curve.attrs["restitution"]), "")
+    return keys
+
+
+def _common_locations(curves: Sequence[xr.Dataset]) -> list[str]:
+    """Return the named masses that all ``curves`` have."""
+    if any("location" not in curve for curve in curves):
+        return []
+    first = curves[0]["location"].values.astype(str)
+    return [name for name in first if all(name in curve["location"].values.astype(str) for curve in curves)]
+
+
+def _relative(curve: xr.Dataset) -> np.ndarray:
+    """Return the largest relative displacement (point,) in m of the first site."""
+    values: np.ndarray = curve["largest"].values[:, 0]
+    return values
+
+
+def _displacement(curve: xr.Dataset, name: str) -> np.ndarray:
+    """Return the largest displacement (point,) in m of the mass of that ``name``."""
+    number = curve["location"].values.astype(str).tolist().index(name)
+    values: np.ndarray = curve["peak_displacement"].values[:, number]
+    return values
+
+
+def _lag(curve: xr.Dataset) -> np.ndarray:
+    """Return the phase (point,) in degrees of the first site's fundamental behind the drive."""
+    fundamental = curve["harmonics"].values[:, 0, 1] + 1j * curve["harmonics_imaginary"].values[:, 0, 1]
+    lag = -np.degrees(np.unwrap(np.angle(fundamental)))
+    # The first state lags by less than a turn.
+    return np.asarray(lag - 360 * np.floor((lag[0] + 180) / 360))
+
+
+def _draw_curve(axes: Axes, curve: xr.Dataset, values: np.ndarray, name: str, colour: Any) -> None:
+    """Draw ``values`` of a curve: stable states broad, unstable ones thin and dashed, rings at folds."""
+    parameter = parameter_of(curve)
+    stable = curve["unstable"].values == 0
+    axes.plot(parameter, values, color=colour, lw=0.5, ls="--")
+    axes.plot(parameter, np.where(stable, values, np.nan), color=colour, lw=1.3, label=name)
+    draw_folds(axes, curve, values)
+
+
+def _colours(count: int) -> list[Any]:
+    """Return a colour for each curve: those of the house if these are enough, else a scale from dark to bright."""
+    if count <= len(style.BAND_COLOURS):
+        return [style.band_colour(number) for number in range(1, count + 1)]
+    return [colormaps["viridis"](place) for place in np.linspace(0, 0.9, count)]
