@@ -87,8 +87,10 @@ def follow_all(
 
     # Neighbours in the list fall to different ranks; no rank waits for another until all are followed.
     followed: dict[int, list[Branch[Any]]] = {}
-    for number in range(comm.rank, len(jobs), comm.size):
-        followed[number] = follower(MPI.COMM_SELF).follow(jobs[number])
+    numbers = range(comm.rank, len(jobs), comm.size)
+    if numbers:
+        alone = follower(comm=MPI.COMM_SELF)
+        followed = {number: alone.follow(jobs[number]) for number in numbers}
     # ``gather`` returns None on the other ranks.
     by_number: dict[int, list[Branch[Any]]] = {}
     for of_rank in comm.gather(followed) or []:
