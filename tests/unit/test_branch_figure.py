@@ -9,6 +9,7 @@ import xarray as xr
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.figures import branch_curves, nfrc, registry, style
+from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures
 from vipetsc.io import branch_kinds
 from vipetsc.io.netcdf import write_netcdf
@@ -142,7 +143,7 @@ def test_a_branch_without_points_is_no_file(tmp_path):
     """One of two is drawn, and the other named; a folder without any refuses the figure by its name."""
     put_condensed_branch(tmp_path / "branch-empty.h5", 0)
     assert registry.draw(registry.BRANCHES, [tmp_path]) == []
-    assert list(reasons_without_pictures(registry.BRANCHES, [tmp_path])) == [registry.BRANCH]
+    assert list(reasons_without_pictures(registry.BRANCHES, [tmp_path], Files())) == [registry.BRANCH]
     put_condensed_branch(tmp_path / "branch-begun.h5", 3)
     assert [path.name for path in registry.draw(registry.BRANCHES, [tmp_path])] == ["branch-begun.png"]
-    assert list(reasons_without_pictures(registry.BRANCHES, [tmp_path])) == ["branch-empty"]
+    assert list(reasons_without_pictures(registry.BRANCHES, [tmp_path], Files())) == ["branch-empty"]

@@ -190,7 +190,7 @@ def test_every_figure_is_drawn_from_every_shape_of_run(measured, name):
 
 def test_what_cannot_be_drawn_is_said(measured):
     folder, shape = measured
-    assert reasons_without_pictures("run", [folder]) == WITHOUT.get(shape, {})
+    assert reasons_without_pictures("run", [folder], Files()) == WITHOUT.get(shape, {})
 
 
 @pytest.mark.slow
@@ -248,7 +248,7 @@ def test_ranks_divide_the_figures_among_them(tmp_path):
     for rank in range(2):
         paths = draw("run", [tmp_path], formats=("pdf",), rank=rank, ranks=2)
         written += [path.name for path in paths]
-    drawable = {*figure_names("run")} - {*reasons_without_pictures("run", [tmp_path])}
+    drawable = {*figure_names("run")} - {*reasons_without_pictures("run", [tmp_path], Files())}
     assert sorted(written) == sorted(f"{name}.pdf" for name in drawable)
 
 

@@ -5,12 +5,16 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
 from vipetsc.cli.messages import echo
 from vipetsc.io.folder import FolderError
 from vipetsc.parallel import on_every_rank, on_root
+
+if TYPE_CHECKING:
+    from vipetsc.figures.sweep_members import Files
 
 SWEEP_FIGURES = "sweep"  # the source of pictures whose measures are those of the file
 
@@ -53,22 +57,26 @@ def draw_pictures(
     that hold nothing to draw, and for a figure that does not exist.
     """
     from vipetsc.figures.registry import draw
+    from vipetsc.figures.sweep_members import Files
 
     def draw_part() -> list[Path]:
+        ranks = {"rank": comm.rank, "ranks": comm.size}
         with reading(pictures, folders):
-            return draw(pictures.source, folders, names, formats, rank=comm.rank, ranks=comm.size, newest=newest)
+            return draw(pictures.source, folders, names, formats, **ranks, newest=newest, files=files)
 
     on_root(comm, lambda: prepare(pictures, folders, names))
-    sentences = on_root(comm, lambda: left_out(pictures, folders, names))
-    for sentence in sentences:
-        if pictures.source == SWEEP_FIGURES:
-            echo(comm, f"vipetsc: {sentence}", sys.stderr)
-        else:
-            # A lattice without sites has no impacts: no matter to warn of.
-            echo(comm, f"  {sentence}")
-    # Rank 0 reads the time, so that all ranks use the same one even if their file systems differ.
-    newest = None if afresh else on_root(comm, lambda: newest_result(folders))
-    drawn = on_every_rank(comm, draw_part)
+    # What is left out and what is drawn is read from the same results, which are opened once.
+    with Files() as files:
+        sentences = on_root(comm, lambda: left_out(pictures, folders, files, names))
+        for sentence in sentences:
+            if pictures.source == SWEEP_FIGURES:
+                echo(comm, f"vipetsc: {sentence}", sys.stderr)
+            else:
+                # A lattice without sites has no impacts: no matter to warn of.
+                echo(comm, f"  {sentence}")
+        # Rank 0 reads the time, so that all ranks use the same one even if their file systems differ.
+        newest = None if afresh else on_root(comm, lambda: newest_result(folders))
+        drawn = on_every_rank(comm, draw_part)
     # ``gather`` gives None on all ranks but the first.
     return sorted(path for paths in comm.gather(drawn) or [] for path in paths)
 
@@ -103,14 +111,17 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
         pictures.prepare(folders)
 
 
-def left_out(pictures: Pictures, folders: Sequence[Path], names: list[str] | None) -> list[str]:
-    """Messages about pictures that are not drawn; on one rank. Raises FolderError for a requested figure."""
+def left_out(pictures: Pictures, folders: Sequence[Path], files: "Files", names: list[str] | None) -> list[str]:
+    """Messages about pictures that are not drawn; on one rank, which opens results as ``files``.
+
+    Raises FolderError for a requested figure.
+    """
     from vipetsc.figures.registry import OVER_BRANCHES
     from vipetsc.figures.transfer_curves import curves_left_out
     from vipetsc.figures.without_picture import reasons_without_pictures
 
     with reading(pictures, folders):
-        reasons = reasons_without_pictures(pictures.source, folders, names)
+        reasons = reasons_without_pictures(pictures.source, folders, files, names)
     asked = [name for name in names or () if name in reasons]
     if asked:
         missing = "; ".join(f"--fig {name}: {reasons[name]}" for name in asked)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from vipetsc import plugins
 from vipetsc.case.parts import module_names
 from vipetsc.figures.style import Drawing
-from vipetsc.io.netcdf import open_netcdf
+from vipetsc.io.netcdf import root_attributes
 from vipetsc.register import FigurePart, PartError
 
 RESULTS = ("run.h5", "ensemble.h5", "branch-*.h5", "design.h5", "optimum.h5", "law.h5", "prediction.h5")
@@ -44,8 +44,7 @@ def _modules(folder: Path) -> list[str]:
     for pattern in RESULTS:
         for path in sorted(folder.glob(pattern))[:1]:
             try:
-                with open_netcdf(path, "result") as file:
-                    case = tomllib.loads(file.attrs.get("case", ""))
+                case = tomllib.loads(root_attributes(path, "result").get("case", ""))
             # What cannot be read is reported where it is drawn.
             except (OSError, ValueError):
                 return []

@@ -203,6 +203,7 @@ def draw(
     rank: int = 0,
     ranks: int = 1,
     newest: float | None = None,
+    files: Files | None = None,
 ) -> list[Path]:
     """Draw what the ``folders`` hold into ``figures/`` of the first of them; return the files, each complete.
 
@@ -217,6 +218,8 @@ def draw(
         Every ``ranks``-th picture from number ``rank`` on is drawn.
     newest
         A time in s since the epoch: pictures that are not older stay.
+    files
+        Results that the caller has opened and will close.
 
     Raises
     ------
@@ -229,9 +232,10 @@ def draw(
     def keep(path: Path) -> bool:
         return newest is not None and path.exists() and path.stat().st_mtime >= newest
 
-    with rc_style(), Files() as files:
+    with rc_style(), Files() as opened_here:
+        opened = opened_here if files is None else files
         return draw_each(
-            drawings(source, folders, files, names),
+            drawings(source, folders, opened, names),
             target=folders[0] / "figures",
             formats=formats,
             turns=itertools.count(rank, ranks),

@@ -27,60 +27,69 @@ from vipetsc.io.read import open_ensemble
 
 
 def reasons_without_pictures(
-    source: str, folders: Sequence[Path], names: Sequence[str] | None = None
+    source: str, folders: Sequence[Path], files: Files, names: Sequence[str] | None = None
 ) -> dict[str, str]:
     """Return why figures of what the ``folders`` hold are not drawn, by name; of branches by the names of their files.
 
+    Results are opened as ``files``, which those who draw them afterwards can use too.
     They are those in ``names``, by default all; of sweeps by default measures, and what lays branches over them where
     ``folders`` hold any. Raises KeyError as ``figure_names``.
     """
     if source == SWEEP:
-        return _reasons_of_sweeps(folders, names)
+        return _reasons_of_sweeps(folders, files, names)
+
     reasons: dict[str, str] = {}
-    with Files() as files:
-        if source == RUN:
-            run, analysis = run_and_analysis(folders[0], files)
-            specs = figures_of(source, folders)
-            for name in figure_names(source, names, folders):
-                without = specs[name].without
-                reasons[name] = without(run, analysis) if without else ""
-        elif source == BRANCHES:
-            paths = sorted(folders[0].glob("branch-*.h5"))
-            for path in paths:
-                has_points = all(point_count(path) for path in of_one_name(folders, path.name))
-                reasons[path.stem] = "" if has_points else "no point of the branch was computed"
-            if paths and all(reasons.values()):
-                reasons = {BRANCH: "no branch has a point"}
-            specs = figures_of(source, folders)
-            for name in names or ():
-                spec = specs.get(name)
-                if spec and spec.without:
-                    branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
-                    of_branch = [branches] if spec.together else [[branch] for branch in branches]
-                    missing = [spec.without(shown) for shown in of_branch]
-                    reasons[name] = missing[0] if all(missing) else ""
+    if source == RUN:
+        run, analysis = run_and_analysis(folders[0], files)
+        specs = figures_of(source, folders)
+        for name in figure_names(source, names, folders):
+            without = specs[name].without
+            reasons[name] = without(run, analysis) if without else ""
+    elif source == BRANCHES:
+        reasons = _reasons_of_branches(folders, files, names or ())
     return {name: reason for name, reason in reasons.items() if reason}
 
 
-def _reasons_of_sweeps(folders: Sequence[Path], names: Sequence[str] | None) -> dict[str, str]:
+def _reasons_of_branches(folders: Sequence[Path], files: Files, names: Sequence[str]) -> dict[str, str]:
+    """Return why branches of the first folder are not drawn, by the names of files, and why figures in ``names``."""
+    reasons = {}
+    paths = sorted(folders[0].glob("branch-*.h5"))
+    for path in paths:
+        has_points = all(point_count(path) for path in of_one_name(folders, path.name))
+        reasons[path.stem] = "" if has_points else "no point of the branch was computed"
+    if paths and all(reasons.values()):
+        reasons = {BRANCH: "no branch has a point"}
+
+    specs = figures_of(BRANCHES, folders)
+    for name in names:
+        spec = specs.get(name)
+        if spec and spec.without:
+            branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
+            of_branch = [branches] if spec.together else [[branch] for branch in branches]
+            missing = [spec.without(shown) for shown in of_branch]
+            reasons[name] = missing[0] if all(missing) else ""
+    return reasons
+
+
+def _reasons_of_sweeps(folders: Sequence[Path], files: Files, names: Sequence[str] | None) -> dict[str, str]:
     """Return why figures of the sweeps in ``folders`` are not drawn, by name."""
     expected = {*(names or ())}
     if len(with_ensemble(folders)) < len(folders) and names is None:
         expected.add(OVER_BRANCHES)
     reasons: dict[str, str] = {}
     specs = figures_of(SWEEP, folders)
-    with Files() as files:
-        ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
-        for name in figure_names(SWEEP, names, folders):
-            spec = specs.get(name)
-            if spec:
-                if name in expected and not any(specified_drawings(spec, ensembles, files)):
-                    unrelated = transfer_curves.curves_left_out(folders) if name == OVER_BRANCHES else ""
-                    reasons[name] = unrelated or f"needs {spec.needs}"
-                continue
-            by_sweep = [_reason(ensemble, name, by_name=names is not None) for ensemble in ensembles]
-            if all(by_sweep):
-                reasons[name] = by_sweep[0]
+    ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
+    for name in figure_names(SWEEP, names, folders):
+        spec = specs.get(name)
+        if spec:
+            if name in expected and not any(specified_drawings(spec, ensembles, files)):
+                unrelated = transfer_curves.curves_left_out(folders) if name == OVER_BRANCHES else ""
+                reasons[name] = unrelated or f"needs {spec.needs}"
+            continue
+
+        by_sweep = [_reason(ensemble, name, by_name=names is not None) for ensemble in ensembles]
+        if all(by_sweep):
+            reasons[name] = by_sweep[0]
     return reasons
 
 

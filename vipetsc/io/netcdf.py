@@ -120,8 +120,7 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
         links = _links(path)
     # Files of other programs have types and links that h5netcdf does not know, and meets with any exception.
     except Exception as error:
-        reason = "another program has it open for writing" if "unable to lock" in str(error) else error
-        raise UnreadableFileError(f"{path} cannot be opened as a {kind}: {reason}") from error
+        raise _unreadable(path, kind, error) from error
     data = _flat(groups, links)
     closing = ExitStack()
     for group in groups.values():
@@ -135,8 +134,37 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     missing = [name for name in needs if name not in present and name not in data.attrs]
     if missing:
         data.close()  # nobody else would
-        raise ResultFileError(f"{path} is not a {kind} of vipetsc: it lacks {', '.join(missing)}")
+    _refuse_other_kinds(path, kind, missing)
     return data
+
+
+def root_attributes(path: str | Path, kind: str, needs: Sequence[str] = ()) -> dict[str, Any]:
+    """The attributes of a file's root, for readers of nothing else: ``open_netcdf`` looks at every variable.
+
+    Parameters and errors are those of ``open_netcdf``.
+    """
+    sys.audit("vipetsc.read", str(path))
+    try:
+        with h5py.File(path) as file:
+            attributes = dict(file.attrs)
+            missing = [name for name in needs if name not in file and name not in attributes]
+    # Files of other programs have types that h5py does not know, and meets with any exception.
+    except Exception as error:
+        raise _unreadable(path, kind, error) from error
+    _refuse_other_kinds(path, kind, missing)
+    return attributes
+
+
+def _unreadable(path: str | Path, kind: str, error: Exception) -> UnreadableFileError:
+    """The error that reports that a file cannot be opened as HDF5, because of ``error``."""
+    reason = "another program has it open for writing" if "unable to lock" in str(error) else error
+    return UnreadableFileError(f"{path} cannot be opened as a {kind}: {reason}")
+
+
+def _refuse_other_kinds(path: str | Path, kind: str, missing: Sequence[str]) -> None:
+    """Raise ResultFileError for a file in which something is ``missing`` that every file of its ``kind`` has."""
+    if missing:
+        raise ResultFileError(f"{path} is not a {kind} of vipetsc: it lacks {', '.join(missing)}")
 
 
 def _links(path: str | Path) -> set[PurePosixPath]:

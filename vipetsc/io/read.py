@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 # Files that are opened if a folder is given: the first one that exists.
 FIRST = "run.h5", "optimum.h5", "prediction.h5", "law.h5", "design.h5", "analysis.h5"
+# What the file of a run has at least.
+RUN_NEEDS = "time", "cell", "energy", "case"
 Selectable = TypeVar("Selectable", "xr.Dataset", "xr.DataArray")
 
 
@@ -30,7 +32,7 @@ def open_run(path: str | Path) -> xr.Dataset:
 
     ``encoding["source"]`` is the path. Raises OSError or ValueError as ``open_netcdf``.
     """
-    run = open_netcdf(path, "run", ("time", "cell", "energy", "case"))
+    run = open_netcdf(path, "run", RUN_NEEDS)
     run = with_point_names(run)
     run.encoding["source"] = str(path)
     return run

@@ -97,7 +97,7 @@ def analyse(
     ``left_out``; those that the stored samples and cells do not resolve are also named in the list ``warnings``.
     """
     sys.audit("vipetsc.analyse")
-    options = options or options_of(run)
+    options = options or options_of(run.attrs["case"])
     about = {
         "format_version": FORMAT_VERSION,
         "vipetsc_version": vipetsc.__version__,

@@ -15,8 +15,8 @@ import vipetsc
 from vipetsc.case import Case, Sweep
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import FolderError, origin
-from vipetsc.io.netcdf import open_netcdf, write_netcdf
-from vipetsc.io.read import open_run, outdated
+from vipetsc.io.netcdf import open_netcdf, root_attributes, write_netcdf
+from vipetsc.io.read import RUN_NEEDS, open_run, outdated
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import on_every_rank, on_root
 from vipetsc.spectra.measures import is_measure
@@ -123,7 +123,7 @@ def measure_run(
         case = Case.of(run)
         linear = read_linear(sweep or folder.parent, case)
         arrival = linear.arrival_at(leading_cell(case)) if linear else None
-        analysis = analyse(run, measures, arrival, options_of(run, folder, overrides))
+        analysis = analyse(run, measures, arrival, options_of(run.attrs["case"], folder, overrides))
         write_netcdf(folder / "analysis.h5", analysis.assign_attrs(origin() | analysis.attrs))
     _put_into_summary(folder / "summary.json", numbers_of(analysis))
     return folder / "analysis.h5"
@@ -154,14 +154,15 @@ def numbers_of(analysis: xr.Dataset) -> dict[str, float | list[float]]:
 
 def is_measured(folder: Path) -> bool:
     """Whether ``folder/analysis.h5`` was measured by this version from ``run.h5`` as it is; raises as ``open_run``."""
-    with open_run(folder / "run.h5") as run:
-        expected = {
-            "case": run.attrs.get("case"),
-            "status": run.attrs.get("status"),
-            "vipetsc_version": vipetsc.__version__,
-            "analysis": describe_options(options_of(run, folder)),
-        }
-        # One that is not there or was cut off raises OSError.
-        with suppress(OSError), open_netcdf(folder / "analysis.h5", "analysis") as analysis:
-            return all(analysis.attrs.get(key) == value for key, value in expected.items())
+    run = root_attributes(folder / "run.h5", "run", RUN_NEEDS)
+    expected = {
+        "case": run["case"],
+        "status": run.get("status"),
+        "vipetsc_version": vipetsc.__version__,
+        "analysis": describe_options(options_of(run["case"], folder)),
+    }
+    # One that is not there or was cut off raises OSError.
+    with suppress(OSError):
+        analysis = root_attributes(folder / "analysis.h5", "analysis")
+        return all(analysis.get(key) == value for key, value in expected.items())
     return False

@@ -17,9 +17,9 @@ from vipetsc.io.read import field_interval, field_time, leading_site
 from vipetsc.lattice import pass_bands
 
 
-def options_of(run: xr.Dataset, folder: Path | None = None, overrides: Iterable[str] = ()) -> AnalysisTable:
-    """Options ``[analysis]`` of a ``run``, from the case in its ``folder`` if there is one, with ``overrides``."""
-    table = tomllib.loads(run.attrs["case"])
+def options_of(case: str, folder: Path | None = None, overrides: Iterable[str] = ()) -> AnalysisTable:
+    """Options ``[analysis]`` of a ``case`` (TOML), or of the one in the run's ``folder`` if given, with ``overrides``."""
+    table = tomllib.loads(case)
     if folder and (folder / "case.toml").exists():
         # The user may have changed [analysis] there since the run.
         table = read_toml(folder / "case.toml")
