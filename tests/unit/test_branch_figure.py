@@ -1,6 +1,9 @@
 """The curve of a branch, and which of its states are drawn as the lowest of their energy."""
 
+import errno
 from pathlib import Path
+
+from mpi4py import MPI
 
 import numpy as np
 import pytest
@@ -8,6 +11,8 @@ import xarray as xr
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
+from vipetsc.cli.drawing import draw_pictures
+from vipetsc.cli.verbs.branch_verbs import PICTURES
 from vipetsc.figures import branch_curves, nfrc, registry, style
 from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures
@@ -147,3 +152,16 @@ def test_a_branch_without_points_is_no_file(tmp_path):
     put_condensed_branch(tmp_path / "branch-begun.h5", 3)
     assert [path.name for path in registry.draw(registry.BRANCHES, [tmp_path])] == ["branch-begun.png"]
     assert list(reasons_without_pictures(registry.BRANCHES, [tmp_path], Files())) == ["branch-empty"]
+
+
+def test_a_full_disk_is_no_error_of_the_branch_that_is_drawn(tmp_path, monkeypatch):
+    """The file can be read: that the picture cannot be written must not be reported as bad input."""
+    put_condensed_branch(tmp_path / "branch-begun.h5", 3)
+
+    def fail(*arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(style, "_print", fail)
+    with pytest.raises(OSError, match="No space left") as raised:
+        draw_pictures(PICTURES, [tmp_path], MPI.COMM_WORLD)
+    assert not isinstance(raised.value, ValueError)

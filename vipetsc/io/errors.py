@@ -1,5 +1,9 @@
 """Errors about folders and files of results."""
 
+import errno
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # of an OSError after which nothing else can be written either
+
 
 class FolderError(ValueError):
     """An output folder that cannot be used as requested."""

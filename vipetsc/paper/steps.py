@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 from mpi4py import MPI
 
+from vipetsc.io.errors import DISK_FULL
 from vipetsc.paper.build_record import read_record, write_record
 from vipetsc.paper.plan import STALE, PaperStep, PartMaker, Plan
 from vipetsc.parallel import StoppedError, StopRequest, on_root
-from vipetsc.studies.pool import DISK_FULL, TaskPool
+from vipetsc.studies.pool import TaskPool
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """Jobs done by teams of ranks: a single job may fail; a request to stop or a full disk ends all jobs."""
 
-import errno
 import sys
 import time
 from collections.abc import Callable, Hashable, Sequence
@@ -9,10 +8,10 @@ from typing import NamedTuple, TypeVar
 
 from mpi4py import MPI
 
+from vipetsc.io.errors import DISK_FULL
 from vipetsc.parallel import SharedCounter, StoppedError, StopRequest, on_root, wait_for_all
 from vipetsc.progress import Progress
 
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # no other job's result could be written either
 BLOCKS = 100  # that each team draws, at least, so that none waits long for the last
 PATIENCE = 5.0  # s that a rank whose job failed waits for the rest of its team to have failed as well
 

@@ -18,7 +18,7 @@ from vipetsc.lattice import pass_bands
 
 
 def options_of(case: str, folder: Path | None = None, overrides: Iterable[str] = ()) -> AnalysisTable:
-    """Options ``[analysis]`` of a ``case`` (TOML), or of the one in the run's ``folder`` if given, with ``overrides``."""
+    """Options ``[analysis]`` of a ``case`` (TOML), or of the case in the run's ``folder``, with ``overrides``."""
     table = tomllib.loads(case)
     if folder and (folder / "case.toml").exists():
         # The user may have changed [analysis] there since the run.
