@@ -117,11 +117,18 @@ def case_files(text: str) -> str:
 
 
 def notebook_page(path: Path) -> str:
-    """The cells of a notebook as a page: text as it stands, code in blocks."""
+    """The cells of a notebook as a page: text, code in blocks, and the picture of each cell that draws one."""
     parts = []
-    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+    for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
         text = "".join(cell["source"])
-        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+        if cell["cell_type"] == "markdown":
+            parts.append(text)
+            continue
+
+        parts.append(f"```python\n{text}\n```")
+        picture = f"pictures/notebook-{path.stem}-{number}.png"
+        if (CHAPTERS / picture).exists():
+            parts.append(f"![the picture of this cell]({picture})")
     return "\n\n".join(parts) + "\n"
 
 

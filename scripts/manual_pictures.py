@@ -1,19 +1,25 @@
-"""The pictures of the chapters theory and read-pictures, drawn by the package and made small.
+"""The pictures of the chapters theory and read-pictures and of the notebooks, drawn by the package and made small.
 
     python scripts/manual_pictures.py [--folder FOLDER]
 
-The built-in run and a sweep over two keys are made in ``FOLDER``, by default a temporary one: a minute of CPU.
+The built-in run, a sweep over two keys and the notebooks are run in ``FOLDER``, by default a temporary one: two minutes
+of CPU.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import json
+import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
 from matplotlib.colors import to_hex
@@ -30,6 +36,7 @@ from vipetsc.io.read import open_run
 from vipetsc.lattice import Contact
 
 PICTURES = ROOT / "vipetsc/manual/pictures"
+NOTEBOOKS = ROOT / "vipetsc/manual/notebooks"
 WIDTH = 760  # pixels
 COLOURS = 255
 MOST = 60_000  # bytes
@@ -163,6 +170,22 @@ def drawn(folder: Path, draw: Callable[[], Figure]) -> Image.Image:
     return Image.open(path)
 
 
+def draw_notebook(notebook: Path, folder: Path) -> None:
+    """Run the cells of a ``notebook`` in ``folder``, and save the picture of each cell that draws one."""
+    names: dict[str, object] = {"__name__": "__main__"}
+    with contextlib.chdir(folder), mpl.rc_context({"backend": "agg"}), open(os.devnull, "w") as nowhere:
+        for number, cell in enumerate(json.loads(notebook.read_text(encoding="utf-8"))["cells"]):
+            if cell["cell_type"] != "code":
+                continue
+
+            with contextlib.redirect_stdout(nowhere):
+                exec(compile("".join(cell["source"]), f"{notebook.name}, cell {number}", "exec"), names)
+            if plt.get_fignums():
+                plt.savefig("cell.png", dpi=style.SCREEN)
+                plt.close("all")
+                save_small(Image.open("cell.png"), PICTURES / f"notebook-{notebook.stem}-{number}.png")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Make the runs, draw, and write the pictures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -180,6 +203,8 @@ def main(arguments: list[str] | None = None) -> int:
         with open_run(folder / "four-band/run.h5") as run:
             save_small(drawn(folder, lambda: named_cell(run)), PICTURES / "cell.png")
             save_small(drawn(folder, lambda: contact_law(Case.of(run))), PICTURES / "contact-law.png")
+        for notebook in sorted(NOTEBOOKS.glob("*.ipynb")):
+            draw_notebook(notebook, folder)
     return 0
 
 

@@ -9,13 +9,13 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, NamedTuple, Self, TypeVar, cast
+from typing import Any, NamedTuple, NoReturn, Self, TypeVar, cast
 
 from mpi4py import MPI
 
 import numpy as np
 
-from vipetsc.process import STOP_SIGNALS
+from vipetsc.process import STOP_SIGNALS, end_now
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
@@ -107,7 +107,17 @@ def _attempt(function: Callable[[], T]) -> _Attempt:
     try:
         return _Attempt(value=function(), error=None)
     except Exception as error:
+        if _comes_of_an_end(error):
+            raise EndedError from None
         return _Attempt(value=None, error=error)
+
+
+def _comes_of_an_end(error: BaseException) -> bool:
+    """Whether a library raised ``error`` while EndedError left it halfway."""
+    cause = error.__context__
+    while cause and not isinstance(cause, EndedError):
+        cause = cause.__context__
+    return cause is not None
 
 
 def _value_or_raise(attempt: _Attempt) -> Any:
@@ -183,6 +193,10 @@ class EndedError(BaseException):
     """
 
 
+def _say_nothing(*error: Any) -> None:
+    """Hook for errors that are not reported."""
+
+
 class StopRequest:
     """A request to stop, by a signal: ``requested`` once this rank has got one.
 
@@ -192,6 +206,7 @@ class StopRequest:
 
     requested = False
     _ends_at_once = False
+    _GRACE = 2  # s in which EndedError has to get out of the work
 
     def agreed(self, comm: MPI.Comm) -> bool:
         """Whether any rank of ``comm`` got a request; all must call it."""
@@ -208,6 +223,7 @@ class StopRequest:
         # A verb that has nothing to save at all may hold such a block within its own.
         outside = self._ends_at_once
         self._ends_at_once = True
+        hooks = sys.excepthook, sys.unraisablehook
         try:
             if self.requested:
                 raise EndedError
@@ -219,6 +235,18 @@ class StopRequest:
             raise
         finally:
             self._ends_at_once = outside
+            if self.requested:
+                signal.alarm(0)
+                sys.excepthook, sys.unraisablehook = hooks
+
+    def _leave(self) -> NoReturn:
+        """Raise EndedError where the work is; end the process if the exception does not get out of the work in time."""
+        # A destructor swallows the exception. It is reported to one of these, or an error of the destructor's own is
+        # (h5py's), which nobody wants to read after a request to stop.
+        sys.excepthook = sys.unraisablehook = _say_nothing
+        signal.signal(signal.SIGALRM, end_now)
+        signal.alarm(self._GRACE)
+        raise EndedError
 
     @contextmanager
     def listening(self) -> Iterator[Self]:
@@ -234,7 +262,7 @@ class StopRequest:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, earlier)
 
             if self._ends_at_once:
-                raise EndedError
+                self._leave()
 
         # What nohup has set stays.
         taken = [number for number in STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]

@@ -44,10 +44,11 @@ def end_on_request() -> None:
     for number in STOP_SIGNALS:
         # What nohup has set stays.
         if signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, _end)
+            signal.signal(number, end_now)
 
 
-def _end(number: int, frame: FrameType | None) -> None:
+def end_now(number: int, frame: FrameType | None) -> None:
+    """Handle a signal by ending the process with exit code 75."""
     # A launcher sends the signal to all ranks, when one of them was killed as well: it is the one to say what happened.
     if launched_rank() is None:
         os.write(2, b"vipetsc: stopped on request\n")

@@ -44,6 +44,18 @@ def test_a_notebook_is_kept_without_what_it_printed(path):
         assert cell.get("execution_count") is None
 
 
+def test_the_manual_shows_what_each_cell_draws():
+    """Every cell that makes a figure has its picture in the manual, whose page of the notebook shows it."""
+    drawing = set()
+    for path in NOTEBOOKS:
+        for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
+            if cell["cell_type"] == "code" and "plt.subplots(" in "".join(cell["source"]):
+                drawing.add(f"notebook-{path.stem}-{number}")
+
+    assert drawing == {path.stem for path in (FOLDER.parent / "pictures").glob("notebook-*.png")}
+    assert len(drawing) == len(NOTEBOOKS)
+
+
 def execute(path: Path) -> dict[str, Any]:
     """Execute the cells in one namespace, which is returned; a value at the end of a cell is shown as in a notebook."""
     names: dict[str, Any] = {"__name__": "__main__"}

@@ -4,9 +4,12 @@ import signal
 import subprocess
 import sys
 
+from mpi4py import MPI
+
 import pytest
 
-from vipetsc.parallel import STOP_SIGNALS, EndedError, StopRequest
+from tests.conftest import clean_environment
+from vipetsc.parallel import STOP_SIGNALS, EndedError, StopRequest, on_every_rank, on_root
 
 
 @pytest.fixture(autouse=True)
@@ -75,6 +78,46 @@ def test_an_error_that_the_end_of_such_work_causes_is_not_reported():
             signal.raise_signal(signal.SIGUSR1)
         finally:
             raise KeyError(0)
+
+
+@pytest.mark.parametrize("agree", [on_root, on_every_rank])
+def test_an_error_that_the_end_of_such_work_causes_is_no_error_of_all_ranks(agree):
+    """Ranks that agree on errors do not agree on this one: it would be raised on those that go on."""
+
+    def work() -> None:
+        try:
+            raise EndedError
+        finally:
+            raise KeyError(0)
+
+    with pytest.raises(EndedError):
+        agree(MPI.COMM_SELF, work)
+
+
+# The first signal comes in a destructor, where Python swallows exceptions; the work goes on after it.
+ENDS_IN_A_DESTRUCTOR = """
+import signal, sys, time, vipetsc.parallel as p
+
+class Handle:
+    def __del__(self):
+        signal.raise_signal(signal.SIGTERM)
+        print("the destructor went on")
+
+with p.StopRequest().listening() as stop, stop.at_once():
+    handle = Handle()
+    del handle
+    time.sleep(30)
+"""
+
+
+@pytest.mark.slow
+def test_a_signal_in_a_destructor_ends_such_work_without_a_trace():
+    """The exception that should end the work is lost there; the process ends in a moment all the same."""
+    script = [sys.executable, "-c", ENDS_IN_A_DESTRUCTOR]
+    ended = subprocess.run(script, capture_output=True, text=True, timeout=25, env=clean_environment(), check=False)
+
+    assert (ended.returncode, ended.stdout) == (75, "")
+    assert ended.stderr == "vipetsc: stopped on request\n"
 
 
 def test_errors_of_such_work_are_reported_where_nobody_asked_to_stop():
