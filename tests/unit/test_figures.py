@@ -259,8 +259,8 @@ def test_a_misspelt_figure_is_refused_with_the_nearest_name(tmp_path):
 
 
 def test_a_figure_that_branches_do_not_have_is_refused():
-    with pytest.raises(KeyError, match="no figure 'foo' of branches; did you mean 'branch'"):
-        figure_names(BRANCHES, ["foo"])
+    with pytest.raises(KeyError, match="no figure 'brunch' of branches; did you mean 'branch'"):
+        figure_names(BRANCHES, ["brunch"])
 
 
 def test_a_file_that_is_no_run_is_not_measured(tmp_path):

@@ -19,6 +19,7 @@ from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures.registry import draw
 from vipetsc.figures.response_family import legend_of
+from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.response_layout import measure
@@ -84,7 +85,7 @@ def test_a_folder_with_one_curve_has_no_common_picture(family, tmp_path):
     single = sorted(folder.glob("branch-*.h5"))[0]
     (tmp_path / single.name).write_bytes(single.read_bytes())
     assert [path.stem for path in draw("branches", [tmp_path])] == [single.stem]
-    reasons = reasons_without_pictures("branches", [tmp_path], ["responses"])
+    reasons = reasons_without_pictures("branches", [tmp_path], Files(), ["responses"])
     assert reasons == {"responses": "needs several curves of nfrc"}
 
 

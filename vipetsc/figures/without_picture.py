@@ -31,9 +31,9 @@ def reasons_without_pictures(
 ) -> dict[str, str]:
     """Return why figures of what the ``folders`` hold are not drawn, by name; of branches by the names of their files.
 
-    Results are opened as ``files``, which those who draw them afterwards can use too.
     They are those in ``names``, by default all; of sweeps by default measures, and what lays branches over them where
-    ``folders`` hold any. Raises KeyError as ``figure_names``.
+    ``folders`` hold any. Results are opened as ``files``, open for those who draw them. Raises KeyError as
+    ``figure_names``.
     """
     if source == SWEEP:
         return _reasons_of_sweeps(folders, files, names)
