@@ -28,7 +28,7 @@ import numpy as np
 
 import vipetsc
 from vipetsc.io.atomic import discard, write_text
-from vipetsc.io.lock import LOCK, FolderError, locked
+from vipetsc.io.lock import FolderError, locked, remove_temporary_files
 from vipetsc.io.names import readable
 from vipetsc.parallel import on_root
 
@@ -160,7 +160,7 @@ def _claim(
 
     if not going_on or _text_of(folder / kind.marker) != text:
         write_text(folder / kind.marker, text)
-    _remove_temporary_files(folder)
+    remove_temporary_files(folder)
     return folder, going_on
 
 
@@ -169,14 +169,6 @@ def _holds_another_kind(path: Path, kind: FolderKind) -> bool:
     patterns = [pattern for other in KINDS if other is not kind for pattern in other.results]
     matches = [folder.glob(pattern) for folder in (path, path / READY, path / MOVING) for pattern in patterns]
     return any(any(files) for files in matches)
-
-
-def _remove_temporary_files(folder: Path) -> None:
-    """Remove temporary files of a killed command from ``folder`` and from the folders of its members."""
-    for temporary in [*folder.glob(".*.part"), *folder.glob("*/.*.part")]:
-        # Another command may work on a member: its lock is in the member's folder.
-        if temporary.parent == folder or not (temporary.parent / LOCK).exists():
-            temporary.unlink(missing_ok=True)
 
 
 def _results(folder: Path) -> list[Path]:

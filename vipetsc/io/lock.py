@@ -50,10 +50,8 @@ def _lock(path: Path) -> Iterator[None]:
     descriptor = None
     try:
         descriptor = _acquire(path, created)
-        # Files of commands that were killed while they wrote; nobody else writes here now.
         if descriptor is not None:
-            for leftover in path.glob(".*.part"):
-                leftover.unlink(missing_ok=True)
+            remove_temporary_files(path)
         yield
     finally:
         # Removed while it is still locked: one that opens it from here on finds another file, and tries again.
@@ -63,6 +61,14 @@ def _lock(path: Path) -> Iterator[None]:
         for folder in created:
             with suppress(OSError):
                 folder.rmdir()
+
+
+def remove_temporary_files(folder: Path) -> None:
+    """Remove temporary files of commands that were killed while they wrote into ``folder`` or the folders in it."""
+    for temporary in [*folder.glob(".*.part"), *folder.glob("*/.*.part")]:
+        # Another command may work on the member of a sweep: its lock is in the member's folder.
+        if temporary.parent == folder or not (temporary.parent / LOCK).exists():
+            temporary.unlink(missing_ok=True)
 
 
 def _acquire(path: Path, created: list[Path]) -> int | None:
