@@ -2,7 +2,10 @@
 
 import errno
 import os
+import platform
 import resource
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +16,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from vipetsc.figures.style import save
-from vipetsc.io.atomic import atomic_write, load_arrays, save_arrays, write_text
+from vipetsc.io.atomic import atomic_write, load_arrays, remove_abandoned, save_arrays, write_text
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 
@@ -53,6 +56,24 @@ def test_a_full_disk_leaves_the_earlier_file_and_names_it(tmp_path, name, limit)
     assert path.read_text() == "earlier"
     # HDF5 crashes later if a file that it could not flush stays open.
     WRITERS[name](path)
+
+
+def test_only_temporary_files_of_processes_that_have_ended_are_removed(tmp_path, monkeypatch):
+    """A folder that is not locked may hold files that another command, here or on another host, is writing."""
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    monkeypatch.setattr(os, "getpid", lambda: ended.pid)
+    # Left as by a kill: the block is not left.
+    abandoned = atomic_write(tmp_path / "a.png").__enter__()
+    monkeypatch.setattr(platform, "node", lambda: "elsewhere")
+    elsewhere = atomic_write(tmp_path / "a.png").__enter__()
+    monkeypatch.undo()
+    written = atomic_write(tmp_path / "a.png").__enter__()
+    for path in (abandoned, elsewhere, written):
+        path.touch()
+
+    remove_abandoned(tmp_path)
+    assert {*tmp_path.iterdir()} == {elsewhere, written}
 
 
 def test_temporary_names_are_not_those_of_another_host_process_or_call(tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """Files that are complete or absent: written under a temporary name, and renamed when complete."""
 
+import glob
 import os
 import platform
 import re
@@ -34,6 +35,29 @@ def atomic_write(path: Path) -> Iterator[Path]:
         raise unwritten(path, error) from error
     finally:
         aside.unlink(missing_ok=True)
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove temporary files of ``atomic_write`` from ``folder`` whose processes on this host have ended.
+
+    For commands that hold no lock on the folder, so that others may write there at the same time.
+    """
+    here = platform.node()
+    for path in folder.glob(f".*.{glob.escape(here)}-*.part"):
+        process = path.name.rpartition(f".{here}-")[2].partition("-")[0]
+        if process.isdigit() and not _is_running(int(process)):
+            path.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    """Whether there is a ``process`` of that number on this host."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass  # another user's
+    return True
 
 
 def unwritten(path: Path, error: Exception) -> OSError:

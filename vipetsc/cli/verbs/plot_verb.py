@@ -13,6 +13,7 @@ from vipetsc.cli.arguments import Argument, argument
 from vipetsc.cli.drawing import Pictures, draw_pictures, prepare
 from vipetsc.cli.messages import echo, echo_paths
 from vipetsc.cli.verb import DONE, PlainVerb
+from vipetsc.io.atomic import remove_abandoned
 from vipetsc.io.folder import FolderError
 from vipetsc.parallel import StopRequest, on_root
 
@@ -58,6 +59,8 @@ OF_MOVIES: dict[str, Argument] = {
 def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
     """Draw the pictures of result folders again, or render a movie of a run."""
     pictures, folders = on_root(comm, lambda: pictures_of(options.path))
+    # A folder can be plotted while another command works in it, and is therefore not locked.
+    on_root(comm, lambda: remove_abandoned(folders[0] / "figures"))
     formats = set(options.format or ())
     of_movie = {name: getattr(options, name) for name in OF_MOVIES if getattr(options, name) is not None}
 
