@@ -31,16 +31,14 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 import vipetsc
-from vipetsc.case.keys import chapter as all_keys
-from vipetsc.cli.chapters import parts
+from vipetsc.cli.chapters import WRITTEN, chapter, parts
 
 PACKAGE = ROOT / "vipetsc"
 CHAPTERS = PACKAGE / "manual"
 GALLERY = CHAPTERS / "gallery"
 NOTEBOOKS = CHAPTERS / "notebooks"
-# Pages that no file of the manual holds: the README, and those that are written from the sources.
+# Pages that are no chapters: the README, and the interface.
 START = "start"
-KEYS = "case-keys"
 API = "api"
 MATHJAX = "tex-svg.js"  # its letters are curves, so that it needs no font either
 STYLE = "manual.css"
@@ -78,7 +76,8 @@ def write_sources(folder: Path, packages: list[str]) -> None:
     put(folder / "index.md", index + tables, CHAPTERS)
     start = (ROOT / "README.md").read_text(encoding="utf-8")
     put(folder / f"{START}.md", start.replace("# vipetsc", "# Get going", 1), ROOT)
-    put(folder / f"{KEYS}.md", all_keys(), CHAPTERS)
+    for name in WRITTEN:
+        put(folder / f"{name}.md", chapter(name), CHAPTERS)
     for name in (path.stem for path in CHAPTERS.glob("*.md") if path.stem != "index"):
         text = (CHAPTERS / f"{name}.md").read_text(encoding="utf-8")
         if name == GALLERY.name:

@@ -274,7 +274,7 @@ def test_a_module_that_fails_halfway_leaves_no_parts(tmp_path):
         ("drive.parameters=", 'drive.parameters.delay: missing; needed for the waveform "ricker"'),
         ("drive.waveform=harmonic", "drive.parameters: does not apply to the waveform 'harmonic'"),
         ("drive.duration=1.0", "drive.duration: does not apply to the waveform 'ricker'"),
-        ("nfrc.range=[0.5,2.0]", "accepts only one burst or harmonic"),
+        ("nfrc.range=[0.5,2.0]", "a steady state repeats itself under a sine"),
     ],
 )
 def test_keys_of_parts_are_checked(folder, change, sentence):

@@ -109,7 +109,7 @@ def test_a_restitution_is_warned_of():
         ({"contacts": {"clearance_minus": 2e-3}}, r"contacts\.clearance_minus"),
         ({"contacts": {"each": {"law": ["bilinear"]}}}, r"contacts\.each"),
         ({"contacts": {"next_cell": True}}, r"contacts\.next_cell"),
-        ({"lattice": {"damping": {"mass": 1.0}}}, "without dashpots"),
+        ({"lattice": {"damping": {"mass": 1.0}}}, "none does with dashpots"),
         ({"lattice": {"absorbing": {"cells": 2, "strength": 1.0}}}, r"lattice\.absorbing"),
         ({"disorder": {"seed": 1, "cells": {"masses": {"relative": 0.01}}}}, "disorder"),
     ],

@@ -109,6 +109,6 @@ def test_lossy_sites_at_rest_are_refused_next_to_struck_ones():
 def test_verbs_about_waves_refuse_it():
     """A law is about a wave in a lattice at rest."""
     with pytest.raises(
-        CaseError, match=r"initial\.kind = 'velocity': this verb treats a wave in a lattice that starts at rest"
+        CaseError, match=r"initial\.kind = 'velocity': the law's fractions .* in a lattice that starts at rest"
     ):
         LawCase.from_table({"initial": {"kind": "velocity", "cell": 1, "velocity": 1.0}, "law": {}})

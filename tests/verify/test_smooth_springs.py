@@ -134,6 +134,6 @@ def test_the_frequency_depends_on_the_amplitude_as_the_closed_form():
     assert np.diff(zeros).mean() == pytest.approx(period, rel=1e-8)
 
 
-def test_verbs_of_linear_springs_refuse_others():
-    with pytest.raises(CaseError, match=r"lattice\.cell\.springs.*linear springs"):
+def test_a_scattering_law_refuses_springs_that_are_not_linear():
+    with pytest.raises(CaseError, match=r"lattice\.cell\.springs: waves in springs that are not linear"):
         LawCase.from_table({"lattice": {"cell": CELL}, "law": {}, "drive": {"frequency": 500.0}})

@@ -15,7 +15,7 @@ from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, rea
 from vipetsc.case.contacts import check_pairs, check_touching, contact_of, gaps_of_sites, laws_of_sites, values_of_sites
 from vipetsc.case.disorder import SEED, DisorderTable, scatter
 from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_speed
-from vipetsc.case.features import FEATURES, refusals
+from vipetsc.case.features import refusals
 from vipetsc.case.html import case_html
 from vipetsc.case.inhomogeneity import check_inhomogeneity
 from vipetsc.case.initial import Beginning, InitialTable, beginning_of, check_initial
@@ -59,7 +59,6 @@ class Case(CaseFile):
     petsc: PetscTable | None = None
 
     verb = "run"
-    takes = FEATURES
     builtin_table: ClassVar[Table] = {"name": "four-band", "lattice": {"preset": "four-band"}}
 
     @classmethod

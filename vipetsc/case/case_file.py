@@ -63,9 +63,9 @@ AnySection = TypeVar("AnySection", bound=Section)
 class CaseFile(Section):
     """Case of a verb as its file gives it: a ``name`` and the sections that a subclass declares as its fields.
 
-    A subclass names its ``verb`` and the ``section`` that only this verb reads ("" for ``run``), and the features of
-    a lattice run it ``takes`` (``vipetsc.case.features``); ``waveforms`` are the drives that it takes, () for all, and
-    ``premise`` begins the message that refuses another lattice. Its hooks: ``check`` finds problems between valid
+    A subclass names its ``verb`` and the ``section`` that only this verb reads ("" for ``run``), and gives in
+    ``refuses`` the reason for every feature of a lattice run that it does not accept (``vipetsc.case.features``);
+    ``waveforms`` are the drives that it accepts if it refuses others. Its hooks: ``check`` finds problems between valid
     keys; ``read`` may fill in the table before its sections are read, and resolve them afterwards. ``builtin_table`` is
     the case without a file, if there is one.
     """
@@ -75,9 +75,8 @@ class CaseFile(Section):
 
     verb: ClassVar[str] = ""
     section: ClassVar[str] = ""
-    takes: ClassVar[frozenset[str]] = frozenset()
+    refuses: ClassVar[Mapping[str, str]] = {}
     waveforms: ClassVar[tuple[str, ...]] = ()
-    premise: ClassVar[str] = ""
     builtin_table: ClassVar[Table] = {}
 
     def __init__(self, **sections: Any) -> None:

@@ -18,6 +18,7 @@ from vipetsc.lattice.contact import PARAMETERS, least_restitution, registered_la
 MATERIAL = ("modulus", "radius", "poisson")
 SIDES = ("side", "clearance_minus", "precompression")
 JOINS = ("pair", "next_cell")
+NO_APPROACH = "a precompressed contact has no approach velocity: its restitution must be 1"
 Gaps = tuple[tuple[float, float], ...]
 
 
@@ -141,8 +142,7 @@ def _check_stops(contacts: ContactsTable, gaps: list[float]) -> Iterator[Problem
             yield Problem(_path_of(contacts, "precompression"), precompressions[number - 1], remedy)
             return
         if min(plus, minus) < 0 and restitutions[number - 1] < 1:
-            remedy = "a precompressed contact has no approach velocity: its restitution must be 1"
-            yield Problem(_path_of(contacts, "precompression"), -min(plus, minus), f"site {number}: {remedy}")
+            yield Problem(_path_of(contacts, "precompression"), -min(plus, minus), f"site {number}: {NO_APPROACH}")
             return
 
 

@@ -22,6 +22,7 @@ from vipetsc.lattice.contact import PARAMETERS, registered_law
 from vipetsc.plugins import only
 from vipetsc.register import LAW, PARTS, WAVEFORM, Parameter
 
+TITLE = "Every key of a case file"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 INDEX = re.compile(r"\[\d+\]")  # of an entry of a list in a path
 Schema = dict[str, Any]
@@ -132,7 +133,7 @@ def chapter() -> str:
     """The manual's chapter with a table of the keys of every section, those of tables within it below it."""
     schema = json_schema()
     lines = [
-        "# Every key of a case file",
+        f"# {TITLE}",
         "",
         "The program checks case files by this list, and `vipetsc schema` passes it to editors. Keys without a",
         "default are optional, except those marked as required. Masses, cells, sites and bands are numbered from 1.",

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -68,9 +68,20 @@ class LawCase(Case):
     law: LawTable
 
     verb = section = "law"
-    takes = frozenset({"disorder", "rings"})
+    refuses: ClassVar[Mapping[str, str]] = {
+        "damping": "not yet: what dashpots take on the way would count as lost at the site",
+        "nonlinear springs": "waves in springs that are not linear depend on their amplitude without any contact too",
+        "profiles": "the law compares the waves that arrive at a site and leave it, in equal cells",
+        "scatter": "the law compares the waves that arrive at a site and leave it, in equal cells",
+        "absorbing ends": "the runs of a law end before waves return, so that nothing has to absorb them",
+        "unlike sites": "not yet: the law is computed for one law of contact and equal stops on both sides",
+        "touching stops": "the law is one of amplitude over clearance, which has no value without a clearance",
+        "initial motion": "the law's fractions are of the work of the drive, in a lattice that starts at rest",
+        "many drives": "the law is that of one wave",
+        "moved wall": "the runs of a law have a ring of cells, in which there is no wall",
+        "other waveforms": "the law is that of a wave of one frequency that ends, which a burst is",
+    }
     waveforms = ("burst",)
-    premise = "a scattering law is computed only for lattices"
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:

@@ -1,7 +1,7 @@
 """The case of the verb ``nfrc``: the lattice, contacts and drive of a run, and ``[nfrc]``."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Problem, Section, Table, Valid
-from vipetsc.case.contacts import gaps_of_sites
+from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites
 from vipetsc.case.family import FamilyMember, family_of
 from vipetsc.case.names import distinct
 from vipetsc.case.resolve import build_chain, check_stiffness
@@ -88,9 +88,13 @@ class NfrcCase(Case):
 
     verb = section = "nfrc"
     kept_by_resume: ClassVar[str] = "the case with which its curves were started, except nfrc.points"
-    takes = frozenset({"disorder", "rings", "damping", "inhomogeneity", "absorbing ends", "unlike sites", "moved wall"})
+    refuses: ClassVar[Mapping[str, str]] = {
+        "nonlinear springs": "not yet: the harmonics of steady states are balanced for linear springs",
+        "initial motion": "a curve has all steady states, whatever the motion at t = 0",
+        "many drives": "not yet: steady states are computed for one force or one moved wall",
+        "other waveforms": "a steady state repeats itself under a sine, that of a harmonic drive or of a burst",
+    }
     waveforms = ("burst", "harmonic")
-    premise = "steady states are computed only for lattices"
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -152,6 +156,9 @@ class NfrcCase(Case):
             yield Problem("nfrc.range", nfrc.range, "must be [low, high]")
         if nfrc.source == "wave" and nfrc.infinite is False:
             yield Problem("nfrc.infinite", False, "an incident wave needs an infinite lattice; omit it")
+        if nfrc.source == "wave" and valid("drive") and sections["drive"].end:
+            remedy = 'a wave that comes from far away is moved by no wall; omit it, or nfrc.source = "force"'
+            yield Problem("drive.end", sections["drive"].end, remedy)
         if nfrc.over == "frequency" and not nfrc.fixed:
             yield Problem("nfrc.fixed", [], "give the amplitudes of the curves over frequency")
         if not nfrc.smallest_step < nfrc.largest_step:
@@ -238,8 +245,7 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     stops = gaps or [(clearance, clearance) for clearance in chain.clearances]
     smallest = min(min(gap) for gap in stops)
     if smallest < 0 and any(restitution < 1 for restitution in nfrc.restitutions):
-        remedy = "a contact that is pressed together has no approach velocity: its restitution must be 1"
-        yield Problem("nfrc.restitutions", nfrc.restitutions, remedy)
+        yield Problem("nfrc.restitutions", nfrc.restitutions, NO_APPROACH)
     if any(0 in gap for gap in stops):
         remedy = "curves begin with a state without contact, and such a stop is touched at every amplitude"
         yield Problem("contacts.clearance", 0.0, f"{remedy}; give a clearance or a precompression")
@@ -249,7 +255,7 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     if not needs_modes(chain):
         return
 
-    reason = "contacts join other masses than the cell's pair"
+    reason = "not yet: in an infinite lattice contacts join the pair of masses that the cell names"
     if chain.is_damped:
         reason = "in a lattice with dashpots a wave from far away has decayed before it arrives"
     elif not chain.is_uniform():

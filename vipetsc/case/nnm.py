@@ -3,7 +3,7 @@
 The system itself is built by ``vipetsc.modes.system.System.from_case``.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
@@ -153,8 +153,16 @@ class NnmCase(CaseFile):
 
     verb = section = "nnm"
     kept_by_resume: ClassVar[str] = "the system, map and flow with which its branches were started"
-    takes = frozenset({"rings"})
-    premise = "normal modes are computed only for lattices"
+    refuses: ClassVar[Mapping[str, str]] = {
+        "damping": "a normal mode is a free motion that repeats itself, and none does with dashpots",
+        "nonlinear springs": "not yet: only the systems of [nnm.own] have springs that are not linear",
+        "profiles": "not yet: normal modes are computed for identical cells",
+        "scatter": "not yet: normal modes are computed for identical cells",
+        "absorbing ends": "absorbing ends are dashpots, with which no free motion repeats itself",
+        "unlike sites": "not yet: normal modes are computed for one law and equal stops on both sides",
+        "touching stops": "branches begin with linear motions within the clearance, and without one there are none",
+        "disorder": "not yet: normal modes are computed for identical cells and sites",
+    }
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:

@@ -1,9 +1,9 @@
 """The case of the verb ``optimise``: the variables with their bounds, the objectives and the constraints."""
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import tomli_w
@@ -94,7 +94,16 @@ class OptimiseCase(CaseFile):
     base: Case
 
     verb = section = "optimise"
-    takes = Case.takes - {"unlike sites", "initial motion"}
+    refuses: ClassVar[Mapping[str, str]] = {
+        "unlike sites": "not yet: designs have one law for all sites and equal stops on both sides",
+        "touching stops": "not yet: clearances of designs are searched by their logarithm, and 0 has none",
+        "initial motion": "not yet: designs are compared at amplitudes of the drive, and the lattice starts at rest",
+    }
+
+    @classmethod
+    def keywords(cls) -> Iterable[str]:
+        """The sections of a run, and that of the search."""
+        return (*Case.sections(), cls.section)
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:

@@ -1,7 +1,7 @@
 """The case of the verb ``predict``: a lattice run with its sites, and the amplitudes at which it is predicted."""
 
-from collections.abc import Iterator
-from typing import Annotated, Any
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
@@ -32,7 +32,12 @@ class PredictCase(LawCase):
     predict: PredictTable
 
     verb = section = "predict"
-    takes = LawCase.takes - {"rings"}
+    refuses: ClassVar[Mapping[str, str]] = {
+        **LawCase.refuses,
+        "absorbing ends": "not yet: the wave between sites is followed in equal cells up to the ends",
+        "rings": "waves around a ring meet its sites again and again, and a prediction follows them once",
+        "moved wall": "not yet: the wave that a force on a mass sends is predicted",
+    }
 
     def warnings(self) -> list[str]:
         """Warnings about the waves of the prediction; its runs do not store fields."""

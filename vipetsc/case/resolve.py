@@ -207,8 +207,7 @@ def check_contacts(
     """Problems with the sites of a run that begins with the motion ``initial``, and with the law."""
     yield from check_sites(lattice, contacts)
     is_unplaced = isinstance(contacts.sites, int) and lattice.preset is None  # a count needs a preset to place it
-    has_stiffnesses = contacts.each and (contacts.each.stiffness or contacts.each.modulus)
-    yield from check_stiffness(contacts, bool(contacts.sites) and not is_unplaced and not has_stiffnesses, valid)
+    yield from check_stiffness(contacts, bool(contacts.sites) and not is_unplaced, valid)
 
     sites = [] if is_unplaced else site_cells(lattice, contacts)
     has_clearances = contacts.clearance is not None or lattice.preset is not None or not sites
@@ -225,7 +224,9 @@ def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> I
     missing = [key for key in material if key not in given]
     if contacts.stiffness is not None and given not in ([], ["radius"]):
         yield Problem("contacts.stiffness", contacts.stiffness, f"give it or {', '.join(given)}, not both")
-    if contacts.stiffness is None and missing and any_sites and valid(*(f"contacts.{key}" for key in material)):
+    has_stiffnesses = contacts.each and (contacts.each.stiffness or contacts.each.modulus)
+    is_needed = any_sites and contacts.stiffness is None and not has_stiffnesses
+    if is_needed and missing and valid(*(f"contacts.{key}" for key in material)):
         yield Problem("contacts.stiffness", None, f"missing; give it or also {', '.join(missing)}")
 
 

@@ -57,7 +57,6 @@ class Sweep(CaseFile):
     axes: tuple[Values, ...]
 
     verb = section = "sweep"
-    takes = Case.takes
 
     @classmethod
     def keywords(cls) -> Iterable[str]:

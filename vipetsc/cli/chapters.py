@@ -2,13 +2,15 @@
 
 import itertools
 import re
+from importlib import import_module
 from importlib.resources import files
 from textwrap import indent
 
 from vipetsc.cli.formulas import FormulaError, formula_text
 
 WIDEST = 40  # characters of a column, on average over all but the last; wider ones hold sentences
-KEYS = "case-keys"  # the chapter that is written from the schema
+# Chapters that no file holds, and the modules that write them.
+WRITTEN = {"case-keys": "vipetsc.case.keys", "features": "vipetsc.cli.feature_table"}
 # What no formula is in: blocks of code, and code in a paragraph.
 CODE = re.compile(r"(^```.*?^```$|`(?:[^`\n]|\n(?!\n))+`)", flags=re.M | re.S)
 
@@ -17,8 +19,8 @@ def parts() -> dict[str, list[str]]:
     """Names of the manual's chapters by part, as the headings and tables of its index list them."""
     sections = re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", chapter("index"), flags=re.M | re.S)
     listed = {title: re.findall(r"^\| \[[^]]*\]\(([\w-]+)\.md\)", text, flags=re.M) for title, text in sections}
-    # No file holds this chapter, and no index links to it.
-    listed["Reference"].append(KEYS)
+    # No file holds these chapters, and no index links to them.
+    listed["Reference"] += WRITTEN
     return {title: names for title, names in listed.items() if names}
 
 
@@ -28,12 +30,17 @@ def studies() -> list[str]:
 
 
 def chapter(name: str) -> str:
-    """The text of a chapter; the one of all keys is written from their schema."""
-    if name == KEYS:
-        from vipetsc.case.keys import chapter as all_keys
-
-        return all_keys()
+    """The text of a chapter, which a module may write."""
+    if name in WRITTEN:
+        return str(import_module(WRITTEN[name]).chapter())
     return (files("vipetsc") / "manual" / f"{name}.md").read_text(encoding="utf-8")
+
+
+def title(name: str) -> str:
+    """The title of a chapter."""
+    if name in WRITTEN:
+        return str(import_module(WRITTEN[name]).TITLE)
+    return chapter(name).partition("\n")[0].removeprefix("# ")
 
 
 def contents() -> str:
@@ -44,8 +51,7 @@ def contents() -> str:
     for part, names in listed.items():
         lines.append(part)
         for name in names:
-            title = chapter(name).partition("\n")[0].removeprefix("# ")
-            lines.append(f"  {name:<{width}}  {title}")
+            lines.append(f"  {name:<{width}}  {title(name)}")
     return "\n".join(lines)
 
 

@@ -47,7 +47,7 @@ def find_modes(case: Case, count: int, near: float, folder: Path, comm: MPI.Comm
     All ranks must call it. Raises CaseError if there are not so many, or SLEPc is missing.
     """
     chain = case.model().chain
-    _check(case, count, near)
+    check_modes(case, count, near)
     matrices = LatticeMatrices(chain, comm)
     modes = modes_near(matrices, count, near)
     # Freed here, on all ranks together: garbage collection would come on each rank at its own time.
@@ -78,7 +78,7 @@ def find_modes(case: Case, count: int, near: float, folder: Path, comm: MPI.Comm
     return written[0] if written else None
 
 
-def _check(case: Case, count: int, near: float) -> None:
+def check_modes(case: Case, count: int, near: float) -> None:
     """Raise CaseError if ``count`` modes near ``near`` cannot be found."""
     chain = case.model().chain
     gaps = case.model().gaps
@@ -86,9 +86,8 @@ def _check(case: Case, count: int, near: float) -> None:
     if not 1 <= count <= masses:
         raise CaseError([Problem("--modes", count, f"the lattice has {masses} modes")])
     if gaps and np.min(gaps) <= 0:
-        raise CaseError(
-            [Problem("contacts.clearance", None, "linear modes do not include contacts that touch at rest")]
-        )
+        remedy = "not yet: linear modes do not include contacts that touch or are pressed at rest"
+        raise CaseError([Problem("contacts.clearance", None, remedy)])
     if not 0 <= near < 1e50:
         raise CaseError([Problem("--near", near, "give a frequency in rad/s that is not negative")])
     if 8 * count * masses > GATHER_LIMIT:

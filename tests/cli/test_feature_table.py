@@ -1,0 +1,170 @@
+"""The manual's table of verbs and features: each yes is computed as a user would, each no is what the program says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import tomli_w
+
+from vipetsc.cli.feature_table import BASE, COLUMNS, FEATURES, UNREAD, YES, Column, Feature, answers, chapter, merged
+
+ANSWERS = answers()
+BY_HEADING = {column.heading: column for column in COLUMNS}
+PLAIN = next(feature for feature in FEATURES if feature.name == "burst")
+LATTICE = {"profiles of cells", "disorder of cells", "free ends", "ring"}
+ENDS = {"free ends", "ring"}
+# What a verb accepts and what does not change its results: linear modes have no contact, no drive and no dashpot; the
+# law's site is on a ring of cells; an infinite lattice has no ends, and the reduced model is one pair of masses; for
+# steady states a burst gives the frequency, as a harmonic drive does; the few points of branches touch a site or none.
+WITHOUT_INFLUENCE = {
+    "bands": {feature.name for feature in FEATURES} - LATTICE,
+    "law": ENDS,
+    "nfrc": {"harmonic"},
+    "wave": {"harmonic"} | ENDS,
+    "reduced": {"law of a plugin"} | ENDS,
+    "chain": {"unequal clearances", "law of a plugin"},
+    "own": {"law of a plugin"},
+    "condensed": {"unequal clearances"},
+}
+pytestmark = pytest.mark.slow
+
+
+def pairs(is_asked) -> list[Any]:
+    """The column and the feature of each answer that ``is_asked``."""
+    found = []
+    for feature in FEATURES:
+        for column, answer in zip(COLUMNS, ANSWERS[feature.name], strict=True):
+            if is_asked(answer):
+                found.append(pytest.param(column, feature, id=f"{column.heading}-{feature.name}"))
+    return found
+
+
+def words_of(column: Column, case: Path) -> list[str]:
+    """The command for the case file of a column."""
+    if column.heading == "bands":
+        return ["bands", str(case), "--modes", "2"]
+    return [column.kind.verb, str(case)]
+
+
+def put_case(column: Column, feature: Feature, folder: Path) -> Path:
+    """Write the case of a column with a feature; returns its path."""
+    path = folder / "case.toml"
+    path.write_text(tomli_w.dumps(column.table(feature)), encoding="utf-8")
+    return path
+
+
+def motion_of(folder: Path) -> np.ndarray:
+    """Displacements in m of a run, over time, cell and mass."""
+    with h5py.File(folder / "run.h5") as file:
+        return file["displacement"][...]
+
+
+def numbers_of(folder: Path) -> dict[str, np.ndarray]:
+    """All numbers of the results in a folder, by file and name."""
+    numbers: dict[str, np.ndarray] = {}
+
+    def keep(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and item.dtype.kind == "f":
+            numbers[f"{path.name}/{name}"] = item[...]
+
+    for path in sorted(folder.glob("*.h5")):
+        with h5py.File(path) as file:
+            file.visititems(keep)
+    return numbers
+
+
+@pytest.fixture(scope="module")
+def plain_results() -> dict[str, dict[str, np.ndarray]]:
+    """The results of columns without a feature, by heading, filled by the tests that need them."""
+    return {}
+
+
+@pytest.mark.parametrize(("column", "feature"), pairs(lambda answer: answer == YES))
+def test_every_yes_is_computed(column, feature, tmp_path, in_process, plain_results):
+    """The verb ends well, and its results differ from those without the feature: no yes is one that is ignored."""
+
+    def computed(case: Path, out: Path) -> dict[str, np.ndarray]:
+        ended = in_process(*words_of(column, case), "--out", out)
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+        return numbers_of(out)
+
+    if column.heading not in plain_results:
+        plain = tmp_path / "plain.toml"
+        plain.write_text(tomli_w.dumps(merged(BASE, column.sections)), encoding="utf-8")
+        plain_results[column.heading] = computed(plain, tmp_path / "plain")
+    results = computed(put_case(column, feature, tmp_path), tmp_path / "out")
+    assert results
+
+    before = plain_results[column.heading]
+    is_same = results.keys() == before.keys() and all(
+        np.array_equal(values, before[name], equal_nan=True) for name, values in results.items()
+    )
+    assert is_same == (feature is PLAIN or feature.name in WITHOUT_INFLUENCE.get(column.heading, ()))
+
+
+@pytest.mark.parametrize(("column", "feature"), pairs(lambda answer: answer not in (YES, UNREAD)))
+def test_every_no_is_what_the_program_says(column, feature, tmp_path, in_process):
+    """A verb that refuses a feature writes nothing, and its message has the sentences of the table."""
+    [answer] = [a for c, a in zip(COLUMNS, ANSWERS[feature.name], strict=True) if c is column]
+    folder = tmp_path / "out"
+    ended = in_process(*words_of(column, put_case(column, feature, tmp_path)), "--out", folder)
+    if column.heading == "propagator":
+        # The run goes on with the other engine, and says why.
+        assert ended.returncode == 0
+        assert answer in ended.stdout + ended.stderr
+    else:
+        assert ended.returncode == 2
+        assert all(sentence in ended.stderr for sentence in answer.split("; "))
+        assert not list(folder.glob("*.h5"))
+
+
+@pytest.mark.parametrize("feature", FEATURES, ids=lambda feature: feature.name)
+def test_a_feature_changes_a_run_and_both_engines_agree(feature, tmp_path, in_process):
+    """A yes is no feature that is ignored: the motion differs from that of the plain case, equally by both engines."""
+    motions = {}
+    asked = {"plain": (BY_HEADING["run"], PLAIN), "ts": (BY_HEADING["run"], feature)}
+    asked["propagator"] = (BY_HEADING["propagator"], feature)
+    for name, (column, of) in asked.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        ended = in_process("run", put_case(column, of, folder), "--out", folder / "out")
+        assert ended.returncode == 0, ended.stderr
+        motions[name] = motion_of(folder / "out")
+
+    largest = np.abs(motions["ts"]).max()
+    difference = np.abs(motions["propagator"] - motions["ts"]).max()
+    assert difference < 1e-6 * largest
+    if feature is not PLAIN:
+        assert np.abs(motions["ts"] - motions["plain"]).max() > 1e-4 * largest
+
+
+@pytest.mark.parametrize("feature", FEATURES, ids=lambda feature: feature.name)
+def test_results_are_exported_and_drawn(feature, tmp_path, in_process, plain_pictures):
+    """``export`` and ``plot`` accept the run of every feature."""
+    folder = tmp_path / "out"
+    in_process("run", put_case(BY_HEADING["run"], feature, tmp_path), "--out", folder)
+    for verb in ("export", "plot"):
+        ended = in_process(verb, folder)
+        assert ended.returncode == 0, ended.stderr
+
+
+def test_the_chapter_has_every_answer():
+    """Each row has an answer of every column, and each number is that of a sentence below the table."""
+    text = chapter()
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| ")]
+    assert [row[0] for row in rows] == ["feature", *(feature.name for feature in FEATURES)]
+
+    sentences = dict(line.split(". ", 1) for line in text.splitlines() if line[:1].isdigit())
+    for row in rows[1:]:
+        shown = [sentences.get(answer, answer) for answer in row[1:]]
+        assert shown == ANSWERS[row[0]]
+
+
+def test_no_feature_is_refused_for_a_fault_of_the_small_case():
+    """A message about a key that is missing or misplaced would say nothing about the feature."""
+    said = {answer for row in ANSWERS.values() for answer in row}
+    assert not [answer for answer in said if "missing" in answer or "outside" in answer or "unknown" in answer]

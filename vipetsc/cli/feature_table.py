@@ -1,0 +1,268 @@
+"""Which verb accepts which feature of a case: a table made by checking a small case for each pair of them.
+
+A verb accepts a feature if its case with this feature is valid, and if the checks that follow the reading of the case
+(of an engine, of linear modes) accept it too. Otherwise the message that refuses it stands in the table.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from typing import Any
+
+from vipetsc.case import Case, CaseError, CaseFile, LawCase, NnmCase, Sweep
+from vipetsc.case.case_file import Table
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.predict import PredictCase
+
+TITLE = "Verbs and features"
+YES = "yes"
+UNREAD = "-"  # the verb reads no section that has the feature
+
+# A chain of masses on which resonators sit: pass bands 0-1468 and 1936-3405 rad/s.
+HOST_SPRING = {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}
+RESONATOR_SPRING = {"start": 1, "end": 2, "stiffness": 5e3}
+BASE: Table = {
+    "name": "feature",
+    "lattice": {"cells": 24, "cell": {"masses": [4e-3, 2e-3], "springs": [HOST_SPRING, RESONATOR_SPRING]}},
+    "contacts": {"law": "hertz", "stiffness": 1e7, "sites": [12, 14], "clearance": 1e-4, "restitution": 0.7},
+}
+DRIVEN: Table = {
+    "drive": {"amplitude": 3.0, "frequency": 1000.0, "cycles": 3, "cell": 4},
+    "time": {"end": 0.05, "sample_interval": 2e-4},
+    "output": {"figures": False},
+}
+# Two masses between walls, the second one with a stop.
+OWN: Table = {
+    "masses": [1.0, 1.0],
+    "springs": [{"start": 0, "end": 1, "stiffness": 1.0}, {"start": 1, "end": 2, "stiffness": 1.0}],
+    "contacts": [{"host": 1, "resonator": 2, "clearance": 0.1}],
+}
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A feature by its ``name``, and the ``changes`` of a case that bring it in, by section.
+
+    ``of_system`` are the changes that bring it into the system of [nnm.own], None if such a system cannot have it.
+    ``scaled`` are changes of sections that only some verbs read, to which these then belong.
+    """
+
+    name: str
+    changes: Table
+    of_system: Table | None = None
+    scaled: Table = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A verb in one of its ways: the ``heading``, the class of its case, and the ``sections`` that it needs.
+
+    ``refusal`` checks a valid case further and returns the reason for which it is refused, or an empty text.
+    """
+
+    heading: str
+    kind: type[CaseFile]
+    sections: Table
+    refusal: Callable[[Any], str] = field(default=lambda case: "")
+    is_system: bool = False
+
+    def table(self, feature: Feature) -> Table | None:
+        """The case with ``feature``, as a file would give it; None if the verb reads no section that has it."""
+        changes = feature.of_system if self.is_system else feature.changes
+        if changes is None:
+            return None
+
+        read = {*self.kind.keywords(), "plugins"} | ({"disorder"} if self.kind is NnmCase else set())
+        if not changes.keys() <= read:
+            return None
+        scaled = {section: keys for section, keys in feature.scaled.items() if section in self.sections}
+        return merged(merged(BASE, self.sections), changes | scaled)
+
+    def answer(self, feature: Feature) -> str:
+        """``YES``, ``UNREAD``, or the sentence that refuses ``feature``."""
+        table = self.table(feature)
+        if table is None:
+            return UNREAD
+        try:
+            case = self.kind.from_table(table)
+            if isinstance(case, Sweep):
+                case.members()
+        except CaseError as error:
+            return _sentences(error)
+        return self.refusal(case) or YES
+
+
+def merged(table: Mapping[str, Any], changes: Mapping[str, Any]) -> Table:
+    """``table`` with the ``changes`` put into it, tables within tables as well; None removes a key."""
+    result = dict(table)
+    for key, value in changes.items():
+        if isinstance(value, dict) and isinstance(result.get(key), dict):
+            value = merged(result[key], value)
+        result[key] = value
+    return {key: value for key, value in result.items() if value is not None}
+
+
+def _sentences(error: CaseError) -> str:
+    """What the messages of ``error`` say, each once, without the keys and the values of the small case."""
+    return "; ".join(dict.fromkeys(problem.remedy for problem in error.problems))
+
+
+def _propagator_refusal(case: Case) -> str:
+    """Why the propagator does not suit ``case``."""
+    from vipetsc.dynamics.propagator.engine import Propagator
+
+    return Propagator.refusal(case.model()) or ""
+
+
+def _modes_refusal(case: Case) -> str:
+    """Why linear modes of ``case`` are not computed."""
+    from vipetsc.studies.linear_modes import check_modes
+
+    try:
+        check_modes(case, 1, 0.0)
+    except CaseError as error:
+        return _sentences(error)
+    return ""
+
+
+QUIET: Table = {"output": {"figures": False}}
+NNM = {"modes": [1], "points": 3, "energy": [0.0, 1.0]}
+BREATHER = {"start_frequency": [4500.0], "start_sites": [1]}
+STEPS = {"points": 10, "harmonics": 5, "first_step": 0.2, "largest_step": 0.3}
+FORCE = {"source": "force", "infinite": False, "range": [0.44, 1.0]}
+FEW_RUNS = {"largest": 2.0, "tolerance": 0.9, "finest": 0.5, "samples": 1}
+SEARCH = {"budget": 2, "variables": {"profile": [1e-5, 1e-3]}, "objective": [{"measure": "entropy"}]}
+COLUMNS: tuple[Column, ...] = (
+    Column("run", Case, DRIVEN),
+    Column("propagator", Case, merged(DRIVEN, {"time": {"engine": "propagator"}}), _propagator_refusal),
+    Column("sweep", Sweep, merged(DRIVEN, {"sweep": {"measures": ["motion"], "time": {"rtol": [1e-8, 1e-9]}}})),
+    Column("optimise", OptimiseCase, merged(DRIVEN, {"optimise": SEARCH})),
+    Column("bands", Case, DRIVEN, _modes_refusal),
+    Column("law", LawCase, merged(DRIVEN, {"law": FEW_RUNS})),
+    Column("predict", PredictCase, merged(DRIVEN, {"predict": {"amplitudes": [2.0], "points": 16}})),
+    Column("nfrc", NfrcCase, merged(DRIVEN, {"nfrc": STEPS | FORCE})),
+    Column("wave", NfrcCase, merged(DRIVEN, {"nfrc": STEPS | {"range": [0.9, 2.0]}})),
+    Column("reduced", NnmCase, QUIET | {"nnm": NNM | {"system": "reduced", "modes": [2]}}),
+    Column("chain", NnmCase, QUIET | {"nnm": NNM | {"system": "chain", "modes": [25]}}),
+    Column("own", NnmCase, QUIET | {"nnm": NNM | {"system": "own", "own": OWN}}, is_system=True),
+    Column("condensed", NnmCase, QUIET | {"nnm": NNM | BREATHER | {"system": "condensed"}}),
+)
+"""The verbs that read a case, each in its ways."""
+
+
+def _lattice(**changes: Any) -> Table:
+    return {"lattice": changes}
+
+
+def _contacts(**changes: Any) -> Table:
+    return {"contacts": changes}
+
+
+def _own_contacts(*contacts: tuple[int, float]) -> Table:
+    """Contacts (host, clearance in m) of the second mass of [nnm.own]."""
+    pairs = [{"host": host, "resonator": 2, "clearance": clearance} for host, clearance in contacts]
+    return {"nnm": {"own": {"contacts": pairs}}}
+
+
+def _drive(**changes: Any) -> Table:
+    # Keys of the burst of other columns that the waveform may not have are removed.
+    return {"drive": {"cycles": None, "frequency": None, **changes}}
+
+
+def _initial(**changes: Any) -> Table:
+    return {"initial": changes}
+
+
+CUBIC_CELL = {"springs": [HOST_SPRING, RESONATOR_SPRING | {"cubic": 1e9}]}
+MEASURED = {"time": [0.0, 1e-3, 2e-3, 3e-3, 4e-3], "value": [0.0, 1.0, -1.0, 0.5, 0.0]}
+RUBBER = {"plugins": {"modules": [str(files("vipetsc") / "examples" / "own_law.py")]}} | _contacts(
+    law="rubber-stop", parameters={"b": 1e7}
+)
+FEATURES: tuple[Feature, ...] = (
+    Feature("dashpots", _lattice(damping={"mass": 1.0})),
+    Feature("loss by bands", _lattice(damping={"loss": {"1": 0.01}})),
+    Feature(
+        "smooth springs",
+        _lattice(cell=CUBIC_CELL),
+        {"nnm": {"own": {"smooth": [{"start": 0, "end": 1, "cubic": 0.5}]}}},
+    ),
+    Feature("profiles of cells", _lattice(profiles={"masses[1]": {"first": 4e-3, "last": 4.1e-3}})),
+    Feature("disorder of cells", {"disorder": {"cells": {"masses[1]": {"relative": 0.01}}}}),
+    Feature("disorder of sites", {"disorder": {"clearance": {"relative": 0.01}}}),
+    Feature("absorbing ends", _lattice(absorbing={"cells": 9, "strength": 1.0})),
+    Feature("free ends", _lattice(ends="free")),
+    Feature("ring", _lattice(ends="periodic")),
+    Feature("one-sided stops", _contacts(side="plus"), _contacts(side="plus")),
+    Feature("two clearances", _contacts(clearance_minus=2e-4), _contacts(clearance_minus=2e-4)),
+    Feature("unequal clearances", _contacts(clearance=[1e-4, 2e-4]), _own_contacts((1, 0.1), (0, 0.2))),
+    Feature("touching stops", _contacts(clearance=0.0, side="plus", restitution=1.0)),
+    Feature("preload", _contacts(precompression=2e-4, side="plus", restitution=1.0)),
+    Feature(
+        "a law for each site", _contacts(each={"law": ["bilinear", "hertz"], "stiffness": [1e5, 1e7]}, stiffness=None)
+    ),
+    Feature("restitutions of sites", _contacts(each={"restitution": [0.9, 0.7]})),
+    Feature("law of a plugin", RUBBER, RUBBER),
+    Feature("contacts to ground", _contacts(pair=[0, 2]), _own_contacts((0, 0.2))),
+    Feature("contacts between cells", _contacts(pair=[1, 1], next_cell=True)),
+    Feature("several in a cell", _contacts(sites=[12, 12], each={"pair": [[1, 2], [0, 2]]})),
+    Feature("burst", {"drive": {}}),
+    Feature("harmonic", _drive(waveform="harmonic", frequency=1000.0)),
+    Feature("chirp", _drive(waveform="chirp", frequency=1000.0, bandwidth=200.0, duration=0.02)),
+    Feature("impulse", _drive(waveform="impulse", duration=1e-3)),
+    Feature("step", _drive(waveform="step", ramp=5e-3)),
+    Feature("measured samples", _drive(waveform="samples", samples=MEASURED)),
+    Feature(
+        "moved wall",
+        {"drive": {"end": "left", "cell": None, "amplitude": 1e-4}},
+        scaled={"nfrc": {"range": [1e-6, 2e-5]}},
+    ),
+    Feature("several drives", {"drive": {"more": [{"amplitude": 0.5, "frequency": 900.0, "cycles": 3, "cell": 6}]}}),
+    Feature("mode at t = 0", _initial(kind="mode", number=3, amplitude=1e-5)),
+    Feature("packet at t = 0", _initial(kind="packet", band=1, wavenumber=1.0, cell=12, width=2.0, amplitude=1e-5)),
+    Feature("struck masses", _initial(kind="velocity", cell=5, velocity=0.1)),
+)
+"""The features of a case, in the order of the chapter."""
+
+
+def answers() -> dict[str, list[str]]:
+    """The answer of each column to each feature, by the feature's name."""
+    return {feature.name: [column.answer(feature) for column in COLUMNS] for feature in FEATURES}
+
+
+def chapter() -> str:
+    """The manual's chapter with the table, and the reasons below it."""
+    rows = answers()
+    reasons = list(dict.fromkeys(reason for row in rows.values() for reason in row if reason not in (YES, UNREAD)))
+    return "\n".join([*_introduction(), *_table(rows, reasons), "", *_reasons(reasons), ""])
+
+
+def _introduction() -> Iterator[str]:
+    yield from (
+        f"# {TITLE}",
+        "",
+        "Each answer is that of the program to a small case with one feature: **yes**, or the number of the message",
+        f"that refuses it, below the table; `{UNREAD}` where the verb reads no section that has the feature. A message",
+        "with *not yet* gives no reason of physics: the verb could accept the feature, but is not written for it.",
+        "",
+        "The columns are verbs, and some of their ways: `run` by `ts` and by the `propagator` (a run that it refuses",
+        "goes on with `ts`), `bands --modes` (linear modes, without dashpots), `nfrc` of a force or a moved wall and",
+        "of an incident `wave`, and `nnm` of each system, of which `condensed` has the breathers. `plot` and `export`",
+        "accept the results of every yes.",
+        "",
+    )
+
+
+def _table(rows: Mapping[str, Sequence[str]], reasons: Sequence[str]) -> Iterator[str]:
+    """The lines of the table, with numbers in place of ``reasons``."""
+    shown = {reason: str(number) for number, reason in enumerate(reasons, 1)} | {YES: YES, UNREAD: UNREAD}
+    yield f"| feature | {' | '.join(column.heading for column in COLUMNS)} |"
+    yield "|---" * (len(COLUMNS) + 1) + "|"
+    for name, row in rows.items():
+        yield f"| {name} | {' | '.join(shown[reason] for reason in row)} |"
+
+
+def _reasons(reasons: Sequence[str]) -> Iterator[str]:
+    """The numbered ``reasons``."""
+    for number, reason in enumerate(reasons, 1):
+        yield f"{number}. {reason}"
