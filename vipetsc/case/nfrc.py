@@ -34,7 +34,9 @@ class NfrcTable(Section):
     combination of the values of further keys in ``family``, which are lists or ranges as in ``[sweep]``. The lattice is
     ``infinite``, or ends where its cells do: always if it has dashpots, cells that differ, or contacts between other
     masses than the cell's pair. ``harmonics`` is the number of the last one; motions that are not ``symmetric``
-    (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too. Steps are in units
+    (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too. Besides folds the
+    points are located where states become stable or unstable (``special_points``: Neimark-Sacker, period doubling,
+    branch points), or ``all`` where the number of growing perturbations changes. Steps are in units
     of the clearance and of the amplitude that touches, or half the range of frequencies.
     """
 
@@ -49,6 +51,7 @@ class NfrcTable(Section):
     family: dict[str, Any] | None = None
     harmonics: int = Field(41, ge=1, le=2000)
     symmetric: bool | None = None
+    special_points: Literal["stability", "all"] = "stability"
     points: int = Field(1000, ge=1)
     first_step: Positive = 0.02
     smallest_step: Positive = 1e-9

@@ -20,7 +20,13 @@ ENERGIES = {
     "upper": ("U, other harmonics", style.VERMILION, style.DOTTED),
     "lost": ("L, dissipated in contacts", style.ORANGE, "-."),
 }
-FOLD = 1  # of the variable ``kind``
+# Marks of special points, by the codes of the variable ``kind``: label, marker, size.
+SPECIAL = {
+    1: ("fold", "o", 3.5),
+    2: ("Neimark-Sacker", "D", 3.0),
+    3: ("period doubling", "^", 3.8),
+    4: ("branch point", "s", 3.2),
+}
 
 
 def frequency_response(paths: Sequence[Path]) -> Figure:
@@ -103,17 +109,19 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
         dashed = np.where(~stable | before | after, size, np.nan)
         axes.plot(parameter, dashed, color=style.BLACK, lw=0.9, ls="--", label="unstable")
 
-    draw_folds(axes, branch, size, label="fold")
+    draw_special(axes, branch, size, labelled=True)
     axes.set_ylabel(label)
     axes.legend(fontsize=6, loc="best")
 
 
-def draw_folds(axes: Axes, branch: xr.Dataset, values: np.ndarray, label: str | None = None) -> None:
-    """Draw a ring at each fold of a curve that shows ``values`` (point,)."""
-    folds = np.nonzero(branch["kind"].values == FOLD)[0]
-    if folds.size:
-        look = {"ms": 3.5, "mfc": "white", "mec": style.VERMILION, "ls": "none"}
-        axes.plot(parameter_of(branch)[folds], values[folds], "o", label=label, **look)
+def draw_special(axes: Axes, branch: xr.Dataset, values: np.ndarray, labelled: bool = False) -> None:
+    """Mark the special points of a curve that shows ``values`` (point,)."""
+    parameter = parameter_of(branch)
+    for code, (label, marker, size) in SPECIAL.items():
+        (places,) = np.nonzero(branch["kind"].values == code)
+        if places.size:
+            look = {"ms": size, "mfc": "white", "mec": style.VERMILION, "ls": "none", "marker": marker}
+            axes.plot(parameter[places], values[places], label=label if labelled else None, **look)
 
 
 def _draw_phase(axes: Axes, branch: xr.Dataset) -> None:

@@ -17,7 +17,7 @@ from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
-from vipetsc.figures.nfrc import draw_folds, parameter_label, parameter_of
+from vipetsc.figures.nfrc import draw_special, parameter_label, parameter_of
 from vipetsc.figures.swept_axes import SweptKey
 from vipetsc.io.branch_kinds import RESPONSES, branch_kind
 from vipetsc.io.netcdf import open_netcdf
@@ -141,12 +141,12 @@ def _lag(curve: xr.Dataset) -> np.ndarray:
 
 
 def _draw_curve(axes: Axes, curve: xr.Dataset, values: np.ndarray, name: str, colour: Any) -> None:
-    """Draw ``values`` of a curve: stable states broad, unstable ones thin and dashed, rings at folds."""
+    """Draw ``values`` of a curve: stable states broad, unstable ones thin and dashed, special points are marked."""
     parameter = parameter_of(curve)
     stable = curve["unstable"].values == 0
     axes.plot(parameter, values, color=colour, lw=0.5, ls="--")
     axes.plot(parameter, np.where(stable, values, np.nan), color=colour, lw=1.3, label=name)
-    draw_folds(axes, curve, values)
+    draw_special(axes, curve, values)
 
 
 def _colours(count: int) -> list[Any]:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
 from vipetsc.figures import panels, style
-from vipetsc.figures.nfrc import draw_folds, parameter_label, parameter_of
+from vipetsc.figures.nfrc import draw_special, parameter_label, parameter_of
 from vipetsc.io.netcdf import open_netcdf
 
 # Labels of the rows of the page by the quantities that they show.
@@ -90,11 +90,11 @@ def _draw_forces(axes: Axes, curve: xr.Dataset) -> None:
 
 
 def _draw_states(axes: Axes, curve: xr.Dataset, values: np.ndarray, number: int, label: str | None = None) -> None:
-    """Draw ``values`` over the parameter: stable states broad, unstable ones thin; rings at folds."""
+    """Draw ``values`` over the parameter: stable states broad, unstable ones thin; special points are marked."""
     colour = style.band_colour(number + 1)
     parameter = parameter_of(curve)
     stable = curve["unstable"].values == 0
     axes.plot(parameter, values, color=colour, lw=0.5, ls="--")
     dash = DASHES[number % len(DASHES)]
     axes.plot(parameter, np.where(stable, values, np.nan), color=colour, lw=1.3, ls=dash, label=label)
-    draw_folds(axes, curve, values)
+    draw_special(axes, curve, values)

@@ -29,6 +29,13 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 MOST_SPECIAL = 4  # points of a kind that are printed
+# Headings of the special points of frequency responses, by their kinds.
+SPECIAL_POINTS = {
+    "fold": "folds",
+    "neimark-sacker": "Neimark-Sacker",
+    "period-doubling": "period doubling",
+    "branch-point": "branch points",
+}
 SHOW_EVERY = 0.5  # s between two lines of the live table
 
 
@@ -199,8 +206,10 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
     if options.over == "amplitude":
         unit = "clearances" if options.source == "wave" else "N"
     parameter = measure(curve, options.over)
-    folds = parameter[curve.is_kind("fold")]
-    rows.append(("folds", ", ".join(f"{at:.6g}" for at in folds) + f" {unit}" if folds.size else "none"))
+    for kind, heading in SPECIAL_POINTS.items():
+        at = parameter[curve.is_kind(kind)]
+        if at.size or kind == "fold":
+            rows.append((heading, ", ".join(f"{value:.6g}" for value in at) + f" {unit}" if at.size else "none"))
 
     jumps = []
     for direction, path in (("up", sweep_up(curve)), ("down", sweep_down(curve))):

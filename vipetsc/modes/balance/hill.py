@@ -40,6 +40,8 @@ LINES = (0.1, 0.02)
 COARSE = 24
 FINEST = 14
 TURN = 0.7
+# Exponent at which D(0) is taken: at 0 itself a lattice that is free to move has no compliance.
+AT_ZERO = 1e-9
 KEPT = 48  # orders of perturbations that are kept where nothing dissipates
 # Steps, first step and accuracy, over Om, of the secant method.
 MOST_STEPS = 30
@@ -50,15 +52,41 @@ LARGEST_LOG = 300.0  # of a determinant, which overflows beyond
 
 
 class ContourLine(NamedTuple):
-    """D along Re lambda = const: Im lambda/Om from 0 to 1/2 as ``positions``, and log D with its turns added up."""
+    """D along Re lambda = const: Im lambda/Om from 0 to 1/2 as ``positions``, and log D with its turns added up.
+
+    ``ends`` are D at the first and the last position, where it is real.
+    """
 
     positions: np.ndarray
     logs: np.ndarray
+    ends: tuple[float, float]
 
     def zeros_beyond(self) -> int:
         """The number of zeros to the right of the line; -1 if it is undecided."""
         turned = -float(self.logs[-1].imag) / np.pi
         return round(turned) if abs(turned - round(turned)) < 0.25 else -1
+
+
+class Perturbations(NamedTuple):
+    """The number of perturbations that grow, -1 if it is undecided, and lambda/Om of the ``fastest``, None if unknown.
+
+    Im lambda >= 0 of a pair; ``fastest`` is 0 if none grows.
+    """
+
+    unstable: int
+    fastest: complex | None
+
+
+class Stability(NamedTuple):
+    """Number of perturbations of a motion that grow (-1: undecided), and D where a multiplier is real.
+
+    ``at_one`` and ``at_minus_one`` are D at Re lambda = ``least`` Om for Im lambda = 0 and Om/2: real, and zero where a
+    multiplier has the size exp(2 pi least) and is positive, or negative.
+    """
+
+    unstable: int
+    at_one: float
+    at_minus_one: float
 
 
 class Hill:
@@ -139,11 +167,35 @@ class Hill:
             positions = np.insert(positions, wide + 1, middles)
 
         turned = np.cumsum(np.angle(values[1:] / values[:-1]))
-        return ContourLine(positions, np.log(np.abs(values)) + 1j * np.insert(turned, 0, 0.0))
+        return ContourLine(
+            positions=positions,
+            logs=np.log(np.abs(values)) + 1j * np.insert(turned, 0, 0.0),
+            ends=(float(values[0].real), float(values[-1].real)),
+        )
 
     def unstable(self, series: ForceSeries) -> int:
         """Number of perturbations that grow faster than ``least`` Om, two for a complex pair; -1 if it is undecided."""
         return self._line(series, self.least).zeros_beyond()
+
+    def stability(self, series: ForceSeries) -> Stability:
+        """The number of perturbations that grow faster than ``least`` Om, and D where multipliers are real."""
+        line = self._line(series, self.least)
+        return Stability(line.zeros_beyond(), *line.ends)
+
+    def pairs(self, series: ForceSeries) -> list[complex]:
+        """lambda/Om, Im lambda > 0, of the complex pairs that grow faster than ``least`` Om, the slowest first.
+
+        Empty also where not all of what grows is found.
+        """
+        zeros = self._beyond(series, self.least) or []
+        return sorted((zero for zero in zeros if REAL < zero.imag < 0.5 - REAL), key=lambda zero: zero.real)
+
+    def near(self, series: ForceSeries, guess: complex) -> complex:
+        """lambda/Om near a ``guess``, of a motion near one that has it; raises ArithmeticError if none is found."""
+        zero = self._zero(series, guess, [])
+        if zero is None or not REAL < zero.imag < 0.5 - REAL:
+            raise ArithmeticError("no complex pair of multipliers is found near that of the state before")
+        return zero
 
     def fastest(self, series: ForceSeries) -> complex | None:
         """lambda/Om, Im lambda >= 0, of what grows fastest; 0 if nothing does, None if it is not found."""

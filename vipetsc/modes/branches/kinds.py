@@ -7,7 +7,7 @@ from vipetsc.io.branch_kinds import RESPONSES
 
 # The codes of normal modes and of responses; a file's own attribute ``flag_meanings`` is what it is read by.
 KINDS = ("regular", "fold-energy", "fold-frequency", "branch-point", "symmetry-breaking", "period-doubling", "grazing")
-RESPONSE_KINDS = ("regular", "fold")
+RESPONSE_KINDS = ("regular", "fold", "neimark-sacker", "period-doubling", "branch-point")
 
 
 def kinds_of(branch_kind: str) -> tuple[str, ...]:

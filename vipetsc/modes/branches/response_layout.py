@@ -30,6 +30,7 @@ LAYOUT = {
     "share": Stored("way", "1", "outgoing or dissipated energy over the incident energy"),
     "unstable": Stored("", "1", "number of growing perturbations (Hill's method); -1: unknown"),
     "growth": Stored("", "1", "largest growth rate over the frequency; 0 if none, NaN if not found"),
+    "sideband": Stored("", "1", "frequency of the fastest growing perturbation over that of the drive; 1/2 at most"),
     "closed": Stored("site", "1", "fraction of the time in contact"),
     "episodes": Stored("", "1", "contact episodes per period"),
     "truncation": Stored("", "1", "estimated size of the neglected harmonics over those included"),
@@ -134,7 +135,7 @@ class ResponseLayout:
         regular = -1
         for i, kind in enumerate(stored_kinds(data)):
             regular += kind == "regular"
-            row = {name: data[name].values[i] for name in LAYOUT}
+            row = {name: data[name].values[i] for name in LAYOUT if name in data}
 
             measures = Measures(
                 frequency=float(row["frequency"]),
@@ -143,6 +144,8 @@ class ResponseLayout:
                 fractions=row["share"],
                 unstable=int(row["unstable"]),
                 growth=float(row["growth"]),
+                # Files of earlier versions have none.
+                sideband=float(row.get("sideband", np.nan)),
                 closed=row["closed"],
                 episodes=int(row["episodes"]),
                 truncation=float(row["truncation"]),

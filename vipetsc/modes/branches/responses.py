@@ -82,7 +82,9 @@ class ResponseMethod(Method[Response]):
         return TurningSteps(problem, max(self.case.nfrc.points - 1 - done, 0))
 
     def assess(self, problem: PeriodicProblem[Response], point: Response) -> Response:
-        """The state with its measures."""
+        """The state with its measures, which special points have already."""
+        if point.measures is not None:
+            return point
         assert isinstance(problem, SteadyStates)
         return replace(point, measures=problem.measured(point.xi))
 

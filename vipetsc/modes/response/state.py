@@ -13,7 +13,8 @@ class Measures(NamedTuple):
     """Measures of a steady state (``branches.response_layout`` has units and texts).
 
     ``fractions`` (4,) of the energy that comes in are transmitted, reflected, at higher harmonics, and lost;
-    ``harmonics`` (site, order) complex in m; ``unstable`` perturbations grow, the fastest at ``growth`` over Om.
+    ``harmonics`` (site, order) complex in m; ``unstable`` perturbations grow, the fastest as exp(lambda t) with
+    lambda = (``growth`` + i ``sideband``) Om.
     ``outputs`` are what ``[output]`` of the case asks for, by the names in the file (``outputs``).
     """
 
@@ -23,6 +24,7 @@ class Measures(NamedTuple):
     fractions: np.ndarray
     unstable: int
     growth: float
+    sideband: float
     closed: np.ndarray
     episodes: int
     truncation: float

@@ -13,21 +13,26 @@ other reflected (R); what leaves at k Om, k > 1, is U; contacts lose L. T + R + 
 as the loss is that of the harmonics kept. A force gives what it gives: fractions are over that, T to higher cells.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
-from vipetsc.modes.balance.hill import Hill
-from vipetsc.modes.problem import FlowError
+from vipetsc.modes.balance.hill import Hill, Perturbations, Stability
+from vipetsc.modes.problem import FlowError, SpecialKind
 from vipetsc.modes.response.condensation import compliance_of, driven_points, stops_of
 from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
 from vipetsc.modes.response.outputs import HarmonicMotion, ResponseOutputs, largest_values
-from vipetsc.modes.response.state import Measures
+from vipetsc.modes.response.stability_changes import StabilityChanges
+from vipetsc.modes.response.state import Measures, Response
 
 # A force's work over what it moves, below which nothing but rounding says that something leaves or is lost.
 LEAST_WORK = 1e-12
+# States whose stability is kept.
+KEPT_STATES = 3
 # Frequencies whose linear motions are kept: those of a step and of its differences.
 KEPT_MOTIONS = 9
 
@@ -59,6 +64,7 @@ class SteadyStates(SteadyEquations):
         # Latest linear motions by frequency, and the latest determinant: neighbours on a curve over the amplitude.
         self._motions: dict[float, LinearMotion] = {}
         self._hill: Hill | None = None
+        self._stabilities: dict[bytes, Stability] = {}
 
         clearance = self._unit()
         super().__init__(
@@ -113,17 +119,15 @@ class SteadyStates(SteadyEquations):
         z[:, 1] = wave.relative * self._unit()
         return LinearMotion(z, wave)
 
-    def measured(self, xi: np.ndarray) -> Measures:
-        """The measures of a state for its file."""
+    def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
+        """The measures of a state for its file; its ``perturbations`` are counted if they are not given."""
         omega, amplitude = self.drive(xi[-1])
         x = xi[:-1] * self.clearance
         z = self.balance.unpack(x)
         series = self.balance.series(x, omega)
 
-        hill = self.hill(omega)
-        unstable = hill.unstable(series)
-        # The count is cheaper than the zeros themselves, and most states are stable.
-        fastest = hill.fastest(series) if unstable else 0j
+        unstable, fastest = perturbations or self._perturbations(xi, series)
+        rate = complex(np.nan, np.nan) if fastest is None else fastest
         forces = series.forces[:, : z.shape[1]]
         return Measures(
             frequency=omega,
@@ -131,7 +135,8 @@ class SteadyStates(SteadyEquations):
             largest=largest_values(z),
             fractions=self._fractions(omega, amplitude, forces, float(series.loss.sum())),
             unstable=unstable,
-            growth=np.nan if fastest is None else fastest.real,
+            growth=rate.real,
+            sideband=rate.imag,
             closed=series.closed,
             episodes=len(series.episodes),
             truncation=self.balance.truncation(x, omega),
@@ -155,6 +160,49 @@ class SteadyStates(SteadyEquations):
             episodes=series.episodes,
             incident=incident,
         )
+
+    def stability(self, xi: np.ndarray) -> Stability:
+        """The stability of a state; the latest are kept, since neighbours on a curve are compared."""
+        key = xi.tobytes()
+        if key not in self._stabilities:
+            self._stabilities = dict(list(self._stabilities.items())[1 - KEPT_STATES :])
+            omega, _ = self.drive(xi[-1])
+            series = self.balance.series(xi[:-1] * self.clearance, omega)
+            self._stabilities[key] = self.hill(omega).stability(series)
+        return self._stabilities[key]
+
+    def _perturbations(self, xi: np.ndarray, series: ForceSeries) -> Perturbations:
+        """The perturbations of a state with these forces that grow."""
+        # The count is cheaper than the zeros themselves, and most states are stable.
+        unstable = self.stability(xi).unstable
+        omega, _ = self.drive(xi[-1])
+        return Perturbations(unstable, self.hill(omega).fastest(series) if unstable else 0j)
+
+    def determinant(self, xi: np.ndarray, exponent: complex) -> float:
+        """Hill's determinant of a state at lambda/Om = ``exponent``, where it is real."""
+        omega, _ = self.drive(xi[-1])
+        series = self.balance.series(xi[:-1] * self.clearance, omega)
+        return float(self.hill(omega).determinants(series, np.array([exponent]))[0].real)
+
+    def growing_pairs(self, xi: np.ndarray) -> list[complex]:
+        """lambda/Om of the complex pairs of perturbations of a state that grow, the slowest first."""
+        omega, _ = self.drive(xi[-1])
+        return self.hill(omega).pairs(self.balance.series(xi[:-1] * self.clearance, omega))
+
+    def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
+        """lambda/Om of the pair of perturbations of a state near a ``guess``; raises ArithmeticError without one."""
+        omega, _ = self.drive(xi[-1])
+        return self.hill(omega).near(self.balance.series(xi[:-1] * self.clearance, omega), guess)
+
+    def least_growth(self, xi: np.ndarray) -> float:
+        """Re lambda/Om up to which perturbations of a state count as stable."""
+        omega, _ = self.drive(xi[-1])
+        return self.hill(omega).least
+
+    def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
+        """Folds, and where the number of growing perturbations changes otherwise."""
+        yield from super().special_kinds(left, right)
+        yield from StabilityChanges(self, left, right).kinds()
 
     def hill(self, omega: float) -> Hill:
         """Hill's determinant at a frequency; the latest is kept, since it keeps the compliances of perturbations."""

@@ -1,0 +1,140 @@
+"""Special points of frequency responses: kinds and places against multipliers by time integration; their files."""
+
+from __future__ import annotations
+
+import csv
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+import vipetsc
+from tests.conftest import assert_same_bits, datasets
+from tests.rigs import TWO_MASSES, after_a_period, followed, multipliers
+from tests.steady_states import motion_at
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.cli.verbs.branch_verbs import curve_rows
+from vipetsc.figures.registry import draw
+from vipetsc.modes.branches.files import read_branch
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.response.stability_changes import StabilityChanges
+
+pytestmark = pytest.mark.parallel(1)
+
+# Ranges of frequency in which two masses with a stop have a pair that grows, one that flips, and an uneven motion.
+PAIR = {"nfrc": {"range": [1.12, 1.24]}}
+FLIP = {"contacts": {"clearance": 0.1}, "nfrc": {"range": [1.05, 1.15]}}
+UNEVEN = {"contacts": {"side": "both", "clearance": 0.05}, "nfrc": {"range": [0.9, 0.95]}}
+
+
+def case_of(changes: dict[str, Any], **nfrc: Any) -> NfrcCase:
+    """Two masses with these ``changes`` by section."""
+    table = TWO_MASSES | {"nfrc": TWO_MASSES["nfrc"] | {"harmonics": 61}}
+    table |= {section: table[section] | values for section, values in changes.items()}
+    return NfrcCase.from_table(table | {"nfrc": table["nfrc"] | nfrc})
+
+
+def multipliers_at(states, point) -> np.ndarray:
+    """Floquet multipliers of a state by differences of the map of a period."""
+    state = np.ravel(motion_at(states, point.xi, np.arange(2)))
+    return multipliers(states, point, state, after_a_period(states, point, state))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "kind", "count"),
+    [(PAIR, "neimark-sacker", 2), (FLIP, "period-doubling", 2), (UNEVEN, "branch-point", 1)],
+)
+def test_a_special_point_has_the_multiplier_of_its_kind(changes, kind, count, tmp_path):
+    states, points = followed(case_of(changes), tmp_path / "rig")
+    special = [point for point in points if point.kind != "regular"]
+    assert [point.kind for point in special] == [kind] * count
+    for point in special:
+        found = multipliers_at(states, point)
+        if kind == "neimark-sacker":
+            pair = found[np.argsort(np.abs(np.abs(found) - 1))[:2]]
+            np.testing.assert_allclose(np.abs(pair), 1, atol=3e-3)
+            np.testing.assert_allclose(np.abs(np.angle(pair)) / (2 * np.pi), point.measured.sideband, atol=1e-3)
+        else:
+            critical = -1 if kind == "period-doubling" else 1
+            assert np.abs(found - critical).min() < 5e-3
+            assert point.measured.sideband == (0.5 if critical < 0 else 0.0)
+        # None but the critical ones grow.
+        assert point.measured.unstable == 0
+        assert np.abs(found).max() < 1.005
+
+    # One grows on one side of it, none on the other.
+    places = [points.index(point) for point in special]
+    for place in places:
+        around = sorted(points[near].measured.unstable for near in (place - 1, place + 1))
+        assert around == [0, 2 if kind == "neimark-sacker" else 1]
+
+
+@pytest.mark.slow
+def test_folds_are_no_branch_points(tmp_path):
+    """At a fold a multiplier is 1 as well; all points that are asked for are those where the number changes."""
+    states, points = followed(case_of({"nfrc": {"range": [1.2, 1.45]}}, harmonics=31, special_points="all"), tmp_path)
+    kinds = [point.kind for point in points if point.kind != "regular"]
+    assert kinds.count("fold") == 2
+    assert "branch-point" not in kinds
+    fold = next(point for point in points if point.kind == "fold")
+    assert np.abs(multipliers_at(states, fold) - 1).min() < 5e-3
+
+
+def test_points_between_unstable_states_are_located_if_all_are_asked_for(tmp_path):
+    changes = {"contacts": {"clearance": 0.05, "side": "both"}, "nfrc": {"range": [1.6, 1.7]}}
+    kinds = {}
+    for asked in ("stability", "all"):
+        _, points = followed(case_of(changes, harmonics=15, special_points=asked), tmp_path / asked)
+        kinds[asked] = [(point.kind, point.measured.unstable) for point in points if point.kind != "regular"]
+        regular = [point for point in points if point.kind in ("regular", "fold")]
+        kinds[asked + " regular"] = len(regular)
+    assert any(unstable > 0 for kind, unstable in kinds["all"] if kind != "fold")
+    assert all(unstable == 0 for kind, unstable in kinds["stability"] if kind != "fold")
+    assert kinds["all regular"] == kinds["stability regular"]
+
+
+@pytest.mark.slow
+def test_a_pair_is_located_by_its_number_where_it_cannot_be_followed(tmp_path, monkeypatch):
+    _, points = followed(case_of(PAIR), tmp_path / "followed")
+    at = [point.measured.frequency for point in points if point.kind == "neimark-sacker"]
+    monkeypatch.setattr("vipetsc.modes.response.steady.SteadyStates.growing_pairs", lambda self, xi: [])
+    _, points = followed(case_of(PAIR), tmp_path / "counted")
+    counted = [point for point in points if point.kind == "neimark-sacker"]
+    np.testing.assert_allclose([point.measured.frequency for point in counted], at, rtol=1e-9)
+    assert np.isnan([point.measured.sideband for point in counted]).all()
+
+
+def test_special_points_are_in_files_and_pictures(tmp_path):
+    case = case_of(FLIP, harmonics=15)
+    (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
+    path = tmp_path / f"branch-{curve.name}.h5"
+    rows = list(csv.DictReader(path.with_suffix(".csv").open()))
+    special = [row for row in rows if row["kind"] != "regular"]
+    assert [(row["kind"], row["sideband"]) for row in special] == [("period-doubling", "0.5")] * 2
+    with vipetsc.open(path) as data:
+        assert data["kind"].attrs["flag_meanings"].split()[3] == "period-doubling"
+    assert dict(curve_rows(case, curve))["period doubling"].startswith("1.08")
+    (picture,) = draw("branches", [tmp_path], formats=("json",))
+    assert "period doubling" in picture.read_text()
+
+    # A curve that goes on has the same points.
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    few = case.model_copy(update={"nfrc": case.nfrc.model_copy(update={"points": 8})})
+    follow_all(few, parts, MPI.COMM_SELF)
+    follow_all(case, parts, MPI.COMM_SELF, resume=True)
+    assert_same_bits(datasets(path), datasets(parts / path.name))
+    assert len(read_branch(path).points) == len(rows)
+
+
+def test_undecided_states_have_no_special_points_between_them(tmp_path):
+    states, points = followed(case_of(FLIP, harmonics=9), tmp_path / "rig")
+    place = next(i for i, point in enumerate(points) if point.kind == "period-doubling")
+    left, right = points[place - 1], points[place + 1]
+    assert [kind.name for kind in StabilityChanges(states, left, right).kinds()] == ["period-doubling"]
+    key = left.xi.tobytes()
+    states._stabilities[key] = states.stability(left.xi)._replace(unstable=-1)
+    assert list(StabilityChanges(states, left, right).kinds()) == []
