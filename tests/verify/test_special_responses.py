@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from types import SimpleNamespace
 from typing import Any
 
 from mpi4py import MPI
@@ -17,9 +18,11 @@ from tests.steady_states import motion_at
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.cli.verbs.branch_verbs import curve_rows
 from vipetsc.figures.registry import draw
+from vipetsc.modes.balance.hill import Hill, Stability
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.response.stability_changes import StabilityChanges
+from vipetsc.modes.response.state import Response
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -138,3 +141,50 @@ def test_undecided_states_have_no_special_points_between_them(tmp_path):
     key = left.xi.tobytes()
     states._stabilities[key] = states.stability(left.xi)._replace(unstable=-1)
     assert list(StabilityChanges(states, left, right).kinds()) == []
+
+
+class States:
+    """Steady states of given stability, of which nothing else is known."""
+
+    options = SimpleNamespace(special_points="all")
+
+    def __init__(self, *stabilities: Stability) -> None:
+        self.stabilities = stabilities
+
+    def stability(self, xi: np.ndarray) -> Stability:
+        return self.stabilities[int(xi[0])]
+
+    def determinant(self, xi: np.ndarray, exponent: complex) -> float:
+        return self.stability(xi).at_one
+
+    def least_growth(self, xi: np.ndarray) -> float:
+        return 1e-4
+
+    def growing_pairs(self, xi: np.ndarray) -> list[complex]:
+        return []
+
+
+@pytest.mark.parametrize(
+    ("right", "slope", "kinds"),
+    [
+        (Stability(0, 1.0, 1.0), 1.0, []),
+        (Stability(1, -1.0, 1.0), 1.0, ["branch-point"]),
+        (Stability(1, -1.0, 1.0), -1.0, []),  # a fold
+        (Stability(1, 1.0, -1.0), 1.0, ["period-doubling"]),
+        (Stability(2, 1.0, 1.0), 1.0, ["neimark-sacker"]),
+        (Stability(2, -1.0, -1.0), -1.0, ["period-doubling"]),
+        (Stability(3, 1.0, -1.0), 1.0, ["period-doubling", "neimark-sacker"]),
+    ],
+)
+def test_signs_and_numbers_tell_the_kinds(right, slope, kinds):
+    """A determinant that changes sign is a real multiplier that passes; pairs are what is left of the number."""
+    states = States(Stability(0, 1.0, 1.0), right)
+    ends = [Response(xi=np.array([float(i)]), tangent=np.array([tangent])) for i, tangent in enumerate((1.0, slope))]
+    assert [kind.name for kind in StabilityChanges(states, *ends).kinds()] == kinds
+
+
+def test_pairs_come_in_the_order_of_their_growth(monkeypatch):
+    zeros = [0.2 + 0.1j, 0.2 - 0.1j, 0.3 + 0j, 0.1 + 0.4j, 0.1 - 0.4j, 0.15 + 0.5j]
+    monkeypatch.setattr(Hill, "_beyond", lambda self, series, growth: zeros)
+    hill = Hill(None, omega=1.0, order=3, odd=False, finite=True)
+    assert hill.pairs(None) == [0.1 + 0.4j, 0.2 + 0.1j]
