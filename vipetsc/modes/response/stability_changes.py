@@ -10,14 +10,13 @@ growing perturbations is that of pairs.
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
-from vipetsc.modes.balance.hill import AT_ZERO, Perturbations
+import numpy as np
+
+from vipetsc.modes.balance.hill import AT_ZERO, Perturbations, Stability
 from vipetsc.modes.problem import SpecialKind
-from vipetsc.modes.response.state import Response
-
-if TYPE_CHECKING:
-    from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.state import Measures, Response
 
 FOLD = "fold"
 BRANCH_POINT = "branch-point"
@@ -25,10 +24,36 @@ PERIOD_DOUBLING = "period-doubling"
 NEIMARK_SACKER = "neimark-sacker"
 
 
+class StatesWithStability(Protocol):
+    """What is asked of the states of a curve (``SteadyStates``), each given by its unknowns ``xi``."""
+
+    @property
+    def options(self) -> Any:
+        """The section [nfrc] of the case."""
+
+    def stability(self, xi: np.ndarray) -> Stability:
+        """The stability of a state."""
+
+    def determinant(self, xi: np.ndarray, exponent: complex) -> float:
+        """Hill's determinant at lambda/Om = ``exponent``, where it is real."""
+
+    def growing_pairs(self, xi: np.ndarray) -> list[complex]:
+        """lambda/Om of the complex pairs that grow, the slowest first."""
+
+    def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
+        """lambda/Om of the pair near a ``guess``; raises ArithmeticError without one."""
+
+    def least_growth(self, xi: np.ndarray) -> float:
+        """Re lambda/Om up to which perturbations count as stable."""
+
+    def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
+        """The measures of a state."""
+
+
 class StabilityChanges:
     """Changes of stability between two neighbouring states of a curve: those that ``nfrc.special_points`` asks for."""
 
-    def __init__(self, states: "SteadyStates", left: Response, right: Response) -> None:
+    def __init__(self, states: StatesWithStability, left: Response, right: Response) -> None:
         self.states = states
         self.left = left
         self.right = right
