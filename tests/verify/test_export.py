@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from xml.etree import ElementTree
 
 from mpi4py import MPI
@@ -15,8 +16,10 @@ import xarray as xr
 import vipetsc as package
 from tests.conftest import assert_same_bits, datasets, small_case
 from vipetsc.case import Case, Sweep
+from vipetsc.cli.verbs.file_verbs import write_exports
 from vipetsc.dynamics import simulate
 from vipetsc.io import export
+from vipetsc.io.errors import FolderError
 from vipetsc.io.netcdf import open_netcdf, variable, write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.studies.sweep import run_sweep
@@ -180,6 +183,18 @@ def test_a_sweep_is_one_table_of_members(tmp_path):
         row = members[(members["amplitude (N)"] == 30.0) & (members["restitution"] == 0.5)]
         assert len(members) == 4
         assert row["ibtet"].item() == picked["ibtet"].item()
+
+
+def test_a_full_disk_is_no_error_of_the_results(folder, monkeypatch):
+    """The run can be read: that its curves cannot be written must not be reported as bad input."""
+
+    def fail(path, text):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(export, "write_text", fail)
+    with pytest.raises(OSError, match="No space left") as raised:
+        write_exports(folder)
+    assert not isinstance(raised.value, FolderError)
 
 
 def test_what_holds_no_results_is_refused(in_process, tmp_path):
