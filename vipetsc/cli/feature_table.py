@@ -45,7 +45,7 @@ class Feature:
     """A feature by its ``name``, and the ``changes`` of a case that bring it in, by section.
 
     ``of_system`` are the changes that bring it into the system of [nnm.own], None if such a system cannot have it.
-    ``scaled`` are changes of sections that only some verbs read, to which these then belong.
+    ``scaled`` are further changes for a column, by its heading, where numbers have another unit with the feature.
     """
 
     name: str
@@ -76,8 +76,7 @@ class Column:
         read = {*self.kind.keywords(), "plugins"} | ({"disorder"} if self.kind is NnmCase else set())
         if not changes.keys() <= read:
             return None
-        scaled = {section: keys for section, keys in feature.scaled.items() if section in self.sections}
-        return merged(merged(BASE, self.sections), changes | scaled)
+        return merged(merged(BASE, self.sections), changes | feature.scaled.get(self.heading, {}))
 
     def answer(self, feature: Feature) -> str:
         """``YES``, ``UNREAD``, or the sentence that refuses ``feature``."""
@@ -215,7 +214,7 @@ FEATURES: tuple[Feature, ...] = (
     Feature(
         "moved wall",
         {"drive": {"end": "left", "cell": None, "amplitude": 1e-4}},
-        scaled={"nfrc": {"range": [1e-6, 2e-5]}},
+        scaled={"nfrc": {"nfrc": {"range": [1e-6, 2e-5]}}},
     ),
     Feature("several drives", {"drive": {"more": [{"amplitude": 0.5, "frequency": 900.0, "cycles": 3, "cell": 6}]}}),
     Feature("mode at t = 0", _initial(kind="mode", number=3, amplitude=1e-5)),
