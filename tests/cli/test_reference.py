@@ -83,7 +83,7 @@ def test_the_schema_takes_every_case_file(path):
     "text",
     [
         "lattice.cels = 3",
-        "lattice.cells = 1",
+        "lattice.cells = 0",
         "lattice.ends = 'loose'",
         "drive.wavenumber = '5p/9'",
         "drive.wavenumber = 4.0",

@@ -207,7 +207,7 @@ def test_the_design_searches_eta_below_one():
         ("drive.mass=5", "drive.mass"),
         ("drive.wavenumber=4.0", "drive.wavenumber"),
         ("drive.wavenumber=pi/0", "drive.wavenumber"),
-        ("lattice.cells=1", "lattice.cells"),
+        ("lattice.cells=0", "lattice.cells"),
         ("lattice.eta=1.5", "lattice.eta"),
         ("time.rtol=0", "time.rtol"),
         ("time.end=-1", "time.end"),

@@ -159,7 +159,7 @@ class LatticeTable(Section):
 
     preset: Literal["four-band", "diatomic"] | None = None
     cell: CellTable | None = None
-    cells: int = Field(300, ge=2, le=MOST_CELLS)
+    cells: int = Field(300, ge=1, le=MOST_CELLS)
     ends: Literal["fixed", "free", "periodic"] = "fixed"
     reading: Literal["printed", "calibrated"] = "calibrated"
     lam: Positive | None = Field(None, alias="lambda")

@@ -47,8 +47,9 @@ def damped_bloch(cell: UnitCell, kappa: ArrayLike) -> DampedPoint:
     stiffness = inverse * cell.stiffness_matrix(kappa)
     damping = inverse * cell.damping_matrix(kappa)
 
-    # The state is (scale u, u'): displacements and velocities of one size.
-    scale = np.sqrt(np.abs(stiffness).sum(axis=-1).max())
+    # The state is (scale u, u'): displacements and velocities of one size. Nothing but dashpots resists a motion of
+    # equal masses together.
+    scale = np.sqrt(np.abs(stiffness).sum(axis=-1).max()) or np.abs(damping).sum(axis=-1).max() or 1.0
     state = np.zeros((*kappa.shape, 2 * d, 2 * d), complex)
     state[..., :d, d:] = scale * np.eye(d)
     state[..., d:, :d] = -stiffness / scale

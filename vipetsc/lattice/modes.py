@@ -113,7 +113,7 @@ def _modes(chain: Chain) -> Modes:
         raise ValueError(f"modes of {chain.cells} cells that differ, with more than {MOST_DOFS} masses")
 
     matrix = _scaled(chain)
-    if ring:
+    if ring or matrix.shape == (1, 1):
         squared, vectors = eigh(matrix.toarray(), driver="evr")
     else:
         squared, vectors = _near_diagonal(matrix)

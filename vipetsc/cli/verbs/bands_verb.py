@@ -111,7 +111,7 @@ def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
             "damping_ratio": float(point.ratio[band.number - 1]),
             "frequency": float(rate.imag),
             # The complex rate has the decay in its negative real part.
-            "decay_time": float(-1 / rate.real),
+            "decay_time": float(-1 / rate.real) if rate.real else np.inf,
         })  # fmt: skip
     return {"damping": rows, "decay_length": {"frequency": frequency, "cells": decay_length(cell, frequency)}}
 
