@@ -70,10 +70,11 @@ def measure_claims(root: Path) -> list[dict]:
     ):
         path = root / step / "ensemble.h5"
         value = {}
-        # With a part of the paper one of the steps may be missing.
+        # With a part of the paper one of the steps may be missing; where all members failed, nothing was measured.
         if path.exists():
             with h5py.File(path) as file:
-                value = {"total": float(np.nansum(file[data][...]))}
+                if data in file:
+                    value = {"total": float(np.nansum(file[data][...]))}
 
         verdict = "holds" if value else "not measured"
         for reading in ("calibrated", "printed"):

@@ -221,7 +221,7 @@ def test_files_that_a_killed_command_leaves_are_removed(tmp_path):
 def test_verbs_without_results_of_their_own_remove_such_files_too(tmp_path):
     """``analyse`` and ``plot`` lock a folder that they do not claim: leftovers go, also in the folders of members."""
     (tmp_path / "member").mkdir()
-    for name in (".index.json.host-7-ab.part", "member/.analysis.h5.host-7-cd.part"):
+    for name in (".index.json.host-7-ab.part", "member/.analysis.h5.host-7-cd.part", "member/.lock"):
         (tmp_path / name).touch()
     with locked(MPI.COMM_SELF, tmp_path):
         assert names_in(tmp_path) == {".lock", "member"}

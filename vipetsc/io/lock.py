@@ -54,21 +54,38 @@ def _lock(path: Path) -> Iterator[None]:
             remove_temporary_files(path)
         yield
     finally:
-        # Removed while it is still locked: one that opens it from here on finds another file, and tries again.
         if descriptor is not None:
-            (path / LOCK).unlink(missing_ok=True)
-            os.close(descriptor)
+            _unlock(path, descriptor)
         for folder in created:
             with suppress(OSError):
                 folder.rmdir()
 
 
+def _unlock(path: Path, descriptor: int) -> None:
+    """Give back the lock of a folder that ``descriptor`` holds."""
+    # Removed while it is still locked: one that opens it from here on finds another file, and tries again.
+    (path / LOCK).unlink(missing_ok=True)
+    os.close(descriptor)
+
+
 def remove_temporary_files(folder: Path) -> None:
-    """Remove temporary files of commands that were killed while they wrote into ``folder`` or the folders in it."""
-    for temporary in [*folder.glob(".*.part"), *folder.glob("*/.*.part")]:
-        # Another command may work on the member of a sweep: its lock is in the member's folder.
-        if temporary.parent == folder or not (temporary.parent / LOCK).exists():
+    """Remove temporary files, and locks that nobody holds, which killed commands have left in ``folder`` and below it.
+
+    The caller has the lock of ``folder``. Another command may have that of a folder in it, as of a member of a sweep.
+    """
+    for temporary in folder.glob(".*.part"):
+        temporary.unlink(missing_ok=True)
+
+    for inner in filter(Path.is_dir, folder.iterdir()):
+        descriptor = None
+        if (inner / LOCK).exists():
+            descriptor, _ = _try_to_lock(inner)
+            if descriptor is None:
+                continue
+        for temporary in inner.glob(".*.part"):
             temporary.unlink(missing_ok=True)
+        if descriptor is not None:
+            _unlock(inner, descriptor)
 
 
 def _acquire(path: Path, created: list[Path]) -> int | None:
