@@ -19,6 +19,7 @@ FLOORS = (
     "paper",
     "studies",
     "figures",
+    "identification",
     "modes",
     "dynamics",
     "contact",

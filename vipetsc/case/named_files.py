@@ -12,8 +12,8 @@ from typing import Any
 
 from vipetsc.io.names import path_named, readable
 
-# Keys that name a file: `drive.samples.file` and `initial.path`, which a sweep may vary.
-SECTIONS = "drive", "initial", "sweep"
+# Keys that name a file: `drive.samples.file` and `initial.path`, which a sweep may vary, and `identify.records`.
+SECTIONS = "drive", "initial", "sweep", "identify"
 KEYS = "file", "path"
 MISSING = "no such file, neither in the folder of the case file nor in the current one"
 

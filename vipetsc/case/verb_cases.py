@@ -7,6 +7,7 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section, read_toml, with_overrides
 from vipetsc.case.design import DesignCase
 from vipetsc.case.disorder import DisorderTable
+from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.law import LawCase
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
@@ -15,7 +16,7 @@ from vipetsc.case.predict import PredictCase
 from vipetsc.case.sweep import Sweep
 
 VERB_CASES: tuple[type[CaseFile], ...]
-VERB_CASES = (Case, Sweep, NnmCase, DesignCase, LawCase, OptimiseCase, PredictCase, NfrcCase)
+VERB_CASES = (Case, Sweep, NnmCase, DesignCase, LawCase, OptimiseCase, PredictCase, NfrcCase, IdentifyCase)
 """The case of every verb that reads one of its own, ``run`` first; sections, schema and manual follow this order."""
 
 OF_SECTION = {kind.section: kind for kind in VERB_CASES if kind.section}
@@ -23,7 +24,7 @@ SECTIONS: dict[str, type[Section]] = {name: table for kind in VERB_CASES for nam
 """Sections that a case file may have. A case reads those it declares and ignores the others."""
 
 # Sections that mark a file as one of a run, or of verbs that consist of runs; normal modes read the others too.
-SECTIONS_OF_RUNS = {"disorder", "drive", "initial", "time", "output", "sweep", "optimise"}
+SECTIONS_OF_RUNS = {"disorder", "drive", "initial", "time", "output", "sweep", "optimise", "identify"}
 
 
 def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) -> list[CaseFile]:

@@ -18,6 +18,7 @@ from vipetsc.figures import (
     cost_maps,
     entropy,
     frequency_energy,
+    identified,
     impact_panels,
     law_panels,
     measure_pages,
@@ -47,7 +48,7 @@ MOST_WARNINGS = 4  # below a picture
 
 # The sources: what folders hold.
 RUN, SWEEP, BRANCHES, DESIGN = "run", "sweep", "branches", "design"
-OPTIMUM, LAW, PREDICTION = "optimum", "law", "prediction"
+OPTIMUM, LAW, PREDICTION, IDENTIFIED = "optimum", "law", "prediction", "identification"
 PAPER = "paper"  # sweeps of the paper, in its panels; of any sweep `measure_pages` draws what it measured
 
 
@@ -61,6 +62,7 @@ class ResultFile(NamedTuple):
 FILES: Mapping[str, ResultFile] = {
     DESIGN: ResultFile("design.h5", needs=("cost", "frequency")),
     OPTIMUM: ResultFile("optimum.h5", needs=("value", "comparison")),
+    IDENTIFIED: ResultFile("identified.h5", needs=("value", "profile")),
     LAW: ResultFile("law.h5", needs=("share", "efficiency")),
     PREDICTION: ResultFile("prediction.h5", needs=("predicted", "onset_amplitude")),
 }
@@ -150,6 +152,11 @@ _SPECS = (
     FigureSpec("convergence", OPTIMUM, optimum.convergence),
     FigureSpec("compared_designs", OPTIMUM, optimum.compared_designs),
     FigureSpec("compared_curves", OPTIMUM, optimum.compared_curves),
+    FigureSpec("record_and_model", IDENTIFIED, identified.record_and_model),
+    FigureSpec("residual_correlations", IDENTIFIED, identified.residual_correlations),
+    FigureSpec("misfit_profiles", IDENTIFIED, identified.misfit_profiles),
+    FigureSpec("parameter_correlation", IDENTIFIED, identified.parameter_correlation),
+    FigureSpec("growing_windows", IDENTIFIED, identified.growing_windows),
 )
 FIGURES: Mapping[str, FigureSpec] = {spec.name: spec for spec in _SPECS}
 reserve(FIGURE, FIGURES)

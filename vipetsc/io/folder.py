@@ -67,8 +67,11 @@ LAW = FolderKind("law", ("law.h5", "law-runs*.jsonl"))
 SWEEP = FolderKind("sweep", ("index.json", "members*.jsonl"), ("*/", "ensemble.h5", "backbone.h5"))
 PREDICTION = FolderKind("prediction", ("prediction.h5", "prediction-runs*.jsonl"))
 OPTIMUM = FolderKind("optimum", ("optimum.h5", "optimum-runs*.jsonl"), ("figures", "curves", "law", "best*.toml"))
+IDENTIFIED = FolderKind(
+    "identification", ("identified.h5", "identified-runs*.jsonl"), ("figures", "curves", "identified.toml")
+)
 PAPER = FolderKind("paper", ("plan.json",), (), "plan.json")
-KINDS = (RUN, BRANCHES, SEARCH, LAW, PREDICTION, SWEEP, OPTIMUM, PAPER)
+KINDS = (RUN, BRANCHES, SEARCH, LAW, PREDICTION, SWEEP, OPTIMUM, IDENTIFIED, PAPER)
 
 
 class Claim:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 # Files that are opened if a folder is given: the first one that exists.
-FIRST = "run.h5", "optimum.h5", "prediction.h5", "law.h5", "design.h5", "analysis.h5"
+FIRST = "run.h5", "optimum.h5", "identified.h5", "prediction.h5", "law.h5", "design.h5", "analysis.h5"
 # What the file of a run has at least.
 RUN_NEEDS = "time", "cell", "energy", "case"
 Selectable = TypeVar("Selectable", "xr.Dataset", "xr.DataArray")

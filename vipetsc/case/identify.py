@@ -1,0 +1,376 @@
+"""The case of the verb ``identify``: measured records, and the parameters that are sought in them."""
+
+import copy
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from functools import cached_property
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+import tomli_w
+from pydantic import Field
+
+from vipetsc.case.case import Case
+from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
+from vipetsc.case.contacts import values_of_sites
+from vipetsc.case.disorder import with_cell
+from vipetsc.case.features import refusals, refuse_disorder
+from vipetsc.case.measured import MeasuredError, RecordTable, read_measured, sensor_problems
+from vipetsc.case.warnings import loss_warnings, unit_warnings
+from vipetsc.lattice import UnitCell
+from vipetsc.lattice.contact import LAWS
+
+OF_SITES = ("clearance", "stiffness", "exponent", "restitution")
+OF_CELL = ("mass", "spring", "dashpot")
+LINEAR = (*OF_CELL, "amplitude")
+"""Unknowns on which a motion without contact depends."""
+UNITS = {"clearance": "m", "mass": "kg", "spring": "N/m", "dashpot": "N s/m", "amplitude": "N"}
+
+
+class UnknownTable(Section):
+    """A ``quantity`` that is sought within ``bounds`` in SI units, from ``start`` on, by default that of the case.
+
+    ``of``: "all" sites, masses or springs have one value, "each" has one of its own, or groups of their numbers have.
+    ``scale``: derivatives and steps are those of the logarithm or of the value.
+    """
+
+    quantity: Literal["clearance", "stiffness", "exponent", "restitution", "mass", "spring", "dashpot", "amplitude"]
+    bounds: Annotated[list[float], Field(min_length=2, max_length=2)]
+    of: Literal["all", "each"] | list[list[int]] = "all"
+    scale: Literal["logarithmic", "linear"] | None = None
+    start: float | list[float] | None = None
+
+
+class IdentifyTable(Section):
+    """Parameters are fitted to ``records`` over windows that grow, from one or several starts.
+
+    The first window ends with the model's contact number ``impacts``, and each has ``growth`` times as many as the
+    one before. ``starts``: the first one is that of the unknowns, the others are drawn between their bounds by Latin
+    hypercube sampling with ``seed``. ``steps``: evaluations of a window. ``confidence`` is that of the intervals;
+    ``profile``: values of each parameter for which all others are fitted.
+    """
+
+    records: list[RecordTable] = Field([], min_length=1)
+    unknowns: list[UnknownTable] = Field([], min_length=1)
+    impacts: int = Field(4, ge=1)
+    growth: Annotated[float, Field(gt=1, le=100)] = 1.6
+    starts: int = Field(1, ge=1, le=10_000)
+    seed: int = Field(1, ge=0)
+    steps: int = Field(30, ge=1, le=10_000)
+    confidence: Annotated[float, Field(gt=0, lt=1)] = 0.9
+    profile: int = Field(5, ge=0, le=1000)
+
+
+class Parameter(NamedTuple):
+    """A number that is sought: a ``quantity`` at the ``members`` (sites, masses, springs or records, from 0).
+
+    The coordinate of the fit is its logarithm, or its position between the bounds: a number of order one.
+    """
+
+    name: str
+    quantity: str
+    members: tuple[int, ...]
+    low: float
+    high: float
+    start: float
+    unit: str
+    is_logarithmic: bool
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the motion depends on it without contact."""
+        return self.quantity in LINEAR
+
+    def to_coordinate(self, value: float) -> float:
+        """The fit's coordinate of a ``value``."""
+        return float(np.log(value)) if self.is_logarithmic else (value - self.low) / (self.high - self.low)
+
+    def from_coordinate(self, z: float) -> float:
+        """The value at the fit's coordinate ``z``, kept between the bounds, which rounding may miss."""
+        value = np.exp(z) if self.is_logarithmic else self.low + (self.high - self.low) * z
+        return float(np.clip(value, self.low, self.high))
+
+    def slope(self, z: float) -> float:
+        """Derivative of the value by the fit's coordinate at ``z``."""
+        return self.from_coordinate(z) if self.is_logarithmic else self.high - self.low
+
+
+class IdentifyCase(CaseFile):
+    """The case whose parameters are sought, resolved (``base``), and its ``table`` without ``[identify]``."""
+
+    table: Table
+    options: IdentifyTable
+    base: Case
+
+    verb = section = "identify"
+    takes = Case.takes - {"nonlinear springs", "initial motion", "disorder"}
+    premise = "identification holds for a lattice at rest"
+
+    @classmethod
+    def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
+        """The fields, and everything that is wrong with the section, the data or the case."""
+        table = dict(table)
+        section = table.pop("identify", None)
+        if not isinstance(section, dict):
+            remedy = "missing; give [[identify.records]] with their sensors, and [[identify.unknowns]]"
+            return {}, [Problem("identify", section, remedy)]
+
+        options, problems = read_section(IdentifyTable, section, "identify")
+        problems += refuse_disorder(cls, table)
+        try:
+            base = Case.from_table({k: table[k] for k in table if k in Case.model_fields} | {"name": "model"})
+        except CaseError as error:
+            return {}, problems + error.problems
+        problems += refusals(cls, dict(base), lambda *keys: True)
+        if problems:
+            return {}, problems
+
+        fields = {"table": table, "options": options, "base": base}
+        problems = [*_case_problems(base), *_unknown_problems(options, base), *_record_problems(options, base)]
+        if problems:
+            return fields, problems
+        fields["options"], problems = _with_hashes(options)
+        return fields, problems
+
+    def warnings(self) -> list[str]:
+        """Warnings of settings in the case that are probably unintended."""
+        # Times and samples are those of the records: what a run would warn of does not matter.
+        return [*unit_warnings(self.base.drive, self.base.model().chain), *loss_warnings(self.base.lattice)]
+
+    def to_toml(self) -> str:
+        """The case as TOML; reading it back gives the same identification."""
+        section = self.options.model_dump(exclude_none=True)
+        return tomli_w.dumps({"name": self.name} | self.table | {"identify": section})
+
+    def runs(self) -> list[CaseFile]:
+        """The case whose parameters are sought."""
+        return [self.base]
+
+    @property
+    def wants_pictures(self) -> bool:
+        """Whether the results are drawn, ``output.figures`` of the case."""
+        return self.base.output.figures
+
+    @cached_property
+    def parameters(self) -> list[Parameter]:
+        """What is sought: the unknowns one by one, then offsets of records."""
+        found = []
+        for unknown in self.options.unknowns:
+            values = values_of(self.base, unknown.quantity)
+            for number, members in enumerate(_groups(unknown, len(values))):
+                start = unknown.start[number] if isinstance(unknown.start, list) else unknown.start
+                if start is None:
+                    start = float(np.mean([values[member] for member in members]))
+                found.append(_parameter(unknown, members, start, len(values)))
+        for number, record in enumerate(self.options.records):
+            if isinstance(record.offset, list):
+                low, high = record.offset
+                name = "offset" if len(self.options.records) == 1 else f"offset {number + 1}"
+                found.append(Parameter(name, "offset", (number,), low, high, (low + high) / 2, "s", False))
+        return found
+
+    def case_of(self, values: Iterable[float], name: str = "model") -> Case:
+        """The case with the ``values`` (parameter,); raises CaseError if it is impossible."""
+        values = list(values)
+        contacts: Table = {}
+        drive: Table = {}
+        base = self.base
+        cell = base.lattice.undamped_cell()
+        changed_cell = cell
+        for quantity in OF_SITES + LINEAR:
+            sought = [
+                (parameter, value)
+                for parameter, value in zip(self.parameters, values, strict=True)
+                if parameter.quantity == quantity
+            ]
+            if not sought:
+                continue
+            numbers = list(values_of(base, quantity))
+            for parameter, value in sought:
+                for member in parameter.members:
+                    numbers[member] = float(value)
+            if quantity == "amplitude":
+                drive["amplitude"] = numbers[0]
+            elif quantity in OF_CELL:
+                changed_cell = _with_values(changed_cell, quantity, numbers)
+            elif quantity == "clearance":
+                contacts["clearance"] = numbers
+            elif len(set(numbers)) == 1 and not (base.contacts.each and getattr(base.contacts.each, quantity)):
+                contacts[quantity] = numbers[0]
+            else:
+                each = contacts.get("each") or (base.contacts.each or Section()).model_dump(exclude_none=True)
+                contacts["each"] = each | {quantity: numbers}
+
+        changes = {key: section for key, section in (("contacts", contacts), ("drive", drive)) if section}
+        if changed_cell is not cell:
+            lattice = base.lattice.model_dump(by_alias=True, exclude_none=True)
+            changes["lattice"] = dict.fromkeys(lattice) | with_cell(lattice, changed_cell, {})
+        return base.varied(name=name, **changes)
+
+    def record_case(self, case: Case, number: int) -> Case:
+        """The ``case`` with the drive of the record of that ``number`` (from 0)."""
+        drive = self.options.records[number].drive
+        return case.varied(drive=copy.deepcopy(drive)) if drive else case
+
+
+def values_of(case: Case, quantity: str) -> list[float]:
+    """The values of a ``quantity`` in a case: of its sites, of the masses or springs of its cell, of its drive."""
+    cell = case.lattice.undamped_cell()
+    if quantity == "mass":
+        return list(cell.masses)
+    if quantity == "spring":
+        return [spring.stiffness for spring in cell.springs]
+    if quantity == "dashpot":
+        return [spring.damping for spring in cell.springs]
+    if quantity == "amplitude":
+        return [case.drive.amplitude]
+    chain = case.model().chain
+    if quantity == "clearance":
+        return list(chain.clearances)
+    return values_of_sites(case.contacts, quantity, len(chain.sites))
+
+
+def _with_values(cell: UnitCell, quantity: str, numbers: list[float]) -> UnitCell:
+    """The ``cell`` with other masses, springs or dashpots."""
+    if quantity == "mass":
+        return replace(cell, masses=tuple(numbers))
+    springs = []
+    for spring, number in zip(cell.springs, numbers, strict=True):
+        is_spring = quantity == "spring"
+        springs.append(replace(spring, stiffness=number) if is_spring else replace(spring, damping=number))
+    return replace(cell, springs=tuple(springs))
+
+
+def _groups(unknown: UnknownTable, count: int) -> list[tuple[int, ...]]:
+    """The members (0-based) of each value of an unknown of ``count`` members."""
+    if unknown.of == "all":
+        return [tuple(range(count))]
+    if unknown.of == "each":
+        return [(member,) for member in range(count)]
+    return [tuple(number - 1 for number in group) for group in unknown.of]
+
+
+def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float, count: int) -> Parameter:
+    """One of the values of an ``unknown``."""
+    low, high = unknown.bounds
+    name: str = unknown.quantity
+    if unknown.of != "all":
+        name += f" {'+'.join(str(member + 1) for member in members)}"
+    scale = unknown.scale or ("linear" if unknown.quantity in ("restitution", "exponent") else "logarithmic")
+    # The case may lie outside the bounds; the search does not.
+    start = min(max(start, low), high)
+    unit = UNITS.get(unknown.quantity, "N/m^n" if unknown.quantity == "stiffness" else "1")
+    return Parameter(name, unknown.quantity, members, low, high, start, unit, scale == "logarithmic")
+
+
+def _case_problems(base: Case) -> Iterator[Problem]:
+    """Problems of a case in which contacts touch at rest."""
+    model = base.model()
+    gaps = model.gaps or [(gap, gap) for gap in model.chain.clearances]
+    for number, pair in enumerate(gaps, 1):
+        if min(pair) <= 0:
+            remedy = (
+                f"site {number} touches or is pressed at rest; identification needs open contacts, whose derivatives"
+                " begin at an onset"
+            )
+            yield Problem("contacts.clearance", float(min(pair)), remedy)
+            return
+
+
+def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
+    """Problems of the unknowns in a case."""
+    taken: set[tuple[str, int]] = set()
+    for index, unknown in enumerate(options.unknowns, 1):
+        at = f"identify.unknowns[{index}]"
+        quantity = unknown.quantity
+        values = values_of(base, quantity)
+        low, high = unknown.bounds
+        if not low < high:
+            yield Problem(f"{at}.bounds", unknown.bounds, "must be [low, high] with low below high")
+            continue
+        yield from _bounds_problems(unknown, at)
+        if not values:
+            yield Problem(f"{at}.quantity", quantity, "the case has no contact sites")
+            continue
+        if quantity == "exponent" and any(law.law != "power" for law in base.model().used_laws):
+            yield Problem(f"{at}.quantity", quantity, 'only the law "power" has an exponent; set contacts.law')
+        if quantity == "stiffness" and any(law.law not in LAWS for law in base.model().used_laws):
+            remedy = "a registered law need not be proportional to its stiffness; only shipped laws can be identified"
+            yield Problem(f"{at}.quantity", quantity, remedy)
+        if quantity == "amplitude" and all("amplitude" in record.drive for record in options.records):
+            yield Problem(f"{at}.quantity", quantity, "every record gives its amplitude; none is left to be sought")
+        if quantity in OF_CELL and (base.lattice.profiles or base.lattice.absorbing):
+            remedy = (
+                "masses, springs and dashpots are sought in lattices of equal cells only; omit profiles and absorbing"
+            )
+            yield Problem(f"{at}.quantity", quantity, remedy)
+        if quantity == "dashpot" and any(value == 0 for value in values) and unknown.start is None:
+            yield Problem(f"{at}.start", None, "missing; the case has springs without a dashpot to begin with")
+
+        groups = _groups(unknown, len(values))
+        wrong = [member + 1 for group in groups for member in group if not 0 <= member < len(values)]
+        if wrong or not all(groups):
+            yield Problem(f"{at}.of", unknown.of, f"numbers are from 1 to {len(values)}, one or more in each group")
+            continue
+        for group in groups:
+            for member in group:
+                if (quantity, member) in taken:
+                    yield Problem(f"{at}.of", unknown.of, f"{quantity} {member + 1} is sought twice")
+                taken.add((quantity, member))
+        if isinstance(unknown.start, list) and len(unknown.start) != len(groups):
+            yield Problem(f"{at}.start", unknown.start, f"give one number for each of the {len(groups)} values")
+        starts = unknown.start if isinstance(unknown.start, list) else [unknown.start]
+        if any(start is not None and not low <= start <= high for start in starts):
+            yield Problem(f"{at}.start", unknown.start, f"must lie within the bounds {low:g} and {high:g}")
+
+
+def _bounds_problems(unknown: UnknownTable, at: str) -> Iterator[Problem]:
+    """Problems of bounds beyond what the quantity may be."""
+    low, high = unknown.bounds
+    quantity = unknown.quantity
+    if quantity == "restitution" and not 0 <= low < high <= 1:
+        yield Problem(f"{at}.bounds", unknown.bounds, "a restitution is between 0 and 1")
+    elif quantity == "exponent" and not 1 <= low < high <= 10:
+        yield Problem(f"{at}.bounds", unknown.bounds, "an exponent is between 1 and 10")
+    elif low <= 0 and (quantity not in ("restitution", "dashpot") or unknown.scale == "logarithmic"):
+        yield Problem(f"{at}.bounds", unknown.bounds, "must be positive")
+    elif quantity == "dashpot" and low <= 0 and unknown.scale != "linear":
+        yield Problem(f"{at}.bounds", unknown.bounds, 'must be positive, or give scale = "linear"')
+
+
+def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
+    """Problems of the records' keys, their sensors and their drives."""
+    dofs = base.lattice.unit_cell().dofs
+    for number, record in enumerate(options.records, 1):
+        at = f"identify.records[{number}]"
+        if (record.time is None) == (record.rate is None):
+            yield Problem(f"{at}.time", record.time, "give the column of times or the rate in Hz, one of both")
+        if isinstance(record.offset, list) and not record.offset[0] < record.offset[1]:
+            yield Problem(f"{at}.offset", record.offset, "must be a number, or bounds [low, high] with low below high")
+        yield from sensor_problems(record, at, base.lattice.cells, dofs, len(base.drive.every))
+        if record.drive:
+            try:
+                base.varied(drive=copy.deepcopy(record.drive))
+            except CaseError as error:
+                for problem in error.problems:
+                    yield replace(problem, key=f"{at}.{problem.key}")
+    if not any(record.contact for record in options.records):
+        for index, unknown in enumerate(options.unknowns, 1):
+            if unknown.quantity in OF_SITES:
+                remedy = "no record has contact: a lattice that does not touch says nothing about its contacts"
+                yield Problem(f"identify.unknowns[{index}].quantity", unknown.quantity, remedy)
+
+
+def _with_hashes(options: IdentifyTable) -> tuple[IdentifyTable, list[Problem]]:
+    """The ``options`` with the hash of every record's file, and what is wrong with the data."""
+    records = []
+    problems = []
+    for number, record in enumerate(options.records, 1):
+        # With a hash it is a resolved one: results are read where the data are gone.
+        if record.sha256 is None:
+            try:
+                record = record.model_copy(update={"sha256": read_measured(record).sha256})
+            except MeasuredError as error:
+                problems.append(Problem(f"identify.records[{number}].{error.key}", error.value, error.remedy))
+        records.append(record)
+    return options.model_copy(update={"records": records}), problems

@@ -1,0 +1,256 @@
+"""Measured records of the verb ``identify``: their sections, and the reading of their files."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import h5py
+import numpy as np
+from pydantic import Field
+
+from vipetsc.case.case_file import Problem, Section
+from vipetsc.case.initial import file_hash
+from vipetsc.case.named_files import MISSING
+from vipetsc.case.schema import Finite, Positive
+from vipetsc.io.names import path_named
+
+MOST_ROWS = 1_000_000
+# Times may differ from even ones by this fraction of their interval, as those printed with few digits do.
+UNEVEN = 0.05
+HDF5 = (".h5", ".hdf5", ".nc")
+UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2", "force": "N"}
+
+Place = int | str
+
+
+class SensorTable(Section):
+    """A ``quantity`` at a ``mass`` of a ``cell``, or the force of a ``drive``, in a ``column`` of the record.
+
+    ``column``: a name or a number from 1 in a table of text, a dataset (with "[3]" behind it its third column) in HDF5.
+    Values times ``factor`` are in SI units, and so is ``noise``, the standard deviation of their errors.
+    """
+
+    quantity: Literal["displacement", "velocity", "acceleration", "force"]
+    column: Place
+    cell: int | None = Field(None, ge=1)
+    mass: int | None = Field(None, ge=1)
+    drive: int | None = Field(None, ge=1)
+    factor: Finite = 1.0
+    noise: Positive | None = None
+
+    @property
+    def name(self) -> str:
+        """The sensor in words."""
+        if self.quantity == "force":
+            return f"force of drive {self.drive or 1}"
+        return f"{self.quantity} of mass {self.mass or 1} in cell {self.cell}"
+
+
+class RecordTable(Section):
+    """A measurement that begins with the lattice at rest: its ``file``, the times, and what the ``sensors`` recorded.
+
+    ``time``: the column of times, which ``time_factor`` makes seconds, or the ``rate`` in Hz instead. The drive begins
+    at the record's time ``offset``; [low, high] are bounds between which it is sought. ``end``: the last time that is
+    used, in s. ``drive``: keys in which the drive differs from that of the case. Without ``contact`` nothing touched.
+    The ``sha256`` of the file is filled in.
+    """
+
+    file: str
+    sha256: str | None = None
+    time: Place | None = None
+    time_factor: Positive = 1.0
+    rate: Positive | None = None
+    offset: Finite | Annotated[list[Finite], Field(min_length=2, max_length=2)] = 0.0
+    end: Finite | None = None
+    drive: dict[str, Any] = Field({})
+    contact: bool = True
+    sensors: list[SensorTable] = Field(min_length=1)
+
+
+class Measured(NamedTuple):
+    """A record in SI units: even ``times`` (sample,) in s of its own clock, ``values`` (sample, sensor)."""
+
+    times: np.ndarray
+    values: np.ndarray
+    sha256: str
+
+
+class MeasuredError(ValueError):
+    """A record that cannot be used: ``key`` below that of the record, the ``value`` there, and the ``remedy``."""
+
+    def __init__(self, key: str, value: Any, remedy: str) -> None:
+        super().__init__(key, value, remedy)
+        self.key = key
+        self.value = value
+        self.remedy = remedy
+
+
+def read_measured(record: RecordTable) -> Measured:
+    """The times and values of a ``record``; raises MeasuredError for bad data."""
+    path = path_named(record.file).resolve()
+    try:
+        digest = file_hash(path)
+    except FileNotFoundError:
+        raise MeasuredError("file", record.file, MISSING) from None
+    except OSError as error:
+        raise MeasuredError("file", record.file, str(error.strerror or error)) from None
+
+    read = _hdf5_columns if path.suffix.lower() in HDF5 else _text_columns
+    columns = read(path, record)
+    lengths = {key: len(values) for key, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{key}: {length}" for key, length in lengths.items())
+        raise MeasuredError("file", record.file, f"its columns have different lengths ({listed})")
+    for key, values in columns.items():
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            remedy = f"sample {bad[0] + 1} of {len(values)} is not a finite number; cut the record or fill the gap"
+            raise MeasuredError(key, float(values[bad[0]]), remedy)
+
+    values = np.column_stack(
+        [columns[f"sensors[{number}].column"] * sensor.factor for number, sensor in enumerate(record.sensors, 1)]
+    )
+    times = _times(record, columns.get("time"), len(values))
+    if record.end is not None:
+        used = times <= record.end * (1 + 1e-12)
+        times = times[used]
+        values = values[used]
+    if len(times) < 8:
+        raise MeasuredError(
+            "end" if record.end is not None else "file",
+            record.end or record.file,
+            f"leaves {len(times)} samples; at least 8 are needed",
+        )
+    for number, column in enumerate(values.T, 1):
+        if not column.any():
+            raise MeasuredError(
+                f"sensors[{number}].column",
+                record.sensors[number - 1].column,
+                "is zero at all times; is the sensor connected?",
+            )
+    return Measured(times, values, digest)
+
+
+def _times(record: RecordTable, column: np.ndarray | None, count: int) -> np.ndarray:
+    """Even times (count,) in s from the ``rate`` or from the ``column`` of times."""
+    if record.rate is not None:
+        return np.arange(count) / record.rate
+    assert column is not None
+    times = column * record.time_factor
+    if count < 2:
+        return times
+    interval = (times[-1] - times[0]) / (count - 1)
+    even = times[0] + interval * np.arange(count)
+    if not interval > 0:
+        raise MeasuredError("time", record.time, "must rise from sample to sample")
+    worst = int(np.argmax(abs(times - even)))
+    if abs(times[worst] - even[worst]) > UNEVEN * interval:
+        where = f"sample {worst + 1} is at {times[worst]:.9g} s instead of {even[worst]:.9g} s"
+        remedy = f"is uneven: {where}; resample the record evenly, or give its rate"
+        raise MeasuredError("time", record.time, remedy)
+    return np.asarray(even)
+
+
+def _wanted(record: RecordTable) -> Iterator[tuple[str, Place]]:
+    """The places of all columns of a record, by their keys."""
+    if record.time is not None:
+        yield "time", record.time
+    for number, sensor in enumerate(record.sensors, 1):
+        yield f"sensors[{number}].column", sensor.column
+
+
+def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
+    """The columns of a table of text, with a line of names or without."""
+    try:
+        lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
+    except (OSError, ValueError):
+        raise MeasuredError("file", record.file, "is not a table of text; HDF5 files end in .h5") from None
+    lines = [line for line in lines if line and not line.startswith("#")]
+    if not lines or len(lines) > MOST_ROWS:
+        raise MeasuredError("file", record.file, f"has {len(lines)} lines; a table has 1 to {MOST_ROWS}")
+
+    separator = next((mark for mark in (",", ";", "\t") if mark in lines[0]), None)
+    rows = [[field.strip().strip('"') for field in line.split(separator)] for line in lines]
+    names: list[str] = []
+    # Measuring programs leave "nan" for what they miss: that is a number, though a bad one.
+    if not all(_is_number(field) for field in rows[0]):
+        names = rows.pop(0)
+    widths = {len(row) for row in rows}
+    if len(widths) != 1:
+        raise MeasuredError("file", record.file, f"its lines have {' or '.join(map(str, sorted(widths)))} fields")
+    try:
+        table = np.array(rows, float)
+    except ValueError:
+        number, row = next((n, row) for n, row in enumerate(rows, 1) if not all(_is_number(field) for field in row))
+        raise MeasuredError("file", record.file, f"row {number} is no row of numbers: {', '.join(row)}") from None
+
+    columns = {}
+    for key, place in _wanted(record):
+        if isinstance(place, str) and place not in names:
+            known = f"there are {', '.join(names)}" if names else "the table has no line of names; give a number from 1"
+            raise MeasuredError(key, place, f"no column of that name; {known}")
+        index = names.index(place) if isinstance(place, str) else place - 1
+        if not 0 <= index < table.shape[1]:
+            raise MeasuredError(key, place, f"the table has the columns 1 to {table.shape[1]}")
+        columns[key] = table[:, index]
+    return columns
+
+
+def _is_number(field: str) -> bool:
+    """Whether a field of a table is a number."""
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
+
+
+def _hdf5_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
+    """The datasets of an HDF5 file, or columns of those with two dimensions."""
+    columns = {}
+    try:
+        with h5py.File(path) as file:
+            for key, place in _wanted(record):
+                found = re.fullmatch(r"(.+?)(?:\[(\d+)\])?", str(place))
+                name, column = found.groups() if found else (str(place), None)
+                dataset = file.get(name)
+                if not isinstance(dataset, h5py.Dataset):
+                    raise MeasuredError(key, place, f"the file has no dataset {name}")
+                if dataset.size > MOST_ROWS * 100 or dataset.ndim != (1 if column is None else 2):
+                    shape = " x ".join(map(str, dataset.shape))
+                    raise MeasuredError(
+                        key, place, f'is an array of {shape}; write "{name}[1]" for the first column of two dimensions'
+                    )
+                if column is not None and not 1 <= int(column) <= dataset.shape[1]:
+                    raise MeasuredError(key, place, f"the dataset has the columns 1 to {dataset.shape[1]}")
+                values = dataset[:] if column is None else dataset[:, int(column) - 1]
+                columns[key] = np.asarray(values, float)
+    except (OSError, TypeError) as error:
+        raise MeasuredError("file", record.file, f"is not an HDF5 file of numbers ({error})") from None
+    return columns
+
+
+def sensor_problems(record: RecordTable, at: str, cells: int, dofs: int, drives: int) -> Iterator[Problem]:
+    """Problems of a record's sensors in a lattice of ``cells`` with ``dofs`` masses each and so many ``drives``."""
+    for number, sensor in enumerate(record.sensors, 1):
+        path = f"{at}.sensors[{number}]"
+        if sensor.factor == 0:
+            yield Problem(f"{path}.factor", 0.0, "must not be zero")
+        if sensor.quantity == "force":
+            if sensor.cell is not None or sensor.mass is not None:
+                yield Problem(
+                    f"{path}.cell", sensor.cell, "a force is that of a drive: give drive in place of cell and mass"
+                )
+            if (sensor.drive or 1) > drives:
+                yield Problem(f"{path}.drive", sensor.drive, f"the case has {drives} drive{'s' * (drives > 1)}")
+            continue
+        if sensor.drive is not None:
+            yield Problem(f"{path}.drive", sensor.drive, "applies to a force; give cell and mass")
+        if sensor.cell is None:
+            yield Problem(f"{path}.cell", None, f"missing; give the sensor's cell, 1 to {cells}, and mass")
+        elif sensor.cell > cells:
+            yield Problem(f"{path}.cell", sensor.cell, f"the lattice has the cells 1 to {cells}")
+        if sensor.mass is not None and sensor.mass > dofs:
+            has = "the one mass 1" if dofs == 1 else f"the masses 1 to {dofs}"
+            yield Problem(f"{path}.mass", sensor.mass, f"a cell has {has}")

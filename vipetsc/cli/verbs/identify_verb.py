@@ -1,0 +1,38 @@
+"""The verb ``identify``: parameters of a case from measured records, with their uncertainty."""
+
+from vipetsc.case.identify import IdentifyCase
+from vipetsc.cli.arguments import OF_STUDIES, case_with
+from vipetsc.cli.drawing import Pictures
+from vipetsc.cli.tables import first_few
+from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
+from vipetsc.io.folder import IDENTIFIED
+
+
+def identify_parameters(plan: IdentifyCase, work: Work) -> Outcome:
+    """Fit the parameters to the records."""
+    from vipetsc.studies.identification import run_identification
+
+    work.report(run_identification(plan, work.folder, work.comm, **work.keywords))
+    return Outcome()
+
+
+def identify_rows(plan: IdentifyCase, ranks: int) -> Rows:
+    """The parameters, the records and the starts."""
+    parameters = first_few([parameter.name for parameter in plan.parameters])
+    rows = [("identify", f"{parameters}; starts: {plan.options.starts}")]
+    for record in plan.options.records:
+        rows.append(("record", f"{record.file}: {first_few([sensor.name for sensor in record.sensors])}"))
+    return rows
+
+
+VERB = StudyVerb(
+    name="identify",
+    text="find parameters from measured records",
+    example="identify runs/examples/identify.toml",
+    arguments=(case_with("identify"), *OF_STUDIES),
+    case=IdentifyCase,
+    study=identify_parameters,
+    table=identify_rows,
+    results=IDENTIFIED,
+    pictures=Pictures(source="identification", file="identified.h5", noun=IDENTIFIED.noun),
+)

@@ -1,0 +1,153 @@
+"""An identification: record and model, residuals, profiles of the misfit, correlation, and the course of the fit."""
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from vipetsc.case.identify import IdentifyCase
+from vipetsc.figures import panels, style
+
+MOST_CHANNELS = 8  # on a page
+MOST_NAMES = 12  # parameters whose correlations are written into the cells
+MOST_LAGS = 40
+
+
+def record_and_model(identified: xr.Dataset) -> Figure:
+    """Draw every channel: measured values and the model on each other, and the residuals below."""
+    count = min(identified.sizes["channel"], MOST_CHANNELS)
+    figure = style.new_figure(style.PAGE, 1.9 * count)
+    rows = figure.subplots(count, 2, squeeze=False, width_ratios=(3, 2))
+    for number, (motion, residual) in enumerate(rows):
+        channel = identified.isel(channel=number)
+        own = identified["data/channel"].values == number
+        time = 1e3 * identified["data/time"].values[own]
+        measured = identified["data/measured"].values[own]
+        model = identified["data/model"].values[own]
+        unit = channel["channels/unit"].item()
+        motion.plot(time, measured, ".", color=style.GREY, ms=2.5, label="measured")
+        motion.plot(time, model, color=style.BLUE, lw=0.8, label="model")
+        motion.set(xlabel="Time (ms)", ylabel=f"({unit})", title=str(channel["channel"].values))
+
+        noise = float(channel["channels/noise"])
+        residual.axhspan(-noise, noise, color=style.PALE, lw=0)
+        residual.plot(time, measured - model, ".", color=style.VERMILION, ms=2)
+        probability = float(channel["channels/probability"])
+        residual.set(xlabel="Time (ms)", ylabel=f"({unit})", title=f"Measured - model; white: p = {probability:.2g}")
+    rows[0, 0].legend(loc="best", fontsize=6)
+    panels.label_panels(rows)
+    return figure
+
+
+def residual_correlations(identified: xr.Dataset) -> Figure:
+    """Draw the autocorrelation of every channel's residuals with the bounds of white noise."""
+    count = min(identified.sizes["channel"], MOST_CHANNELS)
+    figure = style.new_figure(style.PAGE, 2.4)
+    axes = figure.subplots(1, count, squeeze=False, sharey=True)[0]
+    for number, panel in enumerate(axes):
+        own = identified["data/channel"].values == number
+        residuals = identified["data/measured"].values[own] - identified["data/model"].values[own]
+        residuals = residuals - residuals.mean()
+        power = residuals @ residuals
+        lags = np.arange(1, min(MOST_LAGS, len(residuals) // 2) + 1)
+        values = [residuals[lag:] @ residuals[:-lag] / power if power else 0.0 for lag in lags]
+        bound = 1.96 / np.sqrt(len(residuals))
+        panel.axhspan(-bound, bound, color=style.PALE, lw=0)
+        panel.vlines(lags, 0, values, color=style.BLUE, lw=0.8)
+        panel.set(xlabel="lag (samples)", title=str(identified["channel"].values[number]))
+    axes[0].set_ylabel("autocorrelation of residuals")
+    panels.label_panels(axes)
+    return figure
+
+
+def misfit_profiles(identified: xr.Dataset) -> Figure:
+    """Draw how the misfit rises as each parameter is held beside its best value, with all others fitted."""
+    count = identified.sizes["parameter"]
+    columns = min(count, 4)
+    rows = -(-count // columns)
+    figure = style.new_figure(style.PAGE, 1.7 * rows + 0.4)
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for number, axes in enumerate(grid):
+        if number >= count:
+            axes.set_axis_off()
+            continue
+        _draw_profile(axes, identified.isel(parameter=number))
+    panels.label_panels(grid[:count])
+    return figure
+
+
+def _draw_profile(axes: Axes, parameter: xr.Dataset) -> None:
+    """Draw the profile of one parameter, and the parabola of its standard error."""
+    axes.set_title(str(parameter["parameter"].values))
+    if not parameter.sizes["place"]:
+        panels.annotate_empty(axes, "[identify] profile = 0")
+        return
+    value = float(parameter["value"])
+    error = float(parameter["standard_error"])
+    # In percent: the digits in which clearances differ would not fit below an axis.
+    places = 100 * (parameter["profile/value"].values / value - 1)
+    axes.plot(places, parameter["profile/cost"].values, "o-", color=style.BLUE, ms=3, lw=0.8)
+    if np.isfinite(error) and error > 0:
+        around = np.linspace(places.min(), places.max(), 100)
+        parabola = (around * value / (100 * error)) ** 2
+        axes.plot(around, parabola, color=style.GREY, lw=0.7, ls=style.DASHED)
+    axes.axvline(0.0, color=style.BLACK, lw=0.6)
+    unit = parameter["unit"].item()
+    axes.set(xlabel=f"% from {value:.4g}{'' if unit == '1' else f' {unit}'}", ylabel="misfit - least")
+
+
+def parameter_correlation(identified: xr.Dataset) -> Figure:
+    """Draw the correlation of the errors, and the error along each direction of the parameters."""
+    names = identified["parameter"].values
+    count = len(names)
+    figure = style.new_figure(style.PAGE, 3.2)
+    matrix, directions = figure.subplots(1, 2)
+    shown = matrix.imshow(identified["correlation"].values, vmin=-1, vmax=1, cmap="RdBu_r")
+    size = 6 if count <= MOST_NAMES else 4
+    matrix.set_xticks(np.arange(count), names, rotation=90, fontsize=size)
+    matrix.set_yticks(np.arange(count), names, fontsize=size)
+    matrix.set_title("Correlation of the errors")
+    figure.colorbar(shown, ax=matrix, shrink=0.8)
+    if count <= MOST_NAMES:
+        for row, column in np.ndindex(count, count):
+            value = float(identified["correlation"].values[row, column])
+            matrix.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=4.5)
+
+    singular = np.maximum(identified["singular"].values, 1e-6)
+    directions.semilogy(identified["direction"].values, 1 / singular, "o", color=style.BLUE, ms=4)
+    directions.axhline(0.5, color=style.GREY, lw=0.7, ls=style.DASHED)
+    directions.set(xlabel="direction", ylabel="relative error along it", title="Dashed: no longer determined")
+    panels.label_panels([matrix, directions])
+    return figure
+
+
+def growing_windows(identified: xr.Dataset) -> Figure:
+    """Draw the misfit and the parameters over the windows, and the deviance of all starts."""
+    plan = IdentifyCase.of(identified)
+    figure = style.new_figure(style.PAGE, 2.6)
+    misfit, course, starts = figure.subplots(1, 3)
+    windows = identified["window"].values
+    misfit.semilogy(windows, identified["windows/misfit"].values, "o-", color=style.BLUE, ms=3, lw=0.8)
+    for number, impacts in zip(windows, identified["windows/impacts"].values, strict=True):
+        misfit.annotate(str(impacts), (number, 0.02), xycoords=("data", "axes fraction"), fontsize=5, ha="center")
+    misfit.set(xlabel="window (below: contacts)", ylabel="misfit / noise", title="Misfit")
+
+    values = identified["windows/value"].values
+    for number, parameter in enumerate(plan.parameters):
+        last = parameter.to_coordinate(float(identified["value"].values[number]))
+        path = [parameter.to_coordinate(value) - last for value in values[:, number]]
+        dashes = style.BAND_DASHES[number // len(style.BAND_COLOURS) % len(style.BAND_DASHES)]
+        course.plot(windows, path, marker="o", ls=dashes, ms=2, lw=0.7, label=parameter.name)
+    course.set(xlabel="window", ylabel="distance from the end", title="Coordinates")
+    if len(plan.parameters) <= MOST_NAMES:
+        course.legend(loc="best", fontsize=5)
+
+    valley = identified["starts/valley"].values
+    if len(valley) == 1:
+        panels.annotate_empty(starts, "one start: no other valley was sought")
+    else:
+        starts.plot(valley, identified["starts/deviance"].values, "o", color=style.VERMILION, ms=3)
+        starts.set_yscale("symlog")
+        starts.set(xlabel="valley (0: failed)", ylabel="deviance - least", title=f"{len(valley)} starts")
+    panels.label_panels([misfit, course, starts])
+    return figure

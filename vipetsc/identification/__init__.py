@@ -1,0 +1,48 @@
+r"""Parameters of a lattice with contacts from measured motion.
+
+**1. Motion and derivatives** (``motion``, ``motion_kernels``). With the force F_c of each site and w = c u there,
+
+    M u'' + C u' + K u + sum_c c^T F_c(w, w', w'_minus) = f(t),    u(0) = u'(0) = 0,
+
+the derivative s = du/dp with respect to a parameter p solves the variational equation
+
+    M s'' + C s' + K s + sum_c c^T [F_w c s + F_v c s' + F_q dq + F_p] = f_p - M_p u'' - C_p u' - K_p u,
+
+q = w'_minus. Contact forces are continuous and steps end on every change of a mode, so that the saltation of the state
+is the identity (Leine and Nijmeijer 2004, ch. 7). At an onset sigma w = D the instant moves by -(c s - sigma D_p)/w',
+and dq = c s' - w'' (c s - sigma D_p)/w'. Motion and derivatives are integrated together. The derivatives of the
+coefficients are central differences between models of two cases, exact for all but the restitution's damping: whatever
+a case may vary needs no formula of its own. The tangent flow of the engine, ``dynamics.propagator.tangent``, moves
+variations of the initial state of an undriven lattice; it has no right-hand side f_p - K_p u, which acts in all cells.
+That is why this is an integration of its own; tests compare it with central differences of both engines.
+
+**2. Windows** (``growing_windows``). A motion after many impacts says nothing of its parameters: it is too sensitive,
+and the sum of squares has many valleys. In multiple shooting (Bock 1987) each window has an initial state of its own,
+estimated with the parameters, and continuity is a constraint. A lattice of n masses has 2n unknowns in each such state,
+and a few sensors do not tell them. But a laboratory's lattice begins at rest: the state of every window is a function
+of the parameters alone, and the continuity constraints can be solved for it. What is left is a fit of the parameters
+alone, with the derivatives of 1. The window begins at rest and ends after a few contacts; it grows as the fit gets
+better, by fewer contacts where a longer window is fitted worse. So few new contacts are added at a time that their
+instants are nearly right. What a window does not tell stays where it is by a weak prior, which the last fit lacks.
+
+**3. A clearance that is not reached** has no derivative. Where the model does not touch, its clearance is tried just
+within reach of the motion, and kept there if that explains the record better. If it does not, the largest |w| is a
+lower bound of the clearance, and all that the record says.
+
+**4. Least squares** (``misfit``): the residuals over the noise, by the trust-region method of SciPy within the bounds
+(Branch, Coleman and Li 1999), in the logarithms of positive parameters. Noise that is not given is estimated from the
+residuals of each channel, and the fit is repeated with it, which is the maximum of the likelihood.
+
+**5. What the data tell** (``uncertainty``, ``whiteness``). (J^T J)^-1 is the covariance, J the Jacobian of the
+residuals over the noise; its singular values s are 1 over the standard errors along its right singular vectors. An
+error of more than half a unit of a coordinate, a factor of 1.6, counts as not determined. Residuals that are not white
+(Ljung and Box 1978) show a model that lacks something.
+
+References
+----------
+H. G. Bock, Randwertproblemmethoden zur Parameteridentifizierung in Systemen nichtlinearer Differentialgleichungen,
+Bonner Mathematische Schriften 183 (1987).
+M. A. Branch, T. F. Coleman and Y. Li, SIAM J. Sci. Comput. 21 (1999) 1-23.
+R. I. Leine and H. Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems, Springer 2004.
+G. M. Ljung and G. E. P. Box, On a measure of lack of fit in time series models, Biometrika 65 (1978) 297-303.
+"""

@@ -1,0 +1,194 @@
+"""The motion of a lattice from rest with its derivatives: coefficients from models, and the call of the kernels."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.case import Model
+from vipetsc.contact.tracker import ImpactTracker
+from vipetsc.dynamics.drives import create_drives
+from vipetsc.dynamics.site_dofs import site_records
+from vipetsc.identification.motion_kernels import DONE, Lattice, Motion, Slopes, integrate
+from vipetsc.modes.shooting.dop853 import STAGES
+
+# Errors are relative to a motion, and to derivatives, of at least this fraction of the linear wave: derivatives begin
+# at an onset as a root of time, and no step would resolve that relative to themselves.
+FLOOR = 1e-2
+
+
+class MotionError(RuntimeError):
+    """A motion that could not be followed to its end."""
+
+
+class Coefficients(NamedTuple):
+    """What a model's equations of motion are made of, in arrays that can be differenced.
+
+    ``masses`` (n,) in kg; ``stiffness`` and ``damping`` (entry,) in N/m and N s/m, over the pattern ``first`` (n + 1,)
+    and ``columns`` (entry,) of both; ``sites`` (site,) of dtype ``SITE``; ``gains`` (drive,) of the drives, in N.
+    """
+
+    masses: np.ndarray
+    first: np.ndarray
+    columns: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+    sites: np.ndarray
+    gains: np.ndarray
+
+    @classmethod
+    def of(cls, model: Model) -> "Coefficients":
+        """The coefficients of a ``model``."""
+        chain = model.chain
+        stiffness = chain.stiffness_rows(0, chain.cells).tocoo()
+        damping = chain.damping_rows(0, chain.cells).tocoo()
+        masses = chain.masses()
+        n = len(masses)
+
+        # One pattern for both matrices: places are numbered row by row, and the springs have every place of a dashpot
+        # between masses.
+        diagonal = np.arange(n) * (n + 1)
+        places = [matrix.row.astype(np.int64) * n + matrix.col for matrix in (stiffness, damping)]
+        pattern = np.unique(np.concatenate([*places, diagonal]))
+        values = []
+        for matrix, place in zip((stiffness, damping), places, strict=True):
+            values.append(np.bincount(np.searchsorted(pattern, place), matrix.data, len(pattern)))
+        return cls(
+            masses=masses,
+            first=np.searchsorted(pattern, np.arange(n + 1) * n),
+            columns=pattern % n,
+            stiffness=values[0],
+            damping=values[1],
+            sites=site_records(model, np.arange(len(chain.sites))),
+            gains=gains_of(model),
+        )
+
+
+def gains_of(model: Model) -> np.ndarray:
+    """The amplitudes (drive,) in N of the drives, those of a wall's motion times the stiffness of its spring."""
+    return np.array([drive.waveform.amplitude * (drive.stiffness or 1.0) for drive in model.drives])
+
+
+def slopes_between(lower: Sequence[Model], upper: Sequence[Model], widths: np.ndarray, model: Model) -> Slopes:
+    """Derivatives of the coefficients of ``model`` by central differences between models (parameter,).
+
+    ``widths`` (parameter,) are the distances of the parameter's values in ``lower`` and ``upper``; parameters are
+    numbers of order one, so that all derivatives of a motion have its magnitude. Coefficients are affine in most
+    parameters and smooth in the others, so that no truncation is seen.
+    """
+    own = Coefficients.of(model)
+    count = len(widths)
+    number = len(own.sites)
+    slopes = Slopes(
+        masses=np.zeros((count, len(own.masses))),
+        stiffness=np.zeros((count, len(own.stiffness))),
+        damping=np.zeros((count, len(own.damping))),
+        gaps=np.zeros((count, number, 2)),
+        laws=np.zeros((count, number, 3)),
+        drives=np.zeros((count, len(own.gains))),
+        linear=np.zeros(count, bool),
+    )
+    for p, (low, high, width) in enumerate(zip(lower, upper, widths, strict=True)):
+        sites = [site_records(at, np.arange(len(at.chain.sites))) for at in (low, high)]
+        # Matrices take most of the time, and contacts have no part in them.
+        if low.chain.cell != high.chain.cell:
+            before = Coefficients.of(low)
+            after = Coefficients.of(high)
+            slopes.masses[p] = (after.masses - before.masses) / width
+            slopes.stiffness[p] = (after.stiffness - before.stiffness) / width
+            slopes.damping[p] = (after.damping - before.damping) / width
+            slopes.linear[p] = True
+        gains = gains_of(high) - gains_of(low)
+        slopes.drives[p] = gains / width / np.where(own.gains != 0, own.gains, 1.0)
+        for k, name in enumerate(("clearance", "clearance_minus")):
+            # Where there is no stop both are infinite.
+            stops = np.isfinite(own.sites[name])
+            slopes.gaps[p, stops, k] = (sites[1][name] - sites[0][name])[stops] / width
+        for k, name in enumerate(("stiffness", "exponent")):
+            slopes.laws[p, :, k] = (sites[1]["elastic"][name] - sites[0]["elastic"][name]) / width
+        slopes.laws[p, :, 2] = (sites[1]["damping"] - sites[0]["damping"]) / width
+    return slopes
+
+
+class Response(NamedTuple):
+    """A motion at samples.
+
+    ``motion`` (sample, watched, 4, column): u, u', u'' in m, m/s, m/s^2, and u''' in column 0; column 0 is the motion,
+    column 1 + p its derivative with respect to parameter p. ``episodes`` are the contacts, of dtype ``EPISODE``;
+    ``reached`` (site, 2) the largest |w| in m on the sides + and -.
+    """
+
+    motion: np.ndarray
+    episodes: np.ndarray
+    reached: np.ndarray
+
+
+def no_slopes(model: Model) -> Slopes:
+    """Derivatives with respect to no parameter."""
+    return slopes_between([], [], np.zeros(0), model)
+
+
+def respond(model: Model, slopes: Slopes, times: np.ndarray, watched: np.ndarray, touches: bool = True) -> Response:
+    """The motion of ``model`` from rest and its derivatives at the rising ``times`` (sample,) in s.
+
+    ``watched`` are masses (0-based, cell by cell); without ``touches`` no site ever closes. Raises MotionError.
+    """
+    chain = model.chain
+    coefficients = Coefficients.of(model)
+    sites = coefficients.sites
+    if not touches:
+        sites["clearance"] = sites["clearance_minus"] = np.inf
+    drives = create_drives(model.drives, range(len(model.drives)))
+    for row, drive in zip(drives.rows, model.drives, strict=True):
+        row["target"] = drive.cell * chain.cell.dofs + drive.mass
+
+    ends = np.zeros((len(sites), 2), np.int64)
+    for row, cell, pair in zip(ends, chain.sites, chain.contact_pairs, strict=True):
+        row[0] = cell * chain.cell.dofs + pair.host if pair.host >= 0 else -1
+        row[1] = (cell + pair.next_cell) % chain.cells * chain.cell.dofs + pair.resonator
+    lattice = Lattice(
+        inverse_mass=1 / coefficients.masses,
+        first=coefficients.first,
+        columns=coefficients.columns,
+        stiffness=coefficients.stiffness,
+        damping=coefficients.damping,
+        contacts=sites,
+        ends=ends,
+        drives=drives,
+        slopes=slopes,
+    )
+
+    columns = 1 + len(slopes.linear)
+    rows = 2 * len(coefficients.masses)
+    tracker = ImpactTracker(sites, range(len(sites)))
+    start = create_motion(rows, columns, len(sites), model.scale)
+    outcome, tracks, motion, reached = integrate(lattice, start, tracker.tracks, fastest(coefficients), times, watched)
+    if outcome != DONE:
+        raise MotionError("the steps of the integration became too small")
+    tracker.tracks = tracks
+    episodes = tracker.take_episodes(np.zeros(len(sites)), unfinished=True)
+    return Response(motion, np.sort(episodes, order=("onset", "site")), reached)
+
+
+def create_motion(rows: int, columns: int, sites: int, scale: float) -> Motion:
+    """The state of rest and the workspace of so many ``rows``, 2n, and ``columns``; ``scale`` in m is that of waves."""
+    return Motion(
+        state=np.zeros((rows, columns)),
+        end=np.zeros((rows, columns)),
+        stages=np.zeros((STAGES, rows, columns)),
+        rates=np.zeros((rows, columns)),
+        estimates=np.zeros((2, rows, columns)),
+        approach=np.zeros((sites, columns)),
+        before=np.zeros((sites, 3)),
+        after=np.zeros((sites, 3)),
+        largest=np.full(columns, FLOOR * scale),
+        room=np.zeros((2, 6)),
+    )
+
+
+def fastest(coefficients: Coefficients) -> float:
+    """A bound in rad/s of the fastest mode's frequency, by Gershgorin's circles."""
+    rows = np.repeat(np.arange(len(coefficients.masses)), np.diff(coefficients.first))
+    inverse = 1 / coefficients.masses
+    weights = abs(coefficients.stiffness) * np.sqrt(inverse[rows] * inverse[coefficients.columns])
+    return float(np.sqrt(np.bincount(rows, weights, len(inverse)).max()))

@@ -1,0 +1,66 @@
+"""What the data tell about the parameters: covariance, correlation, singular values, and the sensor that is missing."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+# A direction of the coordinates is determined if its standard error is at most this: one is a factor e of a
+# logarithmic parameter, and the whole range between the bounds of a linear one.
+DETERMINED = 0.5
+# Singular values below this fraction of the largest one are rounding.
+SMALLEST = 1e-12
+
+
+class Uncertainty(NamedTuple):
+    """Of coordinates (parameter,): ``errors`` (parameter,), ``correlation`` (parameter, parameter).
+
+    ``singular`` (direction,) are the singular values of the Jacobian, ``directions`` (direction, parameter) its right
+    singular vectors: 1/s is the standard error along one. ``determined`` (parameter,).
+    """
+
+    errors: np.ndarray
+    correlation: np.ndarray
+    singular: np.ndarray
+    directions: np.ndarray
+    determined: np.ndarray
+
+
+def uncertainty_of(jacobian: np.ndarray) -> Uncertainty:
+    """The uncertainty by the ``jacobian`` J (datum, parameter) of residuals over the noise; covariance (J^T J)^-1."""
+    count = jacobian.shape[1]
+    _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
+    floor = SMALLEST * max(float(np.max(singular, initial=0.0)), float(np.finfo(float).tiny))
+    deviations = 1 / np.maximum(singular, floor)
+    factors = directions * deviations[:, None]
+    covariance = factors.T @ factors
+    errors = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(errors, errors)
+    return Uncertainty(
+        errors=errors,
+        correlation=np.clip(correlation, -1.0, 1.0),
+        singular=np.pad(singular, (0, count - len(singular))),
+        directions=np.pad(directions, ((0, count - len(directions)), (0, 0))),
+        determined=errors <= DETERMINED,
+    )
+
+
+def quantile(confidence: float) -> float:
+    """Standard errors on each side of a value that make an interval of that ``confidence`` for normal errors."""
+    return float(scipy.stats.norm.ppf(0.5 + confidence / 2))
+
+
+def errors_with_sensor(uncertainty: Uncertainty, slopes: np.ndarray, noise: float) -> np.ndarray:
+    """Standard errors (mass, parameter) with one more sensor at each mass.
+
+    ``slopes`` (sample, mass, parameter) are derivatives of what the sensor measures, ``noise`` that of its values.
+    """
+    scaled = uncertainty.directions * uncertainty.singular[:, None]
+    information = scaled.T @ scaled
+    # What no datum tells must not make the matrix singular: an error of 1e6 stands for it.
+    information = information + 1e-12 * np.eye(len(information))
+    errors = []
+    for mass in range(slopes.shape[1]):
+        own = slopes[:, mass] / noise
+        errors.append(np.sqrt(np.diag(np.linalg.inv(information + own.T @ own))))
+    return np.array(errors)

@@ -1,0 +1,32 @@
+"""Whether residuals are white: the test of Ljung and Box (Biometrika 65, 1978, 297-303)."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+MOST_LAGS = 20
+
+
+class Whiteness(NamedTuple):
+    """The statistic Q of ``lags`` autocorrelations and the probability that white noise has one as large."""
+
+    statistic: float
+    lags: int
+    probability: float
+
+
+def ljung_box(residuals: np.ndarray) -> Whiteness:
+    """Test evenly sampled ``residuals`` (sample,): Q = n (n + 2) sum_k r_k^2/(n - k), chi-squared with as many degrees.
+
+    r_k are the autocorrelations up to a fifth of the samples, and not more than 20.
+    """
+    count = len(residuals)
+    lags = max(min(MOST_LAGS, count // 5), 1)
+    centred = residuals - residuals.mean()
+    power = float(centred @ centred)
+    if power == 0:
+        return Whiteness(0.0, lags, 1.0)
+    correlation = np.array([centred[k:] @ centred[:-k] for k in range(1, lags + 1)]) / power
+    statistic = float(count * (count + 2) * np.sum(correlation**2 / (count - np.arange(1, lags + 1))))
+    return Whiteness(statistic, lags, float(scipy.stats.chi2.sf(statistic, lags)))

@@ -1,0 +1,227 @@
+"""Parameters of a case from measured records: the result is ``identified.h5``, with ``identified.toml`` for ``run``.
+
+Ranks share the starts, then the fits of the profiles. The record of each is kept at once, so that an identification
+that was stopped goes on where it was. The same files, to the bit, on any number of ranks.
+"""
+
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+import xarray as xr
+from scipy.stats import qmc
+
+from vipetsc.case import CaseError
+from vipetsc.case.case_file import Problem
+from vipetsc.case.identify import IdentifyCase
+from vipetsc.case.measured import Measured, MeasuredError, read_measured
+from vipetsc.identification.growing_windows import GrowingWindows, Precision
+from vipetsc.identification.misfit import Misfit
+from vipetsc.identification.motion import MotionError
+from vipetsc.identification.uncertainty import uncertainty_of
+from vipetsc.io.atomic import write_text
+from vipetsc.io.folder import IDENTIFIED, claimed, provenance
+from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
+from vipetsc.io.records import Record
+from vipetsc.parallel import StoppedError, StopRequest, on_root
+from vipetsc.studies.identified import LAYOUT, identified_values, summary_of, warnings_of
+from vipetsc.studies.recorded_runs import FAILURES, Key, RecordedRuns
+from vipetsc.studies.sweep import is_whole
+
+# Distance in standard errors of the outermost values of a profile.
+PROFILED = 3.0
+# Evaluations of one fit of a profile, which begins where the covariance puts it.
+PROFILE_STEPS = 10
+
+
+def run_identification(
+    plan: IdentifyCase,
+    folder: str | Path,
+    comm: MPI.Comm = MPI.COMM_WORLD,
+    *,
+    force: bool = False,
+    resume: bool = False,
+    stop: StopRequest | None = None,
+    progress: bool = False,
+) -> str:
+    """Fit the parameters of ``plan`` to its records in ``folder``; returns a table of the results.
+
+    All ranks of ``comm`` must call it. Raises StoppedError, FolderError if the folder holds anything but this
+    identification, CaseError if a record has changed, RuntimeError if no start leads to a fit.
+    """
+    with claimed(comm, folder, IDENTIFIED, plan.to_toml(), force=force, resume=resume) as claim:
+        path = claim.folder / "identified.h5"
+        # A file that was cut off is written again, from the records of its fits.
+        if not on_root(comm, lambda: is_whole(path, [])):
+            measured = on_root(comm, lambda: read_records(plan))
+            _identify(Identification(plan, measured, stop or StopRequest()), claim.folder, comm, progress)
+        claim.publish()
+
+        def summary() -> str:
+            with open_netcdf(claim.path / "identified.h5", "identification", ("value", "summary")) as data:
+                return str(data.attrs["summary"])
+
+        return on_root(comm, summary)
+
+
+def read_records(plan: IdentifyCase) -> list[Measured]:
+    """The records of ``plan``; raises CaseError for one that is not as it was when the case was read."""
+    records = []
+    for number, table in enumerate(plan.options.records, 1):
+        at = f"identify.records[{number}]"
+        try:
+            record = read_measured(table)
+        except MeasuredError as error:
+            raise CaseError([Problem(f"{at}.{error.key}", error.value, error.remedy)], plan.name) from None
+        if record.sha256 != table.sha256:
+            raise CaseError([Problem(f"{at}.sha256", table.sha256, "the file has changed; omit this key")], plan.name)
+        records.append(record)
+    return records
+
+
+class Profile(NamedTuple):
+    """Coordinates ``places`` (parameter, place) at which each parameter is held, and how the others move ``along``."""
+
+    places: np.ndarray
+    along: np.ndarray
+
+
+class Identification:
+    """Fits of one ``plan`` to its ``measured`` records, each on one rank; ``stop`` ends them."""
+
+    def __init__(self, plan: IdentifyCase, measured: list[Measured], stop: StopRequest) -> None:
+        self.plan = plan
+        self.measured = measured
+        self.stop = stop
+
+    def _check(self) -> None:
+        if self.stop.requested:
+            raise StoppedError("stopped on request; the same command continues")
+
+    def windows(self) -> GrowingWindows:
+        """A fit that nothing has been asked of yet."""
+        return GrowingWindows(Misfit(self.plan, self.measured), self._check)
+
+    def starts(self) -> np.ndarray:
+        """The coordinates (start, parameter) at which fits begin: those of the case, then a Latin hypercube."""
+        parameters = self.plan.parameters
+        first = np.array([parameter.to_coordinate(parameter.start) for parameter in parameters])
+        count = self.plan.options.starts - 1
+        if not count:
+            return first[None]
+        bounds = np.array([(p.to_coordinate(p.low), p.to_coordinate(p.high)) for p in parameters]).T
+        drawn = qmc.LatinHypercube(len(parameters), seed=self.plan.options.seed).random(count)
+        return np.vstack([first, qmc.scale(drawn, *bounds)])
+
+    def fit(self, number: int) -> Record:
+        """The record of the fit from the start of that ``number``."""
+        start = self.starts()[number]
+        windows = self.windows()
+        fit = windows.fit(start)
+        residuals = windows.misfit.residuals(fit.coordinates, windows.last)
+        # Minus twice the logarithm of the likelihood but for a constant: fits with other noise can be compared.
+        noise = np.concatenate(
+            [np.tile(noise, len(record.times)) for noise, record in zip(fit.noise, self.measured, strict=True)]
+        )
+        return {
+            "begin": start.tolist(),
+            "coordinates": fit.coordinates.tolist(),
+            "deviance": float(np.sum(residuals**2) + 2 * np.sum(np.log(noise))),
+            "misfit": fit.windows[-1].misfit,
+            "noise": [noise.tolist() for noise in fit.noise],
+            "windows": [
+                {
+                    "end": window.end,
+                    "impacts": window.impacts,
+                    "misfit": window.misfit,
+                    "coordinates": window.coordinates.tolist(),
+                }
+                for window in fit.windows
+            ],
+        }
+
+    def placed(self, record: Record) -> tuple[GrowingWindows, np.ndarray]:
+        """A fit with the noise of a ``record``, and the record's coordinates."""
+        windows = self.windows()
+        windows.misfit.noise = [np.array(noise) for noise in record["noise"]]
+        return windows, np.array(record["coordinates"])
+
+    def profile(self, record: Record) -> Profile:
+        """The profiles to be taken around the fit of a ``record``."""
+        windows, z = self.placed(record)
+        count = self.plan.options.profile
+        known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
+        reach = np.where(known.determined, PROFILED * known.errors, np.inf)
+        low = np.maximum(z - reach, windows.low)
+        high = np.minimum(z + reach, windows.high)
+        # The covariance says where the others go, as long as the problem is nearly linear.
+        along = known.correlation * known.errors / known.errors[:, None]
+        return Profile(np.linspace(low, high, count, axis=1), np.where(known.determined, along, 0.0))
+
+    def profiled(self, record: Record, profile: Profile, number: int, place: int) -> Record:
+        """The least misfit with parameter ``number`` held at a ``place`` of its profile, and all others fitted."""
+        windows, z = self.placed(record)
+        value = float(profile.places[number, place])
+        held = np.clip(z + profile.along[number] * (value - z[number]), windows.low, windows.high)
+        held[number] = value
+        others = [other for other in range(len(z)) if other != number]
+        if others:
+            held = windows.solve(held, windows.last, others, Precision(steps=PROFILE_STEPS, is_rough=True))
+        residuals = windows.misfit.residuals(held, windows.last)
+        return {"cost": float(np.sum(residuals**2))}
+
+
+def _identify(work: Identification, folder: Path, comm: MPI.Comm, progress: bool) -> None:
+    """Fit from all starts, profile the best fit, and write the results."""
+    plan = work.plan
+    recorded = RecordedRuns(
+        "identified-runs", folder, comm, work.stop, failures=(*FAILURES, CaseError, MotionError)
+    ).read()
+
+    def fit(key: Key) -> Record:
+        return work.fit(int(str(key).split()[-1]))
+
+    starts = [f"start {number}" for number in range(plan.options.starts)]
+    recorded.make(starts, fit, what="starts", progress=progress, failures=True)
+    fits = [recorded.records[key] for key in starts]
+    found = [number for number, record in enumerate(fits) if "deviance" in record]
+    if not found:
+        raise RuntimeError(f"no start leads to a fit: {fits[0]['reason']}")
+    best = min(found, key=lambda number: (fits[number]["deviance"], number))
+    places = on_root(comm, lambda: work.profile(fits[best]))
+    shape = places.places.shape
+
+    def profile(key: Key) -> Record:
+        _, number, place = str(key).split()
+        return work.profiled(fits[best], places, int(number), int(place))
+
+    profiles = [f"profile {number} {place}" for number, place in np.ndindex(*shape)]
+    recorded.make(profiles, profile, what="profiles", progress=progress, failures=True)
+    costs = np.array([recorded.records[key].get("cost", np.nan) for key in profiles]).reshape(shape)
+    recorded.finish()
+    on_root(comm, lambda: _write(work, fits, best, (places.places, costs), folder, comm))
+
+
+def _write(
+    work: Identification,
+    fits: list[Record],
+    best: int,
+    profile: tuple[np.ndarray, np.ndarray],
+    folder: Path,
+    comm: MPI.Comm,
+) -> None:
+    """Write the case that was found, then ``identified.h5``, whose presence says that all is done."""
+    sys.audit("vipetsc.conclude", str(folder))
+    plan = work.plan
+    windows, z = work.placed(fits[best])
+    case = plan.case_of(windows.misfit.values(z), name=f"{plan.name}-identified")
+    write_text(folder / "identified.toml", case.to_toml())
+
+    values = identified_values(windows, z, fits, best, profile)
+    about: dict[str, Any] = provenance(comm) | {"case": plan.to_toml()}
+    data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
+    data = data.assign_attrs(warnings=warnings_of(data))
+    write_netcdf(folder / "identified.h5", data.assign_attrs(summary=summary_of(data)))

@@ -1,0 +1,303 @@
+"""What ``identified.h5`` holds: parameters with their uncertainty, windows, starts, residuals, and what it all says."""
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from vipetsc.case.identify import IdentifyCase
+from vipetsc.case.measured import UNITS
+from vipetsc.identification.growing_windows import GrowingWindows
+from vipetsc.identification.misfit import ROWS
+from vipetsc.identification.uncertainty import errors_with_sensor, quantile, uncertainty_of
+from vipetsc.identification.whiteness import ljung_box
+from vipetsc.io.records import Record
+
+# A misfit this many times the noise, and a probability below this over the number of channels, are reported.
+BEYOND_NOISE = 1.2
+IMPROBABLE = 0.01
+# Residuals below this fraction of their channel are those of rounding and steps, not noise.
+EXACT = 1e-6
+# Fits whose coordinates agree to this, or to three standard errors, lie in one valley.
+SAME_VALLEY = 1e-3
+# Sensors are sought on so many masses at most, evenly over the lattice.
+MOST_CANDIDATES = 400
+
+LAYOUT = {
+    "parameter": ("parameter", "1", "what is sought"),
+    "other": ("other", "1", "what is sought"),
+    "unit": ("parameter", "1", "unit of the parameter"),
+    "low": ("parameter", "1", "lower bound"),
+    "high": ("parameter", "1", "upper bound"),
+    "value": ("parameter", "1", "value found, in the parameter's unit"),
+    "standard_error": ("parameter", "1", "standard error, in the parameter's unit; NaN where the data do not tell"),
+    "interval_low": ("parameter", "1", "lower end of the confidence interval; NaN where the data do not tell"),
+    "interval_high": ("parameter", "1", "upper end of the confidence interval; NaN where the data do not tell"),
+    "determined": ("parameter", "1", "1 if the data tell the value, otherwise 0"),
+    "at_least": (
+        "parameter",
+        "m",
+        "of a clearance that is never reached: the largest displacement there; otherwise NaN",
+    ),
+    "relative_error": ("parameter", "1", "standard error of the logarithm, or over the range between the bounds"),
+    "correlation": ("parameter other", "1", "correlation of the errors"),
+    "direction": ("direction", "1", "direction of the parameters, the best determined first"),
+    "singular": ("direction", "1", "singular value of the Jacobian over the noise; its inverse is the error along it"),
+    "vector": ("direction parameter", "1", "component of a direction"),
+    "sensor/cell": ("parameter", "1", "cell (1-based) of the sensor that would tell most about the parameter"),
+    "sensor/mass": ("parameter", "1", "mass (1-based) of that sensor"),
+    "sensor/relative_error": ("parameter", "1", "relative error with that sensor too"),
+    "window": ("window", "1", "window of the best start, the last with the final noise"),
+    "windows/end": ("window", "s", "largest time of the records' clocks in a window"),
+    "windows/impacts": ("window", "1", "contacts of the model in a window"),
+    "windows/misfit": ("window", "1", "root mean square of the residuals over the noise"),
+    "windows/value": ("window parameter", "1", "value found over a window"),
+    "start": ("start", "1", "number of a start; 0 is that of the unknowns"),
+    "starts/begin": ("start parameter", "1", "value at the beginning"),
+    "starts/value": ("start parameter", "1", "value found; NaN for a start that failed"),
+    "starts/deviance": ("start", "1", "minus twice the logarithm of the likelihood, less that of the best start"),
+    "starts/valley": ("start", "1", "number of the valley, the deepest is 1; 0 for a start that failed"),
+    "channel": ("channel", "1", "sensor of a record"),
+    "channels/record": ("channel", "1", "number (1-based) of the record"),
+    "channels/unit": ("channel", "1", "unit of the channel"),
+    "channels/noise": ("channel", "1", "noise, given or estimated, in the unit of the channel"),
+    "channels/is_given": ("channel", "1", "1 if the noise is given, 0 if it is estimated"),
+    "channels/misfit": ("channel", "1", "root mean square of the residuals, in the unit of the channel"),
+    "channels/size": ("channel", "1", "root mean square of the measured values, in the unit of the channel"),
+    "channels/statistic": ("channel", "1", "Q of Ljung and Box of the residuals"),
+    "channels/lags": ("channel", "1", "number of autocorrelations in Q"),
+    "channels/probability": ("channel", "1", "probability that white noise has as large a Q"),
+    "datum": ("datum", "1", "sample of a channel"),
+    "data/channel": ("datum", "1", "number (0-based) of the channel"),
+    "data/time": ("datum", "s", "time of the record's clock"),
+    "data/measured": ("datum", "1", "measured value, in the unit of the channel"),
+    "data/model": ("datum", "1", "value of the model, in the unit of the channel"),
+    "place": ("place", "1", "number of a value of a profile"),
+    "profile/value": ("parameter place", "1", "value at which a parameter is held"),
+    "profile/cost": ("parameter place", "1", "increase of the sum of squared residuals over the noise, others fitted"),
+}
+
+
+def identified_values(
+    windows: GrowingWindows, z: np.ndarray, fits: list[Record], best: int, profile: tuple[np.ndarray, np.ndarray]
+) -> dict[str, Any]:
+    """All values by name in ``LAYOUT``; ``fits`` are the records of the starts, ``profile`` coordinates and costs."""
+    values = _parameter_values(windows, z)
+    values |= _window_values(windows, fits[best])
+    values |= _start_values(windows, fits, best, values["relative_error"])
+    values |= _channel_values(windows, z)
+    places, costs = profile
+    parameters = windows.misfit.plan.parameters
+    cost = float(np.sum(windows.misfit.residuals(z, windows.last) ** 2))
+    rows = [[parameter.from_coordinate(x) for x in row] for parameter, row in zip(parameters, places, strict=True)]
+    return values | {
+        "place": np.arange(places.shape[1]),
+        "profile/value": np.array(rows).reshape(places.shape),
+        "profile/cost": costs - cost,
+    }
+
+
+def _parameter_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
+    """Parameters with their uncertainty, and what is not determined."""
+    misfit = windows.misfit
+    parameters = misfit.plan.parameters
+    known = uncertainty_of(misfit.jacobian(z, windows.last, range(len(z))))
+    reached = windows.reached(z, windows.last)
+    at_least = np.full(len(z), np.nan)
+    for number, parameter in enumerate(parameters):
+        # A group whose sites are all out of reach is at least as wide as the largest motion of any.
+        if parameter.quantity == "clearance" and all(reached[member] > 0 for member in parameter.members):
+            at_least[number] = max(reached[member] for member in parameter.members)
+
+    is_known = known.determined & np.isnan(at_least)
+    slopes = np.array([parameter.slope(x) for parameter, x in zip(parameters, z, strict=True)])
+    width = quantile(misfit.plan.options.confidence) * known.errors
+    low = [parameter.from_coordinate(x) for parameter, x in zip(parameters, z - width, strict=True)]
+    high = [parameter.from_coordinate(x) for parameter, x in zip(parameters, z + width, strict=True)]
+    return {
+        "parameter": [parameter.name for parameter in parameters],
+        "other": [parameter.name for parameter in parameters],
+        "unit": [parameter.unit for parameter in parameters],
+        "low": [parameter.low for parameter in parameters],
+        "high": [parameter.high for parameter in parameters],
+        "value": misfit.values(z),
+        "standard_error": np.where(is_known, slopes * known.errors, np.nan),
+        "interval_low": np.where(is_known, low, np.nan),
+        "interval_high": np.where(is_known, high, np.nan),
+        "determined": is_known.astype(int),
+        "at_least": at_least,
+        "relative_error": known.errors,
+        "correlation": known.correlation,
+        "direction": np.arange(1, len(z) + 1),
+        "singular": known.singular,
+        "vector": known.directions,
+    } | _sensor_values(windows, z)
+
+
+def _sensor_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
+    """The mass at which one more sensor of the first record with contact would lower each error most."""
+    misfit = windows.misfit
+    plan = misfit.plan
+    known = uncertainty_of(misfit.jacobian(z, windows.last, range(len(z))))
+    tables = plan.options.records
+    record = next((number for number, table in enumerate(tables) if table.contact), 0)
+    sensors = [number for number, sensor in enumerate(tables[record].sensors) if sensor.quantity != "force"]
+    quantity = tables[record].sensors[sensors[0]].quantity if sensors else "velocity"
+    noise = float(np.mean([misfit.noise[record][number] for number in sensors])) if sensors else 1.0
+
+    dofs = plan.base.lattice.unit_cell().dofs
+    count = plan.base.lattice.cells * dofs
+    candidates = np.arange(0, count, -(-count // MOST_CANDIDATES))
+    inner = [number for number, parameter in enumerate(plan.parameters) if parameter.quantity != "offset"]
+    response = misfit.respond(z, record, windows.last[record], inner, candidates)
+    slopes = np.zeros((*response.motion.shape[:2], len(z)))
+    slopes[:, :, inner] = response.motion[:, :, ROWS[quantity], 1:]
+    errors = errors_with_sensor(known, slopes, noise)
+    chosen = errors.argmin(axis=0)
+    return {
+        "sensor/cell": candidates[chosen] // dofs + 1,
+        "sensor/mass": candidates[chosen] % dofs + 1,
+        "sensor/relative_error": errors.min(axis=0),
+    }
+
+
+def _window_values(windows: GrowingWindows, record: Record) -> dict[str, Any]:
+    """The windows of the best start."""
+    rows = record["windows"]
+    return {
+        "window": np.arange(1, len(rows) + 1),
+        "windows/end": [row["end"] for row in rows],
+        "windows/impacts": [row["impacts"] for row in rows],
+        "windows/misfit": [row["misfit"] for row in rows],
+        "windows/value": [windows.misfit.values(np.array(row["coordinates"])) for row in rows],
+    }
+
+
+def _start_values(windows: GrowingWindows, fits: list[Record], best: int, errors: np.ndarray) -> dict[str, Any]:
+    """All starts with what they found, in valleys."""
+    count = len(windows.low)
+    starts = windows.misfit.plan.options.starts
+    begin = np.full((starts, count), np.nan)
+    values = np.full((starts, count), np.nan)
+    deviance = np.full(starts, np.nan)
+    valley = np.zeros(starts, int)
+    bottoms: list[np.ndarray] = []
+    for number in sorted(range(starts), key=lambda number: fits[number].get("deviance", np.inf)):
+        record = fits[number]
+        if "deviance" not in record:
+            continue
+        z = np.array(record["coordinates"])
+        begin[number] = windows.misfit.values(np.array(record["begin"]))
+        values[number] = windows.misfit.values(z)
+        deviance[number] = record["deviance"] - fits[best]["deviance"]
+        near = [bool(np.all(abs(z - bottom) <= np.maximum(SAME_VALLEY, 3 * errors))) for bottom in bottoms]
+        if not any(near):
+            bottoms.append(z)
+            near.append(True)
+        valley[number] = near.index(True) + 1
+    return {
+        "start": np.arange(starts),
+        "starts/begin": begin,
+        "starts/value": values,
+        "starts/deviance": deviance,
+        "starts/valley": valley,
+    }
+
+
+def _channel_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
+    """All channels with their residuals."""
+    misfit = windows.misfit
+    columns: dict[str, list[Any]] = {
+        name: [] for name in LAYOUT if name.split("/")[0] in ("channel", "channels", "data", "datum")
+    }
+    for number, (record, table) in enumerate(zip(misfit.records, misfit.plan.options.records, strict=True)):
+        model, _ = misfit.predicted(z, number, windows.last[number])
+        for k, sensor in enumerate(table.sensors):
+            residuals = model[:, k] - record.values[:, k]
+            white = ljung_box(residuals)
+            channel = len(columns["channel"])
+            row = {
+                "channel": f"{number + 1}: {sensor.name}",
+                "channels/record": number + 1,
+                "channels/unit": UNITS[sensor.quantity],
+                "channels/noise": misfit.noise[number][k],
+                "channels/is_given": int(sensor.noise is not None),
+                "channels/misfit": float(np.sqrt(np.mean(residuals**2))),
+                "channels/size": float(np.sqrt(np.mean(record.values[:, k] ** 2))),
+                "channels/statistic": white.statistic,
+                "channels/lags": white.lags,
+                "channels/probability": white.probability,
+            }
+            for name, value in row.items():
+                columns[name].append(value)
+            columns["data/channel"].append(np.full(len(residuals), channel))
+            columns["data/time"].append(record.times)
+            columns["data/measured"].append(record.values[:, k])
+            columns["data/model"].append(model[:, k])
+    values = {name: np.concatenate(parts) if name.startswith("data/") else parts for name, parts in columns.items()}
+    return values | {"datum": np.arange(len(values["data/time"]))}
+
+
+def warnings_of(data: xr.Dataset) -> list[str]:
+    """Sentences on what the fit does not explain, and what the data do not tell."""
+    sentences = []
+    names = data["channel"].values
+    exact = data["channels/misfit"].values <= EXACT * data["channels/size"].values
+    ratio = data["channels/misfit"].values / data["channels/noise"].values
+    beyond = (data["channels/is_given"].values == 1) & (ratio > BEYOND_NOISE)
+    for name, times in zip(names[beyond], ratio[beyond], strict=True):
+        sentences.append(f"{name}: the misfit is {times:.2g} times the noise, which does not explain it")
+    coloured = (data["channels/probability"].values < IMPROBABLE / len(names)) & ~exact
+    if coloured.any():
+        listed = "; ".join(names[coloured])
+        sentences.append(
+            f"the residuals are not white ({listed}): the model lacks something that the data have, such as another"
+            " contact law, and the intervals are too narrow"
+        )
+    at_least = data["at_least"].values
+    for name, least in zip(data["parameter"].values, at_least, strict=True):
+        if np.isfinite(least):
+            sentences.append(f"{name}: at least {least:.4g} m; nothing touches there")
+    for row in np.flatnonzero((data["determined"].values == 0) & np.isnan(at_least)):
+        error = float(data["sensor/relative_error"].values[row])
+        place = f"mass {data['sensor/mass'].values[row]} of cell {data['sensor/cell'].values[row]}"
+        helped = f"a sensor at {place} would, to {100 * error:.2g} %" if error < 0.5 else "no further sensor would"
+        sentences.append(f"{data['parameter'].values[row]}: the data do not tell it; {helped}")
+    valleys = int(data["starts/valley"].values.max(initial=0))
+    if valleys > 1:
+        second = float(data["starts/deviance"].values[data["starts/valley"].values == 2].min())
+        sentences.append(
+            f"{valleys} valleys: the starts lead to different values; the second one's deviance is {second:.3g} more"
+        )
+    return sentences
+
+
+def summary_of(data: xr.Dataset) -> str:
+    """A table of the results, with a line for every parameter, and the warnings."""
+    plan = IdentifyCase.of(data)
+    confidence = f"{100 * plan.options.confidence:g} % interval"
+    lines = [
+        f"{data.sizes['parameter']} parameters from {data.sizes['datum']} values of {data.sizes['channel']} channels;"
+        f" {data.sizes['start']} starts, {int(data['starts/valley'].max())} valleys",
+        f"  {'parameter':<16}{'value':>14}{'error':>12}  {confidence:<26} unit",
+    ]
+    for row in range(data.sizes["parameter"]):
+        point = data.isel(parameter=row)
+        value = f"{float(point['value']):>14.7g}"
+        if np.isfinite(point["at_least"]):
+            found = f"{'':>14}{'':>12}  at least {float(point['at_least']):<17.6g}"
+        elif not point["determined"]:
+            found = f"{value}{'':>12}  {'not determined':<26}"
+        else:
+            interval = f"{float(point['interval_low']):.7g} to {float(point['interval_high']):.7g}"
+            found = f"{value}{float(point['standard_error']):>12.2g}  {interval:<26}"
+        lines.append(f"  {point['parameter'].values!s:<16}{found} {point['unit'].values}")
+    for row in range(data.sizes["channel"]):
+        channel = data.isel(channel=row)
+        noise = "noise given" if channel["channels/is_given"] else "noise estimated"
+        misfit = f"{float(channel['channels/misfit']):.3g} {channel['channels/unit'].values}"
+        white = f"whiteness p = {float(channel['channels/probability']):.2g}"
+        lines.append(
+            f"  {channel['channel'].values}: misfit {misfit}, {noise} {float(channel['channels/noise']):.3g}, {white}"
+        )
+    return "\n".join([*lines, *(f"  warning: {text}" for text in data.attrs["warnings"])])
