@@ -43,6 +43,17 @@ VERB_SECTIONS = {
     "sweep": {"drive": {"amplitude": [1.0, 2.0]}},
     "optimise": {"variables": {"profile": [1e-4, 1e-2]}},
     "nfrc": {"source": "force", "infinite": False},
+    "identify": {
+        "records": [
+            {
+                "file": "record.csv",
+                "sha256": "",
+                "rate": 4000.0,
+                "sensors": [{"quantity": "velocity", "column": 2, "cell": 4}],
+            }
+        ],
+        "unknowns": [{"quantity": "amplitude", "bounds": [0.1, 100.0]}],
+    },
 }
 # Normal modes drive nothing: their cases are tried apart.
 DRIVEN = [kind for kind in VERB_CASES if kind not in (NnmCase, DesignCase)]

@@ -1,10 +1,10 @@
 """The case of the verb ``identify``: measured records, and the parameters that are sought in them."""
 
 import copy
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import tomli_w
@@ -61,7 +61,7 @@ class IdentifyTable(Section):
     profile: int = Field(5, ge=0, le=1000)
 
 
-class Parameter(NamedTuple):
+class SoughtParameter(NamedTuple):
     """A number that is sought: a ``quantity`` at the ``members`` (sites, masses, springs or records, from 0).
 
     The coordinate of the fit is its logarithm, or its position between the bounds: a number of order one.
@@ -87,7 +87,9 @@ class Parameter(NamedTuple):
 
     def from_coordinate(self, z: float) -> float:
         """The value at the fit's coordinate ``z``, kept between the bounds, which rounding may miss."""
-        value = np.exp(z) if self.is_logarithmic else self.low + (self.high - self.low) * z
+        value = self.low + (self.high - self.low) * z
+        if self.is_logarithmic:
+            value = np.exp(np.clip(z, np.log(self.low), np.log(self.high)))
         return float(np.clip(value, self.low, self.high))
 
     def slope(self, z: float) -> float:
@@ -103,8 +105,17 @@ class IdentifyCase(CaseFile):
     base: Case
 
     verb = section = "identify"
-    takes = Case.takes - {"nonlinear springs", "initial motion", "disorder"}
-    premise = "identification holds for a lattice at rest"
+    refuses: ClassVar[Mapping[str, str]] = {
+        "nonlinear springs": "not yet: derivatives of the motion are those of linear springs between contacts",
+        "touching stops": "a stop that touches at rest has no onset, at which the derivatives of a contact begin",
+        "initial motion": "not yet: records begin with the lattice at rest",
+        "disorder": "a lattice that was measured has one value of each quantity, which is sought, and no scatter",
+    }
+
+    @classmethod
+    def keywords(cls) -> Iterable[str]:
+        """The sections of a run, and that of the identification."""
+        return (*Case.sections(), cls.section)
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -152,22 +163,22 @@ class IdentifyCase(CaseFile):
         return self.base.output.figures
 
     @cached_property
-    def parameters(self) -> list[Parameter]:
+    def parameters(self) -> list[SoughtParameter]:
         """What is sought: the unknowns one by one, then offsets of records."""
-        found = []
+        parameters = []
         for unknown in self.options.unknowns:
             values = values_of(self.base, unknown.quantity)
             for number, members in enumerate(_groups(unknown, len(values))):
                 start = unknown.start[number] if isinstance(unknown.start, list) else unknown.start
                 if start is None:
                     start = float(np.mean([values[member] for member in members]))
-                found.append(_parameter(unknown, members, start, len(values)))
+                parameters.append(_parameter(unknown, members, start, len(values)))
         for number, record in enumerate(self.options.records):
             if isinstance(record.offset, list):
                 low, high = record.offset
                 name = "offset" if len(self.options.records) == 1 else f"offset {number + 1}"
-                found.append(Parameter(name, "offset", (number,), low, high, (low + high) / 2, "s", False))
-        return found
+                parameters.append(SoughtParameter(name, "offset", (number,), low, high, (low + high) / 2, "s", False))
+        return parameters
 
     def case_of(self, values: Iterable[float], name: str = "model") -> Case:
         """The case with the ``values`` (parameter,); raises CaseError if it is impossible."""
@@ -250,7 +261,7 @@ def _groups(unknown: UnknownTable, count: int) -> list[tuple[int, ...]]:
     return [tuple(number - 1 for number in group) for group in unknown.of]
 
 
-def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float, count: int) -> Parameter:
+def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float, count: int) -> SoughtParameter:
     """One of the values of an ``unknown``."""
     low, high = unknown.bounds
     name: str = unknown.quantity
@@ -260,7 +271,7 @@ def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float, co
     # The case may lie outside the bounds; the search does not.
     start = min(max(start, low), high)
     unit = UNITS.get(unknown.quantity, "N/m^n" if unknown.quantity == "stiffness" else "1")
-    return Parameter(name, unknown.quantity, members, low, high, start, unit, scale == "logarithmic")
+    return SoughtParameter(name, unknown.quantity, members, low, high, start, unit, scale == "logarithmic")
 
 
 def _case_problems(base: Case) -> Iterator[Problem]:

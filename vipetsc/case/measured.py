@@ -212,8 +212,8 @@ def _hdf5_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
     try:
         with h5py.File(path) as file:
             for key, place in _wanted(record):
-                found = re.fullmatch(r"(.+?)(?:\[(\d+)\])?", str(place))
-                name, column = found.groups() if found else (str(place), None)
+                match = re.fullmatch(r"(.+?)(?:\[(\d+)\])?", str(place))
+                name, column = match.groups() if match else (str(place), None)
                 dataset = file.get(name)
                 if not isinstance(dataset, h5py.Dataset):
                     raise MeasuredError(key, place, f"the file has no dataset {name}")

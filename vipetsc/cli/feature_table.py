@@ -11,6 +11,7 @@ from typing import Any
 
 from vipetsc.case import Case, CaseError, CaseFile, LawCase, NnmCase, Sweep
 from vipetsc.case.case_file import Table
+from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.predict import PredictCase
@@ -132,11 +133,20 @@ STEPS = {"points": 10, "harmonics": 5, "first_step": 0.2, "largest_step": 0.3}
 FORCE = {"source": "force", "infinite": False, "range": [0.44, 1.0]}
 FEW_RUNS = {"largest": 2.0, "tolerance": 0.9, "finest": 0.5, "samples": 1}
 SEARCH = {"budget": 2, "variables": {"profile": [1e-5, 1e-3]}, "objective": [{"measure": "entropy"}]}
+# With a hash the file of a record is not read.
+RECORD = {
+    "file": "record.csv",
+    "sha256": "",
+    "rate": 4000.0,
+    "sensors": [{"quantity": "velocity", "column": 1, "cell": 4}],
+}
+IDENTIFY = {"records": [RECORD], "unknowns": [{"quantity": "amplitude", "bounds": [0.1, 100.0]}]}
 COLUMNS: tuple[Column, ...] = (
     Column("run", Case, DRIVEN),
     Column("propagator", Case, merged(DRIVEN, {"time": {"engine": "propagator"}}), _propagator_refusal),
     Column("sweep", Sweep, merged(DRIVEN, {"sweep": {"measures": ["motion"], "time": {"rtol": [1e-8, 1e-9]}}})),
     Column("optimise", OptimiseCase, merged(DRIVEN, {"optimise": SEARCH})),
+    Column("identify", IdentifyCase, merged(DRIVEN, {"identify": IDENTIFY})),
     Column("bands", Case, DRIVEN, _modes_refusal),
     Column("law", LawCase, merged(DRIVEN, {"law": FEW_RUNS})),
     Column("predict", PredictCase, merged(DRIVEN, {"predict": {"amplitudes": [2.0], "points": 16}})),

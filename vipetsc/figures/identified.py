@@ -20,10 +20,10 @@ def record_and_model(identified: xr.Dataset) -> Figure:
     rows = figure.subplots(count, 2, squeeze=False, width_ratios=(3, 2))
     for number, (motion, residual) in enumerate(rows):
         channel = identified.isel(channel=number)
-        own = identified["data/channel"].values == number
-        time = 1e3 * identified["data/time"].values[own]
-        measured = identified["data/measured"].values[own]
-        model = identified["data/model"].values[own]
+        chosen = identified["data/channel"].values == number
+        time = 1e3 * identified["data/time"].values[chosen]
+        measured = identified["data/measured"].values[chosen]
+        model = identified["data/model"].values[chosen]
         unit = channel["channels/unit"].item()
         motion.plot(time, measured, ".", color=style.GREY, ms=2.5, label="measured")
         motion.plot(time, model, color=style.BLUE, lw=0.8, label="model")
@@ -45,8 +45,8 @@ def residual_correlations(identified: xr.Dataset) -> Figure:
     figure = style.new_figure(style.PAGE, 2.4)
     axes = figure.subplots(1, count, squeeze=False, sharey=True)[0]
     for number, panel in enumerate(axes):
-        own = identified["data/channel"].values == number
-        residuals = identified["data/measured"].values[own] - identified["data/model"].values[own]
+        chosen = identified["data/channel"].values == number
+        residuals = identified["data/measured"].values[chosen] - identified["data/model"].values[chosen]
         residuals = residuals - residuals.mean()
         power = residuals @ residuals
         lags = np.arange(1, min(MOST_LAGS, len(residuals) // 2) + 1)

@@ -1,6 +1,6 @@
 r"""Parameters of a lattice with contacts from measured motion.
 
-**1. Motion and derivatives** (``motion``, ``motion_kernels``). With the force F_c of each site and w = c u there,
+**1. Motion and derivatives** (``motion``, ``motion_rates``, ``motion_steps``). With F_c, the force of a site, w = c u,
 
     M u'' + C u' + K u + sum_c c^T F_c(w, w', w'_minus) = f(t),    u(0) = u'(0) = 0,
 

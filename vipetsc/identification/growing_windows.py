@@ -30,6 +30,8 @@ SHORTEST = 0.01
 # First window of records without contact, over the last one.
 FIRST_LINEAR = 0.1
 REWEIGHTINGS = 2
+# Further passes through all windows.
+REPETITIONS = 1
 
 
 class Window(NamedTuple):
@@ -57,13 +59,13 @@ FINAL = Precision()
 
 
 class Fit(NamedTuple):
-    """The fit from one start: ``coordinates`` (parameter,), the sum of squares, the ``windows`` in their order.
+    """The fit from one start: ``coordinates`` (parameter,), ``deviance``, and the ``windows`` in their order.
 
     ``noise`` has one array (sensor,) a record: given, or estimated from the residuals.
     """
 
     coordinates: np.ndarray
-    cost: float
+    deviance: float
     windows: list[Window]
     noise: list[np.ndarray]
 
@@ -92,14 +94,31 @@ class GrowingWindows:
         """Fit from the coordinates ``z`` (parameter,) on."""
         z = np.clip(z, self.low, self.high)
         windows: list[Window] = []
-        z = self._fit_linear_parts(z, windows)
+        best = self._pass(self._fit_linear_parts(z, windows), windows)
+        # Where noise has led the first windows into a valley beside the right one, they now begin near that one, with
+        # weights that are those of the noise.
+        for _ in range(REPETITIONS):
+            repeated = self._pass(best.coordinates, windows)
+            if repeated.deviance < best.deviance:
+                best = repeated
+        self.misfit.noise = best.noise
+        return best._replace(windows=windows)
+
+    def _pass(self, z: np.ndarray, windows: list[Window]) -> Fit:
+        """Fit all parameters over growing windows, then over all data with the noise that they show."""
         z = self._fit_contacts(z, windows)
         for _ in range(REWEIGHTINGS if not all(map(all, self._is_given)) else 0):
             self._estimate_noise(z)
             z = self.solve(z, self.last, self._every())
         windows.append(self._window(z, self.last))
-        cost = float(np.sum(self.misfit.residuals(z, self.last) ** 2))
-        return Fit(z, cost, windows, self.misfit.noise)
+        return Fit(z, self.deviance(z), windows, self.misfit.noise.copy())
+
+    def deviance(self, z: np.ndarray) -> float:
+        """Minus twice the logarithm of the likelihood but for a constant: fits with other noise can be compared."""
+        total = float(np.sum(self.misfit.residuals(z, self.last) ** 2))
+        for record, noise in zip(self.misfit.records, self.misfit.noise, strict=True):
+            total += 2 * len(record.times) * float(np.sum(np.log(noise)))
+        return total
 
     def _every(self) -> list[int]:
         """The numbers of all parameters."""
@@ -138,11 +157,11 @@ class GrowingWindows:
         while True:
             is_last = ends == self.last
             precision = FINAL if is_last else GROWING
-            found = self.solve(z, ends, self._every(), precision)
-            nearer = self._within_reach(found, ends)
+            fitted = self.solve(z, ends, self._every(), precision)
+            nearer = self._within_reach(fitted, ends)
             if nearer is not None:
-                found = self.solve(nearer, ends, self._every(), precision)
-            window = self._window(found, ends)
+                fitted = self.solve(nearer, ends, self._every(), precision)
+            window = self._window(fitted, ends)
 
             # A misfit that rises shows that the window has grown past the reach of the last fit: it is made shorter.
             shorter = [(a + b) / 2 for a, b in zip(begin, ends, strict=True)]
@@ -152,7 +171,7 @@ class GrowingWindows:
                 continue
 
             windows.append(window)
-            z = found
+            z = fitted
             least = max(1.0, window.misfit)
             if is_last:
                 return z
@@ -247,7 +266,7 @@ class GrowingWindows:
             data = self.misfit.jacobian(whole(x), ends, active)
             return np.concatenate([data, weight * np.eye(len(active))])
 
-        found = least_squares(
+        solution = least_squares(
             residuals,
             # A start on a bound is moved inside by the method, and a start outside is refused.
             np.clip(start, self.low[active], self.high[active]),
@@ -260,7 +279,7 @@ class GrowingWindows:
             gtol=TOLERANCE,
             max_nfev=precision.steps or self.misfit.plan.options.steps,
         )
-        return whole(found.x)
+        return whole(solution.x)
 
     def _estimate_noise(self, z: np.ndarray) -> None:
         """Estimate the noise of the channels for which none is given from their residuals."""

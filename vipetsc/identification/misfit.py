@@ -8,7 +8,7 @@ from vipetsc.case import Case, CaseError, Model
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import Measured
 from vipetsc.dynamics.drives import create_drives, drive_forces
-from vipetsc.identification.motion import MotionError, Response, no_slopes, respond, slopes_between
+from vipetsc.identification.motion import MotionError, RecordedMotion, no_slopes, respond, slopes_between
 
 # Half the distance of the coordinates between which coefficients of the motion are differenced.
 HALF_WIDTH = 1e-5
@@ -76,7 +76,7 @@ class Misfit:
 
     def respond(
         self, z: np.ndarray, number: int, end: float, active: Sequence[int] = (), watched: np.ndarray | None = None
-    ) -> Response:
+    ) -> RecordedMotion:
         """The motion of record ``number`` up to its time ``end``, with derivatives by the parameters ``active``.
 
         Raises CaseError, MotionError.

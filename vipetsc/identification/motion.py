@@ -9,7 +9,8 @@ from vipetsc.case import Model
 from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.site_dofs import site_records
-from vipetsc.identification.motion_kernels import DONE, Lattice, Motion, Slopes, integrate
+from vipetsc.identification.motion_rates import Lattice, MotionState, Slopes
+from vipetsc.identification.motion_steps import DONE, integrate
 from vipetsc.modes.shooting.dop853 import STAGES
 
 # Errors are relative to a motion, and to derivatives, of at least this fraction of the linear wave: derivatives begin
@@ -21,7 +22,7 @@ class MotionError(RuntimeError):
     """A motion that could not be followed to its end."""
 
 
-class Coefficients(NamedTuple):
+class MotionCoefficients(NamedTuple):
     """What a model's equations of motion are made of, in arrays that can be differenced.
 
     ``masses`` (n,) in kg; ``stiffness`` and ``damping`` (entry,) in N/m and N s/m, over the pattern ``first`` (n + 1,)
@@ -37,7 +38,7 @@ class Coefficients(NamedTuple):
     gains: np.ndarray
 
     @classmethod
-    def of(cls, model: Model) -> "Coefficients":
+    def of(cls, model: Model) -> "MotionCoefficients":
         """The coefficients of a ``model``."""
         chain = model.chain
         stiffness = chain.stiffness_rows(0, chain.cells).tocoo()
@@ -73,36 +74,36 @@ def slopes_between(lower: Sequence[Model], upper: Sequence[Model], widths: np.nd
     """Derivatives of the coefficients of ``model`` by central differences between models (parameter,).
 
     ``widths`` (parameter,) are the distances of the parameter's values in ``lower`` and ``upper``; parameters are
-    numbers of order one, so that all derivatives of a motion have its magnitude. Coefficients are affine in most
+    numbers of order one, so that all derivatives of a motion have its magnitude. MotionCoefficients are affine in most
     parameters and smooth in the others, so that no truncation is seen.
     """
-    own = Coefficients.of(model)
+    middle = MotionCoefficients.of(model)
     count = len(widths)
-    number = len(own.sites)
+    number = len(middle.sites)
     slopes = Slopes(
-        masses=np.zeros((count, len(own.masses))),
-        stiffness=np.zeros((count, len(own.stiffness))),
-        damping=np.zeros((count, len(own.damping))),
+        masses=np.zeros((count, len(middle.masses))),
+        stiffness=np.zeros((count, len(middle.stiffness))),
+        damping=np.zeros((count, len(middle.damping))),
         gaps=np.zeros((count, number, 2)),
         laws=np.zeros((count, number, 3)),
-        drives=np.zeros((count, len(own.gains))),
+        drives=np.zeros((count, len(middle.gains))),
         linear=np.zeros(count, bool),
     )
     for p, (low, high, width) in enumerate(zip(lower, upper, widths, strict=True)):
         sites = [site_records(at, np.arange(len(at.chain.sites))) for at in (low, high)]
         # Matrices take most of the time, and contacts have no part in them.
         if low.chain.cell != high.chain.cell:
-            before = Coefficients.of(low)
-            after = Coefficients.of(high)
+            before = MotionCoefficients.of(low)
+            after = MotionCoefficients.of(high)
             slopes.masses[p] = (after.masses - before.masses) / width
             slopes.stiffness[p] = (after.stiffness - before.stiffness) / width
             slopes.damping[p] = (after.damping - before.damping) / width
             slopes.linear[p] = True
         gains = gains_of(high) - gains_of(low)
-        slopes.drives[p] = gains / width / np.where(own.gains != 0, own.gains, 1.0)
+        slopes.drives[p] = gains / width / np.where(middle.gains != 0, middle.gains, 1.0)
         for k, name in enumerate(("clearance", "clearance_minus")):
             # Where there is no stop both are infinite.
-            stops = np.isfinite(own.sites[name])
+            stops = np.isfinite(middle.sites[name])
             slopes.gaps[p, stops, k] = (sites[1][name] - sites[0][name])[stops] / width
         for k, name in enumerate(("stiffness", "exponent")):
             slopes.laws[p, :, k] = (sites[1]["elastic"][name] - sites[0]["elastic"][name]) / width
@@ -110,7 +111,7 @@ def slopes_between(lower: Sequence[Model], upper: Sequence[Model], widths: np.nd
     return slopes
 
 
-class Response(NamedTuple):
+class RecordedMotion(NamedTuple):
     """A motion at samples.
 
     ``motion`` (sample, watched, 4, column): u, u', u'' in m, m/s, m/s^2, and u''' in column 0; column 0 is the motion,
@@ -128,13 +129,15 @@ def no_slopes(model: Model) -> Slopes:
     return slopes_between([], [], np.zeros(0), model)
 
 
-def respond(model: Model, slopes: Slopes, times: np.ndarray, watched: np.ndarray, touches: bool = True) -> Response:
+def respond(
+    model: Model, slopes: Slopes, times: np.ndarray, watched: np.ndarray, touches: bool = True
+) -> RecordedMotion:
     """The motion of ``model`` from rest and its derivatives at the rising ``times`` (sample,) in s.
 
     ``watched`` are masses (0-based, cell by cell); without ``touches`` no site ever closes. Raises MotionError.
     """
     chain = model.chain
-    coefficients = Coefficients.of(model)
+    coefficients = MotionCoefficients.of(model)
     sites = coefficients.sites
     if not touches:
         sites["clearance"] = sites["clearance_minus"] = np.inf
@@ -167,12 +170,12 @@ def respond(model: Model, slopes: Slopes, times: np.ndarray, watched: np.ndarray
         raise MotionError("the steps of the integration became too small")
     tracker.tracks = tracks
     episodes = tracker.take_episodes(np.zeros(len(sites)), unfinished=True)
-    return Response(motion, np.sort(episodes, order=("onset", "site")), reached)
+    return RecordedMotion(motion, np.sort(episodes, order=("onset", "site")), reached)
 
 
-def create_motion(rows: int, columns: int, sites: int, scale: float) -> Motion:
+def create_motion(rows: int, columns: int, sites: int, scale: float) -> MotionState:
     """The state of rest and the workspace of so many ``rows``, 2n, and ``columns``; ``scale`` in m is that of waves."""
-    return Motion(
+    return MotionState(
         state=np.zeros((rows, columns)),
         end=np.zeros((rows, columns)),
         stages=np.zeros((STAGES, rows, columns)),
@@ -186,7 +189,7 @@ def create_motion(rows: int, columns: int, sites: int, scale: float) -> Motion:
     )
 
 
-def fastest(coefficients: Coefficients) -> float:
+def fastest(coefficients: MotionCoefficients) -> float:
     """A bound in rad/s of the fastest mode's frequency, by Gershgorin's circles."""
     rows = np.repeat(np.arange(len(coefficients.masses)), np.diff(coefficients.first))
     inverse = 1 / coefficients.masses

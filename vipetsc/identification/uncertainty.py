@@ -30,7 +30,8 @@ def uncertainty_of(jacobian: np.ndarray) -> Uncertainty:
     """The uncertainty by the ``jacobian`` J (datum, parameter) of residuals over the noise; covariance (J^T J)^-1."""
     count = jacobian.shape[1]
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
-    floor = SMALLEST * max(float(np.max(singular, initial=0.0)), float(np.finfo(float).tiny))
+    # Without any slope all errors are large, and finite.
+    floor = SMALLEST * max(float(np.max(singular, initial=0.0)), 1.0)
     deviations = 1 / np.maximum(singular, floor)
     factors = directions * deviations[:, None]
     covariance = factors.T @ factors
@@ -61,6 +62,6 @@ def errors_with_sensor(uncertainty: Uncertainty, slopes: np.ndarray, noise: floa
     information = information + 1e-12 * np.eye(len(information))
     errors = []
     for mass in range(slopes.shape[1]):
-        own = slopes[:, mass] / noise
-        errors.append(np.sqrt(np.diag(np.linalg.inv(information + own.T @ own))))
+        scaled_slopes = slopes[:, mass] / noise
+        errors.append(np.sqrt(np.diag(np.linalg.inv(information + scaled_slopes.T @ scaled_slopes))))
     return np.array(errors)

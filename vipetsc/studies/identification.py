@@ -35,6 +35,8 @@ from vipetsc.studies.sweep import is_whole
 PROFILED = 3.0
 # Evaluations of one fit of a profile, which begins where the covariance puts it.
 PROFILE_STEPS = 10
+# Coordinates that differ by rounding.
+SAME = 1e-12
 
 
 def run_identification(
@@ -82,7 +84,7 @@ def read_records(plan: IdentifyCase) -> list[Measured]:
     return records
 
 
-class Profile(NamedTuple):
+class MisfitProfile(NamedTuple):
     """Coordinates ``places`` (parameter, place) at which each parameter is held, and how the others move ``along``."""
 
     places: np.ndarray
@@ -121,15 +123,10 @@ class Identification:
         start = self.starts()[number]
         windows = self.windows()
         fit = windows.fit(start)
-        residuals = windows.misfit.residuals(fit.coordinates, windows.last)
-        # Minus twice the logarithm of the likelihood but for a constant: fits with other noise can be compared.
-        noise = np.concatenate(
-            [np.tile(noise, len(record.times)) for noise, record in zip(fit.noise, self.measured, strict=True)]
-        )
         return {
             "begin": start.tolist(),
             "coordinates": fit.coordinates.tolist(),
-            "deviance": float(np.sum(residuals**2) + 2 * np.sum(np.log(noise))),
+            "deviance": fit.deviance,
             "misfit": fit.windows[-1].misfit,
             "noise": [noise.tolist() for noise in fit.noise],
             "windows": [
@@ -149,7 +146,7 @@ class Identification:
         windows.misfit.noise = [np.array(noise) for noise in record["noise"]]
         return windows, np.array(record["coordinates"])
 
-    def profile(self, record: Record) -> Profile:
+    def profile(self, record: Record) -> MisfitProfile:
         """The profiles to be taken around the fit of a ``record``."""
         windows, z = self.placed(record)
         count = self.plan.options.profile
@@ -159,16 +156,17 @@ class Identification:
         high = np.minimum(z + reach, windows.high)
         # The covariance says where the others go, as long as the problem is nearly linear.
         along = known.correlation * known.errors / known.errors[:, None]
-        return Profile(np.linspace(low, high, count, axis=1), np.where(known.determined, along, 0.0))
+        return MisfitProfile(np.linspace(low, high, count, axis=1), np.where(known.determined, along, 0.0))
 
-    def profiled(self, record: Record, profile: Profile, number: int, place: int) -> Record:
+    def profiled(self, record: Record, profile: MisfitProfile, number: int, place: int) -> Record:
         """The least misfit with parameter ``number`` held at a ``place`` of its profile, and all others fitted."""
         windows, z = self.placed(record)
         value = float(profile.places[number, place])
         held = np.clip(z + profile.along[number] * (value - z[number]), windows.low, windows.high)
         held[number] = value
         others = [other for other in range(len(z)) if other != number]
-        if others:
+        # In the middle of a profile is the fit itself.
+        if others and abs(value - z[number]) > SAME:
             held = windows.solve(held, windows.last, others, Precision(steps=PROFILE_STEPS, is_rough=True))
         residuals = windows.misfit.residuals(held, windows.last)
         return {"cost": float(np.sum(residuals**2))}
@@ -187,10 +185,10 @@ def _identify(work: Identification, folder: Path, comm: MPI.Comm, progress: bool
     starts = [f"start {number}" for number in range(plan.options.starts)]
     recorded.make(starts, fit, what="starts", progress=progress, failures=True)
     fits = [recorded.records[key] for key in starts]
-    found = [number for number, record in enumerate(fits) if "deviance" in record]
-    if not found:
+    fitted = [number for number, record in enumerate(fits) if "deviance" in record]
+    if not fitted:
         raise RuntimeError(f"no start leads to a fit: {fits[0]['reason']}")
-    best = min(found, key=lambda number: (fits[number]["deviance"], number))
+    best = min(fitted, key=lambda number: (fits[number]["deviance"], number))
     places = on_root(comm, lambda: work.profile(fits[best]))
     shape = places.places.shape
 
@@ -213,7 +211,7 @@ def _write(
     folder: Path,
     comm: MPI.Comm,
 ) -> None:
-    """Write the case that was found, then ``identified.h5``, whose presence says that all is done."""
+    """Write the case that was fitted, then ``identified.h5``, whose presence says that all is done."""
     sys.audit("vipetsc.conclude", str(folder))
     plan = work.plan
     windows, z = work.placed(fits[best])

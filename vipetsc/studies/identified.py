@@ -285,13 +285,13 @@ def summary_of(data: xr.Dataset) -> str:
         point = data.isel(parameter=row)
         value = f"{float(point['value']):>14.7g}"
         if np.isfinite(point["at_least"]):
-            found = f"{'':>14}{'':>12}  at least {float(point['at_least']):<17.6g}"
+            shown = f"{'':>14}{'':>12}  at least {float(point['at_least']):<17.6g}"
         elif not point["determined"]:
-            found = f"{value}{'':>12}  {'not determined':<26}"
+            shown = f"{value}{'':>12}  {'not determined':<26}"
         else:
             interval = f"{float(point['interval_low']):.7g} to {float(point['interval_high']):.7g}"
-            found = f"{value}{float(point['standard_error']):>12.2g}  {interval:<26}"
-        lines.append(f"  {point['parameter'].values!s:<16}{found} {point['unit'].values}")
+            shown = f"{value}{float(point['standard_error']):>12.2g}  {interval:<26}"
+        lines.append(f"  {point['parameter'].values!s:<16}{shown} {point['unit'].values}")
     for row in range(data.sizes["channel"]):
         channel = data.isel(channel=row)
         noise = "noise given" if channel["channels/is_given"] else "noise estimated"

@@ -1,0 +1,183 @@
+"""The section [identify]: every problem of data and unknowns with its key, value and remedy; parameters and cases."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.identified import identify_table, lattice_table
+from vipetsc.case import Case, CaseError
+from vipetsc.case.identify import IdentifyCase
+from vipetsc.case.measured import RecordTable, read_measured
+
+SENSOR = {"quantity": "velocity", "column": "v", "cell": 2, "mass": 1}
+
+
+def record_in(path, **changes):
+    """The table of a record in ``path``."""
+    return {"file": str(path), "time": "t", "sensors": [SENSOR]} | changes
+
+
+def written(folder, rows=None, names="t,v"):
+    """A record of 20 samples, or of ``rows``, in a table of text."""
+    path = folder / "record.csv"
+    if rows is None:
+        rows = [f"{1e-3 * k:.4f},{np.sin(k):.6f}" for k in range(20)]
+    path.write_text("\n".join([names, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def problems_of(record, **options):
+    """The problems of an identification with one ``record``, by key."""
+    with pytest.raises(CaseError) as caught:
+        IdentifyCase.from_table(identify_table(lattice_table(), record, **options))
+    return {problem.key: f"{problem.value}: {problem.remedy}" for problem in caught.value.problems}
+
+
+def rows_with(index, row):
+    """The rows of a record, with another one at ``index``."""
+    rows = [f"{1e-3 * k:.4f},{np.sin(k):.6f}" for k in range(20)]
+    rows[index] = row
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("rows", "key", "part"),
+    [
+        (rows_with(7, "0.0070,nan"), "sensors[1].column", "sample 8 of 20 is not a finite number"),
+        (rows_with(7, "0.0070,"), "file", "row 8 is no row of numbers"),
+        (rows_with(7, "0.0074,1.0"), "time", "uneven: sample 8 is at 0.0074 s instead of 0.007 s"),
+        (rows_with(7, "0.007"), "file", "its lines have 1 or 2 fields"),
+        (["0.0,1.0"] * 20, "time", "must rise"),
+        ([f"{1e-3 * k},0.0" for k in range(20)], "sensors[1].column", "zero at all times"),
+        ([f"{1e-3 * k},1.0" for k in range(5)], "file", "leaves 5 samples"),
+    ],
+)
+def test_bad_data_are_one_clear_error(tmp_path, rows, key, part):
+    problems = problems_of(record_in(written(tmp_path, rows)))
+    assert list(problems) == [f"identify.records[1].{key}"]
+    assert part in problems[f"identify.records[1].{key}"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "part"),
+    [
+        ({"sensors": [SENSOR | {"cell": 7}]}, "sensors[1].cell", "the lattice has the cells 1 to 6"),
+        ({"sensors": [SENSOR | {"mass": 5}]}, "sensors[1].mass", "a cell has the masses 1 to 4"),
+        ({"sensors": [SENSOR | {"column": "w"}]}, "sensors[1].column", "no column of that name; there are t, v"),
+        ({"sensors": [SENSOR | {"column": 3}]}, "sensors[1].column", "the columns 1 to 2"),
+        ({"sensors": [SENSOR | {"quantity": "force"}]}, "sensors[1].cell", "give drive in place of cell"),
+        ({"rate": 1e3}, "time", "one of both"),
+        ({"offset": [1.0, 0.0]}, "offset", "low below high"),
+        ({"drive": {"frequency": -1.0}}, "drive.frequency", ""),
+        ({"file": "nowhere.csv"}, "file", "no such file"),
+    ],
+)
+def test_keys_of_a_record_are_checked(tmp_path, changes, key, part):
+    problems = problems_of(record_in(written(tmp_path)) | changes)
+    assert part in problems[f"identify.records[1].{key}"]
+
+
+@pytest.mark.parametrize(
+    ("unknown", "key", "part"),
+    [
+        ({"quantity": "exponent", "bounds": [1.0, 2.0]}, "quantity", 'only the law "power" has an exponent'),
+        ({"quantity": "clearance", "bounds": [-1.0, 1.0]}, "bounds", "must be positive"),
+        ({"quantity": "clearance", "bounds": [2.0, 1.0]}, "bounds", "low below high"),
+        ({"quantity": "restitution", "bounds": [0.5, 1.2]}, "bounds", "between 0 and 1"),
+        ({"quantity": "clearance", "bounds": [1e-5, 1.0], "of": [[4]]}, "of", "from 1 to 3"),
+        ({"quantity": "clearance", "bounds": [1e-5, 1.0], "of": [[1], [1, 2]]}, "of", "sought twice"),
+        ({"quantity": "clearance", "bounds": [1e-5, 1.0], "start": [1e-3, 1e-3]}, "start", "each of the 1 values"),
+        ({"quantity": "clearance", "bounds": [1e-5, 1e-4], "start": 1e-3}, "start", "within the bounds"),
+        ({"quantity": "dashpot", "bounds": [1e-3, 1.0]}, "start", "without a dashpot"),
+    ],
+)
+def test_unknowns_are_checked(tmp_path, unknown, key, part):
+    problems = problems_of(record_in(written(tmp_path)), unknowns=[unknown])
+    assert part in problems[f"identify.unknowns[1].{key}"]
+
+
+def test_contacts_are_not_sought_in_silence_nor_where_they_touch(tmp_path):
+    record = record_in(written(tmp_path))
+    problems = problems_of(record | {"contact": False})
+    assert "says nothing about its contacts" in problems["identify.unknowns[1].quantity"]
+
+    table = lattice_table(contacts={"clearance": 0.0, "restitution": 1.0, "side": "plus"})
+    with pytest.raises(CaseError, match="touches or is pressed at rest"):
+        IdentifyCase.from_table(identify_table(table, record))
+
+
+def test_a_table_and_an_hdf5_file_give_the_same_record(tmp_path):
+    """Names, numbers, comments, semicolons, factors and a rate; datasets of one and of two dimensions."""
+    times = 1e-3 * np.arange(20)
+    values = np.sin(np.arange(20.0))
+    text = tmp_path / "r.csv"
+    lines = [
+        "# a comment",
+        "time (ms);v (g)",
+        *(f"{1e3 * t:.17g};{v:.17g}" for t, v in zip(times, values, strict=True)),
+    ]
+    text.write_text("\n".join(lines))
+    with h5py.File(tmp_path / "r.h5", "w") as file:
+        file["clock"] = times
+        file["points/velocity"] = np.column_stack([0 * values, values])
+
+    scaled = [SENSOR | {"column": "v (g)", "factor": 9.81}]
+    by_name = {"file": str(text), "time": "time (ms)", "time_factor": 1e-3, "sensors": scaled}
+    by_number = {"file": str(text), "rate": 1e3, "sensors": [SENSOR | {"column": 2, "factor": 9.81}]}
+    dataset = [SENSOR | {"column": "points/velocity[2]", "factor": 9.81}]
+    in_hdf5 = {"file": str(tmp_path / "r.h5"), "time": "clock", "sensors": dataset}
+    for record in (by_name, by_number, in_hdf5):
+        measured = read_measured(RecordTable.model_validate(record))
+        assert measured.times == pytest.approx(times, abs=1e-15)
+        assert measured.values[:, 0] == pytest.approx(9.81 * values, rel=1e-12)
+    cut = read_measured(RecordTable.model_validate(by_name | {"end": 0.01}))
+    assert len(cut.times) == 11
+
+
+def test_parameters_go_into_the_case(tmp_path):
+    """Groups share a value, the others keep theirs; the case that comes out is one that every verb reads."""
+    unknowns = [
+        {"quantity": "clearance", "of": [[1, 3]], "bounds": [1e-5, 1e-2]},
+        {"quantity": "restitution", "of": "each", "bounds": [0.1, 1.0]},
+        {"quantity": "mass", "of": [[2]], "bounds": [1e-5, 1.0]},
+        {"quantity": "dashpot", "of": [[1]], "bounds": [1e-5, 1.0], "start": 0.1},
+        {"quantity": "amplitude", "bounds": [1.0, 100.0]},
+    ]
+    record = record_in(written(tmp_path), offset=[-1e-3, 1e-3])
+    plan = IdentifyCase.from_table(identify_table(lattice_table(), record, unknowns=unknowns))
+    names = [parameter.name for parameter in plan.parameters]
+    assert names == [
+        "clearance 1+3",
+        *(f"restitution {number}" for number in (1, 2, 3)),
+        "mass 2",
+        "dashpot 1",
+        "amplitude",
+        "offset",
+    ]
+
+    case = plan.case_of([7e-4, 0.5, 0.6, 0.8, 0.003, 0.2, 33.0, 5e-4])
+    chain = case.model().chain
+    assert chain.clearances == (7e-4, 4e-4, 7e-4)
+    assert [law.restitution for law in case.model().laws] == [0.5, 0.6, 0.8]
+    assert chain.cell.masses[1] == 0.003
+    assert [spring.damping for spring in chain.cell.springs][:2] == [0.2, 0.0]
+    assert case.drive.amplitude == 33.0
+    # A mass that changes must not change the frequency of what drove the measurement.
+    assert case.drive.frequency == plan.base.drive.frequency
+    assert Case.from_toml(case.to_toml()) == case
+
+    again = IdentifyCase.from_toml(plan.to_toml())
+    assert again.to_toml() == plan.to_toml()
+    assert again.options.records[0].sha256
+
+
+def test_coordinates_and_values_are_inverse(tmp_path):
+    plan = IdentifyCase.from_table(identify_table(lattice_table(), record_in(written(tmp_path))))
+    for parameter in plan.parameters:
+        z = parameter.to_coordinate(parameter.start)
+        assert parameter.from_coordinate(z) == pytest.approx(parameter.start)
+        h = 1e-6
+        slope = (parameter.from_coordinate(z + h) - parameter.from_coordinate(z - h)) / (2 * h)
+        assert parameter.slope(z) == pytest.approx(slope, rel=1e-6)

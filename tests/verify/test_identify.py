@@ -1,0 +1,232 @@
+"""Identification: derivatives against both engines, parameters from made records, and what a record cannot tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.conftest import run_of
+from tests.identified import identify_table, lattice_table, measured_table
+from vipetsc.case.identify import IdentifyCase
+from vipetsc.identification.uncertainty import errors_with_sensor, quantile, uncertainty_of
+from vipetsc.identification.whiteness import ljung_box
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.parallel import StopRequest
+from vipetsc.studies.identification import Identification, read_records, run_identification
+
+UNKNOWNS = [
+    {"quantity": "clearance", "of": [[1], [2, 3]], "bounds": [1e-4, 2e-3], "start": 4e-4},
+    {"quantity": "stiffness", "bounds": [1e5, 1e7]},
+    {"quantity": "exponent", "bounds": [1.0, 3.0]},
+    {"quantity": "restitution", "bounds": [0.2, 1.0]},
+    {"quantity": "mass", "of": [[3]], "bounds": [1e-4, 1.0]},
+    {"quantity": "spring", "of": [[1, 2]], "bounds": [10.0, 1e5]},
+    {"quantity": "dashpot", "of": "all", "bounds": [1e-3, 10.0], "start": 0.05},
+    {"quantity": "amplitude", "bounds": [1.0, 100.0]},
+]
+POWER = {"law": "power", "exponent": 1.4, "stiffness": 2e6}
+
+
+def fits_of(table) -> Identification:
+    """The fits of an identification, which nothing stops."""
+    plan = IdentifyCase.from_table(table)
+    return Identification(plan, read_records(plan), StopRequest())
+
+
+def results_of(folder, table):
+    """The results of an identification of ``table`` in ``folder``."""
+    run_identification(IdentifyCase.from_table(table), folder)
+    with open_netcdf(folder / "identified.h5", "identification") as file:
+        return file.load()
+
+
+def differences(plan: IdentifyCase, z: np.ndarray, number: int, engine: str) -> np.ndarray:
+    """Derivatives (sample, point) of measured velocities by one coordinate, by differences of order 4 of an engine."""
+    h = 1e-5
+    total = 0.0
+    for steps, weight in ((-2, 1), (-1, -8), (1, 8), (2, -1)):
+        moved = z.copy()
+        moved[number] += steps * h
+        values = [p.from_coordinate(x) for p, x in zip(plan.parameters, moved, strict=True)]
+        case = plan.case_of(values).varied(time={"engine": engine})
+        total = total + weight * run_of(case)["points/velocity"].values / (12 * h)
+    return np.asarray(total)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["ts", "propagator"])
+def test_derivatives_are_those_of_both_engines_over_1_5_and_20_impacts(tmp_path, engine):
+    """All kinds of parameters, through contacts with loss, against central differences of an engine's runs."""
+    table = lattice_table(contacts=POWER, time={"rtol": 1e-13, "end": 0.022})
+    plan_table = identify_table(table, measured_table(tmp_path, table), unknowns=UNKNOWNS)
+    work = fits_of(plan_table)
+    misfit = work.windows().misfit
+    z = work.starts()[0]
+    every = range(len(z))
+    onsets = misfit.respond(z, 0, 1.0).episodes["onset"]
+    assert len(onsets) > 20
+    _, slopes = misfit.predicted(z, 0, 1.0, every)
+    times = misfit.records[0].times
+
+    expected = np.stack([differences(work.plan, z, number, engine) for number in every], axis=-1)
+    for impacts in (1, 5, 20):
+        window = times < onsets[impacts]
+        assert window.sum() > 10
+        error = np.abs(slopes[window] - expected[window]).max(axis=(0, 1))
+        scale = np.abs(expected[window]).max(axis=(0, 1))
+        # Before its first contact a site's clearance has no derivative, and differences have their rounding.
+        assert (error <= 1e-6 * scale + 1e-9).all(), (impacts, error / scale)
+
+
+@pytest.mark.slow
+def test_the_motion_is_that_of_the_engine(tmp_path):
+    """Displacement, velocity, acceleration and the force of the drive, with a sensor's derivative by the offset."""
+    table = lattice_table()
+    record = measured_table(tmp_path, table) | {"offset": [-1e-3, 1e-3]}
+    kinds = ["displacement", "velocity", "acceleration"]
+    record["sensors"] = [{"quantity": kind, "column": "a", "cell": 3, "mass": 2} for kind in kinds]
+    record["sensors"].append({"quantity": "force", "column": "a"})
+    work = fits_of(identify_table(table, record, unknowns=UNKNOWNS[3:4]))
+    misfit = work.windows().misfit
+    z = work.starts()[0]
+    z[0] = work.plan.parameters[0].to_coordinate(0.7)
+    values, slopes = misfit.predicted(z, 0, 1.0, [1])
+
+    run = run_of(work.plan.case_of([0.7, 0.0]).varied(output={"points": [{"name": "p", "cell": 3, "mass": 2}]}))
+    for column, kind in enumerate(kinds):
+        expected = run[f"points/{kind}"].values[:, 0]
+        assert np.abs(values[:, column] - expected).max() < 1e-6 * np.abs(expected).max()
+    force = work.plan.base.model().drives[0].waveform.force(run["time"].values)
+    assert values[:, 3] == pytest.approx(force, abs=1e-9)
+
+    h = 1e-6
+    later, earlier = z.copy(), z.copy()
+    later[1] += h
+    earlier[1] -= h
+    expected = (misfit.predicted(later, 0, 1.0)[0] - misfit.predicted(earlier, 0, 1.0)[0]) / (2 * h)
+    # At t = 0 the offset moves the sample out of the motion.
+    inside = slice(2, None)
+    error = np.abs(slopes[inside, :, 0] - expected[inside]).max(axis=0)
+    assert (error < 1e-4 * np.abs(expected).max(axis=0)).all(), error / np.abs(expected).max(axis=0)
+
+
+@pytest.mark.slow
+def test_clearances_and_restitution_come_back_without_noise(tmp_path):
+    """From starts 30 % off, three sensors tell three clearances, the stiffness and the restitution to 1e-6."""
+    table = lattice_table(time={"end": 0.014})
+    stiffness = IdentifyCase.from_table(identify_table(table, measured_table(tmp_path, table))).base.contacts.stiffness
+    options = identify_table(table, measured_table(tmp_path, table))["identify"]
+    options["unknowns"].append({"quantity": "stiffness", "bounds": [5e5, 5e7], "start": 0.7 * stiffness})
+    found = results_of(tmp_path / "out", table | {"name": "found", "identify": options})
+
+    truth = [*table["contacts"]["clearance"], 0.7, stiffness]
+    assert found["value"].values == pytest.approx(truth, rel=1e-6)
+    assert (found["determined"].values == 1).all()
+    # Residuals are those of rounding: nothing is said of their whiteness.
+    assert found.attrs["warnings"] == "[]"
+    assert found["windows/impacts"].values[-1] > 5
+
+
+@pytest.mark.slow
+def test_linear_parts_come_from_a_record_without_contact(tmp_path):
+    """A record in which nothing touches tells springs and masses, before the clearances are sought."""
+    quiet = lattice_table(drive={"amplitude": 1.0}, lattice={"cells": 6}) | {"name": "quiet"}
+    loud = lattice_table(time={"end": 0.014})
+    records = [
+        measured_table(tmp_path, quiet) | {"contact": False, "drive": {"amplitude": 1.0}},
+        measured_table(tmp_path, loud),
+    ]
+    cell = IdentifyCase.from_table(identify_table(loud, records)).base.lattice.undamped_cell()
+    stiffness = cell.springs[0].stiffness
+    unknowns = [
+        {"quantity": "spring", "of": [[1]], "bounds": [0.3 * stiffness, 3 * stiffness], "start": 1.2 * stiffness},
+        {"quantity": "clearance", "of": "each", "bounds": [5e-5, 3e-3], "start": [6e-4, 3.2e-4, 3.6e-4]},
+    ]
+    found = results_of(tmp_path / "out", identify_table(loud, records, unknowns=unknowns))
+
+    assert found["value"].values == pytest.approx([stiffness, *loud["contacts"]["clearance"]], rel=1e-6)
+    # The first windows have the silent record alone: no contact counts.
+    assert found["windows/impacts"].values[0] == 0
+    assert found["windows/value"].values[0, 1] == pytest.approx(6e-4, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_a_record_that_never_touches_bounds_the_clearance(tmp_path):
+    """Data without contact give a lower bound, the largest displacement there, and no number."""
+    table = lattice_table(drive={"amplitude": 2.0}, contacts={"clearance": 5e-3}, time={"end": 0.014})
+    record = measured_table(tmp_path, table, noise=0.02)
+    unknowns = [{"quantity": "clearance", "bounds": [1e-5, 1e-2], "start": 6e-3}]
+    found = results_of(tmp_path / "out", identify_table(table, record, unknowns=unknowns))
+
+    run = run_of(IdentifyCase.from_table(identify_table(table, record, unknowns=unknowns)).base)
+    u = run["displacement"].values
+    cell = IdentifyCase.of(found).base.lattice.unit_cell()
+    sites = np.array([2, 3, 5]) - 1
+    largest = np.abs(u[:, sites, cell.resonator] - u[:, sites, cell.host]).max()
+    assert found["at_least"].values[0] == pytest.approx(largest, rel=2e-2)
+    assert found["determined"].values[0] == 0
+    assert np.isnan(found["standard_error"].values[0])
+    assert "at least" in found.attrs["warnings"]
+
+
+@pytest.mark.slow
+def test_a_law_of_the_wrong_kind_is_seen(tmp_path):
+    """Data of Hertz's law, and a bilinear model of any stiffness: the residuals are not white."""
+    table = lattice_table(time={"end": 0.014})
+    record = measured_table(tmp_path, table, noise=0.005)
+    wrong = table | {"contacts": table["contacts"] | {"law": "bilinear", "stiffness": 3e4}}
+    unknowns = identify_table(table, record)["identify"]["unknowns"]
+    unknowns.append({"quantity": "stiffness", "bounds": [1e3, 1e6], "start": 3e4})
+
+    right = results_of(tmp_path / "right", identify_table(table, record))
+    assert "not white" not in right.attrs["warnings"]
+    found = results_of(tmp_path / "wrong", identify_table(wrong, record, unknowns=unknowns))
+    assert "not white" in found.attrs["warnings"]
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth(tmp_path):
+    """Over eight records with 2 % noise, 90 % intervals hold most of the true values; errors are those stated."""
+    table = lattice_table(time={"end": 0.014})
+    truth = np.array([*table["contacts"]["clearance"], 0.7])
+    inside = []
+    deviations = []
+    for seed in range(8):
+        record = measured_table(tmp_path, table, noise=0.02, seed=seed)
+        work = fits_of(identify_table(table, record))
+        windows, z = work.placed(work.fit(0))
+        known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
+        expected = [p.to_coordinate(v) for p, v in zip(work.plan.parameters, truth, strict=True)]
+        deviations.append((z - expected) / known.errors)
+        inside.append(np.abs(deviations[-1]) < quantile(0.9))
+    assert 0.75 <= np.mean(inside) <= 1.0
+    assert 0.5 < np.sqrt(np.mean(np.square(deviations))) < 1.5
+
+
+def test_white_noise_is_white_and_a_slow_drift_is_not():
+    """The probability of Ljung and Box's statistic is uniform for white noise, and small for a moving average."""
+    generator = np.random.default_rng(3)
+    noise = generator.standard_normal((200, 300))
+    probabilities = [ljung_box(row).probability for row in noise]
+    assert np.mean(np.array(probabilities) < 0.1) == pytest.approx(0.1, abs=0.06)
+    assert ljung_box(noise[0, 1:] + 0.6 * noise[0, :-1]).probability < 1e-6
+    # By the definition, with one autocorrelation.
+    short = np.array([1.0, -1.0, 2.0, 0.0, -2.0])
+    r = np.sum(short[1:] * short[:-1]) / np.sum(short**2)
+    assert ljung_box(short).statistic == pytest.approx(5 * 7 * r**2 / 4)
+
+
+def test_a_direction_without_data_is_not_determined():
+    """Singular values tell what is lost, and which sensor would tell it."""
+    jacobian = np.array([[100.0, 100.0], [50.0, 50.0], [0.0, 0.1]])
+    known = uncertainty_of(jacobian)
+    assert known.determined.tolist() == [False, False]
+    assert known.correlation[0, 1] == pytest.approx(-1, abs=1e-5)
+    assert np.abs(known.directions[1]) == pytest.approx([0.5**0.5, 0.5**0.5], abs=1e-3)
+    assert known.errors == pytest.approx(np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))), rel=1e-6)
+
+    slopes = np.zeros((1, 2, 2))
+    slopes[0, 1] = [1.0, -1.0]
+    errors = errors_with_sensor(known, slopes, noise=0.1)
+    assert errors[0] == pytest.approx(known.errors, rel=1e-3)
+    assert (errors[1] < 0.1).all()

@@ -1,0 +1,206 @@
+"""The equations of motion of a lattice and of its derivatives with respect to parameters, compiled.
+
+They are derived in the docstring of the package.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.compiled import kernel
+from vipetsc.contact.law import CLIPPED, FREE, elastic_force_and_slope, gap_of
+from vipetsc.dynamics.drives import Drives, drive_force
+
+# Fraction of a period over which the rate of a drive's force is differenced.
+SHORT = 1e-6
+
+
+class Slopes(NamedTuple):
+    """Derivatives of the lattice's coefficients with respect to each parameter.
+
+    ``masses`` (parameter, n), ``stiffness`` and ``damping`` (parameter, entry); ``gaps`` (parameter, site, 2) on the
+    sides + and -; ``laws`` (parameter, site, 3) of the contact stiffness, the exponent and the damping c; ``drives``
+    (parameter, drive), relative to the drive's amplitude. ``linear`` (parameter,): whether a mass, a spring or a
+    dashpot depends on it.
+    """
+
+    masses: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+    gaps: np.ndarray
+    laws: np.ndarray
+    drives: np.ndarray
+    linear: np.ndarray
+
+
+class Lattice(NamedTuple):
+    """A lattice: its rows of K and C have the entries ``first[i]`` to ``first[i + 1]`` in ``columns`` (entry,).
+
+    ``ends`` (site, 2): host, -1 for the ground, and resonator of the ``contacts`` (site,) of dtype ``SITE``; the
+    ``target`` of each row of ``drives`` is a mass.
+    """
+
+    inverse_mass: np.ndarray
+    first: np.ndarray
+    columns: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+    contacts: np.ndarray
+    ends: np.ndarray
+    drives: Drives
+    slopes: Slopes
+
+
+class MotionState(NamedTuple):
+    """State and workspace. Column 0 is the motion, column 1 + p its derivative with respect to parameter p.
+
+    ``state`` and ``end`` (2n, column), ``stages`` (stage, 2n, column), ``rates`` (2n, column) at the end; ``estimates``
+    (2, 2n, column) are those of errors, ``approach`` (site, column) derivatives of w'_minus; ``before`` and ``after``
+    (site, 3) hold w, w', w'' at both ends of a step, ``largest`` (column,) the largest values so far.
+    """
+
+    state: np.ndarray
+    end: np.ndarray
+    stages: np.ndarray
+    rates: np.ndarray
+    estimates: np.ndarray
+    approach: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    largest: np.ndarray
+    room: np.ndarray
+
+
+@kernel
+def difference(y: np.ndarray, ends: np.ndarray, i: int, first: int, j: int) -> float:
+    """Resonator's less host's entry of column ``j`` of ``y``, from row ``first`` on, of site ``i``."""
+    value = y[first + ends[i, 1], j]
+    if ends[i, 0] >= 0:
+        value -= y[first + ends[i, 0], j]
+    return value
+
+
+@kernel
+def _add_contact(lattice: Lattice, i: int, y: np.ndarray, approach: np.ndarray, out: np.ndarray) -> None:
+    """Add the force of the closed site ``i`` and its derivatives to ``out`` (2n, column), in the rows of velocities."""
+    n = lattice.inverse_mass.size
+    site = lattice.contacts[i]
+    slopes = lattice.slopes
+    side = 1.0 if site.mode > 0 else -1.0
+    which = 0 if site.mode > 0 else 1
+    w = difference(y, lattice.ends, i, 0, 0)
+    rate = difference(y, lattice.ends, i, n, 0)
+    x = side * w - gap_of(site, side)
+    elastic, slope = elastic_force_and_slope(site.elastic, x)
+    g = 1.0 + site.damping * rate / site.approach
+    by_rate = side * elastic * site.damping / site.approach
+    by_approach = -by_rate * rate / site.approach
+    # x^n log x vanishes at the onset, before which the law is continued as an odd function.
+    by_exponent = elastic * np.log(x) if x > 0.0 else 0.0
+
+    host = lattice.ends[i, 0]
+    resonator = lattice.ends[i, 1]
+    for j in range(y.shape[1]):
+        force = side * elastic * g
+        if j > 0:
+            force = slope * g * difference(y, lattice.ends, i, 0, j)
+            force += by_rate * difference(y, lattice.ends, i, n, j)
+            force += by_approach * approach[i, j]
+            force -= side * slope * g * slopes.gaps[j - 1, i, which]
+            force += side * g * elastic / site.elastic.stiffness * slopes.laws[j - 1, i, 0]
+            force += side * g * by_exponent * slopes.laws[j - 1, i, 1]
+            force += side * elastic * rate / site.approach * slopes.laws[j - 1, i, 2]
+        out[n + resonator, j] -= force
+        if host >= 0:
+            out[n + host, j] += force
+
+
+@kernel
+def _add_springs(lattice: Lattice, y: np.ndarray, out: np.ndarray) -> None:
+    """Add the forces of springs and dashpots and their derivatives to ``out``, in the rows of velocities."""
+    n = lattice.inverse_mass.size
+    slopes = lattice.slopes
+    for i in range(n):
+        for e in range(lattice.first[i], lattice.first[i + 1]):
+            c = lattice.columns[e]
+            stiffness = lattice.stiffness[e]
+            damping = lattice.damping[e]
+            for j in range(y.shape[1]):
+                out[n + i, j] -= stiffness * y[c, j]
+            if damping != 0.0:
+                for j in range(y.shape[1]):
+                    out[n + i, j] -= damping * y[n + c, j]
+            for p in range(slopes.linear.size):
+                if slopes.linear[p]:
+                    out[n + i, 1 + p] -= slopes.stiffness[p, e] * y[c, 0] + slopes.damping[p, e] * y[n + c, 0]
+
+
+@kernel
+def rates_of(lattice: Lattice, t: float, y: np.ndarray, approach: np.ndarray, out: np.ndarray) -> None:
+    """Time derivatives ``out`` of the motion and its derivatives in ``y`` (2n, column) at time t in s."""
+    n = lattice.inverse_mass.size
+    slopes = lattice.slopes
+    for i in range(n):
+        for j in range(y.shape[1]):
+            out[i, j] = y[n + i, j]
+            out[n + i, j] = 0.0
+    _add_springs(lattice, y, out)
+
+    for d in range(lattice.drives.rows.size):
+        force = drive_force(lattice.drives, d, t)
+        target = n + lattice.drives.rows[d].target
+        out[target, 0] += force
+        for p in range(slopes.linear.size):
+            out[target, 1 + p] += slopes.drives[p, d] * force
+    for i in range(lattice.contacts.size):
+        mode = abs(lattice.contacts[i].mode)
+        if mode != FREE and mode != CLIPPED:
+            _add_contact(lattice, i, y, approach, out)
+
+    for i in range(n):
+        for j in range(y.shape[1]):
+            out[n + i, j] *= lattice.inverse_mass[i]
+        # (M + dM) u'' = f + df: dM times the acceleration acts as a force.
+        for p in range(slopes.linear.size):
+            if slopes.linear[p]:
+                out[n + i, 1 + p] -= slopes.masses[p, i] * lattice.inverse_mass[i] * out[n + i, 0]
+
+
+@kernel
+def observe(lattice: Lattice, y: np.ndarray, rates: np.ndarray, motion: np.ndarray) -> None:
+    """Put w, w' and w'' of every site into ``motion`` (site, 3)."""
+    n = lattice.inverse_mass.size
+    for i in range(lattice.contacts.size):
+        motion[i, 0] = difference(y, lattice.ends, i, 0, 0)
+        motion[i, 1] = difference(y, lattice.ends, i, n, 0)
+        motion[i, 2] = difference(rates, lattice.ends, i, n, 0)
+
+
+@kernel
+def jerk(lattice: Lattice, motion: MotionState, t: float, i: int) -> float:
+    """Rate of the acceleration in m/s^3 of mass ``i`` in the state, whose rates are the first stage."""
+    n = lattice.inverse_mass.size
+    rates = motion.stages[0]
+    total = 0.0
+    for e in range(lattice.first[i], lattice.first[i + 1]):
+        c = lattice.columns[e]
+        total -= lattice.stiffness[e] * rates[c, 0] + lattice.damping[e] * rates[n + c, 0]
+    for d in range(lattice.drives.rows.size):
+        row = lattice.drives.rows[d]
+        if row.target == i and row.highest > 0.0:
+            short = SHORT / row.highest
+            change = drive_force(lattice.drives, d, t + short) - drive_force(lattice.drives, d, t - short)
+            total += change / (2.0 * short)
+    for c in range(lattice.contacts.size):
+        site = lattice.contacts[c]
+        is_host = lattice.ends[c, 0] == i
+        if not (is_host or lattice.ends[c, 1] == i) or site.mode == FREE or abs(site.mode) == CLIPPED:
+            continue
+        side = 1.0 if site.mode > 0 else -1.0
+        x = side * motion.before[c, 0] - gap_of(site, side)
+        elastic, slope = elastic_force_and_slope(site.elastic, x)
+        g = 1.0 + site.damping * motion.before[c, 1] / site.approach
+        change = slope * g * motion.before[c, 1]
+        change += side * elastic * site.damping / site.approach * motion.before[c, 2]
+        total += change if is_host else -change
+    return total * lattice.inverse_mass[i]

@@ -1,0 +1,255 @@
+"""Compiled motion of a lattice from rest together with its derivatives with respect to parameters.
+
+Runge and Kutta's method is Dormand and Prince's pair of order 8(5,3) (Hairer, Norsett and Wanner 1993, sec. II.10),
+whose steps end on every sample, on every kink of a drive and on every change of a contact's mode: inside a step all
+right-hand sides are smooth.
+"""
+
+import numpy as np
+
+from vipetsc.compiled import kernel, njit
+from vipetsc.contact.changes import first_change, switching
+from vipetsc.contact.law import FREE
+from vipetsc.contact.search import LANDED, RETRY, SEARCH, Landing, correct, shorten
+from vipetsc.contact.tracker import Tracks, shortest_impact, switch_sites, with_room
+from vipetsc.dynamics.drives import select_piece
+from vipetsc.identification.motion_rates import Lattice, MotionState, difference, jerk, observe, rates_of
+from vipetsc.modes.shooting.dop853 import E3, E5, STAGES, A, B
+
+# Errors allowed per step, relative to the largest motion and the largest derivative so far.
+RTOL = 1e-11
+RTOL_DERIVATIVE = 1e-9
+# A step is at most one radian of the fastest mode, and this fraction of the duration of an impact in contact.
+OF_IMPACT = 0.25
+# First step after an onset, as a fraction of the impact: Hertz's force begins as a power 3/2.
+AFTER_ONSET = 0.01
+SAFETY = 0.9
+LEAST_FACTOR = 0.2
+MOST_FACTOR = 6.0
+SMALLEST_ERROR = 1e-12
+SMALLEST_STEP = 1e-14
+LANDING_GOAL = 1e-4
+# Longest step, in radians of the fastest mode, that is taken without a search.
+BLIND = 1e-7
+# Outcomes: all samples are reached, or the step became too small.
+DONE, STUCK = range(2)
+
+
+@kernel
+def _scaled_error(motion: MotionState, n: int, omega: float, h: float) -> float:
+    """The largest error of a column over what is allowed."""
+    size = motion.end.size
+    stages = motion.stages.reshape(STAGES, size)
+    estimates = motion.estimates
+    flat = estimates.reshape(2, size)
+    for e in range(size):
+        flat[0, e] = 0.0
+        flat[1, e] = 0.0
+    for s in range(STAGES):
+        for e in range(size):
+            flat[0, e] += E3[s] * stages[s, e]
+            flat[1, e] += E5[s] * stages[s, e]
+
+    error = 0.0
+    for j in range(motion.state.shape[1]):
+        fifth = 0.0
+        third = 0.0
+        scale = motion.largest[j]
+        for i in range(2 * n):
+            unit = 1.0 if i < n else 1.0 / omega
+            third = max(third, abs(estimates[0, i, j]) * unit)
+            fifth = max(fifth, abs(estimates[1, i, j]) * unit)
+            scale = max(scale, abs(motion.end[i, j]) * unit)
+        if not np.isfinite(fifth + third):
+            return np.inf
+        if fifth > 0.0:
+            allowed = (RTOL if j == 0 else RTOL_DERIVATIVE) * scale
+            error = max(error, h * fifth * fifth / np.sqrt(fifth * fifth + 0.01 * third * third) / allowed)
+    return error
+
+
+@kernel
+def _step(lattice: Lattice, motion: MotionState, t: float, h: float, omega: float) -> float:
+    """One step of length ``h`` from the state, whose rates are the first stage; returns the scaled error."""
+    rows, columns = motion.state.shape
+    size = rows * columns
+    state = motion.state.reshape(size)
+    end = motion.end.reshape(size)
+    stages = motion.stages.reshape(STAGES, size)
+    for s in range(1, STAGES + 1):
+        weights = A[s] if s < STAGES else B
+        fraction = 0.0
+        for e in range(size):
+            end[e] = state[e]
+        for r in range(s):
+            weight = h * weights[r]
+            fraction += weights[r]
+            if weight != 0.0:
+                for e in range(size):
+                    end[e] += weight * stages[r, e]
+        if s < STAGES:
+            rates_of(lattice, t + fraction * h, motion.end, motion.approach, motion.stages[s])
+    error = _scaled_error(motion, rows // 2, omega, h)
+    rates_of(lattice, t + h, motion.end, motion.approach, motion.rates)
+    observe(lattice, motion.end, motion.rates, motion.after)
+    return error
+
+
+@kernel
+def _land(lattice: Lattice, motion: MotionState, t: float, h: float, omega: float) -> tuple[float, bool]:
+    """Repeat a step that was just tried so that it ends on its first change of a mode: its length, whether it does."""
+    change = first_change(lattice.contacts, motion.before, motion.after, h, motion.room)
+    if change.position > 1.0:
+        return h, False
+
+    landing = Landing(change.position * h, h, np.inf, 0)
+    while True:
+        if landing.length <= SMALLEST_STEP * h:
+            start = switching(lattice.contacts, change.site, change.function, motion.before[change.site])
+            return 0.0, start.value > start.tolerance or (start.value >= -start.tolerance and start.rate > 0.0)
+        _step(lattice, motion, t, landing.length, omega)
+        end = switching(lattice.contacts, change.site, change.function, motion.after[change.site])
+        landing, outcome = correct(landing, end.value, end.rate, end.tolerance, LANDING_GOAL * end.tolerance)
+        if outcome == SEARCH:
+            earlier = first_change(lattice.contacts, motion.before, motion.after, landing.length, motion.room)
+            if earlier.position > 1.0:
+                return landing.length, False
+            change = earlier
+            landing = shorten(landing, earlier.position)
+        elif outcome != RETRY:
+            return landing.length, outcome == LANDED
+
+
+@njit(error_model="numpy")
+def _switch(lattice: Lattice, motion: MotionState, tracks: Tracks, t: float) -> Tracks:
+    """Switch every site that has landed, and begin the derivatives of w'_minus of those that close.
+
+    With the onset at side w - D = 0 the instant moves by -(dw - side dD)/w', and w'_minus by dw' + w'' times that.
+    """
+    n = lattice.inverse_mass.size
+    contacts = lattice.contacts
+    modes = contacts["mode"].copy()
+    tracks = with_room(tracks)
+    switch_sites(contacts, tracks, motion.before, np.zeros(contacts.size), t)
+    for i in range(contacts.size):
+        if modes[i] != FREE or contacts[i].mode == FREE:
+            continue
+        side = 1.0 if contacts[i].mode > 0 else -1.0
+        which = 0 if contacts[i].mode > 0 else 1
+        rate = motion.before[i, 1]
+        for j in range(1, motion.state.shape[1]):
+            moved = difference(motion.state, lattice.ends, i, 0, j) - side * lattice.slopes.gaps[j - 1, i, which]
+            change = difference(motion.state, lattice.ends, i, n, j) - motion.before[i, 2] * moved / rate
+            # Below the floor w'_minus is held and does not vary.
+            motion.approach[i, j] = 0.0 if abs(rate) < contacts[i].floor else change
+    return tracks
+
+
+@kernel
+def _sample(lattice: Lattice, motion: MotionState, t: float, watched: np.ndarray, out: np.ndarray) -> None:
+    """Put u, u', u'' of the masses ``watched`` into ``out`` (watched, 4, column); row 3 has the jerk in column 0."""
+    n = lattice.inverse_mass.size
+    for k in range(watched.size):
+        i = watched[k]
+        for j in range(motion.state.shape[1]):
+            out[k, 0, j] = motion.state[i, j]
+            out[k, 1, j] = motion.state[n + i, j]
+            out[k, 2, j] = motion.stages[0, n + i, j]
+        out[k, 3, 0] = jerk(lattice, motion, t, i)
+
+
+@kernel
+def _refresh(lattice: Lattice, motion: MotionState, t: float) -> None:
+    """Evaluate the rates of the state, and the motion of the sites, at time t in s."""
+    rates_of(lattice, t, motion.state, motion.approach, motion.stages[0])
+    observe(lattice, motion.state, motion.stages[0], motion.before)
+
+
+@kernel
+def _accept(motion: MotionState, omega: float) -> None:
+    """Take the end of a step as the state."""
+    rows, columns = motion.state.shape
+    for i in range(rows):
+        unit = 1.0 if 2 * i < rows else 1.0 / omega
+        for j in range(columns):
+            motion.state[i, j] = motion.end[i, j]
+            motion.largest[j] = max(motion.largest[j], abs(motion.state[i, j]) * unit)
+
+
+@kernel
+def _select_pieces(lattice: Lattice, breaks: np.ndarray, t: float) -> None:
+    """Turn on the pieces of drives that begin by the time t in s; ``breaks`` (drive,) are the next ones' beginnings."""
+    for d in range(breaks.size):
+        if t >= breaks[d] * (1.0 - 1e-14):
+            breaks[d] = select_piece(lattice.drives, d, t * (1.0 + 1e-14))
+
+
+@kernel
+def _length_to(left: float, h: float) -> float:
+    """A step of at most ``h`` s towards what is ``left``: a tiny remainder is avoided by two steps of one length."""
+    if h >= left * (1.0 - 1e-12):
+        return left
+    return 0.5 * left if h > 0.5 * left else h
+
+
+@njit(error_model="numpy")
+def integrate(
+    lattice: Lattice, motion: MotionState, tracks: Tracks, omega: float, times: np.ndarray, watched: np.ndarray
+) -> tuple[int, Tracks, np.ndarray, np.ndarray]:
+    """Go from t = 0 through the rising ``times`` (sample,) in s.
+
+    ``omega`` in rad/s is the fastest mode's. Returns the outcome, the log of contacts, samples (sample, watched, 4,
+    column) as ``_sample`` puts them, and the largest |w| (site, 2) in m on the sides + and -, at ends of steps.
+    """
+    out = np.zeros((times.size, watched.size, 4, motion.state.shape[1]))
+    reached = np.zeros((lattice.contacts.size, 2))
+    breaks = np.zeros(lattice.drives.rows.size)
+    _select_pieces(lattice, breaks, 0.0)
+    t = 0.0
+    h = 0.05 / omega
+    _refresh(lattice, motion, t)
+
+    sample = 0
+    while sample < times.size:
+        # A sample before the beginning is that of rest.
+        if times[sample] <= t:
+            if times[sample] >= 0.0:
+                _sample(lattice, motion, t, watched, out[sample])
+            sample += 1
+            continue
+
+        target = times[sample]
+        for begin in breaks:
+            if t < begin < target:
+                target = begin
+        wanted = min(h, 1.0 / omega, OF_IMPACT * shortest_impact(lattice.contacts))
+        left = target - t
+        h = _length_to(left, wanted)
+        if h < SMALLEST_STEP * times[-1] and h < left:
+            return STUCK, tracks, out, reached
+
+        error = _step(lattice, motion, t, h, omega)
+        if not error < 1.0:
+            h *= max(LEAST_FACTOR, SAFETY * error ** (-0.125)) if error < 1e300 else 0.1
+            continue
+        grown = h * min(MOST_FACTOR, SAFETY * max(error, SMALLEST_ERROR) ** (-0.125))
+        length, landed = _land(lattice, motion, t, h, omega)
+        if length == 0.0 and not landed:
+            # A root at the very beginning that does not rise is none: a step so short that no change is missed.
+            length = min(h, BLIND / omega)
+            _step(lattice, motion, t, length, omega)
+
+        if length > 0.0:
+            _accept(motion, omega)
+            t = target if length == left else t + length
+        h = max(grown, wanted) if h == left else grown
+        _select_pieces(lattice, breaks, t)
+        _refresh(lattice, motion, t)
+        for i in range(reached.shape[0]):
+            reached[i, 0] = max(reached[i, 0], motion.before[i, 0])
+            reached[i, 1] = max(reached[i, 1], -motion.before[i, 0])
+        if landed:
+            tracks = _switch(lattice, motion, tracks, t)
+            h = min(h, AFTER_ONSET * shortest_impact(lattice.contacts))
+            _refresh(lattice, motion, t)
+    return DONE, tracks, out, reached
