@@ -104,8 +104,12 @@ def test_contacts_are_not_sought_in_silence_nor_where_they_touch(tmp_path):
     assert "says nothing about its contacts" in problems["identify.unknowns[1].quantity"]
 
     table = lattice_table(contacts={"clearance": 0.0, "restitution": 1.0, "side": "plus"})
-    with pytest.raises(CaseError, match="touches or is pressed at rest"):
+    with pytest.raises(CaseError, match="has no onset"):
         IdentifyCase.from_table(identify_table(table, record))
+
+    pressed = {"clearance": 1e-4, "precompression": 2e-4, "restitution": 1.0, "side": "plus"}
+    with pytest.raises(CaseError, match="touches or is pressed at rest"):
+        IdentifyCase.from_table(identify_table(lattice_table(contacts=pressed), record))
 
 
 def test_a_table_and_an_hdf5_file_give_the_same_record(tmp_path):

@@ -133,14 +133,15 @@ STEPS = {"points": 10, "harmonics": 5, "first_step": 0.2, "largest_step": 0.3}
 FORCE = {"source": "force", "infinite": False, "range": [0.44, 1.0]}
 FEW_RUNS = {"largest": 2.0, "tolerance": 0.9, "finest": 0.5, "samples": 1}
 SEARCH = {"budget": 2, "variables": {"profile": [1e-5, 1e-3]}, "objective": [{"measure": "entropy"}]}
-# With a hash the file of a record is not read.
+# The record of an example, of another lattice: the fit begins, and that is all that is asked.
 RECORD = {
-    "file": "record.csv",
-    "sha256": "",
-    "rate": 4000.0,
-    "sensors": [{"quantity": "velocity", "column": 1, "cell": 4}],
+    "file": str(files("vipetsc") / "examples" / "identify.csv"),
+    "time": 1,
+    "end": 0.03,
+    "sensors": [{"quantity": "velocity", "column": 2, "cell": 4}],
 }
-IDENTIFY = {"records": [RECORD], "unknowns": [{"quantity": "amplitude", "bounds": [0.1, 100.0]}]}
+AMPLITUDE = {"quantity": "amplitude", "bounds": [0.1, 100.0]}
+IDENTIFY = {"records": [RECORD], "unknowns": [AMPLITUDE], "steps": 2, "profile": 0}
 COLUMNS: tuple[Column, ...] = (
     Column("run", Case, DRIVEN),
     Column("propagator", Case, merged(DRIVEN, {"time": {"engine": "propagator"}}), _propagator_refusal),

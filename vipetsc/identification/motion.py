@@ -104,7 +104,7 @@ def slopes_between(lower: Sequence[Model], upper: Sequence[Model], widths: np.nd
         for k, name in enumerate(("clearance", "clearance_minus")):
             # Where there is no stop both are infinite.
             stops = np.isfinite(middle.sites[name])
-            slopes.gaps[p, stops, k] = (sites[1][name] - sites[0][name])[stops] / width
+            slopes.gaps[p, stops, k] = (sites[1][name][stops] - sites[0][name][stops]) / width
         for k, name in enumerate(("stiffness", "exponent")):
             slopes.laws[p, :, k] = (sites[1]["elastic"][name] - sites[0]["elastic"][name]) / width
         slopes.laws[p, :, 2] = (sites[1]["damping"] - sites[0]["damping"]) / width
