@@ -151,3 +151,7 @@ def growing_windows(identified: xr.Dataset) -> Figure:
         starts.set(xlabel="valley (0: failed)", ylabel="deviance - least", title=f"{len(valley)} starts")
     panels.label_panels([misfit, course, starts])
     return figure
+
+
+FIGURES = (record_and_model, residual_correlations, misfit_profiles, parameter_correlation, growing_windows)
+"""All pictures of an identification, which bear the names of their functions."""

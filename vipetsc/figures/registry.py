@@ -152,11 +152,7 @@ _SPECS = (
     FigureSpec("convergence", OPTIMUM, optimum.convergence),
     FigureSpec("compared_designs", OPTIMUM, optimum.compared_designs),
     FigureSpec("compared_curves", OPTIMUM, optimum.compared_curves),
-    FigureSpec("record_and_model", IDENTIFIED, identified.record_and_model),
-    FigureSpec("residual_correlations", IDENTIFIED, identified.residual_correlations),
-    FigureSpec("misfit_profiles", IDENTIFIED, identified.misfit_profiles),
-    FigureSpec("parameter_correlation", IDENTIFIED, identified.parameter_correlation),
-    FigureSpec("growing_windows", IDENTIFIED, identified.growing_windows),
+    *(FigureSpec(draw.__name__, IDENTIFIED, draw) for draw in identified.FIGURES),
 )
 FIGURES: Mapping[str, FigureSpec] = {spec.name: spec for spec in _SPECS}
 reserve(FIGURE, FIGURES)
