@@ -13,6 +13,7 @@ import h5py
 from vipetsc.cli.verb import Verb
 from vipetsc.cli.verbs.verb_list import VERBS
 
+EXAMPLES = Path(__file__).parents[2] / "vipetsc" / "examples"
 RUN = """
 [lattice]
 preset = "diatomic"
@@ -140,6 +141,33 @@ harmonics = 5
 """
 PREDICT = LAW + "[predict]\namplitudes = [4.0, 8.0]\npoints = 16\n"
 OPTIMISE = LAW.partition("[law]")[0] + "[optimise]\nbudget = 8\ncurve = [10.0]\nvariables.clearance = [1e-5, 1e-3]\n"
+# One clearance in a record of a few contacts, in two starts, so that two ranks have one each.
+IDENTIFY = f"""
+[lattice]
+preset = "four-band"
+cells = 12
+[contacts]
+sites = [3]
+clearance = 1e-3
+[drive]
+cycles = 6
+[identify]
+starts = 2
+steps = 2
+profile = 0
+[[identify.records]]
+file = "{EXAMPLES / "identify.csv"}"
+time = "time (s)"
+end = 0.008
+[[identify.records.sensors]]
+quantity = "velocity"
+column = "near (m/s)"
+cell = 4
+mass = 1
+[[identify.unknowns]]
+quantity = "clearance"
+bounds = [3e-4, 5e-3]
+"""
 # A picture for each kind of folder is enough, and costs the least.
 DRAWN = ("ledger", "branch", "deflections", "amplitudes")
 # So few that a run of 101 samples has several chunks.
@@ -202,6 +230,7 @@ SCENARIOS = {
         Scenario("law", LAW, f"law {OUT} {PLAIN}", ranks=2),
         Scenario("predict", PREDICT, f"predict {OUT} {PLAIN}", ranks=2),
         Scenario("optimise", OPTIMISE, f"optimise {OUT} {PLAIN}", ranks=3),
+        Scenario("identify", IDENTIFY, f"identify {OUT} {PLAIN}", ranks=2),
         Scenario("analyse", TEAM.replace("ranks = 2", ""), "analyse {out}", before=f"sweep {OUT}"),
         Scenario("plot", RUN, "plot {out}", before=f"run {OUT} {PLAIN}"),
         Scenario("movie", RUN, "plot {out} --movie --format gif --width 320", before=f"run {OUT} {PLAIN}"),
