@@ -141,7 +141,7 @@ RECORD = {
     "sensors": [{"quantity": "velocity", "column": 2, "cell": 4}],
 }
 AMPLITUDE = {"quantity": "amplitude", "bounds": [0.1, 100.0]}
-IDENTIFY = {"records": [RECORD], "unknowns": [AMPLITUDE], "steps": 2, "profile": 0}
+IDENTIFY = {"records": [RECORD], "unknowns": [AMPLITUDE], "impacts": 1000, "steps": 1, "profile": 0}
 COLUMNS: tuple[Column, ...] = (
     Column("run", Case, DRIVEN),
     Column("propagator", Case, merged(DRIVEN, {"time": {"engine": "propagator"}}), _propagator_refusal),
