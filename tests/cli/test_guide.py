@@ -272,6 +272,10 @@ def sections() -> dict[str, str]:
 def test_every_excerpt_of_a_case_file_is_valid(text, tmp_path):
     """The verbs of its sections read every excerpt without a problem."""
     (tmp_path / "case.toml").write_text(text, encoding="utf-8")
+    # The record of the chapter identify.
+    time = np.arange(0.0, 0.05, 1e-4)
+    columns = np.column_stack([time, np.sin(500 * time)])
+    np.savetxt(tmp_path / "hammer.csv", columns, delimiter=",", header="t,a3", comments="")
     assert load_every(tmp_path / "case.toml")
 
 

@@ -8,6 +8,7 @@ from tests.conftest import set_words
 from vipetsc.cli.drawing import left_out
 from vipetsc.cli.main import main
 from vipetsc.cli.verbs.sweep_verb import PICTURES
+from vipetsc.figures.sweep_members import Files
 
 LATTICE = """
 [lattice]
@@ -138,8 +139,8 @@ def test_what_is_zero_for_every_member_is_said_and_drawn_on_request(tmp_path, ca
 
 @pytest.mark.slow
 def test_branches_that_a_figure_does_not_show_are_named(burst, tmp_path):
-    (sentence,) = left_out(PICTURES, [burst, tmp_path], ["ibtet"])
+    (sentence,) = left_out(PICTURES, [burst, tmp_path], Files(), ["ibtet"])
     assert sentence == f"ibtet: without the branches of {tmp_path}; --fig ibtet_backbone draws both"
 
-    (sentence,) = left_out(PICTURES, [burst, tmp_path], None)
+    (sentence,) = left_out(PICTURES, [burst, tmp_path], Files(), None)
     assert sentence.startswith("no picture of ibtet_backbone: needs branches of the same law")

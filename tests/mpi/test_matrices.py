@@ -169,7 +169,7 @@ def test_modes_that_cannot_be_found_are_refused(monkeypatch, folder):
             find_modes(case, count, near, folder, COMM)
 
     pressed = small_case(contacts={"side": "plus", "precompression": 3e-4, "restitution": 1.0})
-    with pytest.raises(CaseError, match="touch at rest"):
+    with pytest.raises(CaseError, match="touch or are pressed at rest"):
         find_modes(pressed, 2, 1.0, folder, COMM)
 
     monkeypatch.setattr(eigen, "RESTARTS", 1)

@@ -75,7 +75,7 @@ def test_what_follows_from_the_lattice_is_filled_in():
 @pytest.mark.parametrize(
     ("section", "values", "key", "reason"),
     [
-        ("nfrc", {"source": "wave", "over": "amplitude"}, "nfrc.source", "decayed before it arrives"),
+        ("nfrc", {"source": "wave", "over": "amplitude"}, "drive.end", "moved by no wall"),
         ("nfrc", {"infinite": True}, "nfrc.infinite", "absorbing ends"),
         ("nfrc", {"symmetric": True}, "nfrc.symmetric", "even harmonics"),
         ("lattice", {"cells": 4000}, "lattice.cells", "at most 1000"),

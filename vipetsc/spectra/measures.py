@@ -199,9 +199,13 @@ def power_of(name: str) -> float:
     return _of_name(name).power or 0.0
 
 
-def can_be_scaled() -> bool:
-    """Whether every measure that sweeps take of the motion is proportional to a power of the amplitude."""
-    return all(measure.power is not None for measure in every_measure().values() if measure.group == "motion")
+def can_be_scaled(modules: Sequence[str]) -> bool:
+    """Whether every measure that a sweep takes of the motion is proportional to a power of the amplitude.
+
+    The measures are the shipped ones and those of the ``modules`` that the case names.
+    """
+    with only(modules):
+        return all(measure.power is not None for measure in every_measure().values() if measure.group == "motion")
 
 
 def group_of(name: str) -> Group:

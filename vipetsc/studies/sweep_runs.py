@@ -92,7 +92,8 @@ class SweepRuns:
         site = leading_cell(case)
         name = linear_name(case)
         linear = self._linear_of(case, name, site)
-        scales = not self.plan.options.fields and can_be_scaled()
+        modules = case.plugins.modules if case.plugins else []
+        scales = not self.plan.options.fields and can_be_scaled(modules)
         quiet = scales and bool((linear.reached(case) < MARGIN).all())
         if quiet:
             record = _scaled(case, linear, name, site)
