@@ -224,6 +224,7 @@ class StopRequest:
         outside = self._ends_at_once
         self._ends_at_once = True
         hooks = sys.excepthook, sys.unraisablehook
+        alarm = signal.getsignal(signal.SIGALRM)
         try:
             if self.requested:
                 raise EndedError
@@ -237,6 +238,7 @@ class StopRequest:
             self._ends_at_once = outside
             if self.requested:
                 signal.alarm(0)
+                signal.signal(signal.SIGALRM, alarm)
                 sys.excepthook, sys.unraisablehook = hooks
 
     def _leave(self) -> NoReturn:

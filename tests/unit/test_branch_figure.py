@@ -14,6 +14,7 @@ from vipetsc.case.nnm import NnmCase
 from vipetsc.cli.drawing import draw_pictures
 from vipetsc.cli.verbs.branch_verbs import PICTURES
 from vipetsc.figures import branch_curves, nfrc, registry, style
+from vipetsc.figures.sources import BRANCHES
 from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures
 from vipetsc.io import branch_kinds
@@ -147,11 +148,11 @@ def test_a_condensed_branch_that_was_interrupted_is_drawn_without_motions(tmp_pa
 def test_a_branch_without_points_is_no_file(tmp_path):
     """One of two is drawn, and the other named; a folder without any refuses the figure by its name."""
     put_condensed_branch(tmp_path / "branch-empty.h5", 0)
-    assert registry.draw(registry.BRANCHES, [tmp_path]) == []
-    assert list(reasons_without_pictures(registry.BRANCHES, [tmp_path], Files())) == [registry.BRANCH]
+    assert registry.draw(BRANCHES, [tmp_path]) == []
+    assert list(reasons_without_pictures(BRANCHES, [tmp_path], Files())) == [registry.BRANCH]
     put_condensed_branch(tmp_path / "branch-begun.h5", 3)
-    assert [path.name for path in registry.draw(registry.BRANCHES, [tmp_path])] == ["branch-begun.png"]
-    assert list(reasons_without_pictures(registry.BRANCHES, [tmp_path], Files())) == ["branch-empty"]
+    assert [path.name for path in registry.draw(BRANCHES, [tmp_path])] == ["branch-begun.png"]
+    assert list(reasons_without_pictures(BRANCHES, [tmp_path], Files())) == ["branch-empty"]
 
 
 def test_a_full_disk_is_no_error_of_the_branch_that_is_drawn(tmp_path, monkeypatch):

@@ -15,8 +15,9 @@ from tests.readable import complaints
 from vipetsc.case import Case
 from vipetsc.figures.lattice_strip import draw_lattice
 from vipetsc.figures.log_ticks import label_log_axis
-from vipetsc.figures.registry import BRANCHES, draw, draw_bands, drawings, figure_names
+from vipetsc.figures.registry import draw, draw_bands, drawings, figure_names
 from vipetsc.figures.schematics import draw_unit_cell
+from vipetsc.figures.sources import BRANCHES
 from vipetsc.figures.style import SCREEN, new_figure, rc_style, save
 from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures

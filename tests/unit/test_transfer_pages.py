@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from tests.hertz_branch import write_branch
 from vipetsc.case import Case, Sweep
-from vipetsc.figures import registry, transfer
+from vipetsc.figures import registry, sources, transfer
 from vipetsc.figures.registry import FIGURES, specified_drawings
 from vipetsc.figures.style import Drawing, rc_style
 from vipetsc.figures.sweep_members import Files, MemberRun, Sweeps
@@ -162,7 +162,7 @@ def test_a_page_of_more_lone_members_goes_on_on_the_next(monkeypatch):
 def test_a_page_without_members_has_the_warnings_of_its_sweeps():
     """What shows all of the sweeps warns of all of them."""
     sweep = xr.Dataset(attrs={"case": "[sweep]\nmeasures = ['transfer']", "warnings": json.dumps(["of the sweep"])})
-    spec = registry.FigureSpec("a_figure", registry.SWEEP, lambda sweeps: iter([Drawing("", Figure)]))
+    spec = registry.FigureSpec("a_figure", sources.SWEEP, lambda sweeps: iter([Drawing("", Figure)]))
     with Files() as files:
         (drawing,) = specified_drawings(spec, [sweep], files)
     assert drawing.draw().get_label() == "of the sweep"

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from vipetsc.case.case_file import Problem, Table, put
 from vipetsc.case.names import distinct
-from vipetsc.case.varied import Values, leaves, short_names, values_in
+from vipetsc.case.value_ranges import Values, leaves, short_names, values_in
 
 MOST_MEMBERS = 1000
 SECTIONS = ("lattice", "contacts", "disorder", "drive")  # whose keys may vary

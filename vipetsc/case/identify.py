@@ -16,6 +16,7 @@ from vipetsc.case.contacts import values_of_sites
 from vipetsc.case.disorder import with_cell
 from vipetsc.case.features import refusals, refuse_disorder
 from vipetsc.case.measured import MeasuredError, RecordTable, read_measured, sensor_problems
+from vipetsc.case.study import StudyCase
 from vipetsc.case.warnings import loss_warnings, unit_warnings
 from vipetsc.lattice import UnitCell
 from vipetsc.lattice.contact import LAWS
@@ -97,10 +98,9 @@ class SoughtParameter(NamedTuple):
         return self.from_coordinate(z) if self.is_logarithmic else self.high - self.low
 
 
-class IdentifyCase(CaseFile):
+class IdentifyCase(StudyCase):
     """The case whose parameters are sought, resolved (``base``), and its ``table`` without ``[identify]``."""
 
-    table: Table
     options: IdentifyTable
     base: Case
 
@@ -113,18 +113,12 @@ class IdentifyCase(CaseFile):
     }
 
     @classmethod
-    def keywords(cls) -> Iterable[str]:
-        """The sections of a run, and that of the identification."""
-        return (*Case.sections(), cls.section)
-
-    @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The fields, and everything that is wrong with the section, the data or the case."""
-        table = dict(table)
-        section = table.pop("identify", None)
-        if not isinstance(section, dict):
-            remedy = "missing; give [[identify.records]] with their sensors, and [[identify.unknowns]]"
-            return {}, [Problem("identify", section, remedy)]
+        remedy = "give [[identify.records]] with their sensors, and [[identify.unknowns]]"
+        table, section, missing = cls.divide(table, remedy)
+        if missing:
+            return {}, missing
 
         options, problems = read_section(IdentifyTable, section, "identify")
         problems += refuse_disorder(cls, table)

@@ -1,7 +1,7 @@
 """The case of the verb ``optimise``: the variables with their bounds, the objectives and the constraints."""
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -16,6 +16,7 @@ from vipetsc.case.features import refusals
 from vipetsc.case.objective import ConstraintTable, MeasuredTable, ObjectiveTable, Pair, measured_problems
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import Positive
+from vipetsc.case.study import StudyCase, with_fastest_engine
 
 MOST_DESIGNS = 100_000
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -86,10 +87,9 @@ class Variable(NamedTuple):
         return self.low + (self.high - self.low) * position
 
 
-class OptimiseCase(CaseFile):
+class OptimiseCase(StudyCase):
     """The case to begin with, resolved (``base``), and its ``table`` without ``[optimise]``."""
 
-    table: Table
     options: OptimiseTable
     base: Case
 
@@ -101,21 +101,13 @@ class OptimiseCase(CaseFile):
     }
 
     @classmethod
-    def keywords(cls) -> Iterable[str]:
-        """The sections of a run, and that of the search."""
-        return (*Case.sections(), cls.section)
-
-    @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The fields, and everything that is wrong with the section or with the case to begin with."""
-        table = dict(table)
-        section = table.pop("optimise", None)
-        if not isinstance(section, dict):
-            remedy = "missing; give the quantities that vary, as in: [optimise.variables] clearance = [1e-4, 1e-2]"
-            return {}, [Problem("optimise", section, remedy)]
-        # Many runs want the fastest engine that a case allows.
-        if isinstance(table.get("time", {}), dict):
-            table["time"] = {"engine": "auto"} | table.get("time", {})
+        remedy = "give the quantities that vary, as in: [optimise.variables] clearance = [1e-4, 1e-2]"
+        table, section, missing = cls.divide(table, remedy)
+        if missing:
+            return {}, missing
+        table = with_fastest_engine(table)
 
         options, problems = read_section(OptimiseTable, section, "optimise")
         try:

@@ -18,7 +18,8 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, put, read_section
 from vipetsc.case.html import first_few, html_table
 from vipetsc.case.schema import number
-from vipetsc.case.varied import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
+from vipetsc.case.study import StudyCase, with_fastest_engine
+from vipetsc.case.value_ranges import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
 
 # Members whose cases are resolved to check a sweep before it begins, and sites that they have together.
 MOST_TRIED = 1_000
@@ -49,33 +50,23 @@ class SweepMember:
     problems: Sequence[Problem] = ()
 
 
-class Sweep(CaseFile):
+class Sweep(StudyCase):
     """A sweep: the table of its case file without ``[sweep]``, the options, and the axes in the file's order."""
 
-    table: Table
     options: SweepTable
     axes: tuple[Values, ...]
 
     verb = section = "sweep"
 
     @classmethod
-    def keywords(cls) -> Iterable[str]:
-        """The sections of a run, and that of the keys that vary."""
-        return (*Case.sections(), cls.section)
-
-    @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The fields, and everything that is wrong with ``[sweep]``; the members' cases are built by ``member``."""
-        table = dict(table)
-        section = table.pop("sweep", None)
-        if not isinstance(section, dict):
-            remedy = (
-                "missing; give the keys that vary, as in: [sweep.drive] amplitude = { log = [1.0, 100.0], count = 9 }"
-            )
-            return {}, [Problem("sweep", section, remedy)]
-        # Many runs want the fastest engine that a case allows.
-        if isinstance(table.get("time", {}), dict):
-            table["time"] = {"engine": "auto"} | table.get("time", {})
+        remedy = "give the keys that vary, as in: [sweep.drive] amplitude = { log = [1.0, 100.0], count = 9 }"
+        table, section, missing = cls.divide(table, remedy)
+        if missing:
+            return {}, missing
+        table = with_fastest_engine(table)
+
         # What is measured is not varied: ``analyse`` measures a sweep again.
         sections = Case.model_fields.keys() - {"name", "plugins", "analysis"} | {"disorder"}
         varying = {key: section[key] for key in section if key.partition(".")[0] in sections}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from mpi4py import MPI
 
 from vipetsc.cli.messages import echo
-from vipetsc.io.errors import DISK_FULL
+from vipetsc.io.errors import is_disk_full
 from vipetsc.io.folder import FolderError
 from vipetsc.parallel import on_every_rank, on_root
 
@@ -93,7 +93,7 @@ def reading(pictures: Pictures, folders: Sequence[Path]) -> Iterator[None]:
     except (OSError, KeyError, ValueError) as error:
         # `prepare` has checked the folder: an error after that is an error of the program. A full disk says nothing
         # about the file.
-        if pictures.prepare or getattr(error, "errno", None) in DISK_FULL:
+        if pictures.prepare or is_disk_full(error):
             raise
         article = "an" if pictures.noun[0] in "aeiou" else "a"
         path = folders[0] / pictures.file

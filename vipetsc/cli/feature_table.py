@@ -258,7 +258,7 @@ def _introduction() -> Iterator[str]:
         "The columns are verbs, and some of their ways: `run` by `ts` and by the `propagator` (a run that it refuses",
         "goes on with `ts`), `bands --modes` (linear modes, without dashpots), `nfrc` of a force or a moved wall and",
         "of an incident `wave`, and `nnm` of each system, of which `condensed` has the breathers. `plot` and `export`",
-        "accept the results of every yes.",
+        "accept the run of every feature.",
         "",
     )
 

@@ -1,6 +1,6 @@
 """Nonlinear frequency-response curves: displacement, stability, folds, slow sweeps, and fractions of the energy."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,11 +34,7 @@ def frequency_response(paths: Sequence[Path]) -> Figure:
 
     Phases are drawn of a force over its frequency, as experiments show a response, fractions where there are some.
     """
-    branches = []
-    for path in paths:
-        with open_netcdf(path, "branch", ("share", "unstable", "over")) as file:
-            branches.append(file.load())
-
+    branches = responses_in(paths, "share")
     rows = [_draw_displacement]
     nfrc = NfrcCase.of(branches[0]).nfrc
     if nfrc.source == "force" and nfrc.over == "frequency":
@@ -47,15 +43,31 @@ def frequency_response(paths: Sequence[Path]) -> Figure:
     if any(np.nan_to_num(branch["share"].values).any() for branch in branches):
         rows.append(_draw_energies)
 
-    width = style.COLUMN if len(branches) == 1 else style.PAGE
-    figure = style.new_figure(width, 2.3 * len(rows))
-    columns = figure.subplots(len(rows), len(branches), sharex="col", squeeze=False).T
+    return response_page(branches, rows, height=2.3 * len(rows))
 
-    for column, branch in zip(columns, branches, strict=True):
+
+def responses_in(paths: Sequence[Path], *needs: str) -> list[xr.Dataset]:
+    """Return the frequency responses in files, read completely; each must have the variables ``needs``."""
+    curves = []
+    for path in paths:
+        with open_netcdf(path, "branch", (*needs, "unstable", "over")) as file:
+            curves.append(file.load())
+    return curves
+
+
+def response_page(
+    curves: Sequence[xr.Dataset], rows: Sequence[Callable[[Axes, xr.Dataset], None]], height: float
+) -> Figure:
+    """Return a page of ``height`` in with a column for each of ``curves``, whose panels ``rows`` draw."""
+    width = style.COLUMN if len(curves) == 1 else style.PAGE
+    figure = style.new_figure(width, height)
+    columns = figure.subplots(len(rows), len(curves), sharex="col", squeeze=False).T
+
+    for column, curve in zip(columns, curves, strict=True):
         for axes, draw in zip(column, rows, strict=True):
-            draw(axes, branch)
-        column[-1].set_xlabel(parameter_label(branch))
-        column[0].set_title(str(branch.attrs["name"]))
+            draw(axes, curve)
+        column[-1].set_xlabel(parameter_label(curve))
+        column[0].set_title(str(curve.attrs["name"]))
     if columns.size > 1:
         panels.label_panels(columns.T)
     return figure

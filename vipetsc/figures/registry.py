@@ -35,6 +35,7 @@ from vipetsc.figures import (
     transfer_curves,
 )
 from vipetsc.figures.registered import registered_figures
+from vipetsc.figures.sources import BRANCHES, DESIGN, FILES, IDENTIFIED, LAW, OPTIMUM, PAPER, PREDICTION, RUN, SWEEP
 from vipetsc.figures.style import Drawing, draw_each, rc_style, save
 from vipetsc.figures.sweep_members import Files, Sweeps, table
 from vipetsc.io import branch_kinds
@@ -45,27 +46,6 @@ from vipetsc.register import FIGURE, reserve
 
 NUMBER = re.compile(r"\d[\d.e+-]*")
 MOST_WARNINGS = 4  # below a picture
-
-# The sources: what folders hold.
-RUN, SWEEP, BRANCHES, DESIGN = "run", "sweep", "branches", "design"
-OPTIMUM, LAW, PREDICTION, IDENTIFIED = "optimum", "law", "prediction", "identification"
-PAPER = "paper"  # sweeps of the paper, in its panels; of any sweep `measure_pages` draws what it measured
-
-
-class ResultFile(NamedTuple):
-    """The one file that a source is drawn from: its ``name`` in the folder, and variables that it must hold."""
-
-    name: str
-    needs: tuple[str, ...]
-
-
-FILES: Mapping[str, ResultFile] = {
-    DESIGN: ResultFile("design.h5", needs=("cost", "frequency")),
-    OPTIMUM: ResultFile("optimum.h5", needs=("value", "comparison")),
-    IDENTIFIED: ResultFile("identified.h5", needs=("value", "profile")),
-    LAW: ResultFile("law.h5", needs=("share", "efficiency")),
-    PREDICTION: ResultFile("prediction.h5", needs=("predicted", "onset_amplitude")),
-}
 
 
 class FigureSpec(NamedTuple):

@@ -17,10 +17,9 @@ from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
-from vipetsc.figures.nfrc import draw_special, parameter_label, parameter_of
+from vipetsc.figures.nfrc import draw_special, parameter_label, parameter_of, responses_in
 from vipetsc.figures.swept_axes import SweptKey
 from vipetsc.io.branch_kinds import RESPONSES, branch_kind
-from vipetsc.io.netcdf import open_netcdf
 
 MOST_LOCATIONS = 4  # that have a row of their own
 MOST_CURVES = 24  # of a legend; others have no line in it
@@ -42,11 +41,7 @@ def response_family(paths: Sequence[Path]) -> Figure:
     Rows are the largest relative displacement of the first site, the largest displacement of each named mass that all
     curves have, and the phase of the first site's fundamental under a force over its frequency.
     """
-    curves = []
-    for path in paths:
-        with open_netcdf(path, "branch", ("unstable", "over")) as file:
-            curves.append(file.load())
-
+    curves = responses_in(paths)
     rows: list[Callable[[xr.Dataset], np.ndarray]] = [_relative]
     labels = ["largest |w| (m)"]
     for name in _common_locations(curves)[:MOST_LOCATIONS]:

@@ -10,9 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from vipetsc.figures import panels, style
-from vipetsc.figures.nfrc import draw_special, parameter_label, parameter_of
-from vipetsc.io.netcdf import open_netcdf
+from vipetsc.figures import style
+from vipetsc.figures.nfrc import draw_special, parameter_of, response_page, responses_in
 
 # Labels of the rows of the page by the quantities that they show.
 AMPLITUDES = {"displacement": "displacement (m)", "velocity": "velocity (m/s)", "acceleration": "acceleration (m/s²)"}
@@ -29,11 +28,7 @@ def without_outputs(branches: Sequence[xr.Dataset]) -> str:
 
 def response_outputs(paths: Sequence[Path]) -> Figure:
     """Draw amplitudes and phase of the named masses, and forces, over amplitude or frequency; a column a file."""
-    curves = []
-    for path in paths:
-        with open_netcdf(path, "branch", ("unstable", "over")) as file:
-            curves.append(file.load())
-
+    curves = responses_in(paths)
     rows: list[Callable[[Axes, xr.Dataset], None]] = []
     if "lag" in curves[0]:
         rows += [partial(_draw_amplitude, quantity=quantity) for quantity in AMPLITUDES]
@@ -41,17 +36,7 @@ def response_outputs(paths: Sequence[Path]) -> Figure:
     if "largest_force" in curves[0]:
         rows.append(_draw_forces)
 
-    width = style.COLUMN if len(curves) == 1 else style.PAGE
-    figure = style.new_figure(width, 1.45 * len(rows) + 0.3)
-    columns = figure.subplots(len(rows), len(curves), sharex="col", squeeze=False).T
-    for column, curve in zip(columns, curves, strict=True):
-        for axes, draw in zip(column, rows, strict=True):
-            draw(axes, curve)
-        column[-1].set_xlabel(parameter_label(curve))
-        column[0].set_title(str(curve.attrs["name"]))
-    if columns.size > 1:
-        panels.label_panels(columns.T)
-    return figure
+    return response_page(curves, rows, height=1.45 * len(rows) + 0.3)
 
 
 def _draw_amplitude(axes: Axes, curve: xr.Dataset, quantity: str) -> None:

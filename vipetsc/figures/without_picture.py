@@ -9,10 +9,7 @@ import xarray as xr
 from vipetsc.figures import measure_pages, transfer_curves
 from vipetsc.figures.registry import (
     BRANCH,
-    BRANCHES,
     OVER_BRANCHES,
-    RUN,
-    SWEEP,
     figure_names,
     figures_of,
     of_one_name,
@@ -21,6 +18,7 @@ from vipetsc.figures.registry import (
     specified_drawings,
     with_ensemble,
 )
+from vipetsc.figures.sources import BRANCHES, RUN, SWEEP
 from vipetsc.figures.sweep_members import Files
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble

@@ -95,8 +95,8 @@ class GrowingWindows:
         z = np.clip(z, self.low, self.high)
         windows: list[Window] = []
         best = self._pass(self._fit_linear_parts(z, windows), windows)
-        # Where noise has led the first windows into a valley beside the right one, they now begin near that one, with
-        # weights that are those of the noise.
+        # Where noise has led the first windows into a valley next to the right one, they now begin near the right one,
+        # with weights that are those of the noise.
         for _ in range(REPETITIONS):
             repeated = self._pass(best.coordinates, windows)
             if repeated.deviance < best.deviance:

@@ -9,6 +9,7 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import Measured
 from vipetsc.dynamics.drives import create_drives, drive_forces
 from vipetsc.identification.motion import MotionError, RecordedMotion, no_slopes, respond, slopes_between
+from vipetsc.identification.motion_rates import SHORT
 
 # Half the distance of the coordinates between which coefficients of the motion are differenced.
 HALF_WIDTH = 1e-5
@@ -16,7 +17,6 @@ HALF_WIDTH = 1e-5
 ROWS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 # Residual of a motion that cannot be computed: a step that leads there is rejected.
 REJECTED = 1e8
-SHORT = 1e-6
 
 
 class Misfit:
@@ -58,20 +58,20 @@ class Misfit:
 
     def _models(self, z: np.ndarray, number: int, which: Sequence[int]) -> tuple[list[Model], list[Model], np.ndarray]:
         """The models below and above ``z`` in each of the parameters ``which``, and how far apart these are."""
-        lower, upper, widths = [], [], []
-        parameters = self.plan.parameters
+        lower: list[Model] = []
+        upper: list[Model] = []
+        widths: list[float] = []
         for p in which:
-            ends = []
-            for sign in (-1, 1):
+            parameter = self.plan.parameters[p]
+            # At a bound the difference is one-sided.
+            below = max(z[p] - HALF_WIDTH, parameter.to_coordinate(parameter.low))
+            above = min(z[p] + HALF_WIDTH, parameter.to_coordinate(parameter.high))
+            widths.append(above - below)
+
+            for models, coordinate in ((lower, below), (upper, above)):
                 moved = z.copy()
-                moved[p] += sign * HALF_WIDTH
-                # At a bound the difference is one-sided.
-                limits = parameters[p].to_coordinate(parameters[p].low), parameters[p].to_coordinate(parameters[p].high)
-                moved[p] = np.clip(moved[p], *limits)
-                ends.append((moved[p], self.plan.record_case(self.case(moved), number).model()))
-            lower.append(ends[0][1])
-            upper.append(ends[1][1])
-            widths.append(ends[1][0] - ends[0][0])
+                moved[p] = coordinate
+                models.append(self.plan.record_case(self.case(moved), number).model())
         return lower, upper, np.array(widths)
 
     def respond(

@@ -182,23 +182,31 @@ def jerk(lattice: Lattice, motion: MotionState, t: float, i: int) -> float:
     n = lattice.inverse_mass.size
     rates = motion.stages[0]
     total = 0.0
+
+    # Springs and dashpots.
     for e in range(lattice.first[i], lattice.first[i + 1]):
         c = lattice.columns[e]
         total -= lattice.stiffness[e] * rates[c, 0] + lattice.damping[e] * rates[n + c, 0]
+
+    # A drive has no formula of its rate: its force is differenced.
     for d in range(lattice.drives.rows.size):
         row = lattice.drives.rows[d]
         if row.target == i and row.highest > 0.0:
             short = SHORT / row.highest
             change = drive_force(lattice.drives, d, t + short) - drive_force(lattice.drives, d, t - short)
             total += change / (2.0 * short)
+
+    # Closed contacts on this mass; what acts on the resonator acts on its host with the other sign.
     for c in range(lattice.contacts.size):
         site = lattice.contacts[c]
         is_host = lattice.ends[c, 0] == i
         if not (is_host or lattice.ends[c, 1] == i) or site.mode == FREE or abs(site.mode) == CLIPPED:
             continue
+
         side = 1.0 if site.mode > 0 else -1.0
         x = side * motion.before[c, 0] - gap_of(site, side)
         elastic, slope = elastic_force_and_slope(site.elastic, x)
+        # The force is elastic(x) g(w'), the rate has a term of each factor.
         g = 1.0 + site.damping * motion.before[c, 1] / site.approach
         change = slope * g * motion.before[c, 1]
         change += side * elastic * site.damping / site.approach * motion.before[c, 2]

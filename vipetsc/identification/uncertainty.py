@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-# A direction of the coordinates is determined if its standard error is at most this: one is a factor e of a
-# logarithmic parameter, and the whole range between the bounds of a linear one.
+# A coordinate is determined if its standard error is at most this: one is a factor e of a logarithmic parameter, and
+# the whole range between the bounds of a linear one.
 DETERMINED = 0.5
 # Singular values below this fraction of the largest one are rounding.
 SMALLEST = 1e-12

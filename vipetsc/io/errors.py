@@ -2,7 +2,12 @@
 
 import errno
 
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # of an OSError after which nothing else can be written either
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def is_disk_full(error: Exception) -> bool:
+    """Whether an ``error`` says that nothing else can be written either."""
+    return getattr(error, "errno", None) in DISK_FULL
 
 
 class FolderError(ValueError):

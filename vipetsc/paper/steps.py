@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from mpi4py import MPI
 
-from vipetsc.io.errors import DISK_FULL
+from vipetsc.io.errors import is_disk_full
 from vipetsc.paper.build_record import read_record, write_record
 from vipetsc.paper.plan import STALE, PaperStep, PartMaker, Plan
 from vipetsc.parallel import StoppedError, StopRequest, on_root
@@ -27,7 +27,7 @@ def noted(comm: MPI.Comm, name: str, notes: list[str]) -> Iterator[None]:
     except Exception as error:
         # A rank that failed alone left the others in a collective, where they would wait for ever.
         alone = comm.size > 1 and not getattr(error, "from_root", False)
-        if alone or getattr(error, "errno", None) in DISK_FULL:
+        if alone or is_disk_full(error):
             raise
         notes.append(f"failed: {name}: {error or type(error).__name__}")
 

@@ -1,6 +1,6 @@
 """Parameters of a case from measured records: the result is ``identified.h5``, with ``identified.toml`` for ``run``.
 
-Ranks share the starts, then the fits of the profiles. The record of each is kept at once, so that an identification
+Ranks divide the starts, then the fits of the profiles. The record of each is kept at once, so that an identification
 that was stopped goes on where it was. The same files, to the bit, on any number of ranks.
 """
 

@@ -1,5 +1,6 @@
 """What ``identified.h5`` holds: parameters with their uncertainty, windows, starts, residuals, and what it all says."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import UNITS
 from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit import ROWS
-from vipetsc.identification.uncertainty import errors_with_sensor, quantile, uncertainty_of
+from vipetsc.identification.uncertainty import DETERMINED, Uncertainty, errors_with_sensor, quantile, uncertainty_of
 from vipetsc.identification.whiteness import ljung_box
 from vipetsc.io.records import Record
 
@@ -82,10 +83,13 @@ def identified_values(
     windows: GrowingWindows, z: np.ndarray, fits: list[Record], best: int, profile: tuple[np.ndarray, np.ndarray]
 ) -> dict[str, Any]:
     """All values by name in ``LAYOUT``; ``fits`` are the records of the starts, ``profile`` coordinates and costs."""
-    values = _parameter_values(windows, z)
+    known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
+    values = _parameter_values(windows, z, known)
+    values |= _sensor_values(windows, z, known)
     values |= _window_values(windows, fits[best])
-    values |= _start_values(windows, fits, best, values["relative_error"])
+    values |= _start_values(windows, fits, best, known.errors)
     values |= _channel_values(windows, z)
+
     places, costs = profile
     parameters = windows.misfit.plan.parameters
     cost = float(np.sum(windows.misfit.residuals(z, windows.last) ** 2))
@@ -97,11 +101,10 @@ def identified_values(
     }
 
 
-def _parameter_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
+def _parameter_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty) -> dict[str, Any]:
     """Parameters with their uncertainty, and what is not determined."""
     misfit = windows.misfit
     parameters = misfit.plan.parameters
-    known = uncertainty_of(misfit.jacobian(z, windows.last, range(len(z))))
     reached = windows.reached(z, windows.last)
     at_least = np.full(len(z), np.nan)
     for number, parameter in enumerate(parameters):
@@ -131,14 +134,13 @@ def _parameter_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
         "direction": np.arange(1, len(z) + 1),
         "singular": known.singular,
         "vector": known.directions,
-    } | _sensor_values(windows, z)
+    }
 
 
-def _sensor_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
+def _sensor_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty) -> dict[str, Any]:
     """The mass at which one more sensor of the first record with contact would lower each error most."""
     misfit = windows.misfit
     plan = misfit.plan
-    known = uncertainty_of(misfit.jacobian(z, windows.last, range(len(z))))
     tables = plan.options.records
     record = next((number for number, table in enumerate(tables) if table.contact), 0)
     sensors = [number for number, sensor in enumerate(tables[record].sensors) if sensor.quantity != "force"]
@@ -174,130 +176,157 @@ def _window_values(windows: GrowingWindows, record: Record) -> dict[str, Any]:
 
 
 def _start_values(windows: GrowingWindows, fits: list[Record], best: int, errors: np.ndarray) -> dict[str, Any]:
-    """All starts with what they found, in valleys."""
-    count = len(windows.low)
-    starts = windows.misfit.plan.options.starts
-    begin = np.full((starts, count), np.nan)
-    values = np.full((starts, count), np.nan)
-    deviance = np.full(starts, np.nan)
-    valley = np.zeros(starts, int)
-    bottoms: list[np.ndarray] = []
-    for number in sorted(range(starts), key=lambda number: fits[number].get("deviance", np.inf)):
-        record = fits[number]
-        if "deviance" not in record:
-            continue
-        z = np.array(record["coordinates"])
-        begin[number] = windows.misfit.values(np.array(record["begin"]))
-        values[number] = windows.misfit.values(z)
-        deviance[number] = record["deviance"] - fits[best]["deviance"]
-        near = [bool(np.all(abs(z - bottom) <= np.maximum(SAME_VALLEY, 3 * errors))) for bottom in bottoms]
-        if not any(near):
-            bottoms.append(z)
-            near.append(True)
-        valley[number] = near.index(True) + 1
-    return {
+    """All starts with what they found, in valleys; ``errors`` (parameter,) are standard errors of coordinates."""
+    misfit = windows.misfit
+    starts = misfit.plan.options.starts
+    shape = (starts, len(windows.low))
+    values: dict[str, Any] = {
         "start": np.arange(starts),
-        "starts/begin": begin,
-        "starts/value": values,
-        "starts/deviance": deviance,
-        "starts/valley": valley,
+        "starts/begin": np.full(shape, np.nan),
+        "starts/value": np.full(shape, np.nan),
+        "starts/deviance": np.full(starts, np.nan),
+        "starts/valley": np.zeros(starts, int),
     }
+
+    # Valleys are numbered from the deepest, so that the deepest start comes first.
+    fitted = [number for number in range(starts) if "deviance" in fits[number]]
+    fitted.sort(key=lambda number: fits[number]["deviance"])
+    bottoms: list[np.ndarray] = []
+    for number in fitted:
+        record = fits[number]
+        z = np.array(record["coordinates"])
+        values["starts/begin"][number] = misfit.values(np.array(record["begin"]))
+        values["starts/value"][number] = misfit.values(z)
+        values["starts/deviance"][number] = record["deviance"] - fits[best]["deviance"]
+        values["starts/valley"][number] = 1 + _valley(z, bottoms, np.maximum(SAME_VALLEY, 3 * errors))
+    return values
+
+
+def _valley(z: np.ndarray, bottoms: list[np.ndarray], distance: np.ndarray) -> int:
+    """The index of the valley whose bottom lies within a ``distance`` (parameter,) of ``z``; a new one is added."""
+    for index, bottom in enumerate(bottoms):
+        if np.all(abs(z - bottom) <= distance):
+            return index
+    bottoms.append(z)
+    return len(bottoms) - 1
 
 
 def _channel_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
     """All channels with their residuals."""
     misfit = windows.misfit
-    columns: dict[str, list[Any]] = {
-        name: [] for name in LAYOUT if name.split("/")[0] in ("channel", "channels", "data", "datum")
-    }
+    rows: list[dict[str, Any]] = []
+    data: list[dict[str, np.ndarray]] = []
     for number, (record, table) in enumerate(zip(misfit.records, misfit.plan.options.records, strict=True)):
         model, _ = misfit.predicted(z, number, windows.last[number])
+
         for k, sensor in enumerate(table.sensors):
-            residuals = model[:, k] - record.values[:, k]
+            measured = record.values[:, k]
+            residuals = model[:, k] - measured
             white = ljung_box(residuals)
-            channel = len(columns["channel"])
-            row = {
+            channel = {
                 "channel": f"{number + 1}: {sensor.name}",
                 "channels/record": number + 1,
                 "channels/unit": UNITS[sensor.quantity],
                 "channels/noise": misfit.noise[number][k],
                 "channels/is_given": int(sensor.noise is not None),
                 "channels/misfit": float(np.sqrt(np.mean(residuals**2))),
-                "channels/size": float(np.sqrt(np.mean(record.values[:, k] ** 2))),
+                "channels/size": float(np.sqrt(np.mean(measured**2))),
                 "channels/statistic": white.statistic,
                 "channels/lags": white.lags,
                 "channels/probability": white.probability,
             }
-            for name, value in row.items():
-                columns[name].append(value)
-            columns["data/channel"].append(np.full(len(residuals), channel))
-            columns["data/time"].append(record.times)
-            columns["data/measured"].append(record.values[:, k])
-            columns["data/model"].append(model[:, k])
-    values = {name: np.concatenate(parts) if name.startswith("data/") else parts for name, parts in columns.items()}
+            samples = {
+                "data/channel": np.full(len(residuals), len(rows)),
+                "data/time": record.times,
+                "data/measured": measured,
+                "data/model": model[:, k],
+            }
+            rows.append(channel)
+            data.append(samples)
+
+    values: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]}
+    values |= {name: np.concatenate([samples[name] for samples in data]) for name in data[0]}
     return values | {"datum": np.arange(len(values["data/time"]))}
 
 
 def warnings_of(data: xr.Dataset) -> list[str]:
     """Sentences on what the fit does not explain, and what the data do not tell."""
-    sentences = []
+    return [*_warnings_of_channels(data), *_warnings_of_parameters(data), *_warnings_of_starts(data)]
+
+
+def _warnings_of_channels(data: xr.Dataset) -> Iterator[str]:
+    """Sentences on residuals that are larger than the noise, or not white."""
     names = data["channel"].values
-    exact = data["channels/misfit"].values <= EXACT * data["channels/size"].values
-    ratio = data["channels/misfit"].values / data["channels/noise"].values
+    misfit = data["channels/misfit"].values
+    ratio = misfit / data["channels/noise"].values
     beyond = (data["channels/is_given"].values == 1) & (ratio > BEYOND_NOISE)
     for name, times in zip(names[beyond], ratio[beyond], strict=True):
-        sentences.append(f"{name}: the misfit is {times:.2g} times the noise, which does not explain it")
-    coloured = (data["channels/probability"].values < IMPROBABLE / len(names)) & ~exact
+        yield f"{name}: the misfit is {times:.2g} times the noise, which does not explain it"
+
+    # One of many channels may well be improbable by chance; residuals of rounding are never white.
+    improbable = data["channels/probability"].values < IMPROBABLE / len(names)
+    coloured = improbable & (misfit > EXACT * data["channels/size"].values)
     if coloured.any():
-        listed = "; ".join(names[coloured])
-        sentences.append(
-            f"the residuals are not white ({listed}): the model lacks something that the data have, such as another"
-            " contact law, and the intervals are too narrow"
+        yield (
+            f"the residuals are not white ({'; '.join(names[coloured])}): the model lacks something that the data have,"
+            " such as another contact law, and the intervals are too narrow"
         )
+
+
+def _warnings_of_parameters(data: xr.Dataset) -> Iterator[str]:
+    """Sentences on clearances that are not reached, and on parameters that are not determined."""
     at_least = data["at_least"].values
     for name, least in zip(data["parameter"].values, at_least, strict=True):
         if np.isfinite(least):
-            sentences.append(f"{name}: at least {least:.4g} m; nothing touches there")
+            yield f"{name}: at least {least:.4g} m; nothing touches there"
+
     for row in np.flatnonzero((data["determined"].values == 0) & np.isnan(at_least)):
+        helped = "no further sensor would"
         error = float(data["sensor/relative_error"].values[row])
-        place = f"mass {data['sensor/mass'].values[row]} of cell {data['sensor/cell'].values[row]}"
-        helped = f"a sensor at {place} would, to {100 * error:.2g} %" if error < 0.5 else "no further sensor would"
-        sentences.append(f"{data['parameter'].values[row]}: the data do not tell it; {helped}")
-    valleys = int(data["starts/valley"].values.max(initial=0))
+        if error < DETERMINED:
+            place = f"mass {data['sensor/mass'].values[row]} of cell {data['sensor/cell'].values[row]}"
+            helped = f"a sensor at {place} would, to {100 * error:.2g} %"
+        yield f"{data['parameter'].values[row]}: the data do not tell it; {helped}"
+
+
+def _warnings_of_starts(data: xr.Dataset) -> Iterator[str]:
+    """A sentence if starts end in different valleys."""
+    valley = data["starts/valley"].values
+    valleys = int(valley.max(initial=0))
     if valleys > 1:
-        second = float(data["starts/deviance"].values[data["starts/valley"].values == 2].min())
-        sentences.append(
-            f"{valleys} valleys: the starts lead to different values; the second one's deviance is {second:.3g} more"
-        )
-    return sentences
+        second = float(data["starts/deviance"].values[valley == 2].min())
+        yield f"{valleys} valleys: the starts lead to different values; the second one's deviance is {second:.3g} more"
 
 
 def summary_of(data: xr.Dataset) -> str:
     """A table of the results, with a line for every parameter, and the warnings."""
-    plan = IdentifyCase.of(data)
-    confidence = f"{100 * plan.options.confidence:g} % interval"
+    confidence = f"{100 * IdentifyCase.of(data).options.confidence:g} % interval"
     lines = [
         f"{data.sizes['parameter']} parameters from {data.sizes['datum']} values of {data.sizes['channel']} channels;"
         f" {data.sizes['start']} starts, {int(data['starts/valley'].max())} valleys",
         f"  {'parameter':<16}{'value':>14}{'error':>12}  {confidence:<26} unit",
     ]
-    for row in range(data.sizes["parameter"]):
-        point = data.isel(parameter=row)
-        value = f"{float(point['value']):>14.7g}"
-        if np.isfinite(point["at_least"]):
-            shown = f"{'':>14}{'':>12}  at least {float(point['at_least']):<17.6g}"
-        elif not point["determined"]:
-            shown = f"{value}{'':>12}  {'not determined':<26}"
-        else:
-            interval = f"{float(point['interval_low']):.7g} to {float(point['interval_high']):.7g}"
-            shown = f"{value}{float(point['standard_error']):>12.2g}  {interval:<26}"
-        lines.append(f"  {point['parameter'].values!s:<16}{shown} {point['unit'].values}")
-    for row in range(data.sizes["channel"]):
-        channel = data.isel(channel=row)
-        noise = "noise given" if channel["channels/is_given"] else "noise estimated"
-        misfit = f"{float(channel['channels/misfit']):.3g} {channel['channels/unit'].values}"
-        white = f"whiteness p = {float(channel['channels/probability']):.2g}"
-        lines.append(
-            f"  {channel['channel'].values}: misfit {misfit}, {noise} {float(channel['channels/noise']):.3g}, {white}"
-        )
+    lines += [_parameter_line(data.isel(parameter=row)) for row in range(data.sizes["parameter"])]
+    lines += [_channel_line(data.isel(channel=row)) for row in range(data.sizes["channel"])]
     return "\n".join([*lines, *(f"  warning: {text}" for text in data.attrs["warnings"])])
+
+
+def _parameter_line(parameter: xr.Dataset) -> str:
+    """The line of one parameter: name, value, standard error, interval, unit."""
+    value = f"{float(parameter['value']):>14.7g}"
+    if np.isfinite(parameter["at_least"]):
+        shown = f"{'':>14}{'':>12}  at least {float(parameter['at_least']):<17.6g}"
+    elif not parameter["determined"]:
+        shown = f"{value}{'':>12}  {'not determined':<26}"
+    else:
+        interval = f"{float(parameter['interval_low']):.7g} to {float(parameter['interval_high']):.7g}"
+        shown = f"{value}{float(parameter['standard_error']):>12.2g}  {interval:<26}"
+    return f"  {parameter['parameter'].values!s:<16}{shown} {parameter['unit'].values}"
+
+
+def _channel_line(channel: xr.Dataset) -> str:
+    """The line of one channel: misfit, noise, whiteness."""
+    noise = "noise given" if channel["channels/is_given"] else "noise estimated"
+    misfit = f"{float(channel['channels/misfit']):.3g} {channel['channels/unit'].values}"
+    white = f"whiteness p = {float(channel['channels/probability']):.2g}"
+    return f"  {channel['channel'].values}: misfit {misfit}, {noise} {float(channel['channels/noise']):.3g}, {white}"

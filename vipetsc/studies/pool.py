@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 
 from mpi4py import MPI
 
-from vipetsc.io.errors import DISK_FULL
+from vipetsc.io.errors import is_disk_full
 from vipetsc.parallel import SharedCounter, StoppedError, StopRequest, on_root, wait_for_all
 from vipetsc.progress import Progress
 
@@ -173,6 +173,6 @@ class TaskPool:
         """Whether an ``error`` is a failure of its job alone or ends all jobs, and how it is reported."""
         text = str(error)
         named = text if isinstance(error, RuntimeError) else f"{type(error).__name__}: {text}"
-        if isinstance(error, self.failures) and getattr(error, "errno", None) not in DISK_FULL:
+        if isinstance(error, self.failures) and not is_disk_full(error):
             return JobEnd(Ending.FAILED, named)
         return JobEnd(Ending.FATAL, text if isinstance(error, OSError) else named)

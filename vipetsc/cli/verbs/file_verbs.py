@@ -8,7 +8,7 @@ from mpi4py import MPI
 from vipetsc.cli.arguments import SET, argument
 from vipetsc.cli.messages import echo_paths
 from vipetsc.cli.verb import DONE, PlainVerb
-from vipetsc.io.errors import DISK_FULL
+from vipetsc.io.errors import is_disk_full
 from vipetsc.io.folder import FolderError
 from vipetsc.io.lock import locked
 from vipetsc.parallel import StopRequest, on_root
@@ -54,7 +54,7 @@ def write_exports(path: Path) -> list[Path]:
             written += write_curves(source)
     # OSError: a file that was cut off or is no HDF5. TypeError: another program's, of types that no table can hold.
     except (OSError, TypeError, ValueError) as error:
-        if getattr(error, "errno", None) in DISK_FULL:
+        if is_disk_full(error):
             raise
         raise FolderError(str(error)) from error
     return written
