@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import h5py
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from tests.identified import identify_table, lattice_table
 from vipetsc.case import Case, CaseError
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import RecordTable, read_measured
+from vipetsc.studies.identified import _start_values
 
 SENSOR = {"quantity": "velocity", "column": "v", "cell": 2, "mass": 1}
 
@@ -185,3 +188,20 @@ def test_coordinates_and_values_are_inverse(tmp_path):
         h = 1e-6
         slope = (parameter.from_coordinate(z + h) - parameter.from_coordinate(z - h)) / (2 * h)
         assert parameter.slope(z) == pytest.approx(slope, rel=1e-6)
+
+
+@pytest.mark.parametrize(("error", "valleys"), [(0.1, [2, 1, 0, 1]), (0.03, [3, 1, 0, 2])])
+def test_starts_are_numbered_by_valley_from_the_deepest(error, valleys):
+    """Fits within three standard errors of a bottom lie in its valley; a start that failed lies in none."""
+    fits = []
+    for coordinate, deviance in ((5.0, 40.0), (1.0, 10.0), (None, None), (1.25, 11.0)):
+        fit = {"begin": [0.0], "coordinates": [coordinate], "deviance": deviance}
+        fits.append({"reason": "stuck"} if coordinate is None else fit)
+    plan = SimpleNamespace(options=SimpleNamespace(starts=4))
+    misfit = SimpleNamespace(plan=plan, values=lambda z: 10 * z)
+    windows = SimpleNamespace(misfit=misfit, low=np.zeros(1))
+
+    values = _start_values(windows, fits, best=1, errors=np.array([error]))
+    assert values["starts/valley"].tolist() == valleys
+    assert values["starts/value"][:, 0] == pytest.approx([50.0, 10.0, np.nan, 12.5], nan_ok=True)
+    assert values["starts/deviance"] == pytest.approx([30.0, 0.0, np.nan, 1.0], nan_ok=True)

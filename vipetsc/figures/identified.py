@@ -61,7 +61,7 @@ def residual_correlations(identified: xr.Dataset) -> Figure:
 
 
 def misfit_profiles(identified: xr.Dataset) -> Figure:
-    """Draw how the misfit rises as each parameter is held beside its best value, with all others fitted."""
+    """Draw the misfit with each parameter held at values around the best one, and all others fitted."""
     count = identified.sizes["parameter"]
     columns = min(count, 4)
     rows = -(-count // columns)
