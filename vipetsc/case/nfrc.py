@@ -10,17 +10,19 @@ import tomli_w
 from pydantic import AfterValidator, Field
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import Problem, Section, Table, Valid
+from vipetsc.case.case_file import CaseError, Problem, Section, Table, Valid, read_section
 from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites
 from vipetsc.case.family import FamilyMember, family_of
 from vipetsc.case.names import distinct
 from vipetsc.case.resolve import build_chain, check_stiffness
 from vipetsc.case.schema import Positive, once
 from vipetsc.case.sites import ContactsTable
+from vipetsc.case.varied_key import PARAMETERS, TRIED, is_key, key_problems, table_at
 from vipetsc.lattice import Chain, Contact, UnitCell, waves_at
 from vipetsc.lattice.contact import least_restitution
 from vipetsc.lattice.modal_compliance import MOST_DOFS
 
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 Restitution = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -31,7 +33,9 @@ class NfrcTable(Section):
     displacement that it alone would make at the first site, over the clearance there; of a force: N; of a wall: m) or
     the frequency (rad/s), within the ``range`` [low, high]: a curve for each of the others in ``fixed`` (frequencies:
     by default the drive's) and each of the ``restitutions`` (by default that of ``[contacts]``), and of these for each
-    combination of the values of further keys in ``family``, which are lists or ranges as in ``[sweep]``. The lattice is
+    combination of the values of further keys in ``family``, which are lists or ranges as in ``[sweep]``. Over the path
+    of a key (``contacts.clearance``, in the key's unit) ``fixed`` are amplitudes, at the drive's frequency, and the
+    case is resolved anew at each value. The lattice is
     ``infinite``, or ends where its cells do: always if it has dashpots, cells that differ, or contacts between other
     masses than the cell's pair. ``harmonics`` is the number of the last one; motions that are not ``symmetric``
     (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too. Besides folds the
@@ -44,8 +48,8 @@ class NfrcTable(Section):
     infinite: bool | None = None
     band: Annotated[int, Field(ge=1)] | None = None
     direction: Literal["forward", "backward"] = "forward"
-    over: Literal["amplitude", "frequency"] = "amplitude"
-    range: list[Positive] = Field([0.5, 2.0], min_length=2, max_length=2)
+    over: str = "amplitude"
+    range: list[Finite] = Field([0.5, 2.0], min_length=2, max_length=2)
     fixed: Annotated[list[Positive], AfterValidator(once)] = Field([])
     restitutions: Annotated[list[Restitution], AfterValidator(once)] = Field([])
     family: dict[str, Any] | None = None
@@ -58,6 +62,11 @@ class NfrcTable(Section):
     largest_step: Positive = 0.1
     tolerance: Positive = 1e-11
     max_newton: int = Field(10, ge=1)
+
+    @property
+    def varies_key(self) -> bool:
+        """Whether a key of the case varies along the curves."""
+        return is_key(self.over)
 
     @property
     def towards(self) -> int:
@@ -83,7 +92,8 @@ class ResponseCurve(NamedTuple):
 class NfrcCase(Case):
     """A case of the verb ``nfrc``: that of a run with the section ``[nfrc]``.
 
-    With ``nfrc.family`` its sections are those of the first member, and ``table`` is what it was read from.
+    With ``nfrc.family`` its sections are those of the first member, and those of the lower end of the range where a key
+    varies along the curves; ``table`` is then what it was read from.
     """
 
     nfrc: NfrcTable
@@ -104,6 +114,8 @@ class NfrcCase(Case):
         """The resolved sections, and everything that is wrong with them."""
         if isinstance(table.get("nfrc"), dict) and "family" in table["nfrc"]:
             return cls._read_family(table)
+        if isinstance(table.get("nfrc"), dict) and is_key(table["nfrc"].get("over")):
+            return cls._read_over_key(table)
         sections, problems = super().read(table)
         if problems:
             return sections, problems
@@ -148,6 +160,32 @@ class NfrcCase(Case):
         return read[0] | {"nfrc": nfrc, "table": family.table}, []
 
     @classmethod
+    def _read_over_key(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
+        """The resolved sections at the lower end of a key's range, and everything that is wrong within the range."""
+        options, problems = read_section(NfrcTable, table["nfrc"], "nfrc")
+        problems = problems or key_problems(table)
+        low, high = options.range if not problems else (0.0, 1.0)
+        if not low < high:
+            problems.append(Problem("nfrc.range", options.range, "must be [low, high]"))
+        if problems:
+            return {}, problems
+
+        read = []
+        for place in TRIED:
+            value = low + place * (high - low)
+            member, problems = table_at(table, value)
+            sections, wrong = cls.read(member) if not problems else ({}, problems)
+            if wrong:
+                return sections, [replace(p, remedy=f"{p.remedy} (with {options.over} = {value:.6g})") for p in wrong]
+            read.append(sections)
+
+        # What follows from the lattice follows from that at the lower end.
+        of_case: dict[str, Any] = {name: getattr(read[0]["nfrc"], name) for name in ("band", "restitutions")}
+        for name in ("infinite", "symmetric"):
+            of_case[name] = all(getattr(sections["nfrc"], name) for sections in read)
+        return read[0] | {"nfrc": options.model_copy(update=of_case), "table": table}, []
+
+    @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
         """Problems between keys."""
         yield from super().check(sections, valid)
@@ -155,8 +193,12 @@ class NfrcCase(Case):
             return
 
         nfrc = sections["nfrc"]
-        if not nfrc.range[0] < nfrc.range[1]:
-            yield Problem("nfrc.range", nfrc.range, "must be [low, high]")
+        if nfrc.over not in PARAMETERS:
+            remedy = "must be amplitude, frequency or the path of a key such as contacts.clearance"
+            yield Problem("nfrc.over", nfrc.over, remedy)
+            return
+        if not 0 < nfrc.range[0] < nfrc.range[1]:
+            yield Problem("nfrc.range", nfrc.range, "must be [low, high], both above 0")
         if nfrc.source == "wave" and nfrc.infinite is False:
             yield Problem("nfrc.infinite", False, "an incident wave needs an infinite lattice; omit it")
         if nfrc.source == "wave" and valid("drive") and sections["drive"].end:
@@ -184,13 +226,27 @@ class NfrcCase(Case):
         """No warnings: those about runs in time do not concern steady states."""
         return []
 
+    def at(self, value: float, amplitude: float) -> "NfrcCase":
+        """The case whose key ``nfrc.over`` has a ``value``, for states over the amplitude from ``amplitude`` on.
+
+        Raises CaseError where the case is invalid with that value.
+        """
+        assert self.table is not None
+        member, problems = table_at(self.table, value)
+        if problems:
+            raise CaseError(problems)
+        case = NfrcCase.from_table(member | {"name": self.name})
+        kept = {name: getattr(self.nfrc, name) for name in ("infinite", "symmetric", "band")}
+        update = kept | {"range": [amplitude, 2 * amplitude], "fixed": [self.frequency]}
+        return case.model_copy(update={"nfrc": case.nfrc.model_copy(update=update)})
+
     def physics(self) -> "NfrcCase":
         """The part of the case that a resumed curve must keep: all except the number of points."""
         nfrc = self.nfrc.model_copy(update={"points": 1})
         return self.model_copy(update={"nfrc": nfrc, "table": None})
 
     def to_toml(self) -> str:
-        """The resolved case as TOML; of a family what it was read from, since other keys may follow from its keys."""
+        """The resolved case as TOML; where keys vary what it was read from, since others may follow from them."""
         if self.table is None:
             return super().to_toml()
         table = self.table | {"name": self.name, "nfrc": self.table["nfrc"] | {"points": self.nfrc.points}}
@@ -201,6 +257,9 @@ class NfrcCase(Case):
     @property
     def frequency(self) -> float:
         """A frequency of the curves in rad/s."""
+        if self.nfrc.varies_key:
+            assert self.drive.frequency is not None  # that of a resolved case
+            return self.drive.frequency
         return self.nfrc.fixed[0] if self.nfrc.over == "amplitude" else self.nfrc.range[0]
 
     def laws(self, restitution: float) -> list[Contact]:
@@ -213,7 +272,7 @@ class NfrcCase(Case):
 
     @cached_property
     def _members(self) -> list[tuple[FamilyMember, "NfrcCase"]]:
-        if self.table is None:
+        if self.table is None or not self.nfrc.family:
             return [(FamilyMember("", {}, {}), self)]
         family, _ = family_of(self.table | {"nfrc": self.table["nfrc"] | {"points": self.nfrc.points}})
         return [(member, NfrcCase.from_table(member.table | {"name": self.name})) for member in family.members]

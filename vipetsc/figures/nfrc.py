@@ -67,6 +67,8 @@ def response_page(
         for axes, draw in zip(column, rows, strict=True):
             draw(axes, curve)
         column[-1].set_xlabel(parameter_label(curve))
+        if "parameter" in curve:
+            column[-1].ticklabel_format(axis="x", scilimits=(-2, 4))
         column[0].set_title(str(curve.attrs["name"]))
     if columns.size > 1:
         panels.label_panels(columns.T)
@@ -78,6 +80,9 @@ def parameter_label(branch: xr.Dataset) -> str:
     if branch.attrs["over"] == "frequency":
         return "frequency (rad/s)"
     case = NfrcCase.of(branch)
+    if case.nfrc.varies_key:
+        unit = str(branch["parameter"].attrs["units"])
+        return f"{case.nfrc.over} ({unit})" if unit not in ("", "1") else case.nfrc.over
     if case.nfrc.source == "wave":
         return "amplitude of the wave / clearance"
     return "amplitude of the wall (m)" if case.drive.end else "amplitude (N)"
@@ -85,7 +90,9 @@ def parameter_label(branch: xr.Dataset) -> str:
 
 def parameter_of(branch: xr.Dataset) -> np.ndarray:
     """Return the parameter (point,) that varies along a curve."""
-    values: np.ndarray = branch[str(branch.attrs["over"])].values
+    over = str(branch.attrs["over"])
+    # Over a key of the case its values are a variable of their own.
+    values: np.ndarray = branch[over if over in branch else "parameter"].values
     return values
 
 
@@ -97,7 +104,8 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     clearance = branch["clearance"].values
     label = "largest |w| / clearance"
     relative = branch["largest"].values / np.where(clearance > 0, clearance, 1.0)  # (point, site)
-    if not np.all(clearance > 0):
+    # Along a curve over a key of the case they may not stay what they are at its beginning.
+    if "parameter" in branch or not np.all(clearance > 0):
         label = "largest |w| (mm)"
         relative = 1e3 * branch["largest"].values
     size = relative[:, 0]

@@ -96,12 +96,13 @@ def _keys_of(curve: xr.Dataset) -> dict[str, tuple[Any, str]]:
     table = case.model_dump(by_alias=True, exclude_none=True)
     family = json.loads(curve.attrs.get("family", "{}"))
     keys = {path: (value, unit_of(path, table)) for path, value in family.items()}
-    # The amplitude or frequency that does not vary is that of all points.
-    fixed = "frequency" if curve.attrs["over"] == "amplitude" else "amplitude"
-    unit = "rad/s"
-    if fixed == "amplitude":
+    # An amplitude or frequency that does not vary is that of all points.
+    over = curve.attrs["over"]
+    if over != "amplitude":
         unit = "clearances" if case.nfrc.source == "wave" else unit_of("drive.amplitude", table)
-    keys[fixed] = (float(curve[fixed].values[0]), unit)
+        keys["amplitude"] = (float(curve["amplitude"].values[0]), unit)
+    if over != "frequency":
+        keys["frequency"] = (float(curve["frequency"].values[0]), "rad/s")
     keys["restitution"] = (float(curve.attrs["restitution"]), "")
     return keys
 

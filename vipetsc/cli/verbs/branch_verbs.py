@@ -103,17 +103,20 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
             excitation = f"the motion of the {case.drive.end} wall"
         amplitude_unit = "m" if case.drive.end else "N"
 
+    fixed = "amplitude"
+    fixed_unit = amplitude_unit
+    over_unit = "rad/s"
     if options.over == "amplitude":
         over_unit = amplitude_unit
         fixed = "frequency"
         fixed_unit = "rad/s"
-    else:
-        over_unit = "rad/s"
-        fixed = "amplitude"
-        fixed_unit = amplitude_unit
+    elif options.varies_key:
+        over_unit = unit_of(options.over, case.table or {})
+        fixed_unit += f", {case.drive.frequency:.6g} rad/s"
 
     low, high = options.range
     count = len(case.every_curve())
+    curves = "1 curve" if count == 1 else f"{count} curves"
     parity = "odd only" if options.symmetric else "even and odd"
 
     lattice = dict(lattice_rows(case))
@@ -121,7 +124,7 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
         lattice["lattice"] = f"infinite, with sites in the cells of a segment of {case.lattice.cells}"
     return [
         *lattice.items(),
-        ("nfrc", f"{count} curve{'s' if count > 1 else ''} over the {options.over}, {low:g} to {high:g} {over_unit}"),
+        ("nfrc", f"{curves} over the {options.over}, {low:g} to {high:g} {over_unit}".rstrip()),
         ("driven by", excitation),
         (f"at {fixed}", f"{first_few([f'{value:.6g}' for value in options.fixed])} {fixed_unit}"),
         ("restitution", first_few([f"{restitution:g}" for restitution in options.restitutions])),
@@ -195,7 +198,7 @@ def branch_table(branch: "Branch") -> str:
 
 def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
     """Summary of a curve: length, folds, jumps of a slow sweep up and down, stable points, energy balance."""
-    from vipetsc.modes.branches.response_layout import measure, sweep_down, sweep_up
+    from vipetsc.modes.branches.response_layout import measure, parameter_values, sweep_down, sweep_up
 
     options = case.nfrc
     rows = [("curve", curve.name), ("points", f"{len(curve.points)}; {curve.ending}")]
@@ -205,7 +208,9 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
     unit = "rad/s"
     if options.over == "amplitude":
         unit = "clearances" if options.source == "wave" else "N"
-    parameter = measure(curve, options.over)
+    elif options.varies_key:
+        unit = str(curve.about["unit"])
+    parameter = parameter_values(curve)
     for kind, heading in SPECIAL_POINTS.items():
         at = parameter[curve.is_kind(kind)]
         if at.size or kind == "fold":

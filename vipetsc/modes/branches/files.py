@@ -91,5 +91,5 @@ def read_branch(path: Path) -> Branch[Any]:
         complete=bool(about["complete"]),
         ending=str(about["ending"]),
         findings=json.loads(about.get("warnings", "[]")),
-        about={"over": str(about["over"])} if "over" in about else {},
+        about={name: str(about[name]) for name in ("over", "unit") if name in about},
     )

@@ -39,6 +39,7 @@ LAYOUT = {
 }
 
 OUTPUTS = {
+    "parameter": Stored("", "", "value of the key that varies along the curve, see the attribute over"),
     "peak_displacement": Stored("location", "m", "largest displacement"),
     "peak_velocity": Stored("location", "m/s", "largest velocity"),
     "peak_acceleration": Stored("location", "m/s2", "largest acceleration"),
@@ -57,7 +58,7 @@ OUTPUTS = {
     "first_wall_force": Stored("wall", "N", "first harmonic of the force on the wall"),
     "wall_force_lag": Stored("wall", "degree", "phase of the first harmonic of the force on the wall behind the drive"),
 }
-"""What ``[output]`` asks for; a file has those that its case asked for."""
+"""What ``[output]`` asks for, and a key that varies; a file has those that its case asked for."""
 
 
 def outputs_of(branch: Branch[Response]) -> dict[str, Stored]:
@@ -76,6 +77,12 @@ def measure(branch: Branch[Response], stored: str) -> np.ndarray:
         return np.array([p.measured.harmonics.imag for p in branch.points])
     field = "fractions" if stored == "share" else stored
     return np.array([getattr(p.measured, field) for p in branch.points])
+
+
+def parameter_values(branch: Branch[Response]) -> np.ndarray:
+    """The value (point,) of the parameter that varies along a curve."""
+    over = str(branch.about["over"])
+    return measure(branch, over if over in LAYOUT else "parameter")
 
 
 class ResponseLayout:
@@ -102,6 +109,8 @@ class ResponseLayout:
             "down_point": variable("down", down, "1", "points visited as the parameter decreases slowly"),
         }
         for name, (dimensions, units, text) in (LAYOUT | outputs_of(branch)).items():
+            if name == "parameter":
+                units = branch.about["unit"]
             data[name] = variable(["point", *dimensions.split()], measure(branch, name), units, text)
         return data
 
@@ -117,7 +126,7 @@ class ResponseLayout:
             if "order" in stored.dimensions:
                 continue
             values = measure(branch, name).reshape(count, -1)
-            if name in OUTPUTS and stored.dimensions != "site":
+            if name in OUTPUTS and stored.dimensions not in ("", "site"):
                 labels = branch.extra[stored.dimensions].values
                 columns |= {f"{name}/{label}": column.tolist() for label, column in zip(labels, values.T, strict=True)}
             elif values.shape[1] == 1:
@@ -185,7 +194,7 @@ def _sweep(branch: Branch[Response], sign: int) -> ParameterSweep:
     # With the sign a sweep down is one up as well; -1 unstable perturbations mean that stability is undecided.
     stable = measure(branch, "unstable") == 0
     fold = branch.is_kind("fold")
-    parameter = sign * measure(branch, branch.about["over"])
+    parameter = sign * parameter_values(branch)
     return ParameterSweep(parameter, size=measure(branch, "largest")[:, 0], stable=with_stable_folds(stable, fold))
 
 

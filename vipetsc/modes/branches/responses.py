@@ -7,6 +7,7 @@ from mpi4py import MPI
 
 import numpy as np
 
+from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
@@ -15,7 +16,9 @@ from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.method import Method
 from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem
 from vipetsc.modes.response.condensation import compliance_of
+from vipetsc.modes.response.keyed_case import KeyedCase
 from vipetsc.modes.response.outputs import WALLS
+from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
@@ -49,6 +52,8 @@ class ResponseMethod(Method[Response]):
         """A curve without states."""
         curve = next(curve for curve in self.curves if curve.name == name)
         about: dict[str, Any] = {"over": curve.case.nfrc.over, "restitution": curve.restitution}
+        if curve.case.nfrc.varies_key:
+            about["unit"] = unit_of(curve.case.nfrc.over, curve.case.model_dump(by_alias=True, exclude_none=True))
         if curve.values:
             about["family"] = curve.values
         return Branch(
@@ -64,28 +69,32 @@ class ResponseMethod(Method[Response]):
         """The name of a curve."""
         return self.curves[job].name
 
-    def problem(self, job: int) -> SteadyStates:
+    def problem(self, job: int) -> SteadyStates | StatesOverKey:
         """The equations of a curve."""
         curve = self.curves[job]
+        options = curve.case.nfrc
+        if options.varies_key:
+            keyed = KeyedCase(curve.case, curve.restitution, curve.fixed)
+            return StatesOverKey(keyed.at, options.over, curve.fixed, options)
         if self._compliance is None or self._compliance[0] != curve.member:
             self._compliance = curve.member, compliance_of(curve.case)
         return SteadyStates(curve.case, curve.restitution, curve.fixed, compliance=self._compliance[1])
 
     def start(self, problem: PeriodicProblem[Response], job: int) -> Response:
         """The state at the beginning of the range."""
-        assert isinstance(problem, SteadyStates)
+        assert isinstance(problem, SteadyStates | StatesOverKey)
         return first_state(problem)
 
     def rule(self, problem: PeriodicProblem[Response], start: Response, done: int) -> TurningSteps:
         """Steps to the end of the range; the start counts among ``nfrc.points``."""
-        assert isinstance(problem, SteadyStates)
+        assert isinstance(problem, SteadyStates | StatesOverKey)
         return TurningSteps(problem, max(self.case.nfrc.points - 1 - done, 0))
 
     def assess(self, problem: PeriodicProblem[Response], point: Response) -> Response:
         """The state with its measures, which special points have already."""
         if point.measures is not None:
             return point
-        assert isinstance(problem, SteadyStates)
+        assert isinstance(problem, SteadyStates | StatesOverKey)
         return replace(point, measures=problem.measured(point.xi))
 
 

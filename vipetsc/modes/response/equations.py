@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,10 @@ class LinearMotion(NamedTuple):
 
 
 class ContinuationParameter(NamedTuple):
-    """Parameter of a curve, "amplitude" or "frequency", the value of the other one, and the parameter's unit."""
+    """Parameter of a curve, the value of the amplitude or frequency that is ``fixed``, and the parameter's unit.
+
+    It varies ``over`` the "amplitude", the "frequency" or a key of the case; then the amplitude is fixed.
+    """
 
     over: str
     fixed: float
@@ -38,7 +42,7 @@ class SteadyFrame:
         self.equations = equations
         self.xi = xi
         self.tangent = tangent
-        self.shift = equations.balance.shift(equations.drive(xi[-1])[0])
+        self.shift = equations.shift_near(xi)
 
     def encode(self, point: Response) -> np.ndarray:
         """The unknowns of another state."""
@@ -100,11 +104,21 @@ class SteadyEquations(ABC):
         self.clearance = clearance
         self.parameter = parameter
         self.tolerance = tolerance
-        self.newton = DenseNewton(balance.size + 1, max_newton)
+        self.max_newton = max_newton
 
     @abstractmethod
     def linear_motion(self, omega: float) -> LinearMotion:
         """The motion of the linear lattice at ``omega`` in rad/s; raises FlowError where there is no such drive."""
+
+    @cached_property
+    def newton(self) -> DenseNewton:
+        """Newton's method for states on a plane."""
+        return DenseNewton(self.balance.size + 1, self.max_newton)
+
+    def shift_near(self, xi: np.ndarray) -> np.ndarray:
+        """The stiffnesses by which the compliance is shifted for states near the unknowns ``xi``."""
+        omega, _ = self.drive(xi[-1])
+        return self.balance.shift(omega)
 
     def drive(self, p: float) -> tuple[float, float]:
         """Frequency (rad/s) and amplitude at the scaled parameter ``p``."""
@@ -161,8 +175,6 @@ class SteadyEquations(ABC):
         begin = np.append(guess[:-1], p)
         attempt = SteadyFrame(self, begin, along_parameter).solve(begin, along_parameter, p)
         if not attempt.converged:
-            over = self.parameter.over
-            omega, amplitude = self.drive(p)
-            value = amplitude if over == "amplitude" else omega
-            raise ContinuationError(f"no solution at {over} {value:.6g}: {attempt.reason}")
+            value = p * self.parameter.scale
+            raise ContinuationError(f"no solution at {self.parameter.over} {value:.6g}: {attempt.reason}")
         return attempt.xi

@@ -77,6 +77,11 @@ class SteadyStates(SteadyEquations):
             max_newton=options.max_newton,
         )
 
+    def adopt(self, other: "SteadyStates") -> None:
+        """Take over what ``other`` has computed of perturbations, if it has the same compliance."""
+        if other.compliance is self.compliance:
+            self._hill = other._hill
+
     def _unit(self) -> float:
         """Unit of displacements in m: the first clearance; of contacts without any the linear motion of the range."""
         for stops in self.forces.contacts:

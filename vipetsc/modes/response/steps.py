@@ -4,6 +4,7 @@ import numpy as np
 
 from vipetsc.modes.continuation.arclength import Continuation, Geometry, Verdict
 from vipetsc.modes.problem import Attempt, ContinuationError
+from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 
@@ -23,7 +24,7 @@ class TurningSteps:
     points_key = "nfrc.points"
     chart = ""
 
-    def __init__(self, states: SteadyStates, points: int) -> None:
+    def __init__(self, states: SteadyStates | StatesOverKey, points: int) -> None:
         self.states = states
         self.points = points
         self.first_step = states.options.first_step
@@ -59,18 +60,27 @@ class TurningSteps:
     def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
         """Message where and why the curve cannot go on, and which key to change."""
         omega, amplitude = self.states.drive(last.xi[-1])
+        value = ""
+        if isinstance(self.states, StatesOverKey):
+            value = f", {self.states.parameter.over} = {last.xi[-1] * self.states.parameter.scale:.6g}"
         remedy = "increase nfrc.harmonics or nfrc.max_newton, or decrease nfrc.smallest_step"
         return (
-            f"no step from the last good point, {omega:.8g} rad/s at amplitude {amplitude:.6g}: {verdict.why}; {remedy}"
+            f"no step from the last good point, {omega:.8g} rad/s at amplitude {amplitude:.6g}{value}: "
+            f"{verdict.why}; {remedy}"
         )
 
 
-def first_state(states: SteadyStates, is_ramp: bool = False) -> Response:
+def first_state(states: SteadyStates | StatesOverKey, is_ramp: bool = False) -> Response:
     """The state at the beginning of the range, by growing amplitudes from one that touches no contact.
 
     ``is_ramp``: it is the beginning of such growing amplitudes itself. Raises ContinuationError where amplitudes cannot
     grow so far.
     """
+    if isinstance(states, StatesOverKey):
+        low, _ = states.options.range
+        guess = states.from_state(low, first_state(states.states_at(low)).xi)
+        return _begun(states, guess)
+
     low = states.options.range[0] / states.parameter.scale
     omega, amplitude = states.drive(low)
     linear = states.linear_motion(omega).harmonics
@@ -78,8 +88,13 @@ def first_state(states: SteadyStates, is_ramp: bool = False) -> Response:
     if _touches(states, amplitude * linear[:, 1]) and not is_ramp:
         guess = _ramp(states, omega, amplitude)
 
+    return _begun(states, np.append(guess, low))
+
+
+def _begun(states: SteadyStates | StatesOverKey, guess: np.ndarray) -> Response:
+    """The state near the unknowns ``guess`` with their parameter, from which the parameter grows."""
     # Newton's method from the linear motion, or from the state on the ramp, which is one already but for rounding.
-    start = Response(xi=states.at(np.append(guess, low), low), next_step=states.options.first_step)
+    start = Response(xi=states.at(guess, guess[-1]), next_step=states.options.first_step)
     tangent = states.first_tangent(start, 1)
     return Response(xi=start.xi, tangent=tangent, next_step=start.next_step)
 

@@ -1,0 +1,175 @@
+"""Responses over a key of the case: the same states as over the frequency, their stability, ends and refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+import vipetsc
+from tests.rigs import TWO_MASSES, after_a_period, multipliers
+from tests.steady_states import motion_at
+from vipetsc.case import CaseError
+from vipetsc.case.case_file import put
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.figures.registry import draw
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.response_layout import parameter_values
+from vipetsc.modes.branches.responses import ResponseMethod
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.steps import first_state
+
+pytestmark = pytest.mark.parallel(1)
+
+FREQUENCY = 1.5  # rad/s
+
+
+def over(key: str, low: float, high: float, table: dict[str, Any] = TWO_MASSES, **nfrc: Any) -> NfrcCase:
+    """The two masses with curves over a ``key``, at 1.5 rad/s and 0.2 m of the wall."""
+    options = {"source": "force", "over": key, "range": [low, high], "fixed": [0.2], "harmonics": 11} | nfrc
+    drive = table["drive"] | {"frequency": FREQUENCY}
+    return NfrcCase.from_table(table | {"drive": drive, "nfrc": options})
+
+
+def equations(case: NfrcCase):
+    """The equations of the only curve of a case."""
+    return ResponseMethod(case, MPI.COMM_SELF).problem(0)
+
+
+@pytest.fixture(scope="module")
+def clearances(tmp_path_factory):
+    """A folder with the curve over the clearance, on which two folds and a period doubling lie."""
+    folder = tmp_path_factory.mktemp("clearances")
+    case = over("contacts.clearance", 0.1, 1.0, harmonics=31, largest_step=0.3)
+    (curve,) = follow_all(case, folder, MPI.COMM_SELF)
+    return case, folder, curve
+
+
+@pytest.mark.parametrize(
+    ("key", "low", "high"),
+    [("contacts.clearance", 0.1, 0.12), ("lattice.cell.masses[1]", 0.98, 1.0), ("lattice.damping.mass", 0.05, 0.06)],
+)
+def test_it_comes_to_the_state_of_the_curve_over_the_frequency(key, low, high, tmp_path):
+    """Both curves end where the key has its upper value and the frequency is 1.5 rad/s."""
+    table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
+    steps = {"first_step": 0.2, "largest_step": 1.0, "harmonics": 11}
+    (by_key,) = follow_all(over(key, low, high, table, **steps), tmp_path, MPI.COMM_SELF)
+    assert by_key.ending.startswith("reached the end")
+
+    changed = NfrcCase.from_table(table).model_dump(by_alias=True, exclude_none=True)
+    assert not put(changed, key, high)
+    options = steps | {"source": "force", "over": "frequency", "range": [1.47, FREQUENCY], "fixed": [0.2]}
+    (by_frequency,) = follow_all(NfrcCase.from_table(changed | {"nfrc": options}), tmp_path, MPI.COMM_SELF)
+    ends = [curve.points[-1].measured for curve in (by_key, by_frequency)]
+    assert ends[0].episodes > 0
+    assert ends[0].frequency == ends[1].frequency == FREQUENCY
+    np.testing.assert_allclose(ends[0].harmonics, ends[1].harmonics, atol=1e-10)
+    assert ends[0].unstable == ends[1].unstable
+
+
+def test_newtons_method_converges_quadratically():
+    """The column by differences costs no order: from a guess off by 1e-2 three steps lead to rounding."""
+    for key, low, high in (("contacts.clearance", 0.1, 0.2), ("lattice.cell.masses[1]", 0.9, 1.0)):
+        table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
+        states = equations(over(key, low, high, table))
+        start = first_state(states)
+        frame = states.frame(start)
+        attempt = frame.correct(start.xi + 0.05 * start.tangent + 1e-2 * np.sin(np.arange(len(start.xi))), 0.05)
+        assert attempt.converged
+        first, second, third, *_ = (residual for residual in attempt.history if residual < 0.1)
+        assert second < 30 * first**2 + 1e-9 * first
+        assert third < 30 * second**2 + 1e-9 * second
+
+
+@pytest.mark.slow
+def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are(clearances):
+    """SciPy's time integration of the lattice with the clearance of each state agrees, folds included."""
+    case, _, curve = clearances
+    states = equations(case)
+    touching = [point for point in curve.points if point.measured.episodes and point.kind == "regular"]
+    unstable = set()
+    for number in np.linspace(0, len(touching) - 1, 8).astype(int):
+        point = touching[number]
+        value = float(point.measured.outputs["parameter"])
+        inner = states.states_at(value)
+        assert inner.forces.contacts[0].plus == value
+        xi = np.append(point.xi[:-1] * states.clearance / inner.clearance, 0.2 / inner.parameter.scale)
+        state = np.concatenate([part.ravel() for part in motion_at(inner, xi, np.arange(2))])
+        end = after_a_period(inner, Response(xi=xi), state)
+        assert np.abs(end - state).max() < 1e-3 * np.abs(state).max()
+        grows = np.abs(multipliers(inner, Response(xi=xi), state, end)) > 1.001
+        assert point.measured.unstable == np.count_nonzero(grows)
+        unstable.add(point.measured.unstable)
+    assert len(unstable) > 1
+    folds = parameter_values(curve)[curve.is_kind("fold")]
+    values = parameter_values(curve)
+    assert len(folds) == 2
+    # Between the folds there are three states.
+    assert np.sum(np.diff(np.sign(values - folds.mean())) != 0) == 3
+
+
+@pytest.mark.parametrize(("key", "low", "high"), [("contacts.restitution", 0.9, 1.0), ("contacts.clearance", 0.1, 0.2)])
+def test_a_curve_ends_on_its_range_where_no_case_lies_beyond(key, low, high, tmp_path):
+    table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
+    case = over(key, low, high, table, first_step=0.2, largest_step=1.0)
+    (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
+    assert curve.ending == f"reached the end of nfrc.range, {high:g}"
+    assert parameter_values(curve)[[0, -1]].tolist() == [low, high]
+    if key == "contacts.restitution":
+        alone = NfrcCase.from_table(
+            table
+            | {
+                "drive": table["drive"] | {"frequency": FREQUENCY},
+                "nfrc": {"source": "force", "range": [0.2, 0.3], "fixed": [FREQUENCY], "harmonics": 11},
+            }
+        )
+        elastic = first_state(equations(alone))
+        expected = equations(alone).measured(elastic.xi).harmonics
+        np.testing.assert_allclose(curve.points[-1].measured.harmonics, expected, atol=1e-10)
+
+
+def test_files_have_the_values_of_the_key_with_its_unit(clearances, tmp_path):
+    _, folder, curve = clearances
+    with vipetsc.open(folder / f"branch-{curve.name}.h5") as data:
+        assert data.attrs["over"] == "contacts.clearance"
+        assert data["parameter"].attrs["units"] == "m"
+        np.testing.assert_array_equal(data["parameter"].values, parameter_values(curve))
+    header, first, *_ = (folder / f"branch-{curve.name}.csv").read_text().splitlines()
+    assert float(first.split(",")[header.split(",").index("parameter")]) == 0.1
+    assert [path.stem for path in draw("branches", [folder])] == [f"branch-{curve.name}"]
+
+
+def test_a_curve_goes_on_to_the_same_bits(tmp_path):
+    table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    whole.mkdir()
+    parts.mkdir()
+    (at_once,) = follow_all(over("contacts.stiffness", 10.0, 20.0, table, points=7), whole, MPI.COMM_SELF)
+    follow_all(over("contacts.stiffness", 10.0, 20.0, table, points=4), parts, MPI.COMM_SELF)
+    more = over("contacts.stiffness", 10.0, 20.0, table, points=7)
+    assert NfrcCase.from_toml(more.to_toml()) == more
+    (resumed,) = follow_all(more, parts, MPI.COMM_SELF, resume=True)
+    assert [point.xi.tolist() for point in resumed.points] == [point.xi.tolist() for point in at_once.points]
+
+
+@pytest.mark.parametrize(
+    ("key", "changes", "where", "reason"),
+    [
+        ("clearance", {}, "nfrc.over", "path of a key"),
+        ("drive.amplitude", {}, "nfrc.over", "only keys of lattice, contacts, disorder"),
+        ("contacts.clearance", {"fixed": []}, "nfrc.fixed", "give the amplitudes"),
+        ("contacts.clearance", {"range": [0.2, 0.1]}, "nfrc.range", "must be [low, high]"),
+        ("contacts.clearnce", {}, "contacts.clearnce", "contacts.clearance"),
+        ("contacts.restitution", {"restitutions": [1.0], "range": [0.5, 1.0]}, "nfrc.restitutions", "varies along"),
+        ("contacts.restitution", {"range": [0.5, 1.5]}, "contacts.restitution", "with contacts.restitution = 1.5"),
+        ("lattice.cells", {"range": [2.0, 5.0]}, "lattice.cells", "with lattice.cells"),
+    ],
+)
+def test_keys_that_do_not_vary_along_a_curve_are_refused(key, changes, where, reason):
+    with pytest.raises(CaseError) as caught:
+        over(key, 0.1, 0.2, **changes)
+    assert where in [problem.key for problem in caught.value.problems]
+    assert any(reason in problem.remedy for problem in caught.value.problems)

@@ -1,0 +1,53 @@
+"""A case whose key varies along a curve: the equations of its lattice at each value."""
+
+from dataclasses import replace
+
+from vipetsc.case.case_file import CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.lattice import ModalCompliance, WaveCompliance
+from vipetsc.modes.problem import FlowError
+from vipetsc.modes.response.condensation import compliance_of
+from vipetsc.modes.response.steady import SteadyStates
+
+
+class KeyedCase:
+    """The lattices of a ``case`` over its key ``nfrc.over``, with a ``restitution`` and an ``amplitude``.
+
+    Keys of ``[contacts]`` leave the linear lattice as it is: its compliance is then computed once.
+    """
+
+    def __init__(self, case: NfrcCase, restitution: float, amplitude: float) -> None:
+        self.case = case
+        self.restitution = restitution
+        self.amplitude = amplitude
+        self._last: SteadyStates | None = None
+
+    def at(self, value: float) -> SteadyStates:
+        """The equations at a ``value`` of the key, over the amplitude; raises FlowError where the case is invalid."""
+        key = self.case.nfrc.over
+        try:
+            case = self.case.at(value, self.amplitude)
+        except CaseError as error:
+            reasons = "; ".join(map(str, error.problems))
+            raise FlowError(f"no lattice with {key} = {value:.6g}: {reasons}") from None
+
+        restitution = self.restitution
+        if key == "contacts.restitution":
+            restitution = value
+        states = SteadyStates(case, restitution, case.nfrc.fixed[0], self._compliance(case))
+        if self._last is not None:
+            states.adopt(self._last)
+        self._last = states
+        return states
+
+    def _compliance(self, case: NfrcCase) -> WaveCompliance | ModalCompliance:
+        """The compliance of the lattice of a ``case``: the last one where only clearances differ, which it has not."""
+        last = self._last
+        if last is not None and _without_clearances(last.case) == _without_clearances(case):
+            return last.compliance
+        return compliance_of(case)
+
+
+def _without_clearances(case: NfrcCase) -> object:
+    """The linear lattice of a ``case``, to compare."""
+    return replace(case.model().chain, clearances=())

@@ -1,0 +1,158 @@
+"""Steady states whose parameter is a key of the case: a clearance, a restitution, a mass, a spring, a dashpot.
+
+At each value v of the key the lattice is another one, with equations R(x, v) = 0 of its own (``steady``); amplitude and
+frequency stay the same. Newton's method takes dR/dx from these equations, and dR/dv from central differences of R at
+fixed x, with steps of ``SLOPE`` half ranges. The error of that column is of second order in the step: the convergence
+remains quadratic down to 1e-10 of the first residual, which is below what a step begins with over the tolerance.
+
+A step may pass the end of the range, beyond which the key may have no valid value (a restitution above 1). The
+equations are continued there by their tangent in v; such a state is replaced by that at the end of the range.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from vipetsc.case.nfrc import NfrcTable
+from vipetsc.modes.balance.hill import Perturbations, Stability
+from vipetsc.modes.problem import SpecialKind
+from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
+from vipetsc.modes.response.stability_changes import StabilityChanges
+from vipetsc.modes.response.state import Measures, Response
+from vipetsc.modes.response.steady import SteadyStates
+
+# Step of a difference in the key, over half its range.
+SLOPE = 1e-5
+# Values whose lattices are kept: those of a step and of its differences.
+KEPT_VALUES = 9
+
+
+class StatesOverKey(SteadyEquations):
+    """Steady states over a key, whose equations at a value ``build`` gives, over the amplitude from that of the curve.
+
+    ``over`` is the key's path, ``amplitude`` that of the curve; ``options`` have the range of the key.
+    """
+
+    def __init__(self, build: Callable[[float], SteadyStates], over: str, amplitude: float, options: NfrcTable) -> None:
+        self.options = options
+        self._build = build
+        self._kept: dict[float, SteadyStates] = {}
+        low, high = options.range
+        self._bounds = low, high
+
+        first = self.states_at(low)
+        super().__init__(
+            balance=first.balance,
+            clearance=first.clearance,
+            parameter=ContinuationParameter(over, amplitude, (high - low) / 2),
+            tolerance=options.tolerance,
+            max_newton=options.max_newton,
+        )
+
+    def states_at(self, value: float) -> SteadyStates:
+        """The equations of the lattice whose key has a ``value``; raises FlowError where there is none."""
+        if value not in self._kept:
+            self._kept = dict(list(self._kept.items())[1 - KEPT_VALUES :])
+            self._kept[value] = self._build(value)
+        return self._kept[value]
+
+    def linear_motion(self, omega: float) -> LinearMotion:
+        """The motion of the linear lattice at the lower end of the range."""
+        return self.states_at(self._bounds[0]).linear_motion(omega)
+
+    def drive(self, p: float) -> tuple[float, float]:
+        """Frequency (rad/s) and amplitude, which do not depend on the scaled parameter ``p``."""
+        states = self.states_at(self._bounds[0])
+        return states.parameter.fixed, self.parameter.fixed
+
+    def shift_near(self, xi: np.ndarray) -> np.ndarray:
+        """The stiffnesses by which the compliance is shifted for states near the unknowns ``xi``."""
+        states, inner = self._at(xi)
+        return states.shift_near(inner)
+
+    def residual(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """The residual (n,) of the harmonics, which vanishes at a steady state, over the clearance."""
+        residual = self._residual(xi, xi[-1], shift)
+        beyond = xi[-1] - self._within(xi[-1])
+        if beyond:
+            residual = residual + beyond * self._slope(xi, shift)
+        return residual
+
+    def jacobian(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """The derivative (n, n + 1) of the ``residual``."""
+        states, inner = self._at(xi)
+        return np.column_stack([states.jacobian(inner, shift)[:, :-1], self._slope(xi, shift)])
+
+    def _within(self, p: float) -> float:
+        """The scaled parameter within the range that is nearest to ``p``."""
+        low, high = (bound / self.parameter.scale for bound in self._bounds)
+        return min(max(p, low), high)
+
+    def _residual(self, xi: np.ndarray, p: float, shift: np.ndarray) -> np.ndarray:
+        """The residual of the motion ``xi`` in the lattice at the parameter ``p``, or the end that is nearest."""
+        states, inner = self._at(np.append(xi[:-1], p))
+        return states.residual(inner, shift) * (states.clearance / self.clearance)
+
+    def _slope(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """The derivative (n,) of the residual by the scaled parameter, from a difference within the range."""
+        after = self._within(self._within(xi[-1]) + SLOPE)
+        before = self._within(self._within(xi[-1]) - SLOPE)
+        difference = self._residual(xi, after, shift) - self._residual(xi, before, shift)
+        return np.asarray(difference / (after - before))
+
+    def _at(self, xi: np.ndarray) -> tuple[SteadyStates, np.ndarray]:
+        """The equations at the value of the unknowns ``xi``, and these unknowns in their units."""
+        # At the ends of the range the value is the bound itself, whose lattice is valid.
+        value = min(max(xi[-1] * self.parameter.scale, self._bounds[0]), self._bounds[1])
+        states = self.states_at(float(value))
+        motion = xi[:-1] * (self.clearance / states.clearance)
+        return states, np.append(motion, self.parameter.fixed / states.parameter.scale)
+
+    def from_state(self, value: float, inner: np.ndarray) -> np.ndarray:
+        """The unknowns of the state ``inner`` of the lattice whose key has a ``value``."""
+        motion = inner[:-1] * (self.states_at(value).clearance / self.clearance)
+        return np.append(motion, value / self.parameter.scale)
+
+    def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
+        """The measures of a state for its file, with the value of the key among its outputs."""
+        states, inner = self._at(xi)
+        measures = states.measured(inner, perturbations)
+        value = self._within(xi[-1]) * self.parameter.scale
+        return measures._replace(outputs={"parameter": np.array(value), **measures.outputs})
+
+    def stability(self, xi: np.ndarray) -> Stability:
+        """The stability of a state."""
+        states, inner = self._at(xi)
+        return states.stability(inner)
+
+    def determinant(self, xi: np.ndarray, exponent: complex) -> float:
+        """Hill's determinant of a state at lambda/Om = ``exponent``, where it is real."""
+        states, inner = self._at(xi)
+        return states.determinant(inner, exponent)
+
+    def growing_pairs(self, xi: np.ndarray) -> list[complex]:
+        """lambda/Om of the complex pairs of perturbations of a state that grow, the slowest first."""
+        states, inner = self._at(xi)
+        return states.growing_pairs(inner)
+
+    def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
+        """lambda/Om of the pair of perturbations of a state near a ``guess``; raises ArithmeticError without one."""
+        states, inner = self._at(xi)
+        return states.pair_near(inner, guess)
+
+    def least_growth(self, xi: np.ndarray) -> float:
+        """Re lambda/Om up to which perturbations of a state count as stable."""
+        states, inner = self._at(xi)
+        return states.least_growth(inner)
+
+    def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
+        """Folds, and where the number of growing perturbations changes otherwise, within the range."""
+        for kind in super().special_kinds(left, right):
+            yield replace(kind, accept=self._is_within)
+        for kind in StabilityChanges(self, left, right).kinds():
+            yield replace(kind, accept=self._is_within)
+
+    def _is_within(self, point: Response) -> bool:
+        """Whether a state lies within the range, where the equations are those of a lattice."""
+        return bool(self._within(point.xi[-1]) == point.xi[-1])
