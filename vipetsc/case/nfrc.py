@@ -236,8 +236,8 @@ class NfrcCase(Case):
         if problems:
             raise CaseError(problems)
         case = NfrcCase.from_table(member | {"name": self.name})
-        kept = {name: getattr(self.nfrc, name) for name in ("infinite", "symmetric", "band")}
-        update = kept | {"range": [amplitude, 2 * amplitude], "fixed": [self.frequency]}
+        of_curve = {name: getattr(self.nfrc, name) for name in ("infinite", "symmetric", "band")}
+        update = of_curve | {"range": [amplitude, 2 * amplitude], "fixed": [self.frequency]}
         return case.model_copy(update={"nfrc": case.nfrc.model_copy(update=update)})
 
     def physics(self) -> "NfrcCase":
