@@ -95,10 +95,18 @@ def run_together(files: list[str]) -> list[str]:
     return [f'python -c "{runner}" {" ".join(files)}'] if files else []
 
 
-@pytest.fixture(scope="module")
-def desk(tmp_path_factory) -> Path:
+# Few of its commands are for two ranks, and none has to be fast: it need not have the machine to itself.
+@pytest.mark.slow
+def test_the_guide_does_what_it_says(tmp_path):
+    """The session ends well in a fresh clone, and leaves the results, numbers and the picture that the guide shows."""
+    type_session(tmp_path)
+    assert_results_are_there(tmp_path)
+    assert_numbers_are_those_of_the_guide(tmp_path)
+    assert_the_picture_is_that_of_the_readme(tmp_path)
+
+
+def type_session(folder: Path) -> None:
     """Type the whole session in a fresh clone, without a variable of MPI set, where it ends well."""
-    folder = tmp_path_factory.mktemp("guide")
     shutil.copytree(ROOT / "scripts", folder / "scripts")
     shutil.copytree(ROOT / "runs" / "examples", folder / "runs" / "examples")
 
@@ -110,11 +118,9 @@ def desk(tmp_path_factory) -> Path:
     )
 
     assert ended.returncode == 0, ended.stdout[-2000:] + ended.stderr[-4000:]
-    return folder
 
 
-@pytest.mark.mpirun
-def test_the_guide_leaves_runs_a_sweep_a_branch_and_pictures(desk):
+def assert_results_are_there(desk: Path) -> None:
     """The session leaves the results that the guide speaks of, none of them empty."""
     for name in (
         "four-band/figures/dispersion.png",
@@ -128,8 +134,7 @@ def test_the_guide_leaves_runs_a_sweep_a_branch_and_pictures(desk):
         assert (desk / "runs" / name).stat().st_size > 1000, name
 
 
-@pytest.mark.mpirun
-def test_what_the_guide_says_of_its_lattice_is_so(desk):
+def assert_numbers_are_those_of_the_guide(desk: Path) -> None:
     """The numbers that the guide gives of its lattice, its run and its sweep are those of the files."""
     case = Case.load(desk / "my-lattice.toml")
     assert case.warnings() == []
@@ -152,8 +157,7 @@ def test_what_the_guide_says_of_its_lattice_is_so(desk):
     assert (desk / "runs/my-sweep/figures/ibtet-over-drive.amplitude.png").exists()
 
 
-@pytest.mark.mpirun
-def test_the_picture_of_the_readme_is_the_one_that_the_program_draws(desk):
+def assert_the_picture_is_that_of_the_readme(desk: Path) -> None:
     """The dispersion of the built-in run that the session drew is that of the README, but for versions of fonts."""
 
     def seen(path: Path) -> np.ndarray:

@@ -137,7 +137,7 @@ SEARCH = {"budget": 2, "variables": {"profile": [1e-5, 1e-3]}, "objective": [{"m
 RECORD = {
     "file": str(files("vipetsc") / "examples" / "identify.csv"),
     "time": 1,
-    "end": 0.03,
+    "end": 0.02,
     "sensors": [{"quantity": "velocity", "column": 2, "cell": 4}],
 }
 AMPLITUDE = {"quantity": "amplitude", "bounds": [0.1, 100.0]}

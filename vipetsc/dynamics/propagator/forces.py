@@ -112,10 +112,11 @@ def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, 
     state.begin = begin
     state.position = 0.0
     cluster.moments[:] = 0.0
-    # One landing that leads nowhere may be an accident; from the second one in a step on, its site rests.
-    may_rest = False
+    # One landing that leads nowhere may be an accident; from the second one in a step on, its site rests. Numba would
+    # compile the call twice for a variable that begins as False, once for the constant.
+    landings_nowhere = 0
     for _ in range(MOST_CHANGES):
-        outcome, site = advance_cluster(cluster, may_rest)
+        outcome, site = advance_cluster(cluster, landings_nowhere > 0)
         if outcome not in (CHANGED, RESTS):
             return outcome == DONE, tracks
         tracks = with_room(tracks)
@@ -124,7 +125,7 @@ def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, 
         now = begin + state.position * cluster.interval
         if outcome == CHANGED:
             _switch(cluster, own_tracks, now)
-            may_rest |= site >= 0
+            landings_nowhere += site >= 0
         else:
             _update_open_episodes(cluster, own_tracks)
             rest_site(cluster.contacts, own_tracks, site, cluster.site_motion, cluster.energy, now)

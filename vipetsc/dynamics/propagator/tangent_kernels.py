@@ -140,7 +140,9 @@ def linearise(
         stop = begin
         while stop < rows.size and rows[stop].position == row.position:
             stop += 1
-        active = rows[begin:stop]["site"].copy()
+        active = room.active[: stop - begin]
+        for a in range(active.size):
+            active[a] = rows[begin + a].site
         substep = Substep(row.kind, row.length)
         trial = Trial(
             active=active,
