@@ -9,7 +9,6 @@ import pytest
 
 from vipetsc.case import VERB_CASES, Case, CaseError, CaseFile, DesignCase, NnmCase
 from vipetsc.case.features import FEATURES
-from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.verb_cases import OF_SECTION, SECTIONS
 
 CELL = {
@@ -82,16 +81,11 @@ def refused_keys(kind: type[CaseFile], changes: dict[str, dict[str, Any]]) -> se
     return set()
 
 
-# Refused by a check of the verb's own, which looks at each side of each stop.
-CHECKED_ALONE = {(NfrcCase, "touching stops")}
-
-
 @pytest.mark.parametrize("feature", sorted(FEATURES))
 @pytest.mark.parametrize("kind", DRIVEN, ids=lambda kind: kind.verb)
 def test_a_feature_is_refused_by_verbs_that_give_a_reason(kind, feature):
     changes, key = CHANGES[feature]
-    is_refused = feature in kind.refuses or (kind, feature) in CHECKED_ALONE
-    assert (key in refused_keys(kind, changes)) == is_refused
+    assert (key in refused_keys(kind, changes)) == (feature in kind.refuses)
 
 
 @pytest.mark.parametrize("feature", ["damping", "absorbing ends", "unlike sites", "disorder", "rings"])

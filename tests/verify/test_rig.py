@@ -79,7 +79,6 @@ def test_what_follows_from_the_lattice_is_filled_in():
         ("nfrc", {"infinite": True}, "nfrc.infinite", "absorbing ends"),
         ("nfrc", {"symmetric": True}, "nfrc.symmetric", "even harmonics"),
         ("lattice", {"cells": 4000}, "lattice.cells", "at most 1000"),
-        ("contacts", {"clearance": 0.0}, "contacts.clearance", "touched at every amplitude"),
     ],
 )
 def test_what_has_no_response_is_refused_with_its_reason(section, values, key, reason):

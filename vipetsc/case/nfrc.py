@@ -308,10 +308,7 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     smallest = min(min(gap) for gap in stops)
     if smallest < 0 and any(restitution < 1 for restitution in nfrc.restitutions):
         yield Problem("nfrc.restitutions", nfrc.restitutions, NO_APPROACH)
-    if any(0 in gap for gap in stops):
-        remedy = "curves begin with a state without contact, and such a stop is touched at every amplitude"
-        yield Problem("contacts.clearance", 0.0, f"{remedy}; give a clearance or a precompression")
-    if nfrc.source == "wave" and smallest < 0:
+    if nfrc.source == "wave" and smallest <= 0:
         remedy = "a wave's amplitude counts in clearances, and a contact has none; a force can be given"
         yield Problem("nfrc.source", "wave", remedy)
     if not needs_modes(chain):

@@ -168,6 +168,11 @@ class ForceSeries:
         """Add how the force of an arc depends on the approach velocity at its onset."""
         self._onsets.append(onset)
 
+    def add_dashpot(self, pair: int, rate: float, z: np.ndarray) -> None:
+        """Add a force of ``rate`` z' in N of a pair whose elongation has the harmonics ``z`` (K + 1,)."""
+        self.forces[pair, : len(z)] += 1j * rate * np.arange(len(z)) * z
+        self._rates[pair, 0] += rate
+
     def jacobian(self, exponent: complex = 0.0, orders: np.ndarray | None = None) -> np.ndarray:
         """How f exp(-mu theta) depends on d_k (pairs, orders, orders), if z changes by sum_k d_k exp((i k + mu) theta).
 
@@ -198,12 +203,15 @@ class ForceSeries:
 class Stops(NamedTuple):
     """The ``law`` of a contact, and where its stops are: clearances in m on the sides ``plus`` and ``minus``.
 
-    inf: there is no stop; negative: it is pressed at rest, where a static load balances its force.
+    inf: there is no stop; negative: it is pressed at rest, where a static load balances its force. On the way to a
+    state with stops that touch at rest the force has a factor ``weight``, and a dashpot of ``drag`` in N s/m beside it.
     """
 
     law: Contact
     plus: float
     minus: float
+    weight: float = 1.0
+    drag: float = 0.0
 
     @classmethod
     def both(cls, law: Contact, clearance: float) -> "Stops":
@@ -218,7 +226,8 @@ class Stops(NamedTuple):
     @property
     def load(self) -> float:
         """Force in N, on the side + positive, that a static load balances."""
-        return float(self.law.elastic_force(max(-self.plus, 0.0)) - self.law.elastic_force(max(-self.minus, 0.0)))
+        plus, minus = (float(self.law.elastic_force(max(-gap, 0.0))) for gap in (self.plus, self.minus))
+        return self.weight * (plus - minus)
 
 
 class SiteForces:
@@ -263,6 +272,8 @@ class SiteForces:
                     arc = Episode(pair, side, begin, end - begin, approach=0.0)
                     self._add_arc(series, arc, motion[pair], z, omega)
             series.forces[pair, 0] -= stops.load
+            if stops.drag:
+                series.add_dashpot(pair, stops.drag * omega, z[pair])
 
         # Uniform samples are exact for springs: f exp(-i k theta) has orders up to 3K + 2K, the energy up to 4K.
         samples = motion.shape[1]
@@ -320,14 +331,14 @@ class SiteForces:
         x = np.maximum(side * at_nodes[:, 0] - clearance, 0.0)
         rate = at_nodes[:, 1]
 
-        elastic = law.elastic_force(x)
-        slope = law.elastic_slope(x)
+        elastic = stops.weight * law.elastic_force(x)
+        slope = stops.weight * law.elastic_slope(x)
         g = np.ones_like(rate)
         per_rate = np.zeros_like(rate)
         if c:
             g = 1 + c * rate / approach
             per_rate = side * elastic * c / approach
-        values = np.array([side * elastic * g, slope * g, per_rate, law.elastic_energy(x)])
+        values = np.array([side * elastic * g, slope * g, per_rate, stops.weight * law.elastic_energy(x)])
         series.add(pair, theta, weights, values, rate)
 
         if c and not floored:

@@ -13,14 +13,14 @@ other reflected (R); what leaves at k Om, k > 1, is U; contacts lose L. T + R + 
 as the loss is that of the harmonics kept. A force gives what it gives: fractions are over that, T to higher cells.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
+from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces, Stops
 from vipetsc.modes.balance.hill import Hill, Perturbations, Stability
 from vipetsc.modes.problem import FlowError, SpecialKind
 from vipetsc.modes.response.condensation import compliance_of, driven_points, stops_of
@@ -40,7 +40,7 @@ KEPT_MOTIONS = 9
 class SteadyStates(SteadyEquations):
     """Steady states of the sites of a case with a ``restitution`` and the other parameter ``fixed`` (``NfrcTable``).
 
-    ``compliance`` is that of the case, if it has been computed already.
+    ``compliance`` is that of the case, if it has been computed already; ``stops`` take the place of the case's.
     """
 
     def __init__(
@@ -49,13 +49,14 @@ class SteadyStates(SteadyEquations):
         restitution: float,
         fixed: float,
         compliance: WaveCompliance | ModalCompliance | None = None,
+        stops: Sequence[Stops] | None = None,
     ) -> None:
         options = case.nfrc
         self.case = case
         self.options = options
         self.restitution = restitution
         self.wave = options.source == "wave"
-        self.forces = SiteForces(stops_of(case, restitution))
+        self.forces = SiteForces(stops_of(case, restitution) if stops is None else stops)
         self.points, self.weights = driven_points(case)
         self.compliance = compliance_of(case) if compliance is None else compliance
 

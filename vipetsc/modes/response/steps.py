@@ -85,7 +85,9 @@ def first_state(states: SteadyStates | StatesOverKey, is_ramp: bool = False) -> 
     omega, amplitude = states.drive(low)
     linear = states.linear_motion(omega).harmonics
     guess = states.balance.pack(amplitude * linear) / states.clearance
-    if _touches(states, amplitude * linear[:, 1]) and not is_ramp:
+    if any(0 in (stops.plus, stops.minus) for stops in states.forces.contacts):
+        guess = _closed(states, omega, amplitude)
+    elif _touches(states, amplitude * linear[:, 1]) and not is_ramp:
         guess = _ramp(states, omega, amplitude)
 
     return _begun(states, np.append(guess, low))
@@ -105,6 +107,35 @@ def _touches(states: SteadyStates, linear: np.ndarray) -> bool:
         if not motion < abs(stops.clearance):
             return True
     return False
+
+
+def _closed(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
+    """Scaled harmonics of a state at ``omega`` of a lattice in which stops touch at rest.
+
+    Such a stop is touched at every amplitude. The forces of all contacts are therefore multiplied by a weight s^4, a
+    dashpot of 1 - s times the impedance of the lattice lies beside each, and the state is followed from s = 0, where it
+    is the linear one, to s = 1. The curve cannot come back to s = 0, where there is no other state, and the dashpots
+    keep it from resonances. The power gives stiff contacts, which act at small weights already, a long way.
+    """
+    impedance = 1 / (omega * np.abs(np.diag(states.compliance.at(np.array([omega]))[0])))
+    update = {"over": "amplitude", "range": [amplitude, 2 * amplitude], "fixed": [omega]}
+    case = states.case.model_copy(update={"nfrc": states.options.model_copy(update=update)})
+
+    def weighted(s: float) -> SteadyStates:
+        stops = [
+            one._replace(weight=s**4, drag=(1 - s) * drag)
+            for one, drag in zip(states.forces.contacts, impedance.tolist(), strict=True)
+        ]
+        return SteadyStates(case, states.restitution, omega, states.compliance, stops)
+
+    options = case.nfrc.model_copy(update={"range": [0.0, 1.0]})
+    weights = StatesOverKey(weighted, "weight of contacts", amplitude, options)
+    linear = amplitude * states.linear_motion(omega).harmonics
+    start = _begun(weights, np.append(states.balance.pack(linear) / weights.clearance, 0.0))
+    points = list(Continuation(weights, start, TurningSteps(weights, MOST_RAMP)))
+    if not points or points[-1].xi[-1] * weights.parameter.scale != 1.0:
+        raise ContinuationError(f"no state with stops that touch at rest is found at amplitude {amplitude:g}")
+    return points[-1].xi[:-1] * (weights.clearance / states.clearance)
 
 
 def _ramp(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:

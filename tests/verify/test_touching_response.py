@@ -1,0 +1,106 @@
+"""Steady states of rigs whose stop touches at rest: a bilinear oscillator, exactly and by SciPy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.rigs import TWO_MASSES, after_a_period, followed, multipliers
+from tests.steady_states import motion_at
+from tests.verify.test_one_mass import ONE_MASS
+from vipetsc.case import CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import first_state
+
+pytestmark = pytest.mark.parallel(1)
+
+
+def touching(table: dict[str, Any] = ONE_MASS, contacts: dict[str, Any] | None = None, **nfrc: Any) -> NfrcCase:
+    """A rig with a stop that touches at rest."""
+    options = {
+        "source": "force",
+        "over": "frequency",
+        "range": [1.9, 2.0],
+        "fixed": [0.2],
+        "harmonics": 15,
+        "largest_step": 0.3,
+    } | nfrc
+    stops = table["contacts"] | {"clearance": 0.0} | (contacts or {})
+    return NfrcCase.from_table(table | {"contacts": stops, "nfrc": options})
+
+
+def error_of_a_period(states: SteadyStates, point: Any) -> tuple[float, int]:
+    """By how much a state misses itself after a period of time integration, relatively; multipliers beyond 1."""
+    state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(states.case.lattice.cells))])
+    end = after_a_period(states, point, state)
+    grows = np.abs(multipliers(states, point, state, end)) > 1.001
+    return float(np.abs(end - state).max() / np.abs(state).max()), np.count_nonzero(grows)
+
+
+def test_its_resonance_is_that_of_a_bilinear_oscillator(tmp_path):
+    """Half a period at sqrt(1.5) rad/s and half a period at sqrt(21.5) rad/s, whatever the amplitude."""
+    states, points = followed(touching(), tmp_path / "one")
+    soft, stiff = np.sqrt([1.5, 21.5])
+    resonance = 2 * soft * stiff / (soft + stiff)
+    highest = max(points, key=lambda point: point.measured.largest[0])
+    # The peak of a response with a dashpot of 0.06 1/s is a little lower.
+    assert highest.measured.frequency == pytest.approx(resonance, rel=3e-3)
+    assert highest.measured.episodes == 1
+    assert highest.measured.closed[0] == pytest.approx(soft / (soft + stiff), rel=0.02)
+    for point in points[:: len(points) // 2]:
+        error, growing = error_of_a_period(states, point)
+        assert error < 1e-3
+        assert point.measured.unstable == growing
+
+
+def test_it_is_proportional_to_the_drive(tmp_path):
+    _, points = followed(touching(over="amplitude", range=[0.1, 5.0], fixed=[1.5], largest_step=1.0), tmp_path / "two")
+    first, last = (point.measured for point in (points[0], points[-1]))
+    np.testing.assert_allclose(last.harmonics, 50 * first.harmonics, atol=1e-8)
+    assert first.unstable == last.unstable
+
+
+def test_hertzian_stops_that_touch_beside_one_that_does_not():
+    """The stop of the first mass touches at rest, the second one is met; the state comes back after a period."""
+    each = {"side": ["plus", "minus"], "law": ["hertz", "bilinear"], "stiffness": [9.0, 4.0]}
+    stops = {"sites": [1, 2], "pair": [0, 1], "each": each, "clearance": [0.0, 0.3], "restitution": 1.0}
+    table = TWO_MASSES | {"contacts": stops}
+    options = {"source": "force", "over": "amplitude", "range": [0.2, 0.3], "fixed": [1.4], "harmonics": 31}
+    case = NfrcCase.from_table(table | {"nfrc": options})
+    states = SteadyStates(case, 1.0, 1.4)
+    point = first_state(states)
+    assert {episode.pair for episode in states.balance.series(point.xi[:-1] * states.clearance, 1.4).episodes} == {0, 1}
+    error, _ = error_of_a_period(states, point)
+    assert error < 1e-3
+
+
+def test_a_wave_is_refused():
+    contacts = {"sites": [10], "clearance": 0.0, "side": "plus", "restitution": 1.0}
+    with pytest.raises(CaseError, match="counts in clearances") as caught:
+        NfrcCase.from_table({"lattice": {"preset": "four-band", "cells": 30}, "contacts": contacts, "nfrc": {}})
+    assert [problem.key for problem in caught.value.problems] == ["nfrc.source"]
+
+
+def test_a_lattice_without_damping_has_a_state_between_its_resonances():
+    """The dashpots on the way keep the state from the resonance that a growing force passes; none of them is left."""
+    cell = {
+        "masses": [0.004, 0.002],
+        "springs": [
+            {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True},
+            {"start": 1, "end": 2, "stiffness": 5e3},
+        ],
+    }
+    stops = {"law": "hertz", "stiffness": 1e7, "sites": [12, 14], "clearance": 0.0, "side": "plus", "restitution": 1.0}
+    drive = {"amplitude": 3.0, "frequency": 1000.0, "cycles": 3, "cell": 4}
+    options = {"source": "force", "infinite": False, "range": [0.44, 1.0], "harmonics": 5}
+    case = NfrcCase.from_table(
+        {"lattice": {"cells": 24, "cell": cell}, "contacts": stops, "drive": drive, "nfrc": options}
+    )
+    states = SteadyStates(case, 1.0, 1000.0)
+    point = first_state(states)
+    assert np.abs(states.residual(point.xi, states.shift_near(point.xi))).max() < 1e-10
+    # Nothing takes up energy: all phases are those of the drive or opposite to it.
+    assert np.abs(states.measured(point.xi).harmonics.imag).max() < 1e-9 * states.clearance
