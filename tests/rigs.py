@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 from mpi4py import MPI
@@ -41,7 +42,10 @@ OUTPUT: dict[str, Any] = {
 
 
 def rate_of(states: SteadyStates, omega: float, amplitude: float):
-    """The equations of motion of a lattice with elastic contacts, from its matrices: y' = f(t, y), y = (u, u')."""
+    """The equations of motion of a lattice with elastic contacts, from its matrices: y' = f(t, y), y = (u, u').
+
+    Springs that are not linear are looked for cell by cell, between walls or on a line of cells with free ends.
+    """
     chain = states.case.model().chain
     stiffness = chain.stiffness_matrix().tocsr()
     damping = chain.damping_rows(0, chain.cells)
@@ -57,6 +61,16 @@ def rate_of(states: SteadyStates, omega: float, amplitude: float):
         host = site * d + pair.host if pair.host >= 0 else None
         joins.append((host, (site + pair.next_cell) % chain.cells * d + pair.resonator, stops))
 
+    beyond = []
+    for cell, spring in itertools.product(range(-1, chain.cells), chain.cell.springs):
+        other = cell + spring.next_cell
+        is_inside = cell >= 0 and other < chain.cells
+        if spring.is_linear or not (is_inside or (spring.next_cell and chain.ends == "fixed")):
+            continue
+        start = cell * d + spring.start if cell >= 0 else None
+        end = other * d + spring.end if other < chain.cells else None
+        beyond.append((start, end, spring))
+
     def rate(t: float, y: np.ndarray) -> np.ndarray:
         u, v = y[:n], y[n:]
         force = drive * np.cos(omega * t) - stiffness @ u - damping @ v
@@ -66,6 +80,13 @@ def rate_of(states: SteadyStates, omega: float, amplitude: float):
             force[resonator] -= push
             if host is not None:
                 force[host] += push
+        for start, end, spring in beyond:
+            z = (0.0 if end is None else u[end]) - (0.0 if start is None else u[start])
+            pull = spring.quadratic * z**2 + spring.cubic * z**3
+            if end is not None:
+                force[end] -= pull
+            if start is not None:
+                force[start] += pull
         return np.concatenate([v, force / masses])
 
     return rate

@@ -1,139 +1,234 @@
-"""Springs with quadratic and cubic parts: against another integrator, closed forms, the engine that refuses them."""
+"""Frequency responses of lattices whose springs are not linear: Duffing's oscillator, chains, and a stop beside."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from scipy.integrate import quad, solve_ivp
-from scipy.interpolate import CubicHermiteSpline
-from scipy.optimize import brentq
 
-from tests.conftest import run_of, simulated
-from vipetsc.case import Case, CaseError, LawCase
-from vipetsc.lattice import Chain
+from tests.rigs import OUTPUT, TWO_MASSES, after_a_period, followed, multipliers
+from tests.steady_states import motion_at
+from vipetsc.case import CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.figures.registry import draw
+from vipetsc.lattice import Chain, ModalCompliance, Spring, UnitCell, nonlinear_places
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import first_state
 
-CELL = {
-    "masses": [0.01, 0.02],
-    "springs": [
-        {"start": 1, "end": 1, "stiffness": 4e3, "next_cell": True, "cubic": 3e9, "quadratic": -2e6},
-        {"start": 1, "end": 2, "stiffness": 2e3, "cubic": 4e8, "quadratic": 5e5},
-    ],
-    "contact": [1, 2],
+pytestmark = pytest.mark.parallel(1)
+
+# u'' + 0.1 u' + u + u^3 = 0.1 cos(Om t): half of each spring on either side of the mass.
+HARDENING = {"start": 1, "end": 1, "stiffness": 0.5, "cubic": 0.5, "next_cell": True}
+DUFFING: dict[str, Any] = {
+    "name": "duffing",
+    "lattice": {
+        "cells": 1,
+        "cell": {"masses": [1.0], "springs": [HARDENING], "contact": [1, 1]},
+        "damping": {"mass": 0.1},
+    },
+    "contacts": {"sites": []},
+    "drive": {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "cell": 1, "mass": 1},
+    "time": {"end": 10.0},
+    "nfrc": {"source": "force", "over": "frequency", "range": [0.7, 1.7], "fixed": [0.1], "harmonics": 9},
 }
+STOP = {"law": "bilinear", "stiffness": 5.0, "restitution": 1.0, "sites": [1], "clearance": 0.3, "side": "plus"}
+STOP["pair"] = [0, 1]
 
 
-def case_of(cells: int, ends: str = "fixed", springs: Any = None, **sections: Any) -> Case:
-    """A chain of ``cells`` without contacts, from rest under a burst unless ``sections`` say otherwise."""
-    cell = CELL | ({"springs": springs} if springs else {})
-    table = {
-        "lattice": {"cell": cell, "cells": cells, "ends": ends},
-        "contacts": {"sites": []},
-        "drive": {"amplitude": 2.0, "cycles": 3, "frequency": 500.0},
-        "time": {"end": 0.06, "engine": "auto", "sample_interval": 2e-4, "rtol": 1e-12},
-    }
-    return Case.from_table(table | sections)
+def chain_of(count: int, spring: dict[str, Any], **nfrc: Any) -> dict[str, Any]:
+    """A chain of masses between walls with dashpots, driven at its first mass."""
+    springs = [{"start": 1, "end": 1, "stiffness": 1.0, "next_cell": True} | spring]
+    lattice = {"cells": count, "cell": {"masses": [1.0], "springs": springs, "contact": [1, 1]}}
+    options = DUFFING["nfrc"] | nfrc
+    return DUFFING | {"lattice": lattice | {"damping": {"mass": 0.1}}, "nfrc": options}
 
 
-def spring_ends(chain: Chain, ends: str):
-    """Each spring with the two DoFs that it joins, where None is a wall."""
-    n = chain.cells * chain.cell.dofs
-    for spring in chain.cell.springs:
-        for cell in range(-1, chain.cells):
-            start = chain.cell.dofs * cell + spring.start
-            end = chain.cell.dofs * (cell + spring.next_cell) + spring.end
-            if not spring.next_cell:
-                if cell >= 0:
-                    yield spring, start, end
-            elif ends == "periodic":
-                if cell >= 0:
-                    yield spring, start, end % n
-            elif start >= 0 and end < n:
-                yield spring, start, end
-            elif ends == "fixed":
-                # The first and the last spring between cells hold to a wall.
-                yield spring, start if start >= 0 else None, end if end < n else None
+def misses(states: SteadyStates, point: Response) -> tuple[float, int]:
+    """By how much a state misses itself after a period of SciPy's integration, relatively; multipliers beyond 1."""
+    state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(states.case.lattice.cells))])
+    end = after_a_period(states, point, state)
+    grows = np.abs(multipliers(states, point, state, end)) > 1.001
+    return float(np.abs(end - state).max() / np.abs(state).max()), np.count_nonzero(grows)
 
 
-@pytest.mark.slow
+@pytest.fixture(scope="module")
+def duffing(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("smooth") / "duffing"
+    return folder, *followed(NfrcCase.from_table(DUFFING), folder)
+
+
+def test_its_first_harmonic_is_that_of_duffings_oscillator(duffing):
+    """With one harmonic, a^2 ((1 - Om^2 + 3 a^2/4)^2 + (0.1 Om)^2) = F^2 exactly: the textbook's response."""
+    _, states, points = duffing
+    case = states.case.model_copy(update={"nfrc": states.options.model_copy(update={"harmonics": 1})})
+    one = SteadyStates(case, 1.0, 0.1)
+    for point in points[::8]:
+        guess = point.measured.outputs["spring_harmonics"] + 1j * point.measured.outputs["spring_harmonics_imaginary"]
+        p = states.drive(point.xi[-1])[0] / one.parameter.scale
+        xi = one.at(np.append(one.balance.pack(guess[:, :2]) / one.clearance, p), p)
+        omega = one.drive(xi[-1])[0]
+        a = np.abs(one.balance.unpack(xi[:-1] * one.clearance)[0, 1])
+        left = a**2 * ((1 - omega**2 + 0.75 * a**2) ** 2 + (0.1 * omega) ** 2)
+        assert left == pytest.approx(0.01, rel=1e-9)
+
+
+def test_its_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are(duffing):
+    _, states, points = duffing
+    assert [point.kind for point in points].count("fold") == 2
+    unstable = set()
+    regular = [point for point in points if point.kind == "regular"]
+    for number in np.linspace(0, len(regular) - 1, 8).astype(int):
+        error, growing = misses(states, regular[number])
+        assert error < 1e-6
+        assert regular[number].measured.unstable == growing
+        unstable.add(growing)
+    assert unstable == {0, 1}
+
+
+def test_its_folds_are_those_of_the_response_with_one_harmonic(duffing):
+    """The response turns at its peak, and where the frequency right of the backbone is least; to 1 %."""
+    _, states, points = duffing
+    a = np.linspace(1e-3, 1.5, 20001)
+    # Of a there are two frequencies, left and right of the backbone, up to the peak where they meet.
+    with np.errstate(invalid="ignore"):
+        middle = 1 + 0.75 * a**2 - 0.005
+        width = np.sqrt(middle**2 - (1 + 0.75 * a**2) ** 2 + (0.1 / a) ** 2)
+        left = np.sqrt(middle - width)
+        right = np.sqrt(middle + width)
+    found = sorted(states.drive(point.xi[-1])[0] for point in points if point.kind == "fold")
+    np.testing.assert_allclose(found, [np.nanmin(right), np.nanmax(left)], rtol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("count", "spring", "omega", "amplitude"),
+    [(2, {"cubic": 2.0}, 0.8, 0.3), (3, {"cubic": 1.0, "quadratic": 0.4}, 0.9, 0.2), (2, {"cubic": -0.2}, 0.8, 0.1)],
+)
+def test_chains_come_back_after_a_period(count, spring, omega, amplitude):
+    """Also where springs soften, and where their force is not odd, which makes a mean and even harmonics."""
+    options = {"over": "amplitude", "range": [amplitude, 2 * amplitude], "fixed": [omega], "harmonics": 15}
+    case = NfrcCase.from_table(chain_of(count, spring, **options))
+    assert case.nfrc.symmetric is ("quadratic" not in spring)
+    states = SteadyStates(case, 1.0, omega)
+    point = first_state(states)
+    error, growing = misses(states, point)
+    assert error < 1e-6
+    assert states.measured(point.xi).unstable == growing
+
+
+def test_a_stop_beside_a_nonlinear_spring():
+    options = {"over": "amplitude", "range": [0.3, 0.4], "fixed": [0.8], "harmonics": 41}
+    case = NfrcCase.from_table(chain_of(2, {"cubic": 1.0}, **options) | {"contacts": STOP})
+    states = SteadyStates(case, 1.0, 0.8)
+    point = first_state(states)
+    measured = states.measured(point.xi)
+    assert measured.episodes == 1
+    assert measured.largest.shape == measured.closed.shape == (1,)
+    assert measured.outputs["largest_elongation"].shape == (3,)
+    error, _ = misses(states, point)
+    assert error < 1e-3
+
+
+def test_walls_feel_the_whole_force_of_their_springs():
+    """The force on a wall is that of its spring at each instant, cubic part included."""
+    options = {"over": "amplitude", "range": [0.3, 0.4], "fixed": [0.8], "harmonics": 21}
+    output = OUTPUT | {"transmission": None}
+    table = chain_of(2, {"cubic": 2.0, "quadratic": 0.5}, **options)
+    case = NfrcCase.from_table(table | {"output": {key: value for key, value in output.items() if value is not None}})
+    states = SteadyStates(case, 1.0, 0.8)
+    xi = first_state(states).xi
+    outputs = states.measured(xi).outputs
+    phases = np.linspace(0, 2 * np.pi, 2001)
+    u = np.array([motion_at(states, xi, np.arange(2), phase)[0].ravel() for phase in phases])
+    z = np.stack([u[:, 0], -u[:, 1]], axis=1)
+    force = z + 0.5 * z**2 + 2.0 * z**3
+    np.testing.assert_allclose(outputs["largest_wall_force"], np.abs(force).max(axis=0), rtol=1e-4)
+
+
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
-def test_against_another_integrator(ends):
-    """Displacements are those of SciPy's DOP853 with forces a z^2 + b z^3 in the springs; the engine is the stepper."""
-    case = case_of(3, ends)
-    chain = case.model().chain
-    drive = case.model().drive
-    k = chain.stiffness_matrix().toarray()
-    masses = chain.masses()
-    n = len(masses)
-    springs = list(spring_ends(chain, ends))
+def test_elongations_are_those_of_every_nonlinear_spring(ends):
+    """Their compliance is b^T (K - om^2 M)^-1 b, with a row of b for each spring that the ends leave."""
+    springs = (Spring(0, 1, 1.0, cubic=1.0), Spring(1, 0, 2.0, next_cell=True, quadratic=1.0))
+    chain = Chain(UnitCell((1.0, 0.5), springs, host=0, resonator=1), 3, ends, sites=(1,), clearances=(1.0,))
+    rows = []
+    for cell in range(3):
+        rows.append({2 * cell: -1.0, 2 * cell + 1: 1.0})
+    for cell in {"fixed": range(-1, 3), "free": range(2), "periodic": range(3)}[ends]:
+        row = {}
+        if cell >= 0:
+            row[2 * cell + 1] = -1.0
+        if cell < 2 or ends == "periodic":
+            row[2 * (cell + 1) % 6] = 1.0
+        rows.append(row)
+    b = np.zeros((6, len(rows)))
+    for column, row in enumerate(rows):
+        for mass, sign in row.items():
+            b[mass, column] = sign
 
-    def rate(t, y):
-        u = y[:n]
-        force = -k @ u
-        force[0] += float(drive.force(t))
-        for spring, start, end in springs:
-            elongation = (0.0 if end is None else u[end]) - (0.0 if start is None else u[start])
-            tension = spring.quadratic * elongation**2 + spring.cubic * elongation**3
-            if start is not None:
-                force[start] += tension
-            if end is not None:
-                force[end] -= tension
-        return np.concatenate([y[n:], force / masses])
-
-    data, result = simulated(case)
-    assert result.statistics["engine"] == "ts"
-    assert "quadratic or cubic" in result.statistics["engine_note"]
-    assert result.statistics["ledger_error"] < 1e-9
-
-    # The end of the burst is a kink, which no step may cross.
-    time = data["time"].values
-    kink = drive.duration
-    tight = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-18}
-    first = solve_ivp(rate, (0, kink), np.zeros(2 * n), t_eval=np.append(time[time < kink], kink), **tight)
-    last = solve_ivp(rate, (kink, time[-1]), first.y[:, -1], t_eval=time[time >= kink], **tight)
-    expected = np.concatenate([first.y[:n, :-1], last.y[:n]], axis=1).T
-    u = data["displacement"].values.reshape(len(time), -1)
-    assert np.abs(u - expected).max() < 1e-8 * np.abs(expected).max()
-
-    # The nonlinear parts do much in this run.
-    plain = [spring | {"cubic": 0.0, "quadratic": 0.0} for spring in CELL["springs"]]
-    linear = run_of(case_of(3, ends, plain))["displacement"].values.reshape(len(time), -1)
-    assert np.abs(u - linear).max() > 0.1 * np.abs(expected).max()
+    places = nonlinear_places(chain)
+    assert len(places) == len(rows)
+    found = ModalCompliance(chain).at(0.7)[0][1:, 1:]
+    dynamic = chain.stiffness_matrix().toarray() - 0.49 * np.diag(chain.masses())
+    expected = b.T @ np.linalg.solve(dynamic, b)
+    # The springs are found cell by cell, those in the cell and those to the next one in turn.
+    order = [row if place.number == 0 else 3 + row for place in places for row in [_rank(places, place)]]
+    np.testing.assert_allclose(found, expected[np.ix_(order, order)], atol=1e-10)
 
 
-def test_the_frequency_depends_on_the_amplitude_as_the_closed_form():
-    """Two equal cells of a ring in opposite motion are one oscillator, whose period is an elliptic integral."""
-    springs = [CELL["springs"][0] | {"quadratic": 0.0}, {"start": 1, "end": 2, "stiffness": 1e-7}]
-    case = case_of(
-        2,
-        "periodic",
-        springs,
-        initial={"kind": "mode", "number": 4, "amplitude": 1e-3},
-        drive={"amplitude": 0.0},
-        time={"end": 0.02, "sample_interval": 1e-5, "rtol": 1e-12},
-    )
-    data = run_of(case)
-    time = data["time"].values
-    u = data["displacement"].values[:, 0, 0]
-    v = data["velocity"].values[:, 0, 0]
-
-    # m u'' = -2 k_s (2 u) - 2 c_s (2 u)^3; with u = a sin(x) the period is a smooth integral.
-    a = abs(u[0])
-    k = 8 * springs[0]["stiffness"] / 2
-    c = 16 * springs[0]["cubic"]
-    m = CELL["masses"][0]
-    quarter, _ = quad(lambda x: np.sqrt(m / (k + c * a**2 / 2 * (1 + np.sin(x) ** 2))), 0, np.pi / 2)
-    period = 4 * quarter
-    assert period < 0.8 * 2 * np.pi * np.sqrt(m / k)
-
-    # Zeros between samples, by the cubic that has the values and the rates of both.
-    spline = CubicHermiteSpline(time, u, v)
-    downwards = np.flatnonzero((u[:-1] * u[0] > 0) & (u[1:] * u[0] <= 0))
-    zeros = [brentq(spline, time[number], time[number + 1], xtol=1e-16) for number in downwards]
-    assert np.diff(zeros).mean() == pytest.approx(period, rel=1e-8)
+def _rank(places: list[Any], place: Any) -> int:
+    """The number of a place among those of the same spring of the cell."""
+    return [other for other in places if other.number == place.number].index(place)
 
 
-def test_a_scattering_law_refuses_springs_that_are_not_linear():
-    with pytest.raises(CaseError, match=r"lattice\.cell\.springs: waves in springs that are not linear"):
-        LawCase.from_table({"lattice": {"cell": CELL}, "law": {}, "drive": {"frequency": 500.0}})
+def test_files_and_pictures_have_the_springs(duffing, tmp_path):
+    folder, _, points = duffing
+    (path,) = folder.glob("branch-*.csv")
+    header = path.read_text().splitlines()[0].split(",")
+    assert [name for name in header if name.startswith("largest_elongation")] == [
+        "largest_elongation/0.1",
+        "largest_elongation/1.1",
+    ]
+    assert len(draw("branches", [folder])) == 1
+    np.testing.assert_allclose(*points[10].measured.outputs["largest_elongation"])
+
+
+def test_a_curve_over_a_cubic_coefficient(tmp_path):
+    """From the linear oscillator to Duffing's: the frequency stays, the coefficient grows."""
+    options = {"over": "lattice.cell.springs[1].cubic", "range": [1e-4, 0.5], "largest_step": 1.0}
+    drive = DUFFING["drive"] | {"frequency": 0.8}
+    case = NfrcCase.from_table(DUFFING | {"drive": drive, "nfrc": DUFFING["nfrc"] | options})
+    (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
+    first, last = (curve.points[i].measured.outputs["spring_harmonics"][0, 1] for i in (0, -1))
+    assert first == pytest.approx((0.1 / (1 - 0.64 + 0.08j)).real, rel=1e-3)
+    assert last < first
+
+    with pytest.raises(CaseError, match="begin beside it"):
+        from_zero = DUFFING["nfrc"] | options | {"range": [0.0, 0.5]}
+        NfrcCase.from_table(DUFFING | {"contacts": STOP, "nfrc": from_zero})
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "reason"),
+    [
+        ({"nfrc": {"source": "wave", "range": [0.5, 1.0]}}, "nfrc.source", "changes on its way"),
+        ({"nfrc": DUFFING["nfrc"] | {"harmonics": 2000}}, "nfrc.harmonics", "unknown harmonics"),
+        ({"lattice": TWO_MASSES["lattice"]}, "contacts.sites", "a spring that is not linear"),
+    ],
+)
+def test_refusals(changes, key, reason):
+    table = chain_of(2, {"cubic": 1.0})
+    if "source" in changes.get("nfrc", {}) and changes["nfrc"]["source"] == "wave":
+        table = table | {"lattice": {name: value for name, value in table["lattice"].items() if name != "damping"}}
+        table["contacts"] = {"law": "bilinear", "stiffness": 1.0, "sites": [1], "clearance": 0.1, "restitution": 1.0}
+        table["lattice"]["cell"] = table["lattice"]["cell"] | {"masses": [1.0, 1.0], "contact": [1, 2]}
+        link = {"start": 1, "end": 2, "stiffness": 1.0}
+        table["lattice"]["cell"]["springs"] = [*table["lattice"]["cell"]["springs"], link]
+        table["drive"] = {"frequency": 0.5, "amplitude": 0.1}
+    with pytest.raises(CaseError) as caught:
+        NfrcCase.from_table(table | changes)
+    assert key in [problem.key for problem in caught.value.problems]
+    assert any(reason in problem.remedy for problem in caught.value.problems)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
+import numpy as np
 import tomli_w
 from pydantic import AfterValidator, Field
 
@@ -14,14 +15,15 @@ from vipetsc.case.case_file import CaseError, Problem, Section, Table, Valid, re
 from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites
 from vipetsc.case.family import FamilyMember, family_of
 from vipetsc.case.names import distinct
-from vipetsc.case.resolve import build_chain, check_stiffness
+from vipetsc.case.resolve import build_chain, check_cell, check_stiffness
 from vipetsc.case.schema import Positive, once
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.varied_key import PARAMETERS, TRIED, is_key, key_problems, table_at
-from vipetsc.lattice import Chain, Contact, UnitCell, waves_at
+from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_places, waves_at
 from vipetsc.lattice.contact import least_restitution
 from vipetsc.lattice.modal_compliance import MOST_DOFS
 
+MOST_UNKNOWNS = 6000  # harmonics of all places: a dense matrix of 300 MB
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Restitution = Annotated[float, Field(ge=0, le=1)]
 
@@ -102,7 +104,6 @@ class NfrcCase(Case):
     verb = section = "nfrc"
     kept_by_resume: ClassVar[str] = "the case with which its curves were started, except nfrc.points"
     refuses: ClassVar[Mapping[str, str]] = {
-        "nonlinear springs": "not yet: the harmonics of steady states are balanced for linear springs",
         "initial motion": "a curve has all steady states, whatever the motion at t = 0",
         "many drives": "not yet: steady states are computed for one force or one moved wall",
         "other waveforms": "a steady state repeats itself under a sine, that of a harmonic drive or of a burst",
@@ -132,7 +133,8 @@ class NfrcCase(Case):
         if nfrc.infinite is None:
             update["infinite"] = not needs_modes(chain)
         if nfrc.symmetric is None:
-            update["symmetric"] = not gaps_of_sites(contacts, list(chain.clearances))
+            is_odd = all(spring.is_odd for spring in cell.springs)
+            update["symmetric"] = is_odd and not gaps_of_sites(contacts, list(chain.clearances))
         if nfrc.over == "amplitude":
             update["fixed"] = nfrc.fixed or [sections["drive"].frequency]
         nfrc = nfrc.model_copy(update=update)
@@ -179,6 +181,11 @@ class NfrcCase(Case):
                 return sections, [replace(p, remedy=f"{p.remedy} (with {options.over} = {value:.6g})") for p in wrong]
             read.append(sections)
 
+        laws = [check_cell(sections["lattice"])[0] for sections in read]
+        if len({tuple(spring.is_linear for spring in cell.springs) for cell in laws if cell is not None}) > 1:
+            remedy = f"a spring is linear at {options.over} = {low:g} and has no harmonics; begin beside it"
+            return read[0], [Problem("nfrc.range", options.range, remedy)]
+
         # What follows from the lattice follows from that at the lower end.
         of_case: dict[str, Any] = {name: getattr(read[0]["nfrc"], name) for name in ("band", "restitutions")}
         for name in ("infinite", "symmetric"):
@@ -212,15 +219,17 @@ class NfrcCase(Case):
         # Curves are those of the sites: without one there is nothing to follow.
         if valid("contacts"):
             contacts = sections["contacts"]
-            yield from check_stiffness(contacts, True, valid)
+            yield from check_stiffness(contacts, contacts.sites not in (0, []), valid)
             if nfrc.restitutions and contacts.each and contacts.each.restitution:
                 remedy = "each site has a restitution of its own, contacts.each.restitution; omit one of them"
                 yield Problem("nfrc.restitutions", nfrc.restitutions, remedy)
             least = least_restitution(contacts.damping or "paper")
             if small := [r for r in nfrc.restitutions if r < least]:
                 yield Problem("nfrc.restitutions", small, f"below {least:g} this damping increases without bound")
-            if sections["contacts"].sites in (0, []):
-                yield Problem("contacts.sites", sections["contacts"].sites, "give a cell with a contact")
+            cell = check_cell(sections["lattice"])[0] if valid("lattice") else None
+            if sections["contacts"].sites in (0, []) and cell is not None and cell.is_linear:
+                remedy = "give a cell with a contact, or a spring that is not linear"
+                yield Problem("contacts.sites", sections["contacts"].sites, remedy)
 
     def warnings(self) -> list[str]:
         """No warnings: those about runs in time do not concern steady states."""
@@ -295,7 +304,7 @@ class NfrcCase(Case):
 
 def needs_modes(chain: Chain) -> bool:
     """Whether the response of ``chain`` follows from its modes: Bloch waves are those of equal cells without loss."""
-    return chain.is_damped or not chain.is_uniform() or bool(chain.pairs)
+    return chain.is_damped or not chain.is_uniform() or bool(chain.pairs) or not chain.cell.is_linear
 
 
 def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> Iterator[Problem]:
@@ -304,8 +313,10 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     if nfrc.symmetric and gaps:
         remedy = "contacts that differ on their two sides make even harmonics; omit it"
         yield Problem("nfrc.symmetric", True, remedy)
+    if nfrc.symmetric and not all(spring.is_odd for spring in chain.cell.springs):
+        yield Problem("nfrc.symmetric", True, "a quadratic spring makes even harmonics; omit it")
     stops = gaps or [(clearance, clearance) for clearance in chain.clearances]
-    smallest = min(min(gap) for gap in stops)
+    smallest = min((min(gap) for gap in stops), default=np.inf)
     if smallest < 0 and any(restitution < 1 for restitution in nfrc.restitutions):
         yield Problem("nfrc.restitutions", nfrc.restitutions, NO_APPROACH)
     if nfrc.source == "wave" and smallest <= 0:
@@ -319,6 +330,8 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
         reason = "in a lattice with dashpots a wave from far away has decayed before it arrives"
     elif not chain.is_uniform():
         reason = "a wave of equal cells does not pass cells that differ as it came"
+    elif not chain.cell.is_linear:
+        reason = "a wave in springs that are not linear changes on its way"
     if nfrc.source == "wave":
         yield Problem("nfrc.source", "wave", f'{reason}; source = "force" drives a mass')
     elif nfrc.infinite:
@@ -327,6 +340,12 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     if dofs > MOST_DOFS:
         remedy = f"{dofs} masses: all modes of a lattice with dashpots, unlike cells or other contact pairs are needed"
         yield Problem("lattice.cells", chain.cells, f"{remedy}, of at most {MOST_DOFS} masses")
+    elif not chain.cell.is_linear:
+        places = len(chain.sites) + len(nonlinear_places(chain))
+        unknowns = places * 2 * (nfrc.harmonics + 1)
+        if unknowns > MOST_UNKNOWNS:
+            remedy = f"{places} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
+            yield Problem("nfrc.harmonics", nfrc.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
 
 
 def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:

@@ -96,6 +96,22 @@ def parameter_of(branch: xr.Dataset) -> np.ndarray:
     return values
 
 
+def largest_motions(branch: xr.Dataset) -> np.ndarray:
+    """Return the largest displacement (point, place) in m of each site; without sites of each nonlinear spring."""
+    name = "largest" if branch.sizes["site"] else "largest_elongation"
+    values: np.ndarray = branch[name].values
+    return values
+
+
+def lag_of(branch: xr.Dataset) -> np.ndarray:
+    """Return the phase (point,) in degrees of the fundamental of the first site, or spring, behind the drive."""
+    name = "harmonics" if branch.sizes["site"] else "spring_harmonics"
+    fundamental = branch[name].values[:, 0, 1] + 1j * branch[f"{name}_imaginary"].values[:, 0, 1]
+    lag = -np.degrees(np.unwrap(np.angle(fundamental)))
+    # The first state lags by less than a turn.
+    return np.asarray(lag - 360 * np.floor((lag[0] + 180) / 360))
+
+
 def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     """Draw the first site: stable states as a line, unstable ones dashed, slow sweeps broad; thin lines for others."""
     parameter = parameter_of(branch)
@@ -103,15 +119,19 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     # Contacts that touch at rest have no clearance to compare with.
     clearance = branch["clearance"].values
     label = "largest |w| / clearance"
-    relative = branch["largest"].values / np.where(clearance > 0, clearance, 1.0)  # (point, site)
+    largest = largest_motions(branch)
+    if not clearance.size:
+        clearance = np.zeros(largest.shape[1])
+    relative = largest / np.where(clearance > 0, clearance, 1.0)  # (point, site)
     # Along a curve over a key of the case they may not stay what they are at its beginning.
     if "parameter" in branch or not np.all(clearance > 0):
-        label = "largest |w| (mm)"
-        relative = 1e3 * branch["largest"].values
+        label = "largest |w| (mm)" if branch.sizes["site"] else "largest elongation (mm)"
+        relative = 1e3 * largest
     size = relative[:, 0]
 
+    others = "other sites" if branch.sizes["site"] else "other springs"
     for number, other in enumerate(relative.T[1:]):
-        axes.plot(parameter, other, color=style.GREY, lw=0.6, label=None if number else "other sites")
+        axes.plot(parameter, other, color=style.GREY, lw=0.6, label=None if number else others)
 
     # Sweeps lie beneath the branch, the one down narrower, so that both are seen where they coincide.
     for name, colour, width in (("up", style.GREEN, 6.0), ("down", style.PURPLE, 3.0)):
@@ -148,10 +168,7 @@ def _draw_phase(axes: Axes, branch: xr.Dataset) -> None:
     """Draw the phase of the first site's fundamental behind the drive; unstable states thin."""
     parameter = parameter_of(branch)
     stable = branch["unstable"].values == 0
-    fundamental = branch["harmonics"].values[:, 0, 1] + 1j * branch["harmonics_imaginary"].values[:, 0, 1]
-    lag = -np.degrees(np.unwrap(np.angle(fundamental)))
-    # The first state lags by less than a turn.
-    lag -= 360 * np.floor((lag[0] + 180) / 360)
+    lag = lag_of(branch)
 
     axes.plot(parameter, lag, color=style.BLACK, lw=0.6, ls="--")
     axes.plot(parameter, np.where(stable, lag, np.nan), color=style.BLACK, lw=1.3)

@@ -17,7 +17,7 @@ from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
-from vipetsc.figures.nfrc import draw_special, parameter_label, parameter_of, responses_in
+from vipetsc.figures.nfrc import draw_special, lag_of, largest_motions, parameter_label, parameter_of, responses_in
 from vipetsc.figures.swept_axes import SweptKey
 from vipetsc.io.branch_kinds import RESPONSES, branch_kind
 
@@ -50,7 +50,7 @@ def response_family(paths: Sequence[Path]) -> Figure:
     nfrc = NfrcCase.of(curves[0]).nfrc
     has_phase = nfrc.source == "force" and nfrc.over == "frequency"
     if has_phase:
-        rows.append(_lag)
+        rows.append(lag_of)
         labels.append("phase lag (degrees)")
 
     names = legend_of(curves)
@@ -117,8 +117,7 @@ def _common_locations(curves: Sequence[xr.Dataset]) -> list[str]:
 
 def _relative(curve: xr.Dataset) -> np.ndarray:
     """Return the largest relative displacement (point,) in m of the first site."""
-    values: np.ndarray = curve["largest"].values[:, 0]
-    return values
+    return largest_motions(curve)[:, 0]
 
 
 def _displacement(curve: xr.Dataset, name: str) -> np.ndarray:
@@ -126,14 +125,6 @@ def _displacement(curve: xr.Dataset, name: str) -> np.ndarray:
     number = curve["location"].values.astype(str).tolist().index(name)
     values: np.ndarray = curve["peak_displacement"].values[:, number]
     return values
-
-
-def _lag(curve: xr.Dataset) -> np.ndarray:
-    """Return the phase (point,) in degrees of the first site's fundamental behind the drive."""
-    fundamental = curve["harmonics"].values[:, 0, 1] + 1j * curve["harmonics_imaginary"].values[:, 0, 1]
-    lag = -np.degrees(np.unwrap(np.angle(fundamental)))
-    # The first state lags by less than a turn.
-    return np.asarray(lag - 360 * np.floor((lag[0] + 180) / 360))
 
 
 def _draw_curve(axes: Axes, curve: xr.Dataset, values: np.ndarray, name: str, colour: Any) -> None:

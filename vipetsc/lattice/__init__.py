@@ -8,4 +8,5 @@ from vipetsc.lattice.contact import Contact, contact_stiffness
 from vipetsc.lattice.drive import Drive, Pieces, ToneBurst, Waveform
 from vipetsc.lattice.modal_compliance import ModalCompliance
 from vipetsc.lattice.modes import Modes, linear_modes
+from vipetsc.lattice.spring_places import SpringPlace, nonlinear_places
 from vipetsc.lattice.variation import Coefficients, Variation

@@ -25,6 +25,7 @@ from scipy.sparse import diags
 from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.chain import Chain
+from vipetsc.lattice.spring_places import SpringPlace, nonlinear_places
 
 MOST_DOFS = 1000  # masses of a lattice whose modes are all computed: a minute with dashpots, and 100 MB
 RIGID = 1e-12  # squared frequencies, or losses of a mode, below this fraction of the largest are none
@@ -50,8 +51,9 @@ class Poles(NamedTuple):
 class ModalCompliance:
     """Compliance of the contacts of a finite ``chain``, whose cells may differ and have dashpots.
 
-    Relative displacements of the contact pairs follow from pairs of opposite forces, and from forces on single masses
-    at the ``points``, which are (cell, mass) from 0. Raises ValueError for more than ``MOST_DOFS`` masses, and where
+    Relative displacements of the contact pairs, and behind them elongations of the springs that are not linear, follow
+    from pairs of opposite forces, and from forces on single masses at the ``points``, which are (cell, mass) from 0.
+    Raises ValueError for more than ``MOST_DOFS`` masses, and where
     the damping is so close to critical that the modes do not represent the motion.
     """
 
@@ -64,6 +66,16 @@ class ModalCompliance:
             raise ValueError(f"a lattice of {dofs} masses: all modes are computed of up to {MOST_DOFS}")
 
     @cached_property
+    def springs(self) -> list[SpringPlace]:
+        """The springs that are not linear."""
+        return nonlinear_places(self.chain)
+
+    @property
+    def pairs(self) -> int:
+        """Number of contact pairs and of springs that are not linear."""
+        return len(self.chain.sites) + len(self.springs)
+
+    @cached_property
     def slowest(self) -> float:
         """Rate in 1/s at which the linear mode that is damped least decays; 0 without dashpots."""
         return float(np.abs(self._poles.poles.real).min(initial=np.inf))
@@ -73,7 +85,7 @@ class ModalCompliance:
         """Unit loads (dofs, pairs and points): columns that pick a relative displacement, or one of a mass."""
         chain = self.chain
         d = chain.cell.dofs
-        pairs = len(chain.sites)
+        pairs = self.pairs
         loads = np.zeros((chain.cells * d, pairs + len(self.points)))
         for j, (site, pair) in enumerate(zip(chain.sites, chain.contact_pairs, strict=True)):
             resonator_cell = (site + pair.next_cell) % chain.cells
@@ -81,13 +93,18 @@ class ModalCompliance:
             # The ground does not move.
             if pair.host >= 0:
                 loads[site * d + pair.host, j] = -1
+        for j, place in enumerate(self.springs, len(chain.sites)):
+            if place.end >= 0:
+                loads[place.end, j] = 1
+            if place.start >= 0:
+                loads[place.start, j] = -1
         for j, (cell, mass) in enumerate(self.points, pairs):
             loads[cell * d + mass, j] = 1
         return loads
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Compliance (omega, pair, pair) in m/N at frequencies ``omegas`` in rad/s, on or below the real axis."""
-        return self.response(omegas)[:, :, : len(self.chain.sites)]
+        return self.response(omegas)[:, :, : self.pairs]
 
     def response(self, omegas: ArrayLike) -> np.ndarray:
         """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s.
@@ -112,7 +129,7 @@ class ModalCompliance:
         points, if there are any.
         """
         given = np.asarray(forces, complex)
-        pairs = len(self.chain.sites)
+        pairs = self.pairs
         signed = np.concatenate([-given[:pairs], given[pairs:]])
         force = self.loads[:, : len(signed)] @ signed
 
@@ -133,7 +150,7 @@ class ModalCompliance:
         """Outputs and inputs of the pairs and points: (pairs, pole), (pole, loads), and those of rigid motions."""
         poles = self._poles
         loads = self.loads
-        pairs = loads[:, : len(self.chain.sites)]
+        pairs = loads[:, : self.pairs]
         rigid_rows = pairs.T @ poles.rigid
         rigid_columns = poles.rigid.T @ loads
 

@@ -47,6 +47,9 @@ OUTPUTS = {
     "first_velocity": Stored("location", "m/s", "first harmonic of the velocity"),
     "first_acceleration": Stored("location", "m/s2", "first harmonic of the acceleration"),
     "lag": Stored("location", "degree", "phase of the first harmonic of the displacement behind the drive"),
+    "largest_elongation": Stored("spring", "m", "largest elongation of a spring that is not linear"),
+    "spring_harmonics": Stored("spring order", "m", "harmonics of the elongation, real part"),
+    "spring_harmonics_imaginary": Stored("spring order", "m", "harmonics of the elongation, imaginary part"),
     "location_harmonics": Stored("location order", "m", "harmonics of the displacement, real part"),
     "location_harmonics_imaginary": Stored("location order", "m", "harmonics of the displacement, imaginary part"),
     "transmission": Stored("pair", "1", "rms velocity of the second location over that of the first"),
@@ -195,7 +198,9 @@ def _sweep(branch: Branch[Response], sign: int) -> ParameterSweep:
     stable = measure(branch, "unstable") == 0
     fold = branch.is_kind("fold")
     parameter = sign * parameter_values(branch)
-    return ParameterSweep(parameter, size=measure(branch, "largest")[:, 0], stable=with_stable_folds(stable, fold))
+    # Without contacts the first spring that is not linear stands for the state.
+    size = measure(branch, "largest" if branch.dofs else "largest_elongation")[:, 0]
+    return ParameterSweep(parameter, size=size, stable=with_stable_folds(stable, fold))
 
 
 def _complex(real: np.ndarray, imaginary: np.ndarray) -> np.ndarray:

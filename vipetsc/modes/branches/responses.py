@@ -11,7 +11,7 @@ from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
-from vipetsc.lattice import ModalCompliance, WaveCompliance
+from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.method import Method
 from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem
@@ -108,6 +108,10 @@ def _axes(case: NfrcCase) -> Variables:
         "way": variable("way", np.array(CHANNELS), "1", "destination of the energy"),
         "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
     }
+    if not chain.cell.is_linear:
+        labels = [f"{place.cell + 1}.{place.number + 1}" for place in nonlinear_places(chain)]
+        text = "cell in which a nonlinear spring begins (0: left wall), and its number there, both from 1"
+        axes["spring"] = variable("spring", np.array(labels), "1", text)
     output = case.output
     if output.points:
         names = np.array([point.name for point in output.points])

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase, needs_modes
-from vipetsc.lattice import ModalCompliance, WaveCompliance
-from vipetsc.modes.balance.harmonics import Stops
+from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
+from vipetsc.modes.balance.harmonics import SiteForces, Stops
 
 
 class DrivenPoints(NamedTuple):
@@ -40,6 +40,13 @@ def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
     if needs_modes(chain):
         return ModalCompliance(chain, places)
     return WaveCompliance(chain, bool(case.nfrc.infinite), places)
+
+
+def forces_of(case: NfrcCase, restitution: float) -> SiteForces:
+    """The contacts of a ``case``, with a ``restitution``, and its springs that are not linear."""
+    chain = case.model().chain
+    springs = [] if chain.cell.is_linear else [place.law for place in nonlinear_places(chain)]
+    return SiteForces(stops_of(case, restitution), springs)
 
 
 def stops_of(case: NfrcCase, restitution: float) -> list[Stops]:

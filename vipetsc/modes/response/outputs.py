@@ -54,6 +54,7 @@ class ResponseOutputs:
         self.pairs = [(names.index(source), names.index(receiver)) for source, receiver in output.transmission or []]
 
         chain = compliance.chain
+        self._springs = compliance.springs if isinstance(compliance, ModalCompliance) else []
         self.walls: list[WallSprings] = []
         if self.wants_forces and not case.nfrc.infinite and chain.ends == "fixed":
             self.walls = [wall_springs(chain, wall) for wall in WALLS]
@@ -64,6 +65,13 @@ class ResponseOutputs:
     def of(self, motion: HarmonicMotion) -> dict[str, np.ndarray]:
         """The values of a steady state by their names in its file (``branches.response_layout``)."""
         values: dict[str, np.ndarray] = {}
+        if self._springs:
+            elongations = motion.relative[len(self.contacts) :]
+            values |= {
+                "largest_elongation": largest_values(elongations),
+                "spring_harmonics": elongations.real,
+                "spring_harmonics_imaginary": elongations.imag,
+            }
         field = self._field(motion) if self.cells else np.empty(0)
         if self._masses:
             places = [(self.cells.index(cell), mass) for cell, mass in self._masses]
@@ -120,6 +128,10 @@ class ResponseOutputs:
             u = field[:, self.cells.index(wall.cell)][:, wall.masses]
             rate = 1j * motion.omega * np.arange(len(u))[:, None]
             force = (wall.stiffness * u + wall.damping * rate * u).sum(axis=1)
+            for place, beyond in zip(self._springs, motion.forces[len(self.contacts) :], strict=True):
+                # A spring that pulls at the left wall is stretched by u > 0, one at the right wall by u < 0.
+                if (place.start if name == "left" else place.end) < 0:
+                    force += beyond if name == "left" else -beyond
             if name == self._moved:
                 force[1] -= wall.stiffness.sum() * motion.amplitude
             forces.append(force)

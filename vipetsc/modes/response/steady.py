@@ -13,17 +13,17 @@ other reflected (R); what leaves at k Om, k > 1, is U; contacts lose L. T + R + 
 as the loss is that of the harmonics kept. A force gives what it gives: fractions are over that, T to higher cells.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces, Stops
+from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.balance.hill import Hill, Perturbations, Stability
 from vipetsc.modes.problem import FlowError, SpecialKind
-from vipetsc.modes.response.condensation import compliance_of, driven_points, stops_of
+from vipetsc.modes.response.condensation import compliance_of, driven_points, forces_of
 from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
 from vipetsc.modes.response.outputs import HarmonicMotion, ResponseOutputs, largest_values
 from vipetsc.modes.response.stability_changes import StabilityChanges
@@ -33,6 +33,8 @@ from vipetsc.modes.response.state import Measures, Response
 LEAST_WORK = 1e-12
 # States whose stability is kept.
 KEPT_STATES = 3
+# Frequencies of a range at which the linear motion is compared.
+TRIED = 33
 # Frequencies whose linear motions are kept: those of a step and of its differences.
 KEPT_MOTIONS = 9
 
@@ -40,7 +42,7 @@ KEPT_MOTIONS = 9
 class SteadyStates(SteadyEquations):
     """Steady states of the sites of a case with a ``restitution`` and the other parameter ``fixed`` (``NfrcTable``).
 
-    ``compliance`` is that of the case, if it has been computed already; ``stops`` take the place of the case's.
+    ``compliance`` is that of the case, if it has been computed already; ``forces`` take the place of the case's.
     """
 
     def __init__(
@@ -49,14 +51,14 @@ class SteadyStates(SteadyEquations):
         restitution: float,
         fixed: float,
         compliance: WaveCompliance | ModalCompliance | None = None,
-        stops: Sequence[Stops] | None = None,
+        forces: SiteForces | None = None,
     ) -> None:
         options = case.nfrc
         self.case = case
         self.options = options
         self.restitution = restitution
         self.wave = options.source == "wave"
-        self.forces = SiteForces(stops_of(case, restitution) if stops is None else stops)
+        self.forces = forces_of(case, restitution) if forces is None else forces
         self.points, self.weights = driven_points(case)
         self.compliance = compliance_of(case) if compliance is None else compliance
 
@@ -90,6 +92,13 @@ class SteadyStates(SteadyEquations):
                 if 0 < gap < np.inf:
                     return gap
         over_amplitude = self.options.over == "amplitude"
+        if self.forces.springs and not over_amplitude:
+            # The range of frequencies may have a resonance, at which motions are much larger than at its beginning.
+            low, high = self.options.range
+            largest = max(
+                float(np.abs(self.linear_motion(omega).harmonics).max()) for omega in np.linspace(low, high, TRIED)
+            )
+            return self.options.fixed[0] * largest
         omega = self.case.frequency
         amplitude = self.options.range[1] if over_amplitude else self.options.fixed[0]
         return float(amplitude * np.abs(self.linear_motion(omega).harmonics).max())
@@ -135,18 +144,19 @@ class SteadyStates(SteadyEquations):
         unstable, fastest = perturbations or self._perturbations(xi, series)
         rate = complex(np.nan, np.nan) if fastest is None else fastest
         forces = series.forces[:, : z.shape[1]]
+        sites = len(self.forces.contacts)
         return Measures(
             frequency=omega,
             amplitude=amplitude,
-            largest=largest_values(z),
-            fractions=self._fractions(omega, amplitude, forces, float(series.loss.sum())),
+            largest=largest_values(z[:sites]),
+            fractions=self._fractions(omega, amplitude, forces, float(series.loss[:sites].sum())),
             unstable=unstable,
             growth=rate.real,
             sideband=rate.imag,
-            closed=series.closed,
+            closed=series.closed[:sites],
             episodes=len(series.episodes),
             truncation=self.balance.truncation(x, omega),
-            harmonics=z,
+            harmonics=z[:sites],
             outputs=self.outputs.of(self._harmonic_motion(omega, amplitude, z, series)),
         )
 

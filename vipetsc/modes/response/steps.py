@@ -1,7 +1,10 @@
 """Steps along a curve of steady states, where it begins, and where it ends."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.continuation.arclength import Continuation, Geometry, Verdict
 from vipetsc.modes.problem import Attempt, ContinuationError
 from vipetsc.modes.response.over_key import StatesOverKey
@@ -102,7 +105,12 @@ def _begun(states: SteadyStates | StatesOverKey, guess: np.ndarray) -> Response:
 
 
 def _touches(states: SteadyStates, linear: np.ndarray) -> bool:
-    """Whether the linear motion (pairs,) in m comes to a stop; a contact that is pressed at rest need not open."""
+    """Whether the linear motion (pairs,) in m comes to a stop; a contact that is pressed at rest need not open.
+
+    Springs that are not linear act at every amplitude.
+    """
+    if states.forces.springs:
+        return True
     for stops, motion in zip(states.forces.contacts, np.abs(linear).tolist(), strict=True):
         if not motion < abs(stops.clearance):
             return True
@@ -124,9 +132,12 @@ def _closed(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
     def weighted(s: float) -> SteadyStates:
         stops = [
             one._replace(weight=s**4, drag=(1 - s) * drag)
-            for one, drag in zip(states.forces.contacts, impedance.tolist(), strict=True)
+            for one, drag in zip(states.forces.contacts, impedance.tolist(), strict=False)
         ]
-        return SteadyStates(case, states.restitution, omega, states.compliance, stops)
+        springs = [
+            replace(one, quadratic=s**4 * one.quadratic, cubic=s**4 * one.cubic) for one in states.forces.springs
+        ]
+        return SteadyStates(case, states.restitution, omega, states.compliance, SiteForces(stops, springs))
 
     options = case.nfrc.model_copy(update={"range": [0.0, 1.0]})
     weights = StatesOverKey(weighted, "weight of contacts", amplitude, options)
