@@ -38,14 +38,15 @@ BREATHER: dict[str, Any] = {
 def compile_kernels(comm: MPI.Comm) -> float:
     """Compile the kernels of runs and branches that are not kept yet; returns the seconds of the slowest rank.
 
-    The calls are divided over the ranks, those together that share the fewest kernels; all ranks must call it.
+    The calls are divided over the ranks in turn; the order gives the propagator, which takes as long as all others, a
+    rank of its own of two. All ranks must call it.
     """
     calls: list[Callable[[], object]] = [
         partial(follow, CELL),
         partial(run, "propagator"),
         partial(run, "ts"),
-        partial(follow, BREATHER),
         find_fonts,
+        partial(follow, BREATHER),
     ]
     before = compiling.seconds
 
