@@ -95,6 +95,19 @@ def on_every_rank(comm: MPI.Comm, function: Callable[[], T]) -> T:
     return _value_or_raise(agreed)
 
 
+def divided(comm: MPI.Comm, jobs: Sequence[Callable[[], T]]) -> list[T]:
+    """The values of all ``jobs``, of which each rank computes every ``comm.size``-th, on all ranks.
+
+    What the first job that fails raises is raised on all. All ranks must call it with the same number of jobs.
+    """
+    attempts = {number: _attempt(jobs[number]) for number in range(comm.rank, len(jobs), comm.size)}
+    if comm.size > 1:
+        wait_for_all(comm)
+        for from_rank in comm.allgather(attempts):
+            attempts |= from_rank
+    return [_value_or_raise(attempts[number]) for number in range(len(jobs))]
+
+
 class _Attempt(NamedTuple):
     """The ``value`` of a call, or the ``error`` that it raised."""
 

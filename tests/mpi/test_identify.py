@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 from mpi4py import MPI
 
 import pytest
@@ -9,7 +12,8 @@ import pytest
 from tests.conftest import assert_same_bits, datasets
 from tests.identified import identify_table, lattice_table, measured_table
 from vipetsc.case.identify import IdentifyCase
-from vipetsc.parallel import StoppedError, StopRequest, on_root
+from vipetsc.identification.growing_windows import GrowingWindows
+from vipetsc.parallel import StoppedError, StopRequest, divided, on_root
 from vipetsc.studies.identification import run_identification
 
 OPTIONS = {"starts": 2, "profile": 2, "steps": 4}
@@ -27,17 +31,32 @@ class StopAfter(StopRequest):
         return self.left < 0
 
 
-@pytest.fixture(scope="module")
-def plan(tmp_path_factory):
-    """A fit of one clearance, from two starts, to a record of a few contacts."""
+def plan_of(folder: Path, changes: dict[str, Any], **options: Any) -> IdentifyCase:
+    """A fit of one clearance to a record of a few contacts, with ``changes`` of the record."""
     table = lattice_table(time={"end": 0.009})
 
     def made() -> str:
-        record = measured_table(tmp_path_factory.mktemp("data"), table, noise=0.01)
+        record = measured_table(folder, table, noise=0.01) | changes
         unknowns = [{"quantity": "clearance", "of": [[1]], "bounds": [2e-4, 8e-4], "start": 6e-4}]
-        return IdentifyCase.from_table(identify_table(table, record, unknowns=unknowns, **OPTIONS)).to_toml()
+        return IdentifyCase.from_table(identify_table(table, record, unknowns=unknowns, **options)).to_toml()
 
     return IdentifyCase.from_toml(on_root(MPI.COMM_WORLD, made))
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    """A fit from two starts."""
+    return plan_of(tmp_path_factory.mktemp("data"), {}, **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory):
+    """A fit from one start with an initial state, whose derivatives the ranks divide, and its result of one rank."""
+    changes = {"begin": 0.004, "initial": "estimate"}
+    plan = plan_of(tmp_path_factory.mktemp("single"), changes, profile=0, steps=3)
+    folder = tmp_path_factory.mktemp("single-whole")
+    run_identification(plan, folder, MPI.COMM_SELF)
+    return plan, datasets(folder / "identified.h5")
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +84,55 @@ def test_a_stopped_identification_goes_on(folder, plan, whole):
     run_identification(plan, folder, MPI.COMM_WORLD, resume=True)
     assert_same_bits(datasets(folder / "identified.h5"), whole)
     MPI.COMM_WORLD.Barrier()
+
+
+@pytest.mark.parallel([1, 2, 3])
+def test_ranks_divide_a_single_start_to_the_same_bits(folder, single):
+    plan, whole = single
+    run_identification(plan, folder, MPI.COMM_WORLD)
+    assert_same_bits(datasets(folder / "identified.h5"), whole)
+    MPI.COMM_WORLD.Barrier()
+
+
+@pytest.mark.parallel([1, 2])
+def test_no_window_that_was_solved_is_solved_again(folder, single, monkeypatch):
+    """Two stops inside the only start: every window is solved once, and the bits are those of a fit without a stop."""
+    plan, whole = single
+    solve = GrowingWindows._solve
+    solved: list[int] = []
+
+    def counted(windows: GrowingWindows, *arguments: Any) -> Any:
+        solution = solve(windows, *arguments)
+        solved.append(len(arguments[1]))
+        return solution
+
+    monkeypatch.setattr(GrowingWindows, "_solve", counted)
+    for resume in (False, True):
+        with pytest.raises(StoppedError):
+            run_identification(plan, folder, MPI.COMM_WORLD, stop=StopAfter(14), resume=resume)
+    before = len(solved)
+    assert before >= 2
+    run_identification(plan, folder, MPI.COMM_WORLD, resume=True)
+    lines = (folder / "identified-runs.jsonl").read_text().splitlines()
+    assert len(solved) == sum(" window " in line for line in lines) > before
+    assert_same_bits(datasets(folder / "identified.h5"), whole)
+    MPI.COMM_WORLD.Barrier()
+
+
+@pytest.mark.parallel([1, 2, 3])
+def test_jobs_are_divided_and_their_first_failure_is_that_of_all():
+    comm = MPI.COMM_WORLD
+    computed: list[int] = []
+
+    def job(number: int) -> int:
+        computed.append(number)
+        if number in (2, 4):
+            raise ArithmeticError(f"job {number}")
+        return number**2
+
+    jobs = [lambda number=number: job(number) for number in range(2)]
+    assert divided(comm, jobs) == [0, 1]
+    assert computed == [number for number in range(2) if number % comm.size == comm.rank]
+    with pytest.raises(ArithmeticError, match="job 2"):
+        divided(comm, [lambda number=number: job(number) for number in range(5)])
+    comm.Barrier()

@@ -72,6 +72,14 @@ def test_bad_data_are_one_clear_error(tmp_path, rows, key, part):
         ({"sensors": [SENSOR | {"column": 3}]}, "sensors[1].column", "the columns 1 to 2"),
         ({"sensors": [SENSOR | {"quantity": "force"}]}, "sensors[1].cell", "give drive in place of cell"),
         ({"rate": 1e3}, "time", "one of both"),
+        ({"begin": 0.015}, "begin", "leaves 5 samples"),
+        ({"begin": 0.005, "end": 0.01}, "end", "leaves 6 samples"),
+        ({"initial": {"kind": "velocity", "cell": 9, "velocity": 1.0}}, "initial.cell", "outside the lattice"),
+        (
+            {"initial": "estimate", "sensors": [{"quantity": "force", "column": "v"}]},
+            "initial",
+            "needs a sensor of motion",
+        ),
         ({"offset": [1.0, 0.0]}, "offset", "low below high"),
         ({"drive": {"frequency": -1.0}}, "drive.frequency", ""),
         ({"file": "nowhere.csv"}, "file", "no such file"),
@@ -93,7 +101,9 @@ def test_keys_of_a_record_are_checked(tmp_path, changes, key, part):
         ({"quantity": "clearance", "bounds": [1e-5, 1.0], "of": [[1], [1, 2]]}, "of", "sought twice"),
         ({"quantity": "clearance", "bounds": [1e-5, 1.0], "start": [1e-3, 1e-3]}, "start", "each of the 1 values"),
         ({"quantity": "clearance", "bounds": [1e-5, 1e-4], "start": 1e-3}, "start", "within the bounds"),
-        ({"quantity": "dashpot", "bounds": [1e-3, 1.0]}, "start", "without a dashpot"),
+        ({"quantity": "dashpot", "bounds": [1e-3, 1.0]}, "start", "springs without a dashpot"),
+        ({"quantity": "grounding", "bounds": [1e-3, 1.0]}, "start", "masses without a dashpot"),
+        ({"quantity": "clearance_minus", "bounds": [1e-3, 1.0]}, "quantity", "set contacts.clearance_minus"),
     ],
 )
 def test_unknowns_are_checked(tmp_path, unknown, key, part):
@@ -178,6 +188,33 @@ def test_parameters_go_into_the_case(tmp_path):
     again = IdentifyCase.from_toml(plan.to_toml())
     assert again.to_toml() == plan.to_toml()
     assert again.options.records[0].sha256
+
+
+def test_an_initial_state_of_many_masses_is_refused(tmp_path):
+    record = record_in(written(tmp_path)) | {"initial": "estimate"}
+    table = lattice_table(lattice={"cells": 60})
+    with pytest.raises(CaseError, match="of 240 masses is too much to estimate"):
+        IdentifyCase.from_table(identify_table(table, record))
+
+
+def test_sides_and_dashpots_to_the_ground_go_into_the_case(tmp_path):
+    """Other clearances on the side w < 0, by site and of all; dashpots between masses and the ground."""
+    base = lattice_table(contacts={"clearance_minus": 9e-4})
+    record = record_in(written(tmp_path))
+    bounds = {"bounds": [1e-5, 1e-2], "start": 1e-3}
+    unknowns = [
+        {"quantity": "clearance_minus", "of": [[1, 2]]} | bounds,
+        {"quantity": "grounding", "of": [[3]]} | bounds,
+    ]
+    plan = IdentifyCase.from_table(identify_table(base, record, unknowns=unknowns))
+    assert [parameter.name for parameter in plan.parameters] == ["clearance_minus 1+2", "grounding 3"]
+    model = plan.case_of([7e-4, 2e-3]).model()
+    assert model.gaps == ((5e-4, 7e-4), (4e-4, 7e-4), (3e-4, 9e-4))
+    assert model.chain.cell.grounding == (0.0, 0.0, 2e-3, 0.0)
+
+    unknowns = [{"quantity": "clearance_minus"} | bounds]
+    plan = IdentifyCase.from_table(identify_table(base, record, unknowns=unknowns))
+    assert plan.case_of([7e-4]).model().gaps == ((5e-4, 7e-4), (4e-4, 7e-4), (3e-4, 7e-4))
 
 
 def test_coordinates_and_values_are_inverse(tmp_path):

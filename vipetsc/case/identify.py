@@ -4,42 +4,33 @@ import copy
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar
 
-import numpy as np
 import tomli_w
 from pydantic import Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
-from vipetsc.case.contacts import values_of_sites
-from vipetsc.case.disorder import with_cell
 from vipetsc.case.features import refusals, refuse_disorder
 from vipetsc.case.measured import MeasuredError, RecordTable, read_measured, sensor_problems
+from vipetsc.case.sought import (
+    OF_CELL,
+    OF_SITES,
+    SoughtParameter,
+    UnknownTable,
+    changed_case,
+    differs_by_side,
+    groups_of,
+    parameters_of,
+    values_of,
+)
 from vipetsc.case.study import StudyCase
 from vipetsc.case.warnings import loss_warnings, unit_warnings
-from vipetsc.lattice import UnitCell
 from vipetsc.lattice.contact import LAWS
 
-OF_SITES = ("clearance", "stiffness", "exponent", "restitution")
-OF_CELL = ("mass", "spring", "dashpot")
-LINEAR = (*OF_CELL, "amplitude")
-"""Unknowns on which a motion without contact depends."""
-UNITS = {"clearance": "m", "mass": "kg", "spring": "N/m", "dashpot": "N s/m", "amplitude": "N"}
-
-
-class UnknownTable(Section):
-    """A ``quantity`` that is sought within ``bounds`` in SI units, from ``start`` on, by default that of the case.
-
-    ``of``: "all" sites, masses or springs have one value, "each" has one of its own, or groups of their numbers have.
-    ``scale``: derivatives and steps are those of the logarithm or of the value.
-    """
-
-    quantity: Literal["clearance", "stiffness", "exponent", "restitution", "mass", "spring", "dashpot", "amplitude"]
-    bounds: Annotated[list[float], Field(min_length=2, max_length=2)]
-    of: Literal["all", "each"] | list[list[int]] = "all"
-    scale: Literal["logarithmic", "linear"] | None = None
-    start: float | list[float] | None = None
+DASHPOTS = ("dashpot", "grounding")
+MOST_MASSES = 200
+"""Masses of a lattice whose initial state is estimated: each has two unknowns."""
 
 
 class IdentifyTable(Section):
@@ -62,42 +53,6 @@ class IdentifyTable(Section):
     profile: int = Field(5, ge=0, le=1000)
 
 
-class SoughtParameter(NamedTuple):
-    """A number that is sought: a ``quantity`` at the ``members`` (sites, masses, springs or records, from 0).
-
-    The coordinate of the fit is its logarithm, or its position between the bounds: a number of order one.
-    """
-
-    name: str
-    quantity: str
-    members: tuple[int, ...]
-    low: float
-    high: float
-    start: float
-    unit: str
-    is_logarithmic: bool
-
-    @property
-    def is_linear(self) -> bool:
-        """Whether the motion depends on it without contact."""
-        return self.quantity in LINEAR
-
-    def to_coordinate(self, value: float) -> float:
-        """The fit's coordinate of a ``value``."""
-        return float(np.log(value)) if self.is_logarithmic else (value - self.low) / (self.high - self.low)
-
-    def from_coordinate(self, z: float) -> float:
-        """The value at the fit's coordinate ``z``, kept between the bounds, which rounding may miss."""
-        value = self.low + (self.high - self.low) * z
-        if self.is_logarithmic:
-            value = np.exp(np.clip(z, np.log(self.low), np.log(self.high)))
-        return float(np.clip(value, self.low, self.high))
-
-    def slope(self, z: float) -> float:
-        """Derivative of the value by the fit's coordinate at ``z``."""
-        return self.from_coordinate(z) if self.is_logarithmic else self.high - self.low
-
-
 class IdentifyCase(StudyCase):
     """The case whose parameters are sought, resolved (``base``), and its ``table`` without ``[identify]``."""
 
@@ -108,7 +63,6 @@ class IdentifyCase(StudyCase):
     refuses: ClassVar[Mapping[str, str]] = {
         "nonlinear springs": "not yet: derivatives of the motion are those of linear springs between contacts",
         "touching stops": "a stop that touches at rest has no onset, at which the derivatives of a contact begin",
-        "initial motion": "not yet: records begin with the lattice at rest",
         "disorder": "a lattice that was measured has one value of each quantity, which is sought, and no scatter",
     }
 
@@ -161,12 +115,7 @@ class IdentifyCase(StudyCase):
         """What is sought: the unknowns one by one, then offsets of records."""
         parameters = []
         for unknown in self.options.unknowns:
-            values = values_of(self.base, unknown.quantity)
-            for number, members in enumerate(_groups(unknown, len(values))):
-                start = unknown.start[number] if isinstance(unknown.start, list) else unknown.start
-                if start is None:
-                    start = float(np.mean([values[member] for member in members]))
-                parameters.append(_parameter(unknown, members, start, len(values)))
+            parameters += parameters_of(unknown, self.base)
         for number, record in enumerate(self.options.records):
             if isinstance(record.offset, list):
                 low, high = record.offset
@@ -176,96 +125,18 @@ class IdentifyCase(StudyCase):
 
     def case_of(self, values: Iterable[float], name: str = "model") -> Case:
         """The case with the ``values`` (parameter,); raises CaseError if it is impossible."""
-        values = list(values)
-        contacts: Table = {}
-        drive: Table = {}
-        base = self.base
-        cell = base.lattice.undamped_cell()
-        changed_cell = cell
-        for quantity in OF_SITES + LINEAR:
-            sought = [
-                (parameter, value)
-                for parameter, value in zip(self.parameters, values, strict=True)
-                if parameter.quantity == quantity
-            ]
-            if not sought:
-                continue
-            numbers = list(values_of(base, quantity))
-            for parameter, value in sought:
-                for member in parameter.members:
-                    numbers[member] = float(value)
-            if quantity == "amplitude":
-                drive["amplitude"] = numbers[0]
-            elif quantity in OF_CELL:
-                changed_cell = _with_values(changed_cell, quantity, numbers)
-            elif quantity == "clearance":
-                contacts["clearance"] = numbers
-            elif len(set(numbers)) == 1 and not (base.contacts.each and getattr(base.contacts.each, quantity)):
-                contacts[quantity] = numbers[0]
-            else:
-                each = contacts.get("each") or (base.contacts.each or Section()).model_dump(exclude_none=True)
-                contacts["each"] = each | {quantity: numbers}
-
-        changes = {key: section for key, section in (("contacts", contacts), ("drive", drive)) if section}
-        if changed_cell is not cell:
-            lattice = base.lattice.model_dump(by_alias=True, exclude_none=True)
-            changes["lattice"] = dict.fromkeys(lattice) | with_cell(lattice, changed_cell, {})
-        return base.varied(name=name, **changes)
+        return changed_case(self.base, self.parameters, values, name)
 
     def record_case(self, case: Case, number: int) -> Case:
-        """The ``case`` with the drive of the record of that ``number`` (from 0)."""
-        drive = self.options.records[number].drive
-        return case.varied(drive=copy.deepcopy(drive)) if drive else case
+        """The ``case`` with the drive and the initial motion of the record of that ``number`` (from 0)."""
+        changes = _varied_sections(self.options.records[number])
+        return case.varied(**changes) if changes else case
 
 
-def values_of(case: Case, quantity: str) -> list[float]:
-    """The values of a ``quantity`` in a case: of its sites, of the masses or springs of its cell, of its drive."""
-    cell = case.lattice.undamped_cell()
-    if quantity == "mass":
-        return list(cell.masses)
-    if quantity == "spring":
-        return [spring.stiffness for spring in cell.springs]
-    if quantity == "dashpot":
-        return [spring.damping for spring in cell.springs]
-    if quantity == "amplitude":
-        return [case.drive.amplitude]
-    chain = case.model().chain
-    if quantity == "clearance":
-        return list(chain.clearances)
-    return values_of_sites(case.contacts, quantity, len(chain.sites))
-
-
-def _with_values(cell: UnitCell, quantity: str, numbers: list[float]) -> UnitCell:
-    """The ``cell`` with other masses, springs or dashpots."""
-    if quantity == "mass":
-        return replace(cell, masses=tuple(numbers))
-    springs = []
-    for spring, number in zip(cell.springs, numbers, strict=True):
-        is_spring = quantity == "spring"
-        springs.append(replace(spring, stiffness=number) if is_spring else replace(spring, damping=number))
-    return replace(cell, springs=tuple(springs))
-
-
-def _groups(unknown: UnknownTable, count: int) -> list[tuple[int, ...]]:
-    """The members (0-based) of each value of an unknown of ``count`` members."""
-    if unknown.of == "all":
-        return [tuple(range(count))]
-    if unknown.of == "each":
-        return [(member,) for member in range(count)]
-    return [tuple(number - 1 for number in group) for group in unknown.of]
-
-
-def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float, count: int) -> SoughtParameter:
-    """One of the values of an ``unknown``."""
-    low, high = unknown.bounds
-    name: str = unknown.quantity
-    if unknown.of != "all":
-        name += f" {'+'.join(str(member + 1) for member in members)}"
-    scale = unknown.scale or ("linear" if unknown.quantity in ("restitution", "exponent") else "logarithmic")
-    # The case may lie outside the bounds; the search does not.
-    start = min(max(start, low), high)
-    unit = UNITS.get(unknown.quantity, "N/m^n" if unknown.quantity == "stiffness" else "1")
-    return SoughtParameter(name, unknown.quantity, members, low, high, start, unit, scale == "logarithmic")
+def _varied_sections(record: RecordTable) -> dict[str, Any]:
+    """The sections of a case in which a ``record`` differs from it."""
+    initial = record.initial if isinstance(record.initial, dict) else {}
+    return {key: copy.deepcopy(keys) for key, keys in (("drive", record.drive), ("initial", initial)) if keys}
 
 
 def _case_problems(base: Case) -> Iterator[Problem]:
@@ -294,6 +165,10 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             yield Problem(f"{at}.bounds", unknown.bounds, "must be [low, high] with low below high")
             continue
         yield from _bounds_problems(unknown, at)
+        if quantity == "clearance_minus" and not differs_by_side(base):
+            remedy = "the case has no other clearance on the side w < 0; set contacts.clearance_minus"
+            yield Problem(f"{at}.quantity", quantity, remedy)
+            continue
         if not values:
             yield Problem(f"{at}.quantity", quantity, "the case has no contact sites")
             continue
@@ -309,10 +184,11 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
                 "masses, springs and dashpots are sought in lattices of equal cells only; omit profiles and absorbing"
             )
             yield Problem(f"{at}.quantity", quantity, remedy)
-        if quantity == "dashpot" and any(value == 0 for value in values) and unknown.start is None:
-            yield Problem(f"{at}.start", None, "missing; the case has springs without a dashpot to begin with")
+        if quantity in DASHPOTS and any(value == 0 for value in values) and unknown.start is None:
+            what = "springs" if quantity == "dashpot" else "masses"
+            yield Problem(f"{at}.start", None, f"missing; the case has {what} without a dashpot to begin with")
 
-        groups = _groups(unknown, len(values))
+        groups = groups_of(unknown, len(values))
         wrong = [member + 1 for group in groups for member in group if not 0 <= member < len(values)]
         if wrong or not all(groups):
             yield Problem(f"{at}.of", unknown.of, f"numbers are from 1 to {len(values)}, one or more in each group")
@@ -337,15 +213,16 @@ def _bounds_problems(unknown: UnknownTable, at: str) -> Iterator[Problem]:
         yield Problem(f"{at}.bounds", unknown.bounds, "a restitution is between 0 and 1")
     elif quantity == "exponent" and not 1 <= low < high <= 10:
         yield Problem(f"{at}.bounds", unknown.bounds, "an exponent is between 1 and 10")
-    elif low <= 0 and (quantity not in ("restitution", "dashpot") or unknown.scale == "logarithmic"):
+    elif low <= 0 and (quantity not in ("restitution", *DASHPOTS) or unknown.scale == "logarithmic"):
         yield Problem(f"{at}.bounds", unknown.bounds, "must be positive")
-    elif quantity == "dashpot" and low <= 0 and unknown.scale != "linear":
+    elif quantity in DASHPOTS and low <= 0 and unknown.scale != "linear":
         yield Problem(f"{at}.bounds", unknown.bounds, 'must be positive, or give scale = "linear"')
 
 
 def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
     """Problems of the records' keys, their sensors and their drives."""
     dofs = base.lattice.unit_cell().dofs
+    masses = base.lattice.cells * dofs
     for number, record in enumerate(options.records, 1):
         at = f"identify.records[{number}]"
         if (record.time is None) == (record.rate is None):
@@ -353,12 +230,16 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
         if isinstance(record.offset, list) and not record.offset[0] < record.offset[1]:
             yield Problem(f"{at}.offset", record.offset, "must be a number, or bounds [low, high] with low below high")
         yield from sensor_problems(record, at, base.lattice.cells, dofs, len(base.drive.every))
-        if record.drive:
-            try:
-                base.varied(drive=copy.deepcopy(record.drive))
-            except CaseError as error:
-                for problem in error.problems:
-                    yield replace(problem, key=f"{at}.{problem.key}")
+        if record.initial == "estimate" and masses > MOST_MASSES:
+            remedy = f"of {masses} masses is too much to estimate; {MOST_MASSES} masses are possible"
+            yield Problem(f"{at}.initial", "estimate", remedy)
+        if record.initial == "estimate" and all(sensor.quantity == "force" for sensor in record.sensors):
+            yield Problem(f"{at}.initial", "estimate", "needs a sensor of motion; a drive's force says nothing of it")
+        try:
+            base.varied(**_varied_sections(record))
+        except CaseError as error:
+            for problem in error.problems:
+                yield replace(problem, key=f"{at}.{problem.key}")
     if not any(record.contact for record in options.records):
         for index, unknown in enumerate(options.unknowns, 1):
             if unknown.quantity in OF_SITES:

@@ -16,6 +16,7 @@ from vipetsc.case.schema import Finite, Positive
 from vipetsc.io.names import path_named
 
 MOST_ROWS = 1_000_000
+LEAST_SAMPLES = 8
 # Times may differ from even ones by this fraction of their interval, as those printed with few digits do.
 UNEVEN = 0.05
 HDF5 = (".h5", ".hdf5", ".nc")
@@ -48,12 +49,15 @@ class SensorTable(Section):
 
 
 class RecordTable(Section):
-    """A measurement that begins with the lattice at rest: its ``file``, the times, and what the ``sensors`` recorded.
+    """A measurement: its ``file``, the times, and what the ``sensors`` recorded.
 
     ``time``: the column of times, which ``time_factor`` makes seconds, or the ``rate`` in Hz instead. The drive begins
-    at the record's time ``offset``; [low, high] are bounds between which it is sought. ``end``: the last time that is
-    used, in s. ``drive``: keys in which the drive differs from that of the case. Without ``contact`` nothing touched.
-    The ``sha256`` of the file is filled in.
+    at the record's time ``offset``, with the lattice at rest or in the motion of ``[initial]``; [low, high] are bounds
+    between which it is sought. ``begin`` and ``end``: the first and the last time that are used, in s. ``initial``:
+    keys in which the initial motion differs from that of the case, or "estimate" for a lattice that moves already: the
+    displacements and velocities of all masses at the first time are estimated with the parameters. ``drive``: keys in
+    which the drive differs from that of the case. Without ``contact`` nothing touched. The ``sha256`` of the file is
+    filled in.
     """
 
     file: str
@@ -62,7 +66,9 @@ class RecordTable(Section):
     time_factor: Positive = 1.0
     rate: Positive | None = None
     offset: Finite | Annotated[list[Finite], Field(min_length=2, max_length=2)] = 0.0
+    begin: Finite | None = None
     end: Finite | None = None
+    initial: Literal["estimate"] | dict[str, Any] = Field({})
     drive: dict[str, Any] = Field({})
     contact: bool = True
     sensors: list[SensorTable] = Field(min_length=1)
@@ -112,16 +118,15 @@ def read_measured(record: RecordTable) -> Measured:
         [columns[f"sensors[{number}].column"] * sensor.factor for number, sensor in enumerate(record.sensors, 1)]
     )
     times = _times(record, columns.get("time"), len(values))
-    if record.end is not None:
-        used = times <= record.end * (1 + 1e-12)
-        times = times[used]
-        values = values[used]
-    if len(times) < 8:
-        raise MeasuredError(
-            "end" if record.end is not None else "file",
-            record.end or record.file,
-            f"leaves {len(times)} samples; at least 8 are needed",
-        )
+    for key, sign in (("begin", -1.0), ("end", 1.0)):
+        limit = getattr(record, key)
+        if limit is not None:
+            # A limit on a sample keeps that sample, whatever the last digit of its time is.
+            used = sign * (times - limit) <= 1e-9 * abs(times[-1] - times[0])
+            times = times[used]
+            values = values[used]
+            _check_count(key, limit, len(times))
+    _check_count("file", record.file, len(times))
     for number, column in enumerate(values.T, 1):
         if not column.any():
             raise MeasuredError(
@@ -130,6 +135,12 @@ def read_measured(record: RecordTable) -> Measured:
                 "is zero at all times; is the sensor connected?",
             )
     return Measured(times, values, digest)
+
+
+def _check_count(key: str, value: Any, count: int) -> None:
+    """Raise MeasuredError if a ``key`` with this ``value`` leaves too few samples."""
+    if count < LEAST_SAMPLES:
+        raise MeasuredError(key, value, f"leaves {count} samples; at least {LEAST_SAMPLES} are needed")
 
 
 def _times(record: RecordTable, column: np.ndarray | None, count: int) -> np.ndarray:

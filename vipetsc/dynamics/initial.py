@@ -2,13 +2,14 @@
 
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 
 from vipetsc.case import CaseError, Model
 from vipetsc.case.case_file import Problem
 from vipetsc.case.initial import file_hash
 from vipetsc.dynamics.energies import measure
-from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.observers import Setup
 from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.io.names import path_named
@@ -26,7 +27,8 @@ def set_in_motion(setup: Setup) -> None:
     layout = setup.layout
     meter = setup.meter
     state = layout.create_vector()
-    layout.place(np.hstack(_fields(setup.model, layout)), work=0.0, y=state.array)
+    fields = initial_fields(setup.model, range(layout.start, layout.stop), layout.comm)
+    layout.place(np.hstack(fields), work=0.0, y=state.array)
     state.ghostUpdate()
     with state.localForm() as local:
         y = local.array
@@ -44,35 +46,38 @@ def set_in_motion(setup: Setup) -> None:
     state.destroy()
 
 
-def _fields(model: Model, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement and velocity (cell, dof) of the rank's cells, the same to the last bit on any partition."""
+def initial_fields(model: Model, cells: range, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement and velocity (cell, dof) at t = 0 of the ``cells``, the same to the last bit on any partition.
+
+    All ranks of ``comm`` must call it. Raises CaseError on all if the state's file is gone or has changed.
+    """
     initial = model.initial
     chain = model.chain
     assert initial is not None
     if initial.kind == "file":
-        return _read_fields(initial, layout)
+        return _read_fields(initial, cells, comm)
 
     assert initial.amplitude
     if initial.kind == "velocity":
-        v = np.zeros((layout.stop - layout.start, chain.cell.dofs))
+        v = np.zeros((len(cells), chain.cell.dofs))
         for _, strike in initial.strikes:
-            if layout.start < strike.cell <= layout.stop:
-                v[strike.cell - 1 - layout.start, strike.mass - 1] = strike.velocity
+            if strike.cell - 1 in cells:
+                v[strike.cell - 1 - cells.start, strike.mass - 1] = strike.velocity
         return np.zeros_like(v), v
     if initial.kind == "packet":
-        u, v = initial.packet(chain.cell).on(chain, layout.start, layout.stop)
+        u, v = initial.packet(chain.cell).on(chain, cells.start, cells.stop)
         return initial.amplitude * u, initial.amplitude * v
 
     number = initial.number
     assert number
     # A mode is that of the linear lattice: neither contacts nor cells that differ. It is computed whole, on one rank.
     linear = Chain(chain.cell, chain.cells, chain.ends)
-    shape = on_root(layout.comm, lambda: mode_shape(linear, number))
-    u = initial.amplitude * shape[layout.start : layout.stop]
+    shape = on_root(comm, lambda: mode_shape(linear, number))
+    u = initial.amplitude * shape[cells.start : cells.stop]
     return u, np.zeros_like(u)
 
 
-def _read_fields(initial: Any, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+def _read_fields(initial: Any, cells: range, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
     """The fields of the file that ``initial`` names; its hash must be that with which the case was resolved."""
     path = path_named(str(initial.path))
 
@@ -86,6 +91,6 @@ def _read_fields(initial: Any, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
             raise CaseError([Problem("initial.path", initial.path, remedy)])
 
     # Hashed once, by one rank; read by each, which keeps its own cells only and sends none.
-    on_root(layout.comm, check)
-    state = on_every_rank(layout.comm, lambda: State.read(path, initial.time, initial.orbit))
-    return state.on(layout.start, layout.stop)
+    on_root(comm, check)
+    state = on_every_rank(comm, lambda: State.read(path, initial.time, initial.orbit))
+    return state.on(cells.start, cells.stop)

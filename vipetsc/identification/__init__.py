@@ -2,7 +2,7 @@ r"""Parameters of a lattice with contacts from measured motion.
 
 **1. Motion and derivatives** (``motion``, ``motion_rates``, ``motion_steps``). With F_c, the force of a site, w = c u,
 
-    M u'' + C u' + K u + sum_c c^T F_c(w, w', w'_minus) = f(t),    u(0) = u'(0) = 0,
+    M u'' + C u' + K u + sum_c c^T F_c(w, w', w'_minus) = f(t),    (u, u')(t_0) = x_0,
 
 the derivative s = du/dp with respect to a parameter p solves the variational equation
 
@@ -10,7 +10,8 @@ the derivative s = du/dp with respect to a parameter p solves the variational eq
 
 q = w'_minus. Contact forces are continuous and steps end on every change of a mode, so that the saltation of the state
 is the identity (Leine and Nijmeijer 2004, ch. 7). At an onset sigma w = D the instant moves by -(c s - sigma D_p)/w',
-and dq = c s' - w'' (c s - sigma D_p)/w'. Motion and derivatives are integrated together. The derivatives of the
+and dq = c s' - w'' (c s - sigma D_p)/w'. At t_0 the derivative is that of x_0 (``motion_begin``): zero for a lattice at
+rest. Motion and derivatives are integrated together. The derivatives of the
 coefficients are central differences between models of two cases, exact for all but the restitution's damping: whatever
 a case may vary needs no formula of its own. The tangent flow of the engine, ``dynamics.propagator.tangent``, moves
 variations of the initial state of an undriven lattice; it has no right-hand side f_p - K_p u, which acts in all cells.
@@ -19,24 +20,30 @@ That is why this is an integration of its own; tests compare it with central dif
 **2. Windows** (``growing_windows``). A motion after many impacts says nothing of its parameters: it is too sensitive,
 and the sum of squares has many valleys. In multiple shooting (Bock 1987) each window has an initial state of its own,
 estimated with the parameters, and continuity is a constraint. A lattice of n masses has 2n unknowns in each such state,
-and a few sensors do not tell them. But a laboratory's lattice begins at rest: the state of every window is a function
-of the parameters alone, and the continuity constraints can be solved for it. What is left is a fit of the parameters
-alone, with the derivatives of 1. The window begins at rest and ends after a few contacts; it grows as the fit gets
-better, by fewer contacts where a longer window is fitted worse. So few new contacts are added at a time that their
-instants are nearly right. What a window does not tell stays where it is by a weak prior, which the last fit lacks.
+and a few sensors in a short window do not tell them. Here all windows of a record have one initial state, and the
+continuity constraints are solved exactly: the state at which a window would begin is a function of the parameters and
+of that one state, with the derivatives of 1. A lattice that begins at rest, or in a motion that the case gives, has no
+unknown state at all. The window begins with the record and ends after a few contacts; it grows as the fit gets better,
+by fewer contacts where a longer window is fitted worse. So few new contacts are added at a time that their instants are
+nearly right. What a window does not tell stays where it is by a weak prior, which the last fit lacks.
 
-**3. A clearance that is not reached** has no derivative. Where the model does not touch, its clearance is tried just
-within reach of the motion, and kept there if that explains the record better. If it does not, the largest |w| is a
-lower bound of the clearance, and all that the record says.
+A record that begins while the lattice moves has 2n more unknowns (``initial_state``). They are amplitudes of modes,
+with a wide prior about rest that the last fit keeps, since a few sensors may not tell all of them. The first window has
+more data than unknowns.
+
+**3. A clearance that is not reached** has no derivative, and none leads out of a contact that the lattice did not have.
+Where the model does not touch, its clearance is tried just within reach of the motion; where it does, just out of reach
+of the motion without this stop. It is kept there if that explains the record better. At the end, the largest motion
+towards a stop that is not met is a lower bound of the clearance, and all that the record says.
 
 **4. Least squares** (``misfit``): the residuals over the noise, by the trust-region method of SciPy within the bounds
 (Branch, Coleman and Li 1999), in the logarithms of positive parameters. Noise that is not given is estimated from the
 residuals of each channel, and the fit is repeated with it, which is the maximum of the likelihood.
 
 **5. What the data tell** (``uncertainty``, ``whiteness``). (J^T J)^-1 is the covariance, J the Jacobian of the
-residuals over the noise; its singular values s are 1 over the standard errors along its right singular vectors. An
-error of more than half a unit of a coordinate, a factor of 1.6, counts as not determined. Residuals that are not white
-(Ljung and Box 1978) show a model that lacks something.
+residuals over the noise, of parameters with the initial states left free; its singular values s are 1 over the standard
+errors along its right singular vectors. An error of more than half a unit of a coordinate, a factor of 1.6, counts as
+not determined. Residuals that are not white (Ljung and Box 1978) show a model that lacks something.
 
 References
 ----------

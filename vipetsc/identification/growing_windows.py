@@ -7,6 +7,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from vipetsc.case import CaseError
+from vipetsc.case.sought import SoughtParameter, differs_by_side
+from vipetsc.identification.initial_state import NARROW, WIDTH
 from vipetsc.identification.misfit import Misfit
 from vipetsc.identification.motion import MotionError
 
@@ -17,9 +19,13 @@ PRIOR = 1.0
 ASSUMED_NOISE = 0.01
 # Smallest noise over the size of a channel.
 LEAST_NOISE = 1e-9
-# A clearance that the model does not reach has no derivative: it is tried at this fraction of what is reached.
+# A clearance that the model does not reach has no derivative: it is tried at this fraction of what is reached. One that
+# the model reaches is tried out of reach: the lattice may not have touched there.
 WITHIN_REACH = 0.98
 TOLERANCE = 1e-12
+# Least weight of the prior over the size of the Jacobian. Where a clearance is not reached, a column is zero; without
+# full rank, SciPy makes every step as long as the trust region is, and does not converge.
+RIDGE = 1e-10
 # ... of the cost and of the step, while windows grow.
 ROUGH_COST = 1e-2
 ROUGH_STEP = 1e-3
@@ -27,8 +33,12 @@ ROUGH_STEP = 1e-3
 # until it grows by less than this fraction of the record.
 RISE = 2.0
 SHORTEST = 0.01
-# First window of records without contact, over the last one.
-FIRST_LINEAR = 0.1
+# First window of records without contact, and of those whose initial state is estimated, over the last one.
+FIRST = 0.1
+# Sides, 0 of w > 0, on which a clearance has its stops.
+SIDES = {"clearance": [0], "clearance_minus": [1]}
+# Data of a first window, at least, for each number that is unknown.
+DATA_EACH = 1.5
 REWEIGHTINGS = 2
 # Further passes through all windows.
 REPETITIONS = 1
@@ -71,11 +81,24 @@ class Fit(NamedTuple):
 
 
 class GrowingWindows:
-    """Fits a ``misfit`` over windows; ``check`` is called before every evaluation, and may raise."""
+    """Fits a ``misfit`` over windows; ``check`` is called before every evaluation, and may raise.
 
-    def __init__(self, misfit: Misfit, check: Callable[[], None] = lambda: None) -> None:
+    ``keep`` is called with the solution (coordinate,) of every window. A fit that is given them as ``solved`` takes
+    the first ones as they are and goes on with the next window, to the same bits.
+    """
+
+    def __init__(
+        self,
+        misfit: Misfit,
+        check: Callable[[], None] = lambda: None,
+        solved: Sequence[Sequence[float]] = (),
+        keep: Callable[[int, np.ndarray], None] = lambda number, z: None,
+    ) -> None:
         self.misfit = misfit
         self.check = check
+        self.keep = keep
+        self._solved = [np.array(z) for z in solved]
+        self._solutions = 0
         options = misfit.plan.options
         self.last = [float(record.times[-1]) for record in misfit.records]
         self._is_given = []
@@ -86,12 +109,12 @@ class GrowingWindows:
             self._is_given.append(given)
             misfit.noise[number] = np.array(noise)
         self._sizes = [np.sqrt(np.mean(record.values**2, axis=0)) for record in misfit.records]
-        self.low, self.high = np.array(
-            [(p.to_coordinate(p.low), p.to_coordinate(p.high)) for p in misfit.plan.parameters]
-        ).T
+        bounds = [(p.to_coordinate(p.low), p.to_coordinate(p.high)) for p in misfit.plan.parameters]
+        bounds += [(-np.inf, np.inf)] * (misfit.size - misfit.count)
+        self.low, self.high = np.array(bounds).T
 
     def fit(self, z: np.ndarray) -> Fit:
-        """Fit from the coordinates ``z`` (parameter,) on."""
+        """Fit from the coordinates ``z`` (coordinate,) on."""
         z = np.clip(z, self.low, self.high)
         windows: list[Window] = []
         best = self._pass(self._fit_linear_parts(z, windows), windows)
@@ -115,14 +138,19 @@ class GrowingWindows:
 
     def deviance(self, z: np.ndarray) -> float:
         """Minus twice the logarithm of the likelihood but for a constant: fits with other noise can be compared."""
-        total = float(np.sum(self.misfit.residuals(z, self.last) ** 2))
+        total = self.cost(z, self.last)
         for record, noise in zip(self.misfit.records, self.misfit.noise, strict=True):
             total += 2 * len(record.times) * float(np.sum(np.log(noise)))
         return total
 
+    def cost(self, z: np.ndarray, ends: Sequence[float]) -> float:
+        """The sum of squares of the residuals over the noise, and of the prior of initial states."""
+        data = self.misfit.residuals(z, ends)
+        return float(np.sum(data**2)) + float(np.sum((self.misfit.prior() @ z) ** 2))
+
     def _every(self) -> list[int]:
-        """The numbers of all parameters."""
-        return list(range(len(self.misfit.plan.parameters)))
+        """The numbers of all coordinates."""
+        return list(range(self.misfit.size))
 
     def _fit_linear_parts(self, z: np.ndarray, windows: list[Window]) -> np.ndarray:
         """Fit what motion without contact depends on to the records without contact, if there are any."""
@@ -133,10 +161,12 @@ class GrowingWindows:
             is_own = parameter.quantity == "offset" and silent[parameter.members[0]]
             if parameter.is_linear or is_own:
                 active.append(number)
+        for number, state in self.misfit.states.items():
+            active += state.indices if silent[number] else ()
         if not any(silent) or not active:
             return z
 
-        fraction = FIRST_LINEAR
+        fraction = FIRST
         while fraction:
             ends = []
             for record, end, is_silent in zip(self.misfit.records, self.last, silent, strict=True):
@@ -153,15 +183,16 @@ class GrowingWindows:
         impacts = float(options.impacts)
         begin = self._first()
         least = 1.0
-        ends = self._ends(z, int(impacts))
+        ends = self._ends(z, int(impacts), self._first_lengths())
         while True:
             is_last = ends == self.last
             precision = FINAL if is_last else GROWING
             fitted = self.solve(z, ends, self._every(), precision)
-            nearer = self._within_reach(fitted, ends)
-            if nearer is not None:
-                fitted = self.solve(nearer, ends, self._every(), precision)
             window = self._window(fitted, ends)
+            other = self._other_contacts(fitted, ends) if window.misfit > 1 or is_last else None
+            if other is not None:
+                fitted = self.solve(other, ends, self._every(), precision)
+                window = self._window(fitted, ends)
 
             # A misfit that rises shows that the window has grown past the reach of the last fit: it is made shorter.
             shorter = [(a + b) / 2 for a, b in zip(begin, ends, strict=True)]
@@ -177,7 +208,8 @@ class GrowingWindows:
                 return z
             begin = ends
             impacts = max(options.growth * window.impacts, window.impacts + 1)
-            ends = [max(a, b) for a, b in zip(ends, self._ends(z, int(impacts)), strict=True)]
+            lengths = [options.growth * (end - first) for first, end in zip(self._first(), ends, strict=True)]
+            ends = [max(a, b) for a, b in zip(ends, self._ends(z, int(impacts), lengths), strict=True)]
             if ends == begin:
                 ends = self.last
 
@@ -185,10 +217,25 @@ class GrowingWindows:
         """The first time in s of each record's clock."""
         return [float(record.times[0]) for record in self.misfit.records]
 
-    def _ends(self, z: np.ndarray, impacts: int) -> list[float]:
-        """Times in s of the records' clocks before the model's contact number ``impacts`` + 1, or their last times."""
+    def _first_lengths(self) -> list[float]:
+        """The longest first windows in s of the records, with enough data for the initial states that are estimated."""
+        lengths = []
+        for number, record in enumerate(self.misfit.records):
+            state = self.misfit.states.get(number)
+            unknowns = self.misfit.count + (len(state.indices) if state else 0)
+            fraction = min(max(FIRST, DATA_EACH * unknowns / record.values.size), 1.0)
+            lengths.append(fraction * float(record.times[-1] - record.times[0]))
+        return lengths
+
+    def _ends(self, z: np.ndarray, impacts: int, lengths: Sequence[float]) -> list[float]:
+        """Times in s of the records' clocks before the model's contact number ``impacts`` + 1, or their last times.
+
+        Where the initial state is estimated, the model may not yet move, and a window has no more than its length in s.
+        """
         ends = []
-        for number, last in enumerate(self.last):
+        for number, (first, last, length) in enumerate(zip(self._first(), self.last, lengths, strict=True)):
+            if number in self.misfit.states:
+                last = min(last, first + length)
             onsets = self._onsets(z, number)
             if len(onsets) > impacts:
                 last = min(last, float(onsets[impacts]) + self.misfit.offset(z, number))
@@ -212,45 +259,90 @@ class GrowingWindows:
         return Window(max(ends), impacts, float(np.sqrt(np.mean(residuals**2))), z.copy())
 
     def reached(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray:
-        """The largest |w| (site,) in m that any record reaches in the model up to ``ends``, and 0 where it closes."""
-        largest = np.zeros(len(self.misfit.plan.base.model().chain.sites))
+        """The largest w and -w (site, 2) in m of any record in the model up to ``ends``; NaN where a stop is met."""
+        largest = np.zeros((len(self.misfit.plan.base.model().chain.sites), 2))
         for number, (table, end) in enumerate(zip(self.misfit.plan.options.records, ends, strict=True)):
             if table.contact and (self.misfit.records[number].times <= end).any():
                 response = self.misfit.respond(z, number, end)
-                largest = np.maximum(largest, response.reached.max(axis=1))
-                touched = np.unique(response.episodes["site"])
-                largest[touched] = np.inf
-        return np.where(np.isfinite(largest), largest, 0.0)
+                largest = np.maximum(largest, response.reached)
+                touched = response.episodes["site"], (response.episodes["side"] < 0).astype(int)
+                largest[touched] = np.nan
+        return largest
 
-    def _within_reach(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray | None:
-        """Coordinates with clearances just within reach of the motion, if that lowers the misfit; else None."""
+    def beyond(self, parameter: SoughtParameter, reached: np.ndarray) -> float:
+        """The largest motion in m towards the stops of a clearance if none of them is met, else NaN.
+
+        ``reached`` (site, 2) is that of the method of this name. The clearance of other parameters is NaN.
+        """
+        if parameter.quantity not in SIDES:
+            return np.nan
+        base = self.misfit.plan.base
+        gaps = np.array(base.model().gaps or [(gap, gap) for gap in base.model().chain.clearances])
+        sides = [0, 1] if parameter.quantity == "clearance" and not differs_by_side(base) else SIDES[parameter.quantity]
+        # A stop on one side only has no other side; NaN of any stop that is met is that of all.
+        towards = [reached[i, side] for i in parameter.members for side in sides if np.isfinite(gaps[i, side])]
+        return float(np.max(towards, initial=0.0))
+
+    def _other_contacts(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray | None:
+        """Coordinates with stops that are met just out of reach, or the reverse, if that lowers the misfit; else None.
+
+        Between the two no derivative leads.
+        """
+        best = None
+        least = self.cost(z, ends)
         try:
             reached = self.reached(z, ends)
+            for number, parameter in enumerate(self.misfit.plan.parameters):
+                if parameter.quantity in SIDES:
+                    start = z if best is None else best
+                    moved = self._at_reach(start, ends, number, self.beyond(parameter, reached))
+                    cost = self.cost(moved, ends)
+                    if cost < least:
+                        best = moved
+                        least = cost
         except (CaseError, MotionError):
             return None
-        best = None
-        least = float(np.sum(self.misfit.residuals(z, ends) ** 2))
-        for number, parameter in enumerate(self.misfit.plan.parameters):
-            if parameter.quantity != "clearance":
-                continue
-            wanted = WITHIN_REACH * max(reached[member] for member in parameter.members)
-            if not all(reached[member] for member in parameter.members) or wanted < parameter.low:
-                continue
-            moved = z.copy() if best is None else best.copy()
-            moved[number] = parameter.to_coordinate(wanted)
-            cost = float(np.sum(self.misfit.residuals(moved, ends) ** 2))
-            if cost < least:
-                best = moved
-                least = cost
         return best
+
+    def _at_reach(self, z: np.ndarray, ends: Sequence[float], number: int, beyond: float) -> np.ndarray:
+        """The coordinates ``z`` with clearance ``number`` just within the motion that is ``beyond`` it in m.
+
+        Where ``beyond`` is NaN the stop is met: then just out of reach of the motion without it.
+        """
+        parameter = self.misfit.plan.parameters[number]
+        wanted = WITHIN_REACH * beyond
+        moved = z.copy()
+        if np.isnan(beyond):
+            moved[number] = self.high[number]
+            wanted = self.beyond(parameter, self.reached(moved, ends)) / WITHIN_REACH
+        # A stop that is met wherever it is stays where it is, as one that would have to be out of its bounds.
+        if not parameter.low <= wanted <= parameter.high:
+            return z
+        moved[number] = parameter.to_coordinate(wanted)
+        return moved
 
     def solve(
         self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision = FINAL
     ) -> np.ndarray:
         """The coordinates with the least squares over a window, by a trust region within the bounds."""
+        number = self._solutions
+        self._solutions += 1
+        if number < len(self._solved):
+            return self._solved[number].copy()
+        solution = self._solve(z, ends, active, precision)
+        self.keep(number, solution)
+        return solution
+
+    def _solve(self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision) -> np.ndarray:
+        """The coordinates with the least squares over a window, computed."""
         active = list(active)
         start = z[active].copy()
-        weight = float(precision.has_prior) / PRIOR
+        # Parameters may be held near the start, states always have their own prior, about rest.
+        is_parameter = np.array(active) < self.misfit.count
+        weights = np.where(is_parameter, 0.0, 1 / WIDTH)
+        if precision.has_prior:
+            weights = np.where(is_parameter, 1 / PRIOR, 1 / NARROW)
+        centre = np.where(is_parameter, start, 0.0)
 
         def whole(x: np.ndarray) -> np.ndarray:
             full = z.copy()
@@ -260,11 +352,13 @@ class GrowingWindows:
         def residuals(x: np.ndarray) -> np.ndarray:
             self.check()
             data = self.misfit.residuals(whole(x), ends)
-            return np.concatenate([data, weight * (x - start)])
+            return np.concatenate([data, weights * (x - centre)])
 
         def jacobian(x: np.ndarray) -> np.ndarray:
             data = self.misfit.jacobian(whole(x), ends, active)
-            return np.concatenate([data, weight * np.eye(len(active))])
+            # The first is at the start, where the residuals of the prior are zero with any weight.
+            weights[is_parameter] = np.maximum(weights[is_parameter], RIDGE * np.linalg.norm(data))
+            return np.concatenate([data, np.diag(weights)])
 
         solution = least_squares(
             residuals,
@@ -284,9 +378,18 @@ class GrowingWindows:
     def _estimate_noise(self, z: np.ndarray) -> None:
         """Estimate the noise of the channels for which none is given from their residuals."""
         count = sum(record.values.size for record in self.misfit.records)
-        free = max(count - len(self.misfit.plan.parameters), 1) / count
+        free = max(count - self._fitted(z), 1.0) / count
         for number, record in enumerate(self.misfit.records):
             values, _ = self.misfit.predicted(z, number, self.last[number])
             variance = np.mean((values - record.values) ** 2, axis=0) / free
             estimated = np.maximum(np.sqrt(variance), LEAST_NOISE * self._sizes[number])
             self.misfit.noise[number] = np.where(self._is_given[number], self.misfit.noise[number], estimated)
+
+    def _fitted(self, z: np.ndarray) -> float:
+        """How many data the coordinates use up: one a parameter, and less of a state that the prior holds in part."""
+        if not self.misfit.states:
+            return float(self.misfit.count)
+        # The trace of the projection on the columns of J, with prior, over the rows of data.
+        jacobian = self.misfit.whole_jacobian(z, self.last)
+        orthogonal, _ = np.linalg.qr(jacobian)
+        return float(np.sum(orthogonal[: len(jacobian) - len(self.misfit.prior())] ** 2))

@@ -1,6 +1,7 @@
 """Residuals of measured records and their Jacobian, over windows from the beginning of each record."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -8,7 +9,9 @@ from vipetsc.case import Case, CaseError, Model
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import Measured
 from vipetsc.dynamics.drives import create_drives, drive_forces
-from vipetsc.identification.motion import MotionError, RecordedMotion, no_slopes, respond, slopes_between
+from vipetsc.identification.initial_state import WIDTH, InitialState, initial_state, state_of
+from vipetsc.identification.motion import MotionError, RecordedMotion, respond, slopes_between
+from vipetsc.identification.motion_begin import MotionBegin
 from vipetsc.identification.motion_rates import SHORT
 
 # Half the distance of the coordinates between which coefficients of the motion are differenced.
@@ -17,17 +20,36 @@ HALF_WIDTH = 1e-5
 ROWS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 # Residual of a motion that cannot be computed: a step that leads there is rejected.
 REJECTED = 1e8
+# Derivatives of a record are integrated in so many parts at most, of so many coordinates at least. The parts do not
+# depend on the number of ranks that work on them, and so the steps, and all bits, do not.
+MOST_PARTS = 8
+LEAST_PART = 4
+
+Job = Callable[[], np.ndarray]
+
+
+def one_by_one(jobs: Sequence[Job]) -> list[np.ndarray]:
+    """The values of all ``jobs``, which this rank computes alone."""
+    return [job() for job in jobs]
 
 
 class Misfit:
     """Residuals of the ``records`` of a ``plan`` over what is allowed, (model - measured)/``noise``.
 
-    ``noise`` has one array (sensor,) a record, in SI units. Coordinates z (parameter,) are those of the parameters.
+    ``noise`` has one array (sensor,) a record, in SI units. Coordinates z (coordinate,) are those of the parameters,
+    then those of the initial states that are estimated, ``states`` by the number of the record; there are ``size``.
+    ``compute`` returns the values of jobs that do not depend on each other: ranks may divide them.
     """
 
-    def __init__(self, plan: IdentifyCase, records: Sequence[Measured]) -> None:
+    def __init__(
+        self,
+        plan: IdentifyCase,
+        records: Sequence[Measured],
+        compute: Callable[[Sequence[Job]], list[np.ndarray]] = one_by_one,
+    ) -> None:
         self.plan = plan
         self.records = records
+        self.compute = compute
         self.noise = [np.sqrt(np.mean(record.values**2, axis=0)) for record in records]
         base = plan.base
         dofs = base.lattice.unit_cell().dofs
@@ -36,13 +58,31 @@ class Misfit:
             masses = [0 if s.cell is None else (s.cell - 1) * dofs + (s.mass or 1) - 1 for s in table.sensors]
             self.watched.append(np.array(masses))
 
+        self.states: dict[int, InitialState] = {}
+        self.size = len(plan.parameters)
+        for number, table in enumerate(plan.options.records):
+            if table.initial == "estimate":
+                sensors = [
+                    (int(mass), ROWS[sensor.quantity], float(size))
+                    for mass, sensor, size in zip(self.watched[number], table.sensors, self.noise[number], strict=True)
+                    if sensor.quantity != "force"
+                ]
+                state = initial_state(plan.record_case(base, number).model(), self.size, sensors)
+                self.states[number] = state
+                self.size = state.stop
+
+    @property
+    def count(self) -> int:
+        """The number of parameters."""
+        return len(self.plan.parameters)
+
     def case(self, z: np.ndarray) -> Case:
         """The case at the coordinates ``z``; raises CaseError if it is impossible."""
         return self.plan.case_of(self.values(z))
 
     def values(self, z: np.ndarray) -> np.ndarray:
         """The values (parameter,) at the coordinates ``z``."""
-        return np.array([p.from_coordinate(x) for p, x in zip(self.plan.parameters, z, strict=True)])
+        return np.array([p.from_coordinate(x) for p, x in zip(self.plan.parameters, z[: self.count], strict=True)])
 
     def offset(self, z: np.ndarray, number: int) -> float:
         """The time in s of the record ``number``'s clock at which its drive begins."""
@@ -74,19 +114,72 @@ class Misfit:
                 models.append(self.plan.record_case(self.case(moved), number).model())
         return lower, upper, np.array(widths)
 
+    def columns(self, number: int, active: Iterable[int]) -> tuple[list[int], list[int]]:
+        """Those of the ``active`` coordinates that have a column in the motion of record ``number``.
+
+        They are parameters of the equations of motion, then coordinates of its initial state.
+        """
+        active = list(active)
+        inner = [p for p in active if p < self.count and not self._is(p, "offset")]
+        state = self.states.get(number)
+        return inner, [p for p in active if state and p in state.indices]
+
     def respond(
-        self, z: np.ndarray, number: int, end: float, active: Sequence[int] = (), watched: np.ndarray | None = None
+        self, z: np.ndarray, number: int, end: float, active: Iterable[int] = (), watched: np.ndarray | None = None
     ) -> RecordedMotion:
-        """The motion of record ``number`` up to its time ``end``, with derivatives by the parameters ``active``.
+        """The motion of record ``number`` up to its time ``end``, with derivatives by its ``columns`` of ``active``.
 
         Raises CaseError, MotionError.
         """
         table = self.plan.options.records[number]
         model = self.plan.record_case(self.case(z), number).model()
-        inner = [p for p in active if self.plan.parameters[p].quantity != "offset"]
-        slopes = slopes_between(*self._models(z, number, inner), model) if inner else no_slopes(model)
-        times = self.times(z, number, end)
-        return respond(model, slopes, times, self.watched[number] if watched is None else watched, table.contact)
+        inner, estimated = self.columns(number, active)
+        lower, upper, widths = self._models(z, number, inner)
+        slopes = slopes_between(lower, upper, widths, model, others=len(estimated))
+        return respond(
+            model,
+            slopes,
+            times=self.times(z, number, end),
+            watched=self.watched[number] if watched is None else watched,
+            touches=table.contact,
+            begin=self._begin(z, number, model, (lower, upper, widths), estimated),
+        )
+
+    def _begin(
+        self,
+        z: np.ndarray,
+        number: int,
+        model: Model,
+        around: tuple[list[Model], list[Model], np.ndarray],
+        estimated: Sequence[int],
+    ) -> MotionBegin | None:
+        """The beginning of the motion of record ``number``; None for rest."""
+        lower, upper, widths = around
+        state = self.states.get(number)
+        if state is not None:
+            matrix = state.matrix
+            slopes = np.zeros((len(matrix), len(widths) + len(estimated)))
+            slopes[:, len(widths) :] = matrix[:, [p - state.first for p in estimated]]
+            return MotionBegin(self._earliest(number), matrix @ z[state.first : state.stop], slopes)
+        if model.initial is None:
+            return None
+
+        begin = state_of(model)
+        slopes = np.zeros((len(begin), len(widths)))
+        # Only modes and packets depend on the cell.
+        if model.initial.kind in ("mode", "packet"):
+            for p, (low, high, width) in enumerate(zip(lower, upper, widths, strict=True)):
+                slopes[:, p] = (state_of(high) - state_of(low)) / width
+        return MotionBegin(0.0, begin, slopes)
+
+    def _earliest(self, number: int) -> float:
+        """The time in s since the beginning of the drive of the state that is estimated for record ``number``.
+
+        That is the first sample's, and of an unknown offset the earliest that it can have: the state does not then
+        depend on the offset.
+        """
+        offset = self.plan.options.records[number].offset
+        return float(self.records[number].times[0]) - (offset[1] if isinstance(offset, list) else offset)
 
     def times(self, z: np.ndarray, number: int, end: float) -> np.ndarray:
         """The samples' times in s since the beginning of the drive, up to the record's time ``end``."""
@@ -102,9 +195,9 @@ class Misfit:
         """
         response = self.respond(z, number, end, active)
         table = self.plan.options.records[number]
-        parameters = self.plan.parameters
         motion = response.motion
-        inner = [p for p in active if parameters[p].quantity != "offset"]
+        inner, estimated = self.columns(number, active)
+        column_of = {p: 1 + column for column, p in enumerate(inner + estimated)}
         values = np.zeros(motion.shape[:2])
         slopes = np.zeros((*values.shape, len(active)))
         for k, sensor in enumerate(table.sensors):
@@ -114,16 +207,23 @@ class Misfit:
                 row = ROWS[sensor.quantity]
                 values[:, k] = motion[:, k, row, 0]
                 rate = motion[:, k, row + 1, 0]
+            is_of_amplitude = sensor.drive in (None, 1) and "amplitude" not in table.drive
             for column, p in enumerate(active):
-                parameter = parameters[p]
-                if parameter.quantity == "offset":
-                    if parameter.members == (number,):
-                        slopes[:, k, column] = -rate * parameter.slope(z[p])
+                if self._is(p, "offset"):
+                    parameter = self.plan.parameters[p]
+                    is_own = parameter.members == (number,)
+                    slopes[:, k, column] = -rate * parameter.slope(z[p]) * is_own
                 elif sensor.quantity != "force":
-                    slopes[:, k, column] = motion[:, k, ROWS[sensor.quantity], 1 + inner.index(p)]
-                elif parameter.quantity == "amplitude" and sensor.drive in (None, 1) and "amplitude" not in table.drive:
+                    if p in column_of:
+                        slopes[:, k, column] = motion[:, k, ROWS[sensor.quantity], column_of[p]]
+                elif self._is(p, "amplitude") and is_of_amplitude:
+                    parameter = self.plan.parameters[p]
                     slopes[:, k, column] = values[:, k] / parameter.from_coordinate(z[p]) * parameter.slope(z[p])
         return values, slopes
+
+    def _is(self, p: int, quantity: str) -> bool:
+        """Whether coordinate ``p`` is that of a parameter of this ``quantity``."""
+        return p < self.count and self.plan.parameters[p].quantity == quantity
 
     def _force(self, z: np.ndarray, number: int, end: float, drive: int) -> tuple[np.ndarray, np.ndarray]:
         """The force (sample,) in N of a ``drive`` and its rate in N/s."""
@@ -141,25 +241,51 @@ class Misfit:
 
         Data are ordered by record, sample, sensor; a record with an end of -inf is left out.
         """
-        parts = []
-        for number, (record, end) in enumerate(zip(self.records, ends, strict=True)):
-            used = record.times <= end
-            measured = record.values[used]
-            if not used.any():
-                continue
+
+        def residuals_of(number: int) -> np.ndarray:
+            record = self.records[number]
+            measured = record.values[record.times <= ends[number]]
             try:
-                values, _ = self.predicted(z, number, end)
-                parts.append(((values - measured) / self.noise[number]).ravel())
+                values, _ = self.predicted(z, number, ends[number])
             except (CaseError, MotionError):
-                parts.append(np.full(measured.size, REJECTED))
-        return np.concatenate(parts)
+                return np.full(measured.size, REJECTED)
+            return np.asarray((values - measured) / self.noise[number]).ravel()
+
+        return np.concatenate(self.compute([partial(residuals_of, number) for number in self._used(ends)]))
 
     def jacobian(self, z: np.ndarray, ends: Sequence[float], active: Sequence[int]) -> np.ndarray:
         """Derivatives (datum, active) of ``residuals``; raises CaseError, MotionError."""
+
+        def slopes_of(number: int, part: Sequence[int]) -> np.ndarray:
+            _, slopes = self.predicted(z, number, ends[number], part)
+            return np.asarray(slopes / self.noise[number][:, None]).reshape(-1, len(part))
+
         parts = []
-        for number, (record, end) in enumerate(zip(self.records, ends, strict=True)):
-            if not (record.times <= end).any():
-                continue
-            _, slopes = self.predicted(z, number, end, active)
-            parts.append((slopes / self.noise[number][:, None]).reshape(-1, len(active)))
-        return np.concatenate(parts)
+        for number in self._used(ends):
+            relevant = [p for p in active if p < self.count or p in self.columns(number, active)[1]]
+            length = max(LEAST_PART, -(-len(relevant) // MOST_PARTS))
+            parts += [(number, relevant[k : k + length]) for k in range(0, len(relevant), length)]
+        columns = self.compute([partial(slopes_of, number, part) for number, part in parts])
+
+        place = {p: column for column, p in enumerate(active)}
+        blocks = []
+        for number in self._used(ends):
+            samples = int((self.records[number].times <= ends[number]).sum())
+            block = np.zeros((samples * len(self.watched[number]), len(active)))
+            for (owner, part), values in zip(parts, columns, strict=True):
+                if owner == number:
+                    block[:, [place[p] for p in part]] = values
+            blocks.append(block)
+        return np.concatenate(blocks)
+
+    def _used(self, ends: Sequence[float]) -> list[int]:
+        """The numbers of the records that have samples up to ``ends``."""
+        return [n for n, (record, end) in enumerate(zip(self.records, ends, strict=True)) if record.times[0] <= end]
+
+    def prior(self) -> np.ndarray:
+        """The slopes (state coordinate, coordinate) of residuals that keep initial states finite: coordinate/WIDTH."""
+        return np.eye(self.size)[self.count :] / WIDTH
+
+    def whole_jacobian(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray:
+        """The ``jacobian`` by all coordinates, with the rows of the ``prior`` behind those of data."""
+        return np.vstack([self.jacobian(z, ends, range(self.size)), self.prior()])

@@ -1,4 +1,4 @@
-"""The motion of a lattice from rest with its derivatives: coefficients from models, and the call of the kernels."""
+"""The motion of a lattice with its derivatives: coefficients from models, and the call of the kernels."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,6 +9,7 @@ from vipetsc.case import Model
 from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.site_dofs import site_records
+from vipetsc.identification.motion_begin import MotionBegin, begin_contacts
 from vipetsc.identification.motion_rates import Lattice, MotionState, Slopes
 from vipetsc.identification.motion_steps import DONE, integrate
 from vipetsc.modes.shooting.dop853 import STAGES
@@ -70,15 +71,18 @@ def gains_of(model: Model) -> np.ndarray:
     return np.array([drive.waveform.amplitude * (drive.stiffness or 1.0) for drive in model.drives])
 
 
-def slopes_between(lower: Sequence[Model], upper: Sequence[Model], widths: np.ndarray, model: Model) -> Slopes:
+def slopes_between(
+    lower: Sequence[Model], upper: Sequence[Model], widths: np.ndarray, model: Model, others: int = 0
+) -> Slopes:
     """Derivatives of the coefficients of ``model`` by central differences between models (parameter,).
 
     ``widths`` (parameter,) are the distances of the parameter's values in ``lower`` and ``upper``; parameters are
     numbers of order one, so that all derivatives of a motion have its magnitude. MotionCoefficients are affine in most
-    parameters and smooth in the others, so that no truncation is seen.
+    parameters and smooth in the others, so that no truncation is seen. Behind these parameters come ``others``, on
+    which no coefficient depends.
     """
     middle = MotionCoefficients.of(model)
-    count = len(widths)
+    count = len(widths) + others
     number = len(middle.sites)
     slopes = Slopes(
         masses=np.zeros((count, len(middle.masses))),
@@ -124,17 +128,18 @@ class RecordedMotion(NamedTuple):
     reached: np.ndarray
 
 
-def no_slopes(model: Model) -> Slopes:
-    """Derivatives with respect to no parameter."""
-    return slopes_between([], [], np.zeros(0), model)
-
-
 def respond(
-    model: Model, slopes: Slopes, times: np.ndarray, watched: np.ndarray, touches: bool = True
+    model: Model,
+    slopes: Slopes,
+    times: np.ndarray,
+    watched: np.ndarray,
+    touches: bool = True,
+    begin: MotionBegin | None = None,
 ) -> RecordedMotion:
-    """The motion of ``model`` from rest and its derivatives at the rising ``times`` (sample,) in s.
+    """The motion of ``model`` and its derivatives at the rising ``times`` (sample,) in s.
 
-    ``watched`` are masses (0-based, cell by cell); without ``touches`` no site ever closes. Raises MotionError.
+    It starts as ``begin`` says, by default from rest at t = 0. ``watched`` are masses (0-based, cell by cell); without
+    ``touches`` no site ever closes. Raises MotionError.
     """
     chain = model.chain
     coefficients = MotionCoefficients.of(model)
@@ -164,8 +169,16 @@ def respond(
     columns = 1 + len(slopes.linear)
     rows = 2 * len(coefficients.masses)
     tracker = ImpactTracker(sites, range(len(sites)))
-    start = create_motion(rows, columns, len(sites), model.scale)
-    outcome, tracks, motion, reached = integrate(lattice, start, tracker.tracks, fastest(coefficients), times, watched)
+    state = create_motion(rows, columns, len(sites), model.scale)
+    instant = 0.0
+    if begin is not None:
+        instant = begin.time
+        state.state[:, 0] = begin.state
+        state.state[:, 1:] = begin.slopes
+        begin_contacts(lattice, state, tracker)
+    outcome, tracks, motion, reached = integrate(
+        lattice, state, tracker.tracks, fastest(coefficients), instant, times, watched
+    )
     if outcome != DONE:
         raise MotionError("the steps of the integration became too small")
     tracker.tracks = tracks

@@ -54,6 +54,8 @@ class Lattice(NamedTuple):
 class MotionState(NamedTuple):
     """State and workspace. Column 0 is the motion, column 1 + p its derivative with respect to parameter p.
 
+    A coordinate of the initial state is such a parameter: its column begins with the derivative of that state.
+
     ``state`` and ``end`` (2n, column), ``stages`` (stage, 2n, column), ``rates`` (2n, column) at the end; ``estimates``
     (2, 2n, column) are those of errors, ``approach`` (site, column) derivatives of w'_minus; ``before`` and ``after``
     (site, 3) hold w, w', w'' at both ends of a step, ``largest`` (column,) the largest values so far.

@@ -1,4 +1,4 @@
-"""Compiled motion of a lattice from rest together with its derivatives with respect to parameters.
+"""Compiled motion of a lattice from an initial state together with its derivatives with respect to parameters.
 
 Runge and Kutta's method is Dormand and Prince's pair of order 8(5,3) (Hairer, Norsett and Wanner 1993, sec. II.10),
 whose steps end on every sample, on every kink of a drive and on every change of a contact's mode: inside a step all
@@ -194,38 +194,45 @@ def _length_to(left: float, h: float) -> float:
 
 @njit(error_model="numpy")
 def integrate(
-    lattice: Lattice, motion: MotionState, tracks: Tracks, omega: float, times: np.ndarray, watched: np.ndarray
+    lattice: Lattice,
+    motion: MotionState,
+    tracks: Tracks,
+    omega: float,
+    begin: float,
+    times: np.ndarray,
+    watched: np.ndarray,
 ) -> tuple[int, Tracks, np.ndarray, np.ndarray]:
-    """Go from t = 0 through the rising ``times`` (sample,) in s.
+    """Go from the time ``begin`` in s through the rising ``times`` (sample,) in s; those before ``begin`` have zeros.
 
     ``omega`` in rad/s is the fastest mode's. Returns the outcome, the log of contacts, samples (sample, watched, 4,
     column) as ``_sample`` puts them, and the largest |w| (site, 2) in m on the sides + and -, at ends of steps.
     """
     out = np.zeros((times.size, watched.size, 4, motion.state.shape[1]))
     reached = np.zeros((lattice.contacts.size, 2))
+    # Before t = 0 all drives are off, and t = 0 is a break.
     breaks = np.zeros(lattice.drives.rows.size)
-    _select_pieces(lattice, breaks, 0.0)
-    t = 0.0
+    _select_pieces(lattice, breaks, begin)
+    t = begin
+    longest = max(abs(begin), abs(times[-1]))
     h = 0.05 / omega
     _refresh(lattice, motion, t)
 
     sample = 0
     while sample < times.size:
-        # A sample before the beginning is that of rest.
         if times[sample] <= t:
-            if times[sample] >= 0.0:
+            if times[sample] >= begin:
                 _sample(lattice, motion, t, watched, out[sample])
             sample += 1
             continue
 
         target = times[sample]
-        for begin in breaks:
-            if t < begin < target:
-                target = begin
+        for instant in breaks:
+            if t < instant < target:
+                target = instant
         wanted = min(h, 1.0 / omega, OF_IMPACT * shortest_impact(lattice.contacts))
         left = target - t
         h = _length_to(left, wanted)
-        if h < SMALLEST_STEP * times[-1] and h < left:
+        if h < SMALLEST_STEP * longest and h < left:
             return STUCK, tracks, out, reached
 
         error = _step(lattice, motion, t, h, omega)

@@ -46,6 +46,19 @@ def uncertainty_of(jacobian: np.ndarray) -> Uncertainty:
     )
 
 
+def marginal_jacobian(jacobian: np.ndarray, count: int) -> np.ndarray:
+    """The Jacobian (count, count) of the first ``count`` coordinates alone, whatever the others are.
+
+    Its information matrix is the Schur complement A - B D^-1 B^T of J^T J: in J = Q R with the other coordinates first
+    it is the last block of R. Without others it is the ``jacobian`` (datum, coordinate) itself.
+    """
+    others = jacobian.shape[1] - count
+    if not others:
+        return jacobian
+    _, upper = np.linalg.qr(np.roll(jacobian, others, axis=1))
+    return np.asarray(upper[others:, others:])
+
+
 def quantile(confidence: float) -> float:
     """Standard errors on each side of a value that make an interval of that ``confidence`` for normal errors."""
     return float(scipy.stats.norm.ppf(0.5 + confidence / 2))

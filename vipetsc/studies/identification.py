@@ -1,10 +1,12 @@
 """Parameters of a case from measured records: the result is ``identified.h5``, with ``identified.toml`` for ``run``.
 
-Ranks divide the starts, then the fits of the profiles. The record of each is kept at once, so that an identification
-that was stopped goes on where it was. The same files, to the bit, on any number of ranks.
+Ranks divide the starts, then the fits of the profiles; with more ranks than starts, the ranks of a team divide the
+records and derivatives of a start. The solution of each window is kept at once, so that an identification that was
+stopped goes on where it was. The same files, to the bit, on any number of ranks.
 """
 
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,8 +28,9 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import IDENTIFIED, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.records import Record
-from vipetsc.parallel import StoppedError, StopRequest, on_root
-from vipetsc.studies.identified import LAYOUT, identified_values, summary_of, warnings_of
+from vipetsc.parallel import StopRequest, divided, on_root
+from vipetsc.studies.identified import identified_values, summary_of, warnings_of
+from vipetsc.studies.identified_layout import LAYOUT
 from vipetsc.studies.recorded_runs import FAILURES, Key, RecordedRuns
 from vipetsc.studies.sweep import is_whole
 
@@ -85,43 +88,64 @@ def read_records(plan: IdentifyCase) -> list[Measured]:
 
 
 class MisfitProfile(NamedTuple):
-    """Coordinates ``places`` (parameter, place) at which each parameter is held, and how the others move ``along``."""
+    """Coordinates ``places`` (parameter, place) at which each parameter is held.
+
+    All coordinates move ``along`` (parameter, coordinate) with it, by the covariance.
+    """
 
     places: np.ndarray
     along: np.ndarray
 
 
 class Identification:
-    """Fits of one ``plan`` to its ``measured`` records, each on one rank; ``stop`` ends them."""
+    """Fits of one ``plan`` to its ``measured`` records, each by all ranks of ``team``; ``stop`` ends them."""
 
-    def __init__(self, plan: IdentifyCase, measured: list[Measured], stop: StopRequest) -> None:
+    def __init__(
+        self, plan: IdentifyCase, measured: list[Measured], stop: StopRequest, team: MPI.Comm = MPI.COMM_SELF
+    ) -> None:
         self.plan = plan
         self.measured = measured
         self.stop = stop
-
-    def _check(self) -> None:
-        if self.stop.requested:
-            raise StoppedError("stopped on request; the same command continues")
+        self.team = team
 
     def windows(self) -> GrowingWindows:
         """A fit that nothing has been asked of yet."""
-        return GrowingWindows(Misfit(self.plan, self.measured), self._check)
+        return self._windows((), lambda number, z: None)
+
+    def _windows(self, solved: Sequence[Sequence[float]], keep: Callable[[int, np.ndarray], None]) -> GrowingWindows:
+        """A fit whose first windows are ``solved``, and which gives ``keep`` the solutions of the others."""
+        return GrowingWindows(
+            Misfit(self.plan, self.measured, compute=lambda jobs: divided(self.team, jobs)),
+            check=lambda: self.stop.check(self.team),
+            solved=solved,
+            keep=keep,
+        )
 
     def starts(self) -> np.ndarray:
-        """The coordinates (start, parameter) at which fits begin: those of the case, then a Latin hypercube."""
+        """The coordinates (start, coordinate) at which fits begin: those of the case, then a Latin hypercube.
+
+        Initial states that are estimated begin at rest.
+        """
         parameters = self.plan.parameters
         first = np.array([parameter.to_coordinate(parameter.start) for parameter in parameters])
+        begins = first[None]
         count = self.plan.options.starts - 1
-        if not count:
-            return first[None]
-        bounds = np.array([(p.to_coordinate(p.low), p.to_coordinate(p.high)) for p in parameters]).T
-        drawn = qmc.LatinHypercube(len(parameters), seed=self.plan.options.seed).random(count)
-        return np.vstack([first, qmc.scale(drawn, *bounds)])
+        if count:
+            bounds = np.array([(p.to_coordinate(p.low), p.to_coordinate(p.high)) for p in parameters]).T
+            drawn = qmc.LatinHypercube(len(parameters), seed=self.plan.options.seed).random(count)
+            begins = np.vstack([first, qmc.scale(drawn, *bounds)])
+        states = self.windows().misfit.size - len(parameters)
+        return np.pad(begins, ((0, 0), (0, states)))
 
-    def fit(self, number: int) -> Record:
-        """The record of the fit from the start of that ``number``."""
+    def fit(
+        self,
+        number: int,
+        solved: Sequence[Sequence[float]] = (),
+        keep: Callable[[int, np.ndarray], None] = lambda number, z: None,
+    ) -> Record:
+        """The record of the fit from the start of that ``number``; ``solved`` and ``keep`` as of GrowingWindows."""
         start = self.starts()[number]
-        windows = self.windows()
+        windows = self._windows(solved, keep)
         fit = windows.fit(start)
         return {
             "begin": start.tolist(),
@@ -149,14 +173,15 @@ class Identification:
     def profile(self, record: Record) -> MisfitProfile:
         """The profiles to be taken around the fit of a ``record``."""
         windows, z = self.placed(record)
-        count = self.plan.options.profile
-        known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
+        known = uncertainty_of(windows.misfit.whole_jacobian(z, windows.last))
+        sought = range(windows.misfit.count)
         reach = np.where(known.determined, PROFILED * known.errors, np.inf)
-        low = np.maximum(z - reach, windows.low)
-        high = np.minimum(z + reach, windows.high)
+        low = np.maximum(z - reach, windows.low)[sought]
+        high = np.minimum(z + reach, windows.high)[sought]
         # The covariance says where the others go, as long as the problem is nearly linear.
-        along = known.correlation * known.errors / known.errors[:, None]
-        return MisfitProfile(np.linspace(low, high, count, axis=1), np.where(known.determined, along, 0.0))
+        along = (known.correlation * known.errors / known.errors[:, None])[sought]
+        along = np.where(known.determined[sought, None], along, 0.0)
+        return MisfitProfile(np.linspace(low, high, self.plan.options.profile, axis=1), along)
 
     def profiled(self, record: Record, profile: MisfitProfile, number: int, place: int) -> Record:
         """The least misfit with parameter ``number`` held at a ``place`` of its profile, and all others fitted."""
@@ -168,27 +193,19 @@ class Identification:
         # In the middle of a profile is the fit itself.
         if others and abs(value - z[number]) > SAME:
             held = windows.solve(held, windows.last, others, Precision(steps=PROFILE_STEPS, is_rough=True))
-        residuals = windows.misfit.residuals(held, windows.last)
-        return {"cost": float(np.sum(residuals**2))}
+        return {"cost": windows.cost(held, windows.last)}
 
 
 def _identify(work: Identification, folder: Path, comm: MPI.Comm, progress: bool) -> None:
     """Fit from all starts, profile the best fit, and write the results."""
     plan = work.plan
-    recorded = RecordedRuns(
-        "identified-runs", folder, comm, work.stop, failures=(*FAILURES, CaseError, MotionError)
-    ).read()
-
-    def fit(key: Key) -> Record:
-        return work.fit(int(str(key).split()[-1]))
-
     starts = [f"start {number}" for number in range(plan.options.starts)]
-    recorded.make(starts, fit, what="starts", progress=progress, failures=True)
-    fits = [recorded.records[key] for key in starts]
+    fits = _fits(work, starts, folder, comm, progress)
     fitted = [number for number, record in enumerate(fits) if "deviance" in record]
     if not fitted:
         raise RuntimeError(f"no start leads to a fit: {fits[0]['reason']}")
     best = min(fitted, key=lambda number: (fits[number]["deviance"], number))
+    recorded = _recorded_runs(work, folder, comm, ranks=1)
     places = on_root(comm, lambda: work.profile(fits[best]))
     shape = places.places.shape
 
@@ -201,6 +218,32 @@ def _identify(work: Identification, folder: Path, comm: MPI.Comm, progress: bool
     costs = np.array([recorded.records[key].get("cost", np.nan) for key in profiles]).reshape(shape)
     recorded.finish()
     on_root(comm, lambda: _write(work, fits, best, (places.places, costs), folder, comm))
+
+
+def _recorded_runs(work: Identification, folder: Path, comm: MPI.Comm, ranks: int) -> RecordedRuns:
+    """The records of fits by teams of so many ``ranks``."""
+    failures = (*FAILURES, CaseError, MotionError)
+    return RecordedRuns("identified-runs", folder, comm, work.stop, ranks, failures).read()
+
+
+def _fits(work: Identification, starts: list[str], folder: Path, comm: MPI.Comm, progress: bool) -> list[Record]:
+    """The records of the fits from all ``starts``, which the ranks divide."""
+    recorded = _recorded_runs(work, folder, comm, ranks=max(comm.size // len(starts), 1))
+    by_team = Identification(work.plan, work.measured, work.stop, recorded.team)
+
+    def fit(key: Key) -> Record:
+        solved: list[list[float]] = []
+        while (part := f"{key} window {len(solved)}") in recorded.records:
+            solved.append(recorded.records[part]["coordinates"])
+
+        def keep(number: int, z: np.ndarray) -> None:
+            recorded.keep_part(f"{key} window {number}", {"coordinates": z.tolist()})
+
+        return by_team.fit(int(str(key).split()[-1]), solved, keep)
+
+    recorded.make(starts, fit, what="starts", progress=progress, failures=True)
+    recorded.finish()
+    return [recorded.records[key] for key in starts]
 
 
 def _write(

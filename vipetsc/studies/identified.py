@@ -10,9 +10,17 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import UNITS
 from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit import ROWS
-from vipetsc.identification.uncertainty import DETERMINED, Uncertainty, errors_with_sensor, quantile, uncertainty_of
+from vipetsc.identification.uncertainty import (
+    DETERMINED,
+    Uncertainty,
+    errors_with_sensor,
+    marginal_jacobian,
+    quantile,
+    uncertainty_of,
+)
 from vipetsc.identification.whiteness import ljung_box
 from vipetsc.io.records import Record
+from vipetsc.studies.identified_layout import LAYOUT
 
 # A misfit this many times the noise, and a probability below this over the number of channels, are reported.
 BEYOND_NOISE = 1.2
@@ -24,75 +32,23 @@ SAME_VALLEY = 1e-3
 # Sensors are sought on so many masses at most, evenly over the lattice.
 MOST_CANDIDATES = 400
 
-LAYOUT = {
-    "parameter": ("parameter", "1", "what is sought"),
-    "other": ("other", "1", "what is sought"),
-    "unit": ("parameter", "1", "unit of the parameter"),
-    "low": ("parameter", "1", "lower bound"),
-    "high": ("parameter", "1", "upper bound"),
-    "value": ("parameter", "1", "value found, in the parameter's unit"),
-    "standard_error": ("parameter", "1", "standard error, in the parameter's unit; NaN where the data do not tell"),
-    "interval_low": ("parameter", "1", "lower end of the confidence interval; NaN where the data do not tell"),
-    "interval_high": ("parameter", "1", "upper end of the confidence interval; NaN where the data do not tell"),
-    "determined": ("parameter", "1", "1 if the data tell the value, otherwise 0"),
-    "at_least": (
-        "parameter",
-        "m",
-        "of a clearance that is never reached: the largest displacement there; otherwise NaN",
-    ),
-    "relative_error": ("parameter", "1", "standard error of the logarithm, or over the range between the bounds"),
-    "correlation": ("parameter other", "1", "correlation of the errors"),
-    "direction": ("direction", "1", "direction of the parameters, the best determined first"),
-    "singular": ("direction", "1", "singular value of the Jacobian over the noise; its inverse is the error along it"),
-    "vector": ("direction parameter", "1", "component of a direction"),
-    "sensor/cell": ("parameter", "1", "cell (1-based) of the sensor that would tell most about the parameter"),
-    "sensor/mass": ("parameter", "1", "mass (1-based) of that sensor"),
-    "sensor/relative_error": ("parameter", "1", "relative error with that sensor too"),
-    "window": ("window", "1", "window of the best start, the last with the final noise"),
-    "windows/end": ("window", "s", "largest time of the records' clocks in a window"),
-    "windows/impacts": ("window", "1", "contacts of the model in a window"),
-    "windows/misfit": ("window", "1", "root mean square of the residuals over the noise"),
-    "windows/value": ("window parameter", "1", "value found over a window"),
-    "start": ("start", "1", "number of a start; 0 is that of the unknowns"),
-    "starts/begin": ("start parameter", "1", "value at the beginning"),
-    "starts/value": ("start parameter", "1", "value found; NaN for a start that failed"),
-    "starts/deviance": ("start", "1", "minus twice the logarithm of the likelihood, less that of the best start"),
-    "starts/valley": ("start", "1", "number of the valley, the deepest is 1; 0 for a start that failed"),
-    "channel": ("channel", "1", "sensor of a record"),
-    "channels/record": ("channel", "1", "number (1-based) of the record"),
-    "channels/unit": ("channel", "1", "unit of the channel"),
-    "channels/noise": ("channel", "1", "noise, given or estimated, in the unit of the channel"),
-    "channels/is_given": ("channel", "1", "1 if the noise is given, 0 if it is estimated"),
-    "channels/misfit": ("channel", "1", "root mean square of the residuals, in the unit of the channel"),
-    "channels/size": ("channel", "1", "root mean square of the measured values, in the unit of the channel"),
-    "channels/statistic": ("channel", "1", "Q of Ljung and Box of the residuals"),
-    "channels/lags": ("channel", "1", "number of autocorrelations in Q"),
-    "channels/probability": ("channel", "1", "probability that white noise has as large a Q"),
-    "datum": ("datum", "1", "sample of a channel"),
-    "data/channel": ("datum", "1", "number (0-based) of the channel"),
-    "data/time": ("datum", "s", "time of the record's clock"),
-    "data/measured": ("datum", "1", "measured value, in the unit of the channel"),
-    "data/model": ("datum", "1", "value of the model, in the unit of the channel"),
-    "place": ("place", "1", "number of a value of a profile"),
-    "profile/value": ("parameter place", "1", "value at which a parameter is held"),
-    "profile/cost": ("parameter place", "1", "increase of the sum of squared residuals over the noise, others fitted"),
-}
-
 
 def identified_values(
     windows: GrowingWindows, z: np.ndarray, fits: list[Record], best: int, profile: tuple[np.ndarray, np.ndarray]
 ) -> dict[str, Any]:
     """All values by name in ``LAYOUT``; ``fits`` are the records of the starts, ``profile`` coordinates and costs."""
-    known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
+    jacobian = windows.misfit.whole_jacobian(z, windows.last)
+    known = uncertainty_of(marginal_jacobian(jacobian, windows.misfit.count))
     values = _parameter_values(windows, z, known)
-    values |= _sensor_values(windows, z, known)
+    values |= _sensor_values(windows, z, uncertainty_of(jacobian))
     values |= _window_values(windows, fits[best])
     values |= _start_values(windows, fits, best, known.errors)
     values |= _channel_values(windows, z)
+    values |= _state_values(windows, z, jacobian)
 
     places, costs = profile
     parameters = windows.misfit.plan.parameters
-    cost = float(np.sum(windows.misfit.residuals(z, windows.last) ** 2))
+    cost = windows.cost(z, windows.last)
     rows = [[parameter.from_coordinate(x) for x in row] for parameter, row in zip(parameters, places, strict=True)]
     return values | {
         "place": np.arange(places.shape[1]),
@@ -106,11 +62,9 @@ def _parameter_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty
     misfit = windows.misfit
     parameters = misfit.plan.parameters
     reached = windows.reached(z, windows.last)
-    at_least = np.full(len(z), np.nan)
-    for number, parameter in enumerate(parameters):
-        # A group whose sites are all out of reach is at least as wide as the largest motion of any.
-        if parameter.quantity == "clearance" and all(reached[member] > 0 for member in parameter.members):
-            at_least[number] = max(reached[member] for member in parameter.members)
+    z = z[: misfit.count]
+    # A group whose stops are all out of reach is at least as wide as the largest motion towards any.
+    at_least = np.array([windows.beyond(parameter, reached) for parameter in parameters])
 
     is_known = known.determined & np.isnan(at_least)
     slopes = np.array([parameter.slope(x) for parameter, x in zip(parameters, z, strict=True)])
@@ -138,7 +92,10 @@ def _parameter_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty
 
 
 def _sensor_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty) -> dict[str, Any]:
-    """The mass at which one more sensor of the first record with contact would lower each error most."""
+    """The mass at which one more sensor of the first record with contact would lower each error most.
+
+    ``known`` is the uncertainty of all coordinates: the sensor tells of an initial state that is estimated, too.
+    """
     misfit = windows.misfit
     plan = misfit.plan
     tables = plan.options.records
@@ -150,11 +107,11 @@ def _sensor_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty) -
     dofs = plan.base.lattice.unit_cell().dofs
     count = plan.base.lattice.cells * dofs
     candidates = np.arange(0, count, -(-count // MOST_CANDIDATES))
-    inner = [number for number, parameter in enumerate(plan.parameters) if parameter.quantity != "offset"]
-    response = misfit.respond(z, record, windows.last[record], inner, candidates)
+    inner, estimated = misfit.columns(record, range(misfit.size))
+    response = misfit.respond(z, record, windows.last[record], range(misfit.size), candidates)
     slopes = np.zeros((*response.motion.shape[:2], len(z)))
-    slopes[:, :, inner] = response.motion[:, :, ROWS[quantity], 1:]
-    errors = errors_with_sensor(known, slopes, noise)
+    slopes[:, :, inner + estimated] = response.motion[:, :, ROWS[quantity], 1:]
+    errors = errors_with_sensor(known, slopes, noise)[:, : misfit.count]
     chosen = errors.argmin(axis=0)
     return {
         "sensor/cell": candidates[chosen] // dofs + 1,
@@ -179,7 +136,7 @@ def _start_values(windows: GrowingWindows, fits: list[Record], best: int, errors
     """All starts with what they found, in valleys; ``errors`` (parameter,) are standard errors of coordinates."""
     misfit = windows.misfit
     starts = misfit.plan.options.starts
-    shape = (starts, len(windows.low))
+    shape = (starts, len(errors))
     values: dict[str, Any] = {
         "start": np.arange(starts),
         "starts/begin": np.full(shape, np.nan),
@@ -194,7 +151,7 @@ def _start_values(windows: GrowingWindows, fits: list[Record], best: int, errors
     bottoms: list[np.ndarray] = []
     for number in fitted:
         record = fits[number]
-        z = np.array(record["coordinates"])
+        z = np.array(record["coordinates"])[: len(errors)]
         values["starts/begin"][number] = misfit.values(np.array(record["begin"]))
         values["starts/value"][number] = misfit.values(z)
         values["starts/deviance"][number] = record["deviance"] - fits[best]["deviance"]
@@ -209,6 +166,42 @@ def _valley(z: np.ndarray, bottoms: list[np.ndarray], distance: np.ndarray) -> i
             return index
     bottoms.append(z)
     return len(bottoms) - 1
+
+
+def _state_values(windows: GrowingWindows, z: np.ndarray, jacobian: np.ndarray) -> dict[str, Any]:
+    """The initial states that are estimated, their errors, and what the data without the prior tell of each."""
+    misfit = windows.misfit
+    dofs = misfit.plan.base.lattice.unit_cell().dofs
+    data_rows = len(jacobian) - len(misfit.prior())
+    covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+    parts: dict[str, list[np.ndarray]] = {name: [np.zeros(0)] for name in LAYOUT if name.startswith("initial/")}
+    for number, state in misfit.states.items():
+        displacement, velocity = np.split(state.matrix @ z[state.indices], 2)
+        inside = covariance[np.ix_(state.indices, state.indices)]
+        errors = np.sqrt(np.einsum("ij,jk,ik->i", state.matrix, inside, state.matrix))
+        masses = np.arange(len(displacement))
+
+        # All other coordinates come first: what is left is what the data tell of this state while these are free.
+        others = [p for p in range(misfit.size) if p not in state.indices]
+        ordered = jacobian[:data_rows][:, [*state.indices, *others]]
+        singular = np.linalg.svd(marginal_jacobian(ordered, len(state.matrix)), compute_uv=False)
+        values = {
+            "initial/record": np.full(len(masses), number + 1),
+            "initial/cell": masses // dofs + 1,
+            "initial/mass": masses % dofs + 1,
+            "initial/displacement": displacement,
+            "initial/velocity": velocity,
+            "initial/displacement_error": errors[: len(masses)],
+            "initial/velocity_error": errors[len(masses) :],
+            "initial/of_record": np.full(len(singular), number + 1),
+            "initial/singular": singular,
+        }
+        for name, part in values.items():
+            parts[name].append(part)
+    parts["moving"] = [np.arange(sum(map(len, parts["initial/record"])))]
+    parts["state_direction"] = [np.arange(sum(map(len, parts["initial/of_record"])))]
+    numbers = ("moving", "state_direction", "initial/record", "initial/cell", "initial/mass", "initial/of_record")
+    return {name: np.concatenate(part).astype(int if name in numbers else float) for name, part in parts.items()}
 
 
 def _channel_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
@@ -251,7 +244,12 @@ def _channel_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
 
 def warnings_of(data: xr.Dataset) -> list[str]:
     """Sentences on what the fit does not explain, and what the data do not tell."""
-    return [*_warnings_of_channels(data), *_warnings_of_parameters(data), *_warnings_of_starts(data)]
+    return [
+        *_warnings_of_channels(data),
+        *_warnings_of_parameters(data),
+        *_warnings_of_states(data),
+        *_warnings_of_starts(data),
+    ]
 
 
 def _warnings_of_channels(data: xr.Dataset) -> Iterator[str]:
@@ -287,6 +285,18 @@ def _warnings_of_parameters(data: xr.Dataset) -> Iterator[str]:
             place = f"mass {data['sensor/mass'].values[row]} of cell {data['sensor/cell'].values[row]}"
             helped = f"a sensor at {place} would, to {100 * error:.2g} %"
         yield f"{data['parameter'].values[row]}: the data do not tell it; {helped}"
+
+
+def _warnings_of_states(data: xr.Dataset) -> Iterator[str]:
+    """A sentence on each initial state of which the data tell a part only."""
+    for record in np.unique(data["initial/of_record"].values):
+        singular = data["initial/singular"].values[data["initial/of_record"].values == record]
+        told = int(np.sum(singular >= 1 / DETERMINED))
+        if told < len(singular):
+            yield (
+                f"record {record}: of the {len(singular)} numbers of its initial state the data tell {told};"
+                " the others are bounded by the energy that was measured, and the intervals include them"
+            )
 
 
 def _warnings_of_starts(data: xr.Dataset) -> Iterator[str]:

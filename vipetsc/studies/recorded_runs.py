@@ -137,6 +137,17 @@ class RecordedRuns:
 
         on_root(self.comm, check)
 
+    def keep_part(self, key: Key, record: Record) -> None:
+        """Append the ``record`` of a part of the team's run at once; another attempt finds it in ``records``.
+
+        All ranks of the team must call it. Raises OSError on all if the disk is full.
+        """
+
+        def append() -> None:
+            self.file.append({"key": key, "vipetsc_version": vipetsc.__version__} | record)
+
+        on_root(self.team, append)
+
     def simulate(self, case: Case, output: RunOutput) -> Result:
         """Run ``case`` on all ranks of the team into ``output``.
 

@@ -1,0 +1,107 @@
+"""Records of lattices with stops by SciPy alone: equations, integrator and contacts share nothing with the package."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A stop that mass ``resonator`` meets at w = u_resonator - u_host = ``side`` times ``gap``; host -1 is the ground.
+
+    Its force is k x^n (1 + c w'/w'_minus) with c = 3 (1 - r)/2.
+    """
+
+    resonator: int
+    host: int
+    gap: float
+    stiffness: float
+    exponent: float
+    restitution: float
+    side: int = 1
+
+    def row(self, count: int) -> np.ndarray:
+        """w = row @ u."""
+        row = np.zeros(count)
+        row[self.resonator] = 1.0
+        if self.host >= 0:
+            row[self.host] = -1.0
+        return row
+
+
+@dataclass(frozen=True)
+class ScipyLattice:
+    """M u'' + C u' + K u = force(t) + contacts, with ``masses`` (n,), ``damping`` and ``stiffness`` (n, n)."""
+
+    masses: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+    stops: tuple[Stop, ...]
+    force: Callable[[float], np.ndarray]
+
+    def motion(self, times: np.ndarray, u: np.ndarray, v: np.ndarray, start: float) -> tuple[np.ndarray, int]:
+        """u, u', u'' as (quantity, time, mass) at ``times``, from the state at ``start`` on; the number of impacts."""
+        n = len(self.masses)
+        rows = [stop.row(n) for stop in self.stops]
+        closed: dict[int, float] = {}
+        impacts = 0
+
+        def rates(t: float, y: np.ndarray) -> np.ndarray:
+            total = self.force(t) - self.stiffness @ y[:n] - self.damping @ y[n:]
+            for k, speed in closed.items():
+                stop = self.stops[k]
+                depth = max(stop.side * (rows[k] @ y[:n]) - stop.gap, 0.0)
+                ratio = stop.side * (rows[k] @ y[n:]) / speed
+                pressure = stop.stiffness * depth**stop.exponent * (1 + 1.5 * (1 - stop.restitution) * ratio)
+                total = total - stop.side * pressure * rows[k]
+            return np.concatenate([y[n:], total / self.masses])
+
+        y = np.concatenate([u, v])
+        t = start
+        samples = np.zeros((len(times), 2 * n))
+        accelerations = np.zeros((len(times), n))
+        while t < times[-1]:
+            events = []
+            for k, stop in enumerate(self.stops):
+
+                def beyond(_: float, y: np.ndarray, k: int = k, stop: Stop = stop) -> float:
+                    return float(stop.side * (rows[k] @ y[:n]) - stop.gap)
+
+                beyond.terminal = True
+                beyond.direction = -1 if k in closed else 1
+                events.append(beyond)
+            solution = solve_ivp(
+                rates,
+                (t, times[-1]),
+                y,
+                "DOP853",
+                rtol=1e-11,
+                atol=1e-15,
+                events=events,
+                dense_output=True,
+                max_step=2e-4,
+            )
+            inside = (times >= t) & (times <= solution.t[-1])
+            if inside.any():
+                values = solution.sol(times[inside]).T
+                samples[inside] = values
+                accelerations[inside] = [rates(at, y)[n:] for at, y in zip(times[inside], values, strict=True)]
+            t = float(solution.t[-1])
+            y = solution.y[:, -1].copy()
+            for k, found in enumerate(solution.t_events):
+                if found.size and k in closed:
+                    del closed[k]
+                elif found.size:
+                    closed[k] = float(self.stops[k].side * (rows[k] @ y[n:]))
+                    impacts += 1
+        return np.stack([samples[:, :n], samples[:, n:], accelerations]), impacts
+
+
+def chain_matrices(count: int, stiffness: float, damping: float, ground: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """K and C (count, count) of equal springs and dashpots between two walls, and dashpots to the ground."""
+    shape = 2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
+    return stiffness * shape, damping * shape + ground * np.eye(count)

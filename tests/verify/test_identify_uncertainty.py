@@ -1,0 +1,106 @@
+"""Standard errors, correlation, profiles and the sensor that would tell most, each by another computation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from tests.conftest import run_of
+from tests.identified import POINTS, identify_table, lattice_table, measured_table
+from vipetsc.case.identify import IdentifyCase
+from vipetsc.identification.uncertainty import marginal_jacobian, uncertainty_of
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.parallel import StopRequest
+from vipetsc.studies.identification import Identification, read_records, run_identification
+
+UNKNOWNS = [
+    {"quantity": "clearance", "of": [[1], [2]], "bounds": [1e-4, 2e-3]},
+    {"quantity": "restitution", "bounds": [0.2, 1.0]},
+]
+
+
+def engine_derivatives(plan: IdentifyCase, z: np.ndarray, cell: int, mass: int) -> np.ndarray:
+    """Derivatives (sample, parameter) of a mass's velocity in runs of the propagator, by central differences."""
+    h = 1e-5
+    columns = []
+    for number in range(len(plan.parameters)):
+        runs = []
+        for sign in (-1, 1):
+            moved = z.copy()
+            moved[number] += sign * h
+            values = [p.from_coordinate(x) for p, x in zip(plan.parameters, moved, strict=True)]
+            case = plan.case_of(values).varied(output={"points": [{"name": "p", "cell": cell, "mass": mass}]})
+            runs.append(run_of(case)["points/velocity"].values[:, 0])
+        columns.append((runs[1] - runs[0]) / (2 * h))
+    return np.column_stack(columns)
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory):
+    """The plan, the coordinates found, and the results of a fit of three parameters to a record of a few contacts."""
+    folder = tmp_path_factory.mktemp("uncertainty")
+    table = lattice_table(time={"end": 0.011})
+    record = measured_table(folder, table, noise=0.02)
+    for sensor in record["sensors"]:
+        sensor["noise"] = 0.02
+    plan = IdentifyCase.from_table(identify_table(table, record, unknowns=UNKNOWNS, profile=3))
+    run_identification(plan, folder / "out")
+    with open_netcdf(folder / "out" / "identified.h5", "identification") as file:
+        results = file.load()
+    z = np.array([p.to_coordinate(v) for p, v in zip(plan.parameters, results["value"].values, strict=True)])
+    return plan, z, results
+
+
+@pytest.mark.slow
+def test_errors_and_correlation_are_those_of_an_engines_derivatives(identified):
+    """(J^T J)^-1 with J from differences of runs; one more sensor adds its rows, the best place lowers errors most."""
+    plan, z, results = identified
+    rows = [engine_derivatives(plan, z, point["cell"], point["mass"]) for point in POINTS]
+    jacobian = np.vstack(rows) / 0.02
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    errors = np.sqrt(np.diag(covariance))
+    assert results["relative_error"].values == pytest.approx(errors, rel=1e-4)
+    assert results["correlation"].values == pytest.approx(covariance / np.outer(errors, errors), abs=1e-4)
+    assert results["singular"].values == pytest.approx(np.linalg.svd(jacobian, compute_uv=False), rel=1e-4)
+
+    # Every fifth mass, and the one that is named for the first parameter.
+    named = int(results["sensor/cell"][0]), int(results["sensor/mass"][0])
+    lowest = float(results["sensor/relative_error"][0])
+    for cell, mass in [named, *((1 + k // 4, 1 + k % 4) for k in range(0, 24, 5))]:
+        more = np.vstack([jacobian, engine_derivatives(plan, z, cell, mass) / 0.02])
+        error = np.sqrt(np.linalg.inv(more.T @ more)[0, 0])
+        assert error >= lowest * (1 - 1e-4)
+        if (cell, mass) == named:
+            assert error == pytest.approx(lowest, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_profiles_are_the_least_misfit_with_one_parameter_held(identified):
+    """The outermost place of a profile, fitted again by another method with differences for derivatives."""
+    plan, z, results = identified
+    misfit = Identification(plan, read_records(plan), StopRequest()).windows().misfit
+    ends = [float(misfit.records[0].times[-1])]
+    misfit.noise = [np.full(3, 0.02)]
+    least = float(np.sum(misfit.residuals(z, ends) ** 2))
+    for number in (0, 2):
+        place = float(results["profile/value"].values[number, 2])
+        held = plan.parameters[number].to_coordinate(place)
+
+        def residuals(others: np.ndarray, number: int = number, held: float = held) -> np.ndarray:
+            return misfit.residuals(np.insert(others, number, held), ends)
+
+        fitted = least_squares(residuals, np.delete(z, number), method="lm", x_scale=1e-3)
+        assert results["profile/cost"].values[number, 2] == pytest.approx(2 * fitted.cost - least, rel=2e-2)
+        # Three standard errors away the misfit is nine more, as far as the problem is linear.
+        assert 5 < results["profile/cost"].values[number, 2] < 15
+    assert results["profile/cost"].values[:, 1] == pytest.approx(0, abs=1e-6)
+
+
+def test_the_marginal_jacobian_has_the_inverse_of_the_covariance():
+    """Its information is that of the parameters with the other coordinates free, the Schur complement."""
+    jacobian = np.random.default_rng(2).standard_normal((30, 7))
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    marginal = marginal_jacobian(jacobian, 3)
+    assert np.linalg.inv(marginal.T @ marginal) == pytest.approx(covariance[:3, :3], rel=1e-10)
+    assert uncertainty_of(marginal).errors == pytest.approx(uncertainty_of(jacobian).errors[:3], rel=1e-10)

@@ -1,0 +1,200 @@
+"""Parameters that the verb ``identify`` seeks: their sections, their values in a case, and a case with other values."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from vipetsc.case.case import Case
+from vipetsc.case.case_file import Section, Table
+from vipetsc.case.contacts import values_of_sites
+from vipetsc.case.disorder import with_cell
+from vipetsc.lattice import UnitCell
+
+OF_SITES = ("clearance", "clearance_minus", "stiffness", "exponent", "restitution")
+OF_CELL = ("mass", "spring", "dashpot", "grounding")
+LINEAR = (*OF_CELL, "amplitude")
+"""Unknowns on which a motion without contact depends."""
+UNITS = {
+    "clearance": "m",
+    "clearance_minus": "m",
+    "stiffness": "N/m^n",
+    "mass": "kg",
+    "spring": "N/m",
+    "dashpot": "N s/m",
+    "grounding": "N s/m",
+    "amplitude": "N",
+}
+
+
+class UnknownTable(Section):
+    """A ``quantity`` that is sought within ``bounds`` in SI units, from ``start`` on, by default that of the case.
+
+    ``of``: "all" sites, masses or springs have one value, "each" has one of its own, or groups of their numbers have.
+    ``scale``: derivatives and steps are those of the logarithm or of the value. ``dashpot`` is parallel to a spring,
+    ``grounding`` a dashpot between a mass and the ground; ``amplitude`` is that of the first drive.
+    """
+
+    quantity: Literal[
+        "clearance",
+        "clearance_minus",
+        "stiffness",
+        "exponent",
+        "restitution",
+        "mass",
+        "spring",
+        "dashpot",
+        "grounding",
+        "amplitude",
+    ]
+    bounds: Annotated[list[float], Field(min_length=2, max_length=2)]
+    of: Literal["all", "each"] | list[list[int]] = "all"
+    scale: Literal["logarithmic", "linear"] | None = None
+    start: float | list[float] | None = None
+
+
+class SoughtParameter(NamedTuple):
+    """A number that is sought: a ``quantity`` at the ``members`` (sites, masses, springs or records, from 0).
+
+    The coordinate of the fit is its logarithm, or its position between the bounds: a number of order one.
+    """
+
+    name: str
+    quantity: str
+    members: tuple[int, ...]
+    low: float
+    high: float
+    start: float
+    unit: str
+    is_logarithmic: bool
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the motion depends on it without contact."""
+        return self.quantity in LINEAR
+
+    def to_coordinate(self, value: float) -> float:
+        """The fit's coordinate of a ``value``."""
+        return float(np.log(value)) if self.is_logarithmic else (value - self.low) / (self.high - self.low)
+
+    def from_coordinate(self, z: float) -> float:
+        """The value at the fit's coordinate ``z``, kept between the bounds, which rounding may miss."""
+        value = self.low + (self.high - self.low) * z
+        if self.is_logarithmic:
+            value = np.exp(np.clip(z, np.log(self.low), np.log(self.high)))
+        return float(np.clip(value, self.low, self.high))
+
+    def slope(self, z: float) -> float:
+        """Derivative of the value by the fit's coordinate at ``z``."""
+        return self.from_coordinate(z) if self.is_logarithmic else self.high - self.low
+
+
+def values_of(case: Case, quantity: str) -> list[float]:
+    """The values of a ``quantity`` in a case: of its sites, of the masses or springs of its cell, of its drive."""
+    cell = case.lattice.undamped_cell()
+    if quantity == "mass":
+        return list(cell.masses)
+    if quantity == "spring":
+        return [spring.stiffness for spring in cell.springs]
+    if quantity == "dashpot":
+        return [spring.damping for spring in cell.springs]
+    if quantity == "grounding":
+        return list(cell.grounding) or [0.0] * len(cell.masses)
+    if quantity == "amplitude":
+        return [case.drive.amplitude]
+    model = case.model()
+    if quantity == "clearance":
+        return list(model.chain.clearances)
+    if quantity == "clearance_minus":
+        return [minus for _, minus in model.gaps]
+    return values_of_sites(case.contacts, quantity, len(model.chain.sites))
+
+
+def differs_by_side(base: Case) -> bool:
+    """Whether the clearance on the side w < 0 is another one than on the side w > 0."""
+    each = base.contacts.each
+    return base.contacts.clearance_minus is not None or bool(each and each.clearance_minus)
+
+
+def _with_values(cell: UnitCell, quantity: str, numbers: list[float]) -> UnitCell:
+    """The ``cell`` with other masses, springs or dashpots."""
+    if quantity == "mass":
+        return replace(cell, masses=tuple(numbers))
+    if quantity == "grounding":
+        return replace(cell, grounding=tuple(numbers))
+    springs = []
+    for spring, number in zip(cell.springs, numbers, strict=True):
+        is_spring = quantity == "spring"
+        springs.append(replace(spring, stiffness=number) if is_spring else replace(spring, damping=number))
+    return replace(cell, springs=tuple(springs))
+
+
+def groups_of(unknown: UnknownTable, count: int) -> list[tuple[int, ...]]:
+    """The members (0-based) of each value of an unknown of ``count`` members."""
+    if unknown.of == "all":
+        return [tuple(range(count))]
+    if unknown.of == "each":
+        return [(member,) for member in range(count)]
+    return [tuple(number - 1 for number in group) for group in unknown.of]
+
+
+def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float) -> SoughtParameter:
+    """One of the values of an ``unknown``."""
+    low, high = unknown.bounds
+    name: str = unknown.quantity
+    if unknown.of != "all":
+        name += f" {'+'.join(str(member + 1) for member in members)}"
+    scale = unknown.scale or ("linear" if unknown.quantity in ("restitution", "exponent") else "logarithmic")
+    # The case may lie outside the bounds; the search does not.
+    start = min(max(start, low), high)
+    unit = UNITS.get(unknown.quantity, "1")
+    return SoughtParameter(name, unknown.quantity, members, low, high, start, unit, scale == "logarithmic")
+
+
+def parameters_of(unknown: UnknownTable, base: Case) -> list[SoughtParameter]:
+    """The parameters of an ``unknown`` of the case ``base``, which begin at its values unless a start is given."""
+    values = values_of(base, unknown.quantity)
+    parameters = []
+    for number, members in enumerate(groups_of(unknown, len(values))):
+        start = unknown.start[number] if isinstance(unknown.start, list) else unknown.start
+        if start is None:
+            start = float(np.mean([values[member] for member in members]))
+        parameters.append(_parameter(unknown, members, start))
+    return parameters
+
+
+def changed_case(base: Case, parameters: Sequence[SoughtParameter], values: Iterable[float], name: str) -> Case:
+    """The case ``base`` with the ``values`` (parameter,) of its ``parameters``; raises CaseError."""
+    contacts: Table = {}
+    drive: Table = {}
+    cell = base.lattice.undamped_cell()
+    changed_cell = cell
+    of_quantity: dict[str, list[float]] = {}
+    for parameter, value in zip(parameters, values, strict=True):
+        if parameter.quantity != "offset":
+            numbers = of_quantity.setdefault(parameter.quantity, list(values_of(base, parameter.quantity)))
+            for member in parameter.members:
+                numbers[member] = float(value)
+
+    for quantity, numbers in of_quantity.items():
+        if quantity == "amplitude":
+            drive["amplitude"] = numbers[0]
+        elif quantity in OF_CELL:
+            changed_cell = _with_values(changed_cell, quantity, numbers)
+        elif quantity == "clearance":
+            contacts["clearance"] = numbers
+        elif len(set(numbers)) == 1 and not (base.contacts.each and getattr(base.contacts.each, quantity)):
+            contacts[quantity] = numbers[0]
+        else:
+            each = contacts.get("each") or (base.contacts.each or Section()).model_dump(exclude_none=True)
+            contacts["each"] = each | {quantity: numbers}
+            # A quantity stands in one place.
+            contacts[quantity] = None
+
+    changes = {key: section for key, section in (("contacts", contacts), ("drive", drive)) if section}
+    if changed_cell is not cell:
+        lattice = base.lattice.model_dump(by_alias=True, exclude_none=True)
+        changes["lattice"] = dict.fromkeys(lattice) | with_cell(lattice, changed_cell, {})
+    return base.varied(name=name, **changes)

@@ -1,0 +1,74 @@
+"""The state at which a motion begins, with its derivatives, and the contacts that are closed in it."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.contact.law import CLIPPED, FREE, elastic_energy, elastic_force, gap_of
+from vipetsc.contact.tracker import ImpactTracker
+from vipetsc.identification.motion_rates import Lattice, MotionState, difference
+
+# Fraction of an exponent over which the elastic energy is differenced.
+SHORT = 1e-6
+
+
+class MotionBegin(NamedTuple):
+    """A ``time`` in s, the ``state`` (2n,) in m and m/s then, and its derivatives ``slopes`` (2n, parameter)."""
+
+    time: float
+    state: np.ndarray
+    slopes: np.ndarray
+
+
+def begin_contacts(lattice: Lattice, motion: MotionState, tracker: ImpactTracker) -> None:
+    """Close the sites that the state of ``motion`` holds beyond their clearances, with the derivatives of w'_minus.
+
+    As in ``ImpactTracker.begin``, mu (w'_minus^2 - w'^2)/2 is the elastic energy E(x): the impact had no loss before
+    the motion begins. Hence w'_minus dw'_minus = w' dw' + d(E/mu).
+    """
+    contacts = lattice.contacts
+    n = len(lattice.inverse_mass)
+    rows = range(len(contacts))
+    w = [[difference(motion.state, lattice.ends, i, first, 0) for first in (0, n)] for i in rows]
+    closed = tracker.begin(np.array(w).reshape(-1, 2))
+
+    for i in closed:
+        site = contacts[i]
+        side = 1.0 if site["mode"] > 0 else -1.0
+        which = 0 if side > 0 else 1
+        speed = abs(float(site["approach"]))
+        # At the floor w'_minus is held and does not vary.
+        if speed <= site["floor"] or abs(site["mode"]) in (FREE, CLIPPED):
+            continue
+
+        depth = max(side * w[i][0] - gap_of(site, side), 0.0)
+        force = elastic_force(site["elastic"], depth)
+        energy = elastic_energy(site["elastic"], depth)
+        by_exponent = _energy_by_exponent(site, depth)
+        for j in range(1, motion.state.shape[1]):
+            deeper = side * difference(motion.state, lattice.ends, i, 0, j) - lattice.slopes.gaps[j - 1, i, which]
+            change = force * deeper
+            change += energy / site["elastic"]["stiffness"] * lattice.slopes.laws[j - 1, i, 0]
+            change += by_exponent * lattice.slopes.laws[j - 1, i, 1]
+            change -= energy / site["reduced_mass"] * _reduced_mass_slope(lattice, i, j - 1)
+            faster = w[i][1] * difference(motion.state, lattice.ends, i, n, j)
+            motion.approach[i, j] = side * (faster + change / site["reduced_mass"]) / speed
+
+
+def _energy_by_exponent(site: np.ndarray, depth: float) -> float:
+    """Derivative of the elastic energy in J at a ``depth`` in m by the exponent of the law."""
+    energies = []
+    for sign in (-1, 1):
+        changed = site["elastic"].copy()
+        changed["exponent"] += sign * SHORT
+        energies.append(elastic_energy(changed, depth))
+    return float(energies[1] - energies[0]) / (2 * SHORT)
+
+
+def _reduced_mass_slope(lattice: Lattice, i: int, p: int) -> float:
+    """Derivative of the reduced mass of site ``i`` by parameter ``p``: d mu = mu^2 sum_e dm_e/m_e^2 over its ends."""
+    total = 0.0
+    for mass in lattice.ends[i]:
+        if mass >= 0:
+            total += lattice.slopes.masses[p, mass] * lattice.inverse_mass[mass] ** 2
+    return float(lattice.contacts[i]["reduced_mass"]) ** 2 * total
