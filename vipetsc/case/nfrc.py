@@ -42,8 +42,9 @@ class NfrcTable(Section):
     masses than the cell's pair. ``harmonics`` is the number of the last one; motions that are not ``symmetric``
     (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too. Besides folds the
     points are located where states become stable or unstable (``special_points``: Neimark-Sacker, period doubling,
-    branch points), or ``all`` where the number of growing perturbations changes. Steps are in units
-    of the clearance and of the amplitude that touches, or half the range of frequencies.
+    branch points), or ``all`` where the number of growing perturbations changes. At ``isolas`` places within the range
+    isolated curves are looked for, by way of amplitudes up to ``isola_reach`` times larger or smaller. Steps are in
+    units of the clearance and of the amplitude that touches, or half the range of frequencies.
     """
 
     source: Literal["wave", "force"] = "wave"
@@ -57,6 +58,8 @@ class NfrcTable(Section):
     family: dict[str, Any] | None = None
     harmonics: int = Field(41, ge=1, le=2000)
     symmetric: bool | None = None
+    isolas: int = Field(0, ge=0, le=1000)
+    isola_reach: float = Field(10.0, gt=1, le=1e3)
     special_points: Literal["stability", "all"] = "stability"
     points: int = Field(1000, ge=1)
     first_step: Positive = 0.02
@@ -213,6 +216,11 @@ class NfrcCase(Case):
             yield Problem("drive.end", sections["drive"].end, remedy)
         if nfrc.over == "frequency" and not nfrc.fixed:
             yield Problem("nfrc.fixed", [], "give the amplitudes of the curves over frequency")
+        if nfrc.over == "amplitude" and nfrc.isolas:
+            remedy = (
+                "looked for over other amplitudes, along which this curve runs itself; omit it, or vary the frequency"
+            )
+            yield Problem("nfrc.isolas", nfrc.isolas, remedy)
         if not nfrc.smallest_step < nfrc.largest_step:
             yield Problem("nfrc.smallest_step", nfrc.smallest_step, "must be below nfrc.largest_step")
 

@@ -25,6 +25,7 @@ def table_at(table: Table, value: float) -> tuple[Table, list[Problem]]:
     # The range of the key is none of amplitudes, and what is fixed besides the frequency is one of them.
     amplitudes = nfrc.pop("fixed", [])
     smallest = min(amplitudes, default=1.0)
+    nfrc.pop("isolas", None)
     nfrc |= {"over": "amplitude", "range": [0.5 * smallest, smallest]}
     return changed, problems
 

@@ -43,7 +43,7 @@ def response_family(paths: Sequence[Path]) -> Figure:
     """
     curves = responses_in(paths)
     rows: list[Callable[[xr.Dataset], np.ndarray]] = [_relative]
-    labels = ["largest |w| (m)"]
+    labels = ["largest |w| (m)" if curves[0].sizes["site"] else "largest elongation\n(m)"]
     for name in _common_locations(curves)[:MOST_LOCATIONS]:
         rows.append(partial(_displacement, name=name))
         labels.append(f"displacement\nof {name} (m)")
@@ -87,7 +87,12 @@ def legend_of(curves: Sequence[xr.Dataset]) -> list[str]:
         texts = SweptKey(path, unit, coordinate(values)).texts
         for part, text in zip(parts, texts, strict=True):
             part.append(text)
-    return [", ".join(part) or str(curve.attrs["name"]) for part, curve in zip(parts, curves, strict=True)]
+    texts = []
+    for part, curve in zip(parts, curves, strict=True):
+        isola = curve.attrs.get("isola")
+        named = [*part, f"isola {isola}"] if part and isola else part
+        texts.append(", ".join(named) or str(curve.attrs["name"]))
+    return texts
 
 
 def _keys_of(curve: xr.Dataset) -> dict[str, tuple[Any, str]]:

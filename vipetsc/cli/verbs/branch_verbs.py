@@ -129,8 +129,19 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
         (f"at {fixed}", f"{first_few([f'{value:.6g}' for value in options.fixed])} {fixed_unit}"),
         ("restitution", first_few([f"{restitution:g}" for restitution in options.restitutions])),
         *_family_rows(case),
+        *_isola_rows(case),
         ("harmonics", f"up to {options.harmonics}, {parity}; at most {options.points} points per curve"),
     ]
+
+
+def _isola_rows(case: NfrcCase) -> Rows:
+    """Where isolated curves are looked for, if they are."""
+    count = case.nfrc.isolas
+    places = "1 place" if count == 1 else f"{count} places"
+    reach = case.nfrc.isola_reach
+    return (
+        [("isolas", f"looked for at {places}, by amplitudes up to {reach:g} times larger or smaller")] if count else []
+    )
 
 
 def _family_rows(case: NfrcCase) -> Rows:

@@ -133,7 +133,7 @@ class Follower:
             for suffix in ("h5", "csv"):
                 part = self.folder / f"branch-{branch.name}-down.{suffix}"
                 on_root(self.comm, partial(part.unlink, missing_ok=True))
-        return [branch, *self._crossing(branch)]
+        return [branch, *self._further(branch)]
 
     def _save(self, branch: Branch[Any], follow: Callable[[], None]) -> None:
         """Follow a branch and write it, with the reason if it is stopped or fails."""
@@ -259,10 +259,10 @@ class Follower:
                 logger.warning("vipetsc: warning: %s; computed again", error)
         return fresh
 
-    def _crossing(self, branch: Branch[Any]) -> list[Branch[Any]]:
-        """The branches that cross ``branch`` at the kinds of special points asked for."""
-        branches = []
-        for crossing in self.method.crossings(branch):
+    def _further(self, branch: Branch[Any]) -> list[Branch[Any]]:
+        """The branches that cross ``branch`` or lie beside it, as far as they are asked for."""
+        branches: list[Branch[Any]] = []
+        for crossing in self.method.further(branch, branches):
             other = self._begun(crossing.name)
             branches.append(other)
             if not other.complete:
@@ -270,7 +270,7 @@ class Follower:
         return branches
 
     def _cross(self, branch: Branch[Any], crossing: CrossingBranch) -> None:
-        """Follow a ``branch`` that crosses another one."""
+        """Follow a ``branch`` that crosses another one or lies beside it."""
         sys.audit("vipetsc.switch", branch.name)
         problem, first = crossing.start()
         begin = branch.regular()[-1] if branch.points else first

@@ -1,7 +1,7 @@
 """Interface of the methods that find branches: problems, starts, and additions to points and files."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar, Generic, NamedTuple
 
 from mpi4py import MPI
@@ -14,7 +14,7 @@ Monitor = Callable[[S], str | None]
 
 
 class CrossingBranch(NamedTuple):
-    """A branch that crosses another one.
+    """A branch that crosses another one, or lies beside it.
 
     ``start`` finds its problem and first point when it is followed; ``rule(problem, first, done)`` gives the steps and
     the end of one that has ``done`` regular points after its start.
@@ -91,6 +91,9 @@ class Method(ABC, Generic[S]):
     def finish(self, problem: PeriodicProblem[S], branch: Branch[S]) -> None:
         """Add the variables of a whole branch's file that are not of its points."""
 
-    def crossings(self, branch: Branch[S]) -> Iterator[CrossingBranch]:
-        """The branches that cross a branch and that the case asks for."""
+    def further(self, branch: Branch[S], followed: Sequence[Branch[S]]) -> Iterator[CrossingBranch]:
+        """The branches that cross a branch, or lie beside it, and that the case asks for.
+
+        ``followed`` has those that were followed so far, when the next one is asked for.
+        """
         return iter(())

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 from mpi4py import MPI
@@ -149,7 +149,7 @@ class ShootingMethod(NnmMethod):
         groups = [by_region[region] for region in sorted(by_region)]
         return [group[len(group) // 2] for group in groups]
 
-    def crossings(self, branch: Branch[Point]) -> Iterator[CrossingBranch]:
+    def further(self, branch: Branch[Point], followed: Sequence[Branch[Point]]) -> Iterator[CrossingBranch]:
         """The branches that cross at the kinds of special points in ``nnm.switch``."""
         for kind in self.options.switch:
             special = [p for p in branch.points if p.kind == kind]

@@ -1,5 +1,6 @@
 """Curves of steady states under a drive: the verb ``nfrc``."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,9 +14,10 @@ from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.method import Method
+from vipetsc.modes.branches.method import CrossingBranch, Method
 from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem
 from vipetsc.modes.response.condensation import compliance_of
+from vipetsc.modes.response.isolated import CLOSED, ClosingSteps, places_of, unknown_states
 from vipetsc.modes.response.keyed_case import KeyedCase
 from vipetsc.modes.response.outputs import WALLS
 from vipetsc.modes.response.over_key import StatesOverKey
@@ -24,6 +26,8 @@ from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
 from vipetsc.spectra.measures import JOINT
 
+# Between the name of a curve and the number of an isolated one beside it.
+ISOLA = "-isola-"
 # Where energy goes that comes in.
 CHANNELS = "transmitted", "reflected", "upper", "lost"
 
@@ -49,11 +53,14 @@ class ResponseMethod(Method[Response]):
         return list(range(len(case.every_curve())))
 
     def new_branch(self, name: str) -> Branch[Response]:
-        """A curve without states."""
-        curve = next(curve for curve in self.curves if curve.name == name)
+        """A curve without states, or an isolated one beside it."""
+        base, isola, number = name.partition(ISOLA)
+        curve = next(curve for curve in self.curves if curve.name == base)
         about: dict[str, Any] = {"over": curve.case.nfrc.over, "restitution": curve.restitution}
         if curve.case.nfrc.varies_key:
             about["unit"] = unit_of(curve.case.nfrc.over, curve.case.model_dump(by_alias=True, exclude_none=True))
+        if isola:
+            about["isola"] = number
         if curve.values:
             about["family"] = curve.values
         return Branch(
@@ -89,6 +96,36 @@ class ResponseMethod(Method[Response]):
         """Steps to the end of the range; the start counts among ``nfrc.points``."""
         assert isinstance(problem, SteadyStates | StatesOverKey)
         return TurningSteps(problem, max(self.case.nfrc.points - 1 - done, 0))
+
+    def further(self, branch: Branch[Response], followed: Sequence[Branch[Response]]) -> Iterator[CrossingBranch]:
+        """The isolated curves that are found beside a curve, in both directions where they are not closed."""
+        if not (self.case.nfrc.isolas and branch.complete):
+            return
+        states = self.problem(next(job for job in self.jobs(self.case) if self.name(job) == branch.name))
+
+        def known() -> list[list[Response]]:
+            return [branch.points, *(other.points for other in followed)]
+
+        number = 0
+        for p in places_of(states, self.case.nfrc.isolas):
+            for xi in unknown_states(states, known, float(p)):
+                number += 1
+                start = Response(xi=xi, next_step=states.options.first_step)
+                first = replace(start, tangent=states.first_tangent(start, 1))
+                yield self._isola(states, first, f"{branch.name}{ISOLA}{number}")
+                if not followed[-1].complete:
+                    return  # states on what is left of it would be found again
+                if followed[-1].ending != CLOSED:
+                    back = replace(first, tangent=-first.tangent)
+                    yield self._isola(states, back, f"{branch.name}{ISOLA}{number}-back")
+
+    def _isola(self, states: SteadyStates | StatesOverKey, first: Response, name: str) -> CrossingBranch:
+        """The isolated curve of that ``name`` through the ``first`` state, along its tangent."""
+
+        def rule(problem: PeriodicProblem[Response], begin: Response, done: int) -> ClosingSteps:
+            return ClosingSteps(states, max(self.case.nfrc.points - 1 - done, 0), first, begin)
+
+        return CrossingBranch(name, lambda: (states, first), rule)
 
     def assess(self, problem: PeriodicProblem[Response], point: Response) -> Response:
         """The state with its measures, which special points have already."""

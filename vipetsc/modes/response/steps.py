@@ -158,4 +158,4 @@ def _ramp(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
     points = list(Continuation(ramp, first_state(ramp, is_ramp=True), TurningSteps(ramp, MOST_RAMP)))
     if not points or not np.isclose(points[-1].xi[-1] * ramp.parameter.scale, amplitude):
         raise ContinuationError(f"increasing amplitudes do not reach {amplitude:g}: lower nfrc.range or nfrc.fixed")
-    return points[-1].xi[:-1]
+    return points[-1].xi[:-1] * (ramp.clearance / states.clearance)

@@ -1,0 +1,145 @@
+"""Isolated responses: those of an oscillator with a nonlinear absorber, whose ends SciPy's integration confirms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import vipetsc
+from tests.rigs import after_a_period, rate_of
+from tests.steady_states import motion_at
+from vipetsc.case import CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.figures.registry import draw
+from vipetsc.figures.response_family import legend_of
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.response_layout import measure
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.steady import SteadyStates
+
+pytestmark = pytest.mark.parallel(1)
+
+# A hardening oscillator with a nonlinear tuned vibration absorber of a twentieth of its mass: Detroux et al. (2015),
+# but with a dashpot ten times theirs, so that the isolated curve is short.
+PRIMARY = {"start": 1, "end": 1, "stiffness": 0.5, "cubic": 0.5, "damping": 0.01, "next_cell": True}
+ABSORBER = {"start": 1, "end": 2, "stiffness": 0.0454, "cubic": 0.0042, "damping": 0.0128}
+TABLE: dict[str, Any] = {
+    "name": "absorber",
+    "lattice": {"cells": 1, "cell": {"masses": [1.0, 0.05], "springs": [PRIMARY, ABSORBER], "contact": [1, 2]}},
+    "contacts": {"sites": []},
+    "drive": {"waveform": "harmonic", "amplitude": 0.18, "frequency": 1.0, "cell": 1, "mass": 1},
+    "time": {"end": 10.0},
+}
+
+
+def absorber(force: float = 0.18, **nfrc: Any) -> NfrcCase:
+    """Curves at a ``force`` in N, with isolated ones looked for at two frequencies."""
+    options = {"source": "force", "over": "frequency", "range": [1.55, 1.9], "fixed": [force], "harmonics": 7}
+    return NfrcCase.from_table(TABLE | {"nfrc": options | {"isolas": 2, "largest_step": 0.3} | nfrc})
+
+
+@pytest.fixture(scope="module")
+def curves(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("isolas")
+    return folder, follow_all(absorber(), folder, MPI.COMM_SELF)
+
+
+def equations() -> SteadyStates:
+    return SteadyStates(absorber(), 1.0, 0.18)
+
+
+def state_of(states: SteadyStates, point: Response) -> np.ndarray:
+    """Displacements and velocities (4,) at phase 0."""
+    return np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(1))])
+
+
+def test_an_isolated_curve_is_closed_and_has_a_file_of_its_own(curves):
+    folder, (main, isola) = curves
+    assert main.ending.startswith("reached the end")
+    assert (isola.name, isola.ending) == (f"{main.name}-isola-1", "closed: it has come back to its first state")
+    np.testing.assert_array_equal(isola.points[0].xi, isola.points[-1].xi)
+    # It lies within the range, apart from the curve from the beginning of the range.
+    assert measure(main, "largest_elongation")[:, 0].max() < 1.0 < measure(isola, "largest_elongation")[:, 0].min()
+    with vipetsc.open(folder / f"branch-{isola.name}.h5") as data:
+        assert data.attrs["isola"] == "1"
+    with vipetsc.open(folder / f"branch-{main.name}.h5") as data:
+        assert "isola" not in data.attrs
+    assert sorted(path.stem for path in draw("branches", [folder])) == [
+        f"branch-{main.name}",
+        f"branch-{isola.name}",
+        "responses",
+    ]
+
+
+def test_its_two_ends_are_folds_of_the_flow(curves):
+    """At both ends SciPy's map of a period brings the state back, and has a multiplier of 1."""
+    _, (_, isola) = curves
+    states = equations()
+    folds = [point for point in isola.points if point.kind == "fold"]
+    frequencies = measure(isola, "frequency")
+    found = sorted(point.measured.frequency for point in folds)
+    assert found == [frequencies.min(), frequencies.max()]
+    for point in folds:
+        state = state_of(states, point)
+        end = after_a_period(states, point, state)
+        assert np.abs(end - state).max() < 1e-5 * np.abs(state).max()
+        step = 1e-6
+        columns = [(after_a_period(states, point, state + step * one) - end) / step for one in np.eye(4)]
+        values = np.linalg.eigvals(np.array(columns).T)
+        assert np.abs(values - 1).min() < 1e-2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("place", "stays"), [(-0.01, True), (0.01, False)])
+def test_a_motion_on_it_stays_up_to_its_end_and_falls_beyond(curves, place, stays):
+    """Time integration from the stable state next to the upper end, at frequencies on both sides of it."""
+    _, (_, isola) = curves
+    states = equations()
+    stable = [point for point in isola.points if point.measured.unstable == 0 and point.kind == "regular"]
+    upper = measure(isola, "frequency").max()
+    begin = min(stable, key=lambda point: abs(point.measured.frequency - upper * 0.99))
+    omega = upper * (1 + place)
+    periods = 150
+    rate = rate_of(states, omega, 0.18)
+    end = 2 * np.pi / omega * periods
+    late = np.linspace(0.97 * end, end, 400)
+    motion = solve_ivp(rate, (0, end), state_of(states, begin), "LSODA", t_eval=late, rtol=1e-7, atol=1e-9)
+    largest = np.abs(motion.y[0]).max()
+    assert (largest > 1.3) == stays
+    if not stays:
+        assert largest < 0.5
+
+
+def test_where_there_is_none_no_file_is_left(tmp_path):
+    """At 0.15 N the resonance beyond the absorber is not reached at all, at 0.18 N apart from the rest."""
+    assert len(follow_all(absorber(0.15), tmp_path, MPI.COMM_SELF)) == 1
+
+
+def test_a_stopped_isola_goes_on_to_the_same_bits(curves, tmp_path):
+    _, (_, isola) = curves
+    first = follow_all(absorber(points=40), tmp_path, MPI.COMM_SELF)
+    assert [curve.complete for curve in first] == [True, False]
+    more = follow_all(absorber(), tmp_path, MPI.COMM_SELF, resume=True)
+    assert [point.xi.tolist() for point in more[1].points] == [point.xi.tolist() for point in isola.points]
+
+
+def test_legends_number_isolas_beside_the_keys(curves):
+    folder, _ = curves
+    loaded = []
+    for path in sorted(folder.glob("branch-*.h5")):
+        with vipetsc.open(path) as data:
+            loaded.append(data.load())
+    assert legend_of(loaded) == ["r1-0.18-isola-1", "r1-0.18"]
+    weaker = loaded[1].assign(amplitude=loaded[1]["amplitude"] / 2)
+    texts = [text.replace("\u00a0", " ") for text in legend_of([*loaded, weaker])]
+    assert texts == ["amplitude 0.18 N, isola 1", "amplitude 0.18 N", "amplitude 0.09 N"]
+
+
+def test_a_curve_over_the_amplitude_has_no_such_search():
+    with pytest.raises(CaseError, match="along which this curve runs itself"):
+        absorber(over="amplitude", fixed=[1.7], range=[0.1, 0.3])

@@ -1,0 +1,133 @@
+"""States of isolated curves, which no curve from the beginning of the range meets: where one can begin.
+
+At one amplitude an isolated curve (an isola) hangs together with the others by states at other amplitudes: with the
+amplitude it grows, and in general merges with its neighbour. From each known state at a value p of the parameter the
+states over the amplitude are therefore followed at this p, up and down. Where such a line passes the amplitude of the
+curve again it has found a state of it, known or not. Cf. T. Detroux et al., Mech. Syst. Signal Process. 60-61 (2015)
+799, and R. J. Kuether et al., J. Sound Vib. 351 (2015) 299, who continue folds over the amplitude.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from itertools import pairwise
+
+import numpy as np
+
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.problem import ContinuationError, FlowError
+from vipetsc.modes.response.over_key import StatesOverKey
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import TurningSteps
+
+# States of one line over the amplitude, at most.
+MOST_STATES = 1000
+# Difference of unknowns, over their size, above which two states are not the same.
+DIFFERENT = 1e-6
+# What may end a line, or keep Newton's method from a state.
+FAILURES = ContinuationError, FlowError, ArithmeticError, ValueError
+
+Equations = SteadyStates | StatesOverKey
+Curves = Sequence[Sequence[Response]]
+
+
+def places_of(states: Equations, count: int) -> np.ndarray:
+    """Scaled parameters (count,) evenly within the range of a curve, at which unknown states are looked for."""
+    low, high = (bound / states.parameter.scale for bound in states.options.range)
+    return np.asarray(low + (high - low) * (np.arange(count) + 0.5) / count)
+
+
+def unknown_states(states: Equations, known: Callable[[], Curves], p: float) -> Iterator[np.ndarray]:
+    """Unknowns of states at the scaled parameter ``p`` that lie on none of the ``known`` curves.
+
+    These are asked for before each state, since curves may be added between two states.
+    """
+    states_found: list[np.ndarray] = []
+    passed: list[np.ndarray] = []
+    for begin in states_on(states, known(), p):
+        # A line that has come by this state has followed its line already.
+        if not _is_among(begin, passed):
+            on_line = list(_states_over_amplitude(states, begin))
+            passed += on_line
+            states_found += on_line
+    for xi in states_found:
+        if not _is_among(xi, states_on(states, known(), p)):
+            yield xi
+
+
+def states_on(states: Equations, curves: Curves, p: float) -> list[np.ndarray]:
+    """Unknowns of the states of ``curves`` at the scaled parameter ``p``."""
+    states_found: list[np.ndarray] = []
+    for points in curves:
+        for before, after in pairwise(point.xi for point in points):
+            if (before[-1] - p) * (after[-1] - p) > 0 or before[-1] == after[-1]:
+                continue
+            place = (p - before[-1]) / (after[-1] - before[-1])
+            with suppress(*FAILURES):
+                xi = states.at(before + place * (after - before), p)
+                if not _is_among(xi, states_found):
+                    states_found.append(xi)
+    return states_found
+
+
+def _is_among(xi: np.ndarray, others: Sequence[np.ndarray]) -> bool:
+    """Whether one of the ``others`` is the same state."""
+    return any(np.linalg.norm(xi - other) <= DIFFERENT * np.linalg.norm(xi) for other in others)
+
+
+def _states_over_amplitude(states: Equations, begin: np.ndarray) -> Iterator[np.ndarray]:
+    """Unknowns of further states with the curve's amplitude, on the line over the amplitude through ``begin``."""
+    line = _line(states, begin[-1])
+    _, amplitude = states.drive(begin[-1])
+    p = amplitude / line.parameter.scale
+    unit = states.clearance / line.clearance
+    for direction in (1, -1):
+        with suppress(*FAILURES):
+            start = Response(xi=line.at(np.append(begin[:-1] * unit, p), p), next_step=line.options.first_step)
+            last = start
+            for point in Continuation(line, start, TurningSteps(line, MOST_STATES), direction):
+                # The first step leaves the amplitude itself.
+                if last is not start and (last.xi[-1] - p) * (point.xi[-1] - p) <= 0:
+                    place = (p - last.xi[-1]) / (point.xi[-1] - last.xi[-1])
+                    xi = line.at(last.xi + place * (point.xi - last.xi), p)
+                    yield np.append(xi[:-1] / unit, begin[-1])
+                last = point
+
+
+def _line(states: Equations, p: float) -> SteadyStates:
+    """The equations over the amplitude at the scaled parameter ``p``, from 1/reach to reach times the curve's."""
+    omega, amplitude = states.drive(p)
+    lattice = states if isinstance(states, SteadyStates) else states.states_at(p * states.parameter.scale)
+    reach = states.options.isola_reach
+    update = {"over": "amplitude", "fixed": [omega], "range": [amplitude / reach, amplitude * reach]}
+    case = lattice.case.model_copy(update={"nfrc": lattice.options.model_copy(update=update)})
+    return SteadyStates(case, lattice.restitution, omega, lattice.compliance, lattice.forces)
+
+
+class ClosingSteps(TurningSteps):
+    """Steps of an isolated curve: it ends where it comes back to its ``first`` state, or on the range."""
+
+    def __init__(self, states: Equations, points: int, first: Response, begin: Response) -> None:
+        super().__init__(states, points)
+        self.first = first
+        self._side = self._beyond(begin)
+
+    def end(self, point: Response) -> tuple[Response, str] | None:
+        """The first state, where ``point`` has passed it; else the state on the end of the range, if it was passed."""
+        before = self._side
+        self._side = self._beyond(point)
+        is_near = np.linalg.norm(point.xi - self.first.xi) <= point.step
+        if before < 0 <= self._side and is_near:
+            first = self.first
+            last = Response(
+                xi=first.xi, tangent=first.tangent, index=point.index, step=point.step, next_step=point.next_step
+            )
+            return last, CLOSED
+        return super().end(point)
+
+    def _beyond(self, point: Response) -> float:
+        """How far a state is beyond the first one along its tangent."""
+        return float(self.first.tangent @ (point.xi - self.first.xi))
+
+
+CLOSED = "closed: it has come back to its first state"
