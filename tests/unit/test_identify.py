@@ -149,8 +149,16 @@ def test_a_table_and_an_hdf5_file_give_the_same_record(tmp_path):
         measured = read_measured(RecordTable.model_validate(record))
         assert measured.times == pytest.approx(times, abs=1e-15)
         assert measured.values[:, 0] == pytest.approx(9.81 * values, rel=1e-12)
-    cut = read_measured(RecordTable.model_validate(by_name | {"end": 0.01}))
-    assert len(cut.times) == 11
+
+    decimals = [f"{1e3 * t:.17g};{v:.17g}".replace(".", ",") for t, v in zip(times, values, strict=True)]
+    text.write_text("\n".join(["time (ms);v (g)", *decimals]))
+    with_commas = read_measured(RecordTable.model_validate(by_name))
+    assert with_commas.values[:, 0] == pytest.approx(9.81 * values, rel=1e-12)
+    text.write_text("\n".join(decimals))
+    assert read_measured(RecordTable.model_validate(by_number)).values[0, 0] == pytest.approx(9.81 * values[0])
+    text.write_text("\n".join(lines))
+    cut = read_measured(RecordTable.model_validate(by_name | {"begin": 0.002, "end": 0.01}))
+    assert cut.times == pytest.approx(1e-3 * np.arange(2, 11))
 
 
 def test_parameters_go_into_the_case(tmp_path):

@@ -181,7 +181,12 @@ def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
     if not lines or len(lines) > MOST_ROWS:
         raise MeasuredError("file", record.file, f"has {len(lines)} lines; a table has 1 to {MOST_ROWS}")
 
-    separator = next((mark for mark in (",", ";", "\t") if mark in lines[0]), None)
+    separator = next((mark for mark in (";", "\t", ",") if mark in lines[0]), None)
+    if separator in (";", "\t") and not any("." in line for line in lines[1:]):
+        # Where commas do not separate, they are those of decimals, except in names.
+        decimals = [line.replace(",", ".") for line in lines]
+        has_names = not all(_is_number(field) for field in decimals[0].split(separator))
+        lines = [lines[0], *decimals[1:]] if has_names else decimals
     rows = [[field.strip().strip('"') for field in line.split(separator)] for line in lines]
     names: list[str] = []
     # Measuring programs leave "nan" for what they miss: that is a number, though a bad one.

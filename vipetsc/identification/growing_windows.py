@@ -37,6 +37,8 @@ SHORTEST = 0.01
 FIRST = 0.1
 # Sides, 0 of w > 0, on which a clearance has its stops.
 SIDES = {"clearance": [0], "clearance_minus": [1]}
+# Samples of a window, at least; every record has as many.
+LEAST_SAMPLES = 4
 # Data of a first window, at least, for each number that is unknown.
 DATA_EACH = 1.5
 REWEIGHTINGS = 2
@@ -239,15 +241,18 @@ class GrowingWindows:
             onsets = self._onsets(z, number)
             if len(onsets) > impacts:
                 last = min(last, float(onsets[impacts]) + self.misfit.offset(z, number))
-            ends.append(last)
+            # However soon contacts follow each other, a window has data.
+            ends.append(max(last, float(self.misfit.records[number].times[LEAST_SAMPLES - 1])))
         return ends
 
     def _onsets(self, z: np.ndarray, number: int) -> np.ndarray:
-        """The onsets in s of the model's contacts in a record."""
+        """The onsets in s of the model's contacts in a record, from its first sample on."""
         try:
-            return np.asarray(self.misfit.respond(z, number, self.last[number]).episodes["onset"])
+            onsets = self.misfit.respond(z, number, self.last[number]).episodes["onset"]
         except (CaseError, MotionError):
             return np.zeros(0)
+        first = self.misfit.times(z, number, self.last[number])[0]
+        return np.asarray(onsets[onsets > first])
 
     def _window(self, z: np.ndarray, ends: Sequence[float]) -> Window:
         """The window up to ``ends`` with its misfit."""
