@@ -37,10 +37,11 @@ class NfrcTable(Section):
     by default the drive's) and each of the ``restitutions`` (by default that of ``[contacts]``), and of these for each
     combination of the values of further keys in ``family``, which are lists or ranges as in ``[sweep]``. Over the path
     of a key (``contacts.clearance``, in the key's unit) ``fixed`` are amplitudes, at the drive's frequency, and the
-    case is resolved anew at each value. The lattice is
-    ``infinite``, or ends where its cells do: always if it has dashpots, cells that differ, or contacts between other
-    masses than the cell's pair. ``harmonics`` is the number of the last one; motions that are not ``symmetric``
-    (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too. Besides folds the
+    case is resolved anew at each value. The lattice is ``infinite``, or ends where its cells do: always if it has
+    dashpots, cells that differ, or contacts between other masses than the cell's pair. With ``open_ends`` it goes on
+    for ever as the reference cell in the place of its absorbing ends. ``harmonics`` is the number of the last one;
+    motions that are not ``symmetric`` (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have
+    even ones too. Besides folds the
     points are located where states become stable or unstable (``special_points``: Neimark-Sacker, period doubling,
     branch points), or ``all`` where the number of growing perturbations changes. At ``isolas`` places within the range
     isolated curves are looked for, by way of amplitudes up to ``isola_reach`` times larger or smaller. Steps are in
@@ -49,6 +50,7 @@ class NfrcTable(Section):
 
     source: Literal["wave", "force"] = "wave"
     infinite: bool | None = None
+    open_ends: bool = False
     band: Annotated[int, Field(ge=1)] | None = None
     direction: Literal["forward", "backward"] = "forward"
     over: str = "amplitude"
@@ -214,6 +216,8 @@ class NfrcCase(Case):
         if nfrc.source == "wave" and valid("drive") and sections["drive"].end:
             remedy = 'a wave that comes from far away is moved by no wall; omit it, or nfrc.source = "force"'
             yield Problem("drive.end", sections["drive"].end, remedy)
+        if nfrc.open_ends and valid("lattice", "drive"):
+            yield from _check_open_ends(sections)
         if nfrc.over == "frequency" and not nfrc.fixed:
             yield Problem("nfrc.fixed", [], "give the amplitudes of the curves over frequency")
         if nfrc.over == "amplitude" and nfrc.isolas:
@@ -354,6 +358,22 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
         if unknowns > MOST_UNKNOWNS:
             remedy = f"{places} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
             yield Problem("nfrc.harmonics", nfrc.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
+
+
+def _check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:
+    """Problems with ends that go on for ever."""
+    absorbing = sections["lattice"].absorbing
+    cell, _ = check_cell(sections["lattice"])
+    moved = sections["drive"].end
+    if sections["nfrc"].source == "wave":
+        yield Problem("nfrc.open_ends", True, "the lattice of an incident wave has no ends; omit it")
+    elif not absorbing:
+        yield Problem("nfrc.open_ends", True, "says that absorbing ends reflect nothing; give [lattice.absorbing]")
+    elif cell is not None and not cell.is_linear:
+        remedy = "beyond its ends a lattice goes on with linear springs; omit it, or quadratic and cubic"
+        yield Problem("nfrc.open_ends", True, remedy)
+    elif moved and absorbing.end in (moved, "both"):
+        yield Problem("drive.end", moved, "no wall moves where the lattice goes on; set lattice.absorbing.end")
 
 
 def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:

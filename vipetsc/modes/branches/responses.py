@@ -156,6 +156,6 @@ def _axes(case: NfrcCase) -> Variables:
     if output.transmission:
         pairs = np.array([JOINT.join(pair) for pair in output.transmission])
         axes["pair"] = variable("pair", pairs, "1", "locations of a transmission, from - to")
-    if output.forces and case.lattice.ends == "fixed" and not case.nfrc.infinite:
+    if output.forces and case.lattice.ends == "fixed" and not (case.nfrc.infinite or case.nfrc.open_ends):
         axes["wall"] = variable("wall", np.array(WALLS), "1", "wall at an end of the lattice")
     return axes

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase, needs_modes
-from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
+from vipetsc.case.resolve import build_chain
+from vipetsc.lattice import ModalCompliance, OpenCompliance, WaveCompliance, nonlinear_places
 from vipetsc.modes.balance.harmonics import SiteForces, Stops
 
 
@@ -37,6 +38,12 @@ def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
     """
     chain = case.model().chain
     places = driven_points(case).places
+    if case.nfrc.open_ends:
+        absorbing = case.lattice.absorbing
+        assert absorbing is not None  # checked in the case
+        ends = ("left", "right") if absorbing.end == "both" else (absorbing.end,)
+        without = build_chain(case.lattice.model_copy(update={"absorbing": None}), case.contacts)
+        return OpenCompliance(without, places, ends)
     if needs_modes(chain):
         return ModalCompliance(chain, places)
     return WaveCompliance(chain, bool(case.nfrc.infinite), places)

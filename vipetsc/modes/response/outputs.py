@@ -56,7 +56,7 @@ class ResponseOutputs:
         chain = compliance.chain
         self._springs = compliance.springs if isinstance(compliance, ModalCompliance) else []
         self.walls: list[WallSprings] = []
-        if self.wants_forces and not case.nfrc.infinite and chain.ends == "fixed":
+        if self.wants_forces and not (case.nfrc.infinite or case.nfrc.open_ends) and chain.ends == "fixed":
             self.walls = [wall_springs(chain, wall) for wall in WALLS]
         self._moved = case.drive.end
         self._masses = [(point.cell - 1, point.mass - 1) for point in output.points or []]

@@ -232,7 +232,7 @@ class SteadyStates(SteadyEquations):
                 omega=omega,
                 order=options.harmonics,
                 odd=bool(options.symmetric),
-                finite=not options.infinite,
+                finite=not (options.infinite or options.open_ends),
                 decay=decay,
             )
         return self._hill
