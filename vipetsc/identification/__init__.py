@@ -32,8 +32,8 @@ with a wide prior about rest that the last fit keeps, since a few sensors may no
 more data than unknowns.
 
 **3. A clearance that is not reached** has no derivative, and none leads out of a contact that the lattice did not have.
-Where the model does not touch, its clearance is tried just within reach of the motion; where it does, just out of reach
-of the motion without this stop. It is kept there if that explains the record better. At the end, the largest motion
+Each clearance is therefore tried at some fractions of the motion without its stop, within reach and just out of reach,
+and kept where that explains the record better. At the end, the largest motion
 towards a stop that is not met is a lower bound of the clearance, and all that the record says.
 
 **4. Least squares** (``misfit``): the residuals over the noise, by the trust-region method of SciPy within the bounds

@@ -19,9 +19,9 @@ PRIOR = 1.0
 ASSUMED_NOISE = 0.01
 # Smallest noise over the size of a channel.
 LEAST_NOISE = 1e-9
-# A clearance that the model does not reach has no derivative: it is tried at this fraction of what is reached. One that
-# the model reaches is tried out of reach: the lattice may not have touched there.
-WITHIN_REACH = 0.98
+# Clearances that are tried, over the motion without the stop: out of reach, where the lattice may not have touched,
+# just within it, where derivatives begin, and further in.
+OF_REACH = (1.02, 0.98, 0.8, 0.6, 0.4)
 TOLERANCE = 1e-12
 # Least weight of the prior over the size of the Jacobian. Where a clearance is not reached, a column is zero; without
 # full rank, SciPy makes every step as long as the trust region is, and does not converge.
@@ -289,42 +289,40 @@ class GrowingWindows:
         return float(np.max(towards, initial=0.0))
 
     def _other_contacts(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray | None:
-        """Coordinates with stops that are met just out of reach, or the reverse, if that lowers the misfit; else None.
+        """Coordinates with a clearance within the motion or out of its reach, if that lowers the misfit; else None.
 
-        Between the two no derivative leads.
+        No derivative leads from a stop that is not met to one that is, nor out of a contact that was not there.
         """
         best = None
         least = self.cost(z, ends)
-        try:
-            reached = self.reached(z, ends)
-            for number, parameter in enumerate(self.misfit.plan.parameters):
-                if parameter.quantity in SIDES:
-                    start = z if best is None else best
-                    moved = self._at_reach(start, ends, number, self.beyond(parameter, reached))
-                    cost = self.cost(moved, ends)
-                    if cost < least:
-                        best = moved
-                        least = cost
-        except (CaseError, MotionError):
-            return None
+        for number, parameter in enumerate(self.misfit.plan.parameters):
+            if parameter.quantity not in SIDES:
+                continue
+            for moved in self._clearances_tried(z if best is None else best, ends, number):
+                cost = self.cost(moved, ends)
+                if cost < least:
+                    best = moved
+                    least = cost
         return best
 
-    def _at_reach(self, z: np.ndarray, ends: Sequence[float], number: int, beyond: float) -> np.ndarray:
-        """The coordinates ``z`` with clearance ``number`` just within the motion that is ``beyond`` it in m.
-
-        Where ``beyond`` is NaN the stop is met: then just out of reach of the motion without it.
-        """
+    def _clearances_tried(self, z: np.ndarray, ends: Sequence[float], number: int) -> list[np.ndarray]:
+        """The coordinates ``z`` with other values of the clearance ``number``, by the motion without its stops."""
         parameter = self.misfit.plan.parameters[number]
-        wanted = WITHIN_REACH * beyond
-        moved = z.copy()
-        if np.isnan(beyond):
-            moved[number] = self.high[number]
-            wanted = self.beyond(parameter, self.reached(moved, ends)) / WITHIN_REACH
-        # A stop that is met wherever it is stays where it is, as one that would have to be out of its bounds.
-        if not parameter.low <= wanted <= parameter.high:
-            return z
-        moved[number] = parameter.to_coordinate(wanted)
-        return moved
+        free = z.copy()
+        free[number] = self.high[number]
+        try:
+            beyond = self.beyond(parameter, self.reached(free, ends))
+        except (CaseError, MotionError):
+            return []
+
+        tried = []
+        for fraction in OF_REACH:
+            # Not of a stop that is met even at its upper bound: then the motion without it is not known.
+            if parameter.low <= fraction * beyond <= parameter.high:
+                moved = z.copy()
+                moved[number] = parameter.to_coordinate(fraction * beyond)
+                tried.append(moved)
+        return tried
 
     def solve(
         self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision = FINAL
