@@ -205,8 +205,9 @@ class StopAt(StopRequest):
         return self.left < 0
 
 
-# By these names Open MPI's mpirun, whose layers have been PMIx and PRRTE since 5, says which rank a process is.
-NAMES_OF_RANKS = re.compile(r"(OMPI|PMIX|PRTE)_(?!MCA_|ALLOW_RUN_AS_ROOT)")
+# By these names Open MPI's mpirun, whose layers have been PMIx and PRRTE since 5, says which rank a process is. A
+# process without mpirun sets some of them itself when it loads MPI, and its children inherit them.
+NAMES_OF_RANKS = re.compile(r"(OMPI|PMIX|PRTE)_(?!MCA_|ALLOW_RUN_AS_ROOT)|OMPI_MCA_(ess|orte|pmix)")
 
 
 def set_words(*changes: str) -> list[str]:

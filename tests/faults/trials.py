@@ -91,7 +91,7 @@ class Crew:
         """Call mpirun with a worker; return its code and its messages. No process of it is left."""
         worker = [sys.executable, "-m", "tests.faults.worker", str(self.folder), json.dumps(tasks), str(self.patience)]
         command = ["mpirun", "--oversubscribe", "-n", str(self.ranks), *worker]
-        environment = clean_environment() | {"PYTHONPATH": str(ROOT), "OMPI_MCA_mpi_yield_when_idle": "1"}
+        environment = clean_environment() | {"PYTHONPATH": str(ROOT)}
         log = self.folder / "mpirun.log"
         with log.open("w") as file:
             process = subprocess.Popen(
