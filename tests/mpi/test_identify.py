@@ -86,7 +86,7 @@ def test_a_stopped_identification_goes_on(folder, plan, whole):
     MPI.COMM_WORLD.Barrier()
 
 
-@pytest.mark.parallel([1, 2, 3])
+@pytest.mark.parallel([2, 3])
 def test_ranks_divide_a_single_start_to_the_same_bits(folder, single):
     plan, whole = single
     run_identification(plan, folder, MPI.COMM_WORLD)
