@@ -12,6 +12,7 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.identification.uncertainty import marginal_jacobian, uncertainty_of
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.parallel import StopRequest
+from vipetsc.studies import identified as identified_module
 from vipetsc.studies.identification import Identification, read_records, run_identification
 
 UNKNOWNS = [
@@ -95,6 +96,19 @@ def test_profiles_are_the_least_misfit_with_one_parameter_held(identified):
         # Three standard errors away the misfit is nine more, as far as the problem is linear.
         assert 5 < results["profile/cost"].values[number, 2] < 15
     assert results["profile/cost"].values[:, 1] == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.slow
+def test_a_sensor_is_found_from_every_third_sample(identified, monkeypatch):
+    """Of long records every n-th sample stands for n of them: about the same errors, from a third of the memory."""
+    plan, z, results = identified
+    windows = Identification(plan, read_records(plan), StopRequest()).windows()
+    known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(3)))
+    samples = len(windows.misfit.records[0].times)
+    monkeypatch.setattr(identified_module, "MOST_NUMBERS", samples * 24 * 3 * 4 // 3 + 1)
+    thinned = identified_module._sensor_values(windows, z, known)
+    assert thinned["sensor/relative_error"] == pytest.approx(results["sensor/relative_error"].values, rel=0.5)
+    assert (thinned["sensor/relative_error"] < known.errors).all()
 
 
 def test_the_marginal_jacobian_has_the_inverse_of_the_covariance():

@@ -125,11 +125,18 @@ class Misfit:
         return inner, [p for p in active if state and p in state.indices]
 
     def respond(
-        self, z: np.ndarray, number: int, end: float, active: Iterable[int] = (), watched: np.ndarray | None = None
+        self,
+        z: np.ndarray,
+        number: int,
+        end: float,
+        active: Iterable[int] = (),
+        watched: np.ndarray | None = None,
+        stride: int = 1,
     ) -> RecordedMotion:
         """The motion of record ``number`` up to its time ``end``, with derivatives by its ``columns`` of ``active``.
 
-        Raises CaseError, MotionError.
+        It is that of the masses ``watched``, by default those of the sensors, at every ``stride``-th sample. Raises
+        CaseError, MotionError.
         """
         table = self.plan.options.records[number]
         model = self.plan.record_case(self.case(z), number).model()
@@ -139,7 +146,7 @@ class Misfit:
         return respond(
             model,
             slopes,
-            times=self.times(z, number, end),
+            times=self.times(z, number, end)[::stride],
             watched=self.watched[number] if watched is None else watched,
             touches=table.contact,
             begin=self._begin(z, number, model, (lower, upper, widths), estimated),

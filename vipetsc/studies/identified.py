@@ -31,6 +31,8 @@ EXACT = 1e-6
 SAME_VALLEY = 1e-3
 # Sensors are sought on so many masses at most, evenly over the lattice.
 MOST_CANDIDATES = 400
+# Numbers of their motion and its derivatives that are kept in memory, 160 MB.
+MOST_NUMBERS = 20_000_000
 
 
 def identified_values(
@@ -108,9 +110,12 @@ def _sensor_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty) -
     count = plan.base.lattice.cells * dofs
     candidates = np.arange(0, count, -(-count // MOST_CANDIDATES))
     inner, estimated = misfit.columns(record, range(misfit.size))
-    response = misfit.respond(z, record, windows.last[record], range(misfit.size), candidates)
+    # Of long records of large lattices every n-th sample, which stands for n of them, is enough.
+    numbers = len(misfit.records[record].times) * len(candidates) * len(ROWS) * (1 + len(inner + estimated))
+    stride = -(-numbers // MOST_NUMBERS)
+    response = misfit.respond(z, record, windows.last[record], range(misfit.size), candidates, stride)
     slopes = np.zeros((*response.motion.shape[:2], len(z)))
-    slopes[:, :, inner + estimated] = response.motion[:, :, ROWS[quantity], 1:]
+    slopes[:, :, inner + estimated] = np.sqrt(stride) * response.motion[:, :, ROWS[quantity], 1:]
     errors = errors_with_sensor(known, slopes, noise)[:, : misfit.count]
     chosen = errors.argmin(axis=0)
     return {

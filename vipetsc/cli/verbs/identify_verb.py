@@ -21,7 +21,9 @@ def identify_rows(plan: IdentifyCase, ranks: int) -> Rows:
     parameters = first_few([parameter.name for parameter in plan.parameters])
     rows = [("identify", f"{parameters}; starts: {plan.options.starts}")]
     for record in plan.options.records:
-        rows.append(("record", f"{record.file}: {first_few([sensor.name for sensor in record.sensors])}"))
+        sensors = first_few([sensor.name for sensor in record.sensors])
+        begin = "; its initial state is estimated" if record.initial == "estimate" else ""
+        rows.append(("record", f"{record.file}: {sensors}{begin}"))
     return rows
 
 
