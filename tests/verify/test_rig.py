@@ -139,7 +139,8 @@ def test_a_response_is_a_periodic_motion_and_is_stable_as_its_multipliers_are(ri
         end = after_a_period(states, point, state)
         # Contacts are bilinear: harmonics that are left out fall with the third power of their number.
         assert np.abs(end - state).max() < 1e-3 * np.abs(state).max()
-        if rig == "two_masses":
+        # Of ten cells a map has 40 columns: two states have to do.
+        if rig == "two_masses" or point in chosen[::4]:
             grows = np.abs(multipliers(states, point, state, end)) > 1.001
             assert point.measured.unstable == np.count_nonzero(grows)
             unstable.add(point.measured.unstable)

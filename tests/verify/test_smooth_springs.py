@@ -82,7 +82,7 @@ def test_its_states_come_back_after_a_period_and_are_stable_as_their_multipliers
     assert [point.kind for point in points].count("fold") == 2
     unstable = set()
     regular = [point for point in points if point.kind == "regular"]
-    for number in np.linspace(0, len(regular) - 1, 8).astype(int):
+    for number in np.linspace(0, len(regular) - 1, 10).astype(int):
         error, growing = misses(states, regular[number])
         assert error < 1e-6
         assert regular[number].measured.unstable == growing

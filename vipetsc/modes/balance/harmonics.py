@@ -168,6 +168,12 @@ class ForceSeries:
         """Add how the force of an arc depends on the approach velocity at its onset."""
         self._onsets.append(onset)
 
+    @property
+    def acting(self) -> np.ndarray:
+        """Numbers of the pairs whose force a perturbation changes: those in contact at some phase, and springs."""
+        changes = np.any(self._slopes, axis=1) | np.any(self._rates, axis=1)
+        return np.flatnonzero(changes)
+
     def add_dashpot(self, pair: int, rate: float, z: np.ndarray) -> None:
         """Add a force of ``rate`` z' in N of a pair whose elongation has the harmonics ``z`` (K + 1,)."""
         self.forces[pair, : len(z)] += 1j * rate * np.arange(len(z)) * z

@@ -42,6 +42,7 @@ FINEST = 14
 TURN = 0.7
 # Exponent at which D(0) is taken: at 0 itself a lattice that is free to move has no compliance.
 AT_ZERO = 1e-9
+FEW_PAIRS = 3
 KEPT = 48  # orders of perturbations that are kept where nothing dissipates
 # Steps, first step and accuracy, over Om, of the secant method.
 MOST_STEPS = 30
@@ -115,14 +116,26 @@ class Hill:
         if self._reduced is None or self._reduced[0] is not series:
             self._reduced = series, [self._eliminated(series, orders) for orders in self._blocks]
         out = np.ones(len(exponents), complex)
+        acting = self._acting(series)
+        if not acting.size:
+            return out
         for block, (orders, jacobian) in enumerate(zip(self._blocks, self._reduced[1], strict=True)):
             low = orders if jacobian is None else orders[np.abs(orders) <= KEPT]
             compliances = self._at(block, low, exponents.tolist())
             for i, (mu, g) in enumerate(zip(exponents.tolist(), compliances, strict=True)):
-                matrix = _flat(series.jacobian(mu, low)) if jacobian is None else jacobian
-                phase, log = np.linalg.slogdet(_plus_one(g, matrix))
+                matrix = _flat(series.jacobian(mu, low)[acting]) if jacobian is None else jacobian
+                phase, log = np.linalg.slogdet(_plus_one(_of_pairs(g, acting), matrix))
                 out[i] *= phase * np.exp(min(log, LARGEST_LOG))
         return out
+
+    def _acting(self, series: ForceSeries) -> np.ndarray:
+        """Numbers of the pairs of which the determinant is taken.
+
+        Of a pair that no force acts on the row of J is zero, and it leaves the determinant as it is. Of few pairs all
+        are taken, which costs little.
+        """
+        pairs = len(series.potential)
+        return series.acting if pairs > FEW_PAIRS else np.arange(pairs)
 
     def _at(self, block: int, orders: np.ndarray, exponents: Sequence[complex]) -> list[np.ndarray]:
         """The compliances (order, pair, pair) of a block's ``orders`` at ``exponents``: new ones all in one call."""
@@ -140,13 +153,14 @@ class Hill:
         """J (order pair, order pair) of the orders kept, with what the others do; None if it depends on lambda."""
         if not np.array_equal(series.jacobian(1.0, orders[:2]), series.jacobian(0.0, orders[:2])):
             return None
-        pairs = len(series.potential)
-        jacobian = _flat(series.jacobian(orders=orders))
+        acting = self._acting(series)
+        pairs = len(acting)
+        jacobian = _flat(series.jacobian(orders=orders)[acting])
         high = np.abs(orders) > KEPT
         if not high.any():
             return jacobian
 
-        g = self.compliance.at(orders[high] * self.omega)
+        g = _of_pairs(self.compliance.at(orders[high] * self.omega), acting)
         rows = np.repeat(high, pairs)
         inner = _plus_one(g, jacobian[np.ix_(rows, rows)])
         moved = np.linalg.solve(inner, _plus_one(g, jacobian[np.ix_(rows, ~rows)], 0.0))
@@ -257,6 +271,11 @@ class Hill:
             if abs(mu - before) < ACCURACY:
                 return complex(mu.real, abs(mu.imag - round(mu.imag)))
         return None
+
+
+def _of_pairs(g: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """G (order, pair, pair) between some of the ``pairs``."""
+    return g if len(pairs) == g.shape[1] else g[:, pairs[:, None], pairs]
 
 
 def _flat(jacobian: np.ndarray) -> np.ndarray:
