@@ -175,8 +175,8 @@ def test_a_stop_that_the_lattice_does_not_meet(tmp_path):
     assert 5.5e-4 < at_least < 6e-4
 
 
-@pytest.mark.parametrize(("size", "touches"), [(0.1, False), (1.0, True)])
-def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size, touches):
+@pytest.mark.parametrize(("size", "touching"), [(0.1, 0), (0.3, 2), (1.0, 2)])
+def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size, touching):
     """Of parameters and coordinates of the state, from states of all sites free and from ones with sites in contact."""
     table = lattice_table(time={"end": 0.0065})
     record = measured_table(tmp_path, table) | {"begin": 4e-3, "initial": "estimate", "offset": [-1e-4, 1e-4]}
@@ -190,13 +190,15 @@ def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size
     state = misfit.states[0]
     generator = np.random.default_rng(5)
     z = np.array([p.to_coordinate(p.start) for p in plan.parameters])
-    z = np.concatenate([z, size * generator.standard_normal(len(state.indices))])
+    # The signs of modes are those of the LAPACK that is installed; the state is the same everywhere.
+    moving = size * np.linalg.norm(state.matrix, axis=1) * generator.standard_normal(len(state.matrix))
+    z = np.concatenate([z, np.linalg.solve(state.matrix, moving)])
     ends = [0.0052]
     every = [0, 1, 2, 3, *range(4, misfit.size, 7)]
     jacobian = misfit.jacobian(z, ends, every)
-    # An onset before the record is logged at 0. How many sites touch depends on the signs of the modes.
-    assert np.any(misfit.respond(z, 0, 1.0).episodes["onset"] == 0) == touches
-    h = 2e-5
+    # An onset before the record is logged at 0.
+    assert np.sum(misfit.respond(z, 0, 1.0).episodes["onset"] == 0) == touching
+    h = 1e-4
     for column, p in enumerate(every):
         expected = np.zeros(len(jacobian))
         for steps, weight in ((-2, 1), (-1, -8), (1, 8), (2, -1)):
@@ -204,4 +206,5 @@ def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size
             moved[p] += steps * h
             expected += weight * misfit.residuals(moved, ends) / (12 * h)
         error = np.abs(jacobian[:, column] - expected).max()
-        assert error < 2e-6 * np.abs(expected).max() + 1e-7, (p, error)
+        # Differences of longer and of shorter steps differ by some 3e-6 of the largest.
+        assert error < 1e-5 * np.abs(expected).max() + 1e-7, (p, error)
