@@ -7,7 +7,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MultipleLocator
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures import panels, style
@@ -173,7 +172,7 @@ def _draw_phase(axes: Axes, branch: xr.Dataset) -> None:
     axes.plot(parameter, lag, color=style.BLACK, lw=0.6, ls="--")
     axes.plot(parameter, np.where(stable, lag, np.nan), color=style.BLACK, lw=1.3)
     axes.set_ylabel("phase lag (degrees)")
-    axes.yaxis.set_major_locator(MultipleLocator(90))
+    panels.mark_degrees(axes)
 
 
 def _draw_energies(axes: Axes, branch: xr.Dataset) -> None:

@@ -9,6 +9,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.image import AxesImage
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from vipetsc import spectra
@@ -191,6 +192,11 @@ def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> None:
     panels = np.ravel(axes).tolist()
     options = {"pad": 0.02, "extend": "min"} | options
     panels[0].figure.colorbar(image, ax=panels, label=label, **options)
+
+
+def mark_degrees(axes: Axes) -> None:
+    """Put ticks of a vertical axis in degrees at parts of a right angle, few of a revolution as well as of a degree."""
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 3, 4.5, 9, 10]))
 
 
 def note(axes: Axes, text: str, at: Sequence[float], shift: tuple[float, float], **options: Any) -> None:

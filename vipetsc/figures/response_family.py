@@ -11,7 +11,6 @@ import xarray as xr
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MultipleLocator
 
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
@@ -65,7 +64,7 @@ def response_family(paths: Sequence[Path]) -> Figure:
             _draw_curve(axes, curve, values_of(curve), name, colour)
         axes.set_ylabel(label)
     if has_phase:
-        column[-1].yaxis.set_major_locator(MultipleLocator(90))
+        panels.mark_degrees(column[-1])
     column[-1].set_xlabel(parameter_label(curves[0]))
     handles, texts = column[0].get_legend_handles_labels()
     lower.legend(handles[:MOST_CURVES], texts[:MOST_CURVES], loc="center", fontsize=6)

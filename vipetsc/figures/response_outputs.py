@@ -8,9 +8,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MultipleLocator
 
-from vipetsc.figures import style
+from vipetsc.figures import panels, style
 from vipetsc.figures.nfrc import draw_special, parameter_of, response_page, responses_in
 
 # Labels of the rows of the page by the quantities that they show.
@@ -57,7 +56,7 @@ def _draw_lag(axes: Axes, curve: xr.Dataset) -> None:
         lag = np.degrees(np.unwrap(np.radians(curve["lag"].values[:, number])))
         _draw_states(axes, curve, lag, number)
     axes.set_ylabel("phase lag (degrees)")
-    axes.yaxis.set_major_locator(MultipleLocator(90))
+    panels.mark_degrees(axes)
 
 
 def _draw_forces(axes: Axes, curve: xr.Dataset) -> None:
