@@ -196,6 +196,8 @@ FEATURES: tuple[Feature, ...] = (
         "smooth springs",
         _lattice(cell=CUBIC_CELL),
         {"nnm": {"own": {"smooth": [{"start": 0, "end": 1, "cubic": 0.5}]}}},
+        # Each of these springs has unknown harmonics.
+        scaled={"nfrc": {"nfrc": {"points": 2, "harmonics": 3}}},
     ),
     Feature("profiles of cells", _lattice(profiles={"masses[1]": {"first": 4e-3, "last": 4.1e-3}})),
     Feature("disorder of cells", {"disorder": {"cells": {"masses[1]": {"relative": 0.01}}}}),
