@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import vipetsc as package
@@ -64,7 +65,11 @@ def test_a_copied_case_has_its_modules(in_process, tmp_path, monkeypatch):
     assert copied.contacts == shipped.contacts
     # As the comment in the case says.
     depth = 0.32e-3
-    assert copied.model().contact.elastic_force(depth) == pytest.approx(2 * 2e5 * depth, rel=0.02)
+    law = copied.model().contact
+    assert law.elastic_force(depth) == pytest.approx(2 * 2e5 * depth, rel=0.02)
+    # Of a number the force is a number: numpy makes none of an array of one.
+    assert np.shape(law.elastic_force(depth)) == ()
+    assert law.elastic_force(np.full((2, 1), depth)).shape == (2, 1)
 
 
 def test_a_file_that_differs_is_replaced_on_request_alone(in_process, tmp_path):

@@ -52,11 +52,12 @@ def _address(function: Callable[..., float], count: int) -> int:
 
 
 def evaluate(address: int, stiffness: float, parameters: tuple[float, ...], x: np.ndarray) -> np.ndarray:
-    """Values of the function at an ``address`` at each indentation ``x`` in m."""
+    """Values of the function at an ``address`` at each indentation ``x`` in m, an array of the shape of ``x``."""
     numbers = np.zeros(1 + MOST_PARAMETERS)
     numbers[0] = stiffness
     numbers[1 : 1 + len(parameters)] = parameters
-    given = np.ascontiguousarray(x, float)
+    # ascontiguousarray would give a number a dimension.
+    given = np.asarray(x, float, order="C")
     values = np.empty_like(given)
     _fill(address, numbers, given.reshape(-1), values.reshape(-1))
     return values
