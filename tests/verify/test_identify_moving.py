@@ -206,5 +206,5 @@ def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size
             moved[p] += steps * h
             expected += weight * misfit.residuals(moved, ends) / (12 * h)
         error = np.abs(jacobian[:, column] - expected).max()
-        # Differences of longer and of shorter steps differ by some 3e-6 of the largest.
-        assert error < 1e-5 * np.abs(expected).max() + 1e-7, (p, error)
+        # A force of the power 1.5 has no second derivative at an onset: differences across one have errors up to 1e-4.
+        assert error < 3e-4 * np.abs(expected).max() + 1e-7, (p, error)
