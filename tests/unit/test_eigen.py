@@ -15,6 +15,7 @@ from vipetsc.dynamics import eigen
 from vipetsc.dynamics.eigen import load_slepc, modes_near
 from vipetsc.dynamics.matrices import LatticeMatrices
 from vipetsc.lattice import Chain, Spring, UnitCell
+from vipetsc.studies.linear_modes import first_largest
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -176,3 +177,9 @@ def test_all_modes_but_one_may_be_asked_for():
     assert len(modes.frequency) == matrices.rows - 1
     assert modes.residual.max() < 1e-9
     matrices.destroy()
+
+
+def test_of_two_places_that_are_equal_but_for_rounding_the_first_one_counts():
+    """The place and the sign of a mode of a symmetric lattice do not depend on rounding errors."""
+    values = np.array([[0.2, 1.0, 0.5, 1.0 + 1e-14], [1.0 + 1e-14, 0.1, 1.0, 0.0], [0.0, 0.1, 0.9, 1.0]])
+    assert first_largest(values).tolist() == [1, 0, 3]
