@@ -76,5 +76,11 @@ def test_a_curve_that_cannot_go_on_keeps_its_points(in_process, case, tmp_path):
     assert ended.returncode == 1
     assert "last good point" in ended.stderr
     assert "nfrc.smallest_step" in ended.stderr
+    assert "approach_floor" not in ended.stderr
     assert (out / f"{STEM}.h5").exists()
     assert (out / "figures" / f"{STEM}.png").exists()
+
+    options = ("--set", "nfrc.smallest_step=0.005", "--set", "contacts.restitution=0.8")
+    with_loss = in_process("nfrc", case, "--out", tmp_path / "loss", *options)
+    assert with_loss.returncode == 1
+    assert "a contact with loss that only grazes its stop needs contacts.approach_floor" in with_loss.stderr

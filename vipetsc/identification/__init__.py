@@ -43,7 +43,9 @@ residuals of each channel, and the fit is repeated with it, which is the maximum
 **5. What the data tell** (``uncertainty``, ``whiteness``). (J^T J)^-1 is the covariance, J the Jacobian of the
 residuals over the noise, of parameters with the initial states left free; its singular values s are 1 over the standard
 errors along its right singular vectors. An error of more than half a unit of a coordinate, a factor of 1.6, counts as
-not determined. Residuals that are not white (Ljung and Box 1978) show a model that lacks something.
+not determined. A profile (``misfit_profile``) holds one parameter at several values and fits all others, so that an
+interval that is no multiple of the standard error can be seen. Residuals that are not white (Ljung and Box 1978) show a
+model that lacks something.
 
 References
 ----------

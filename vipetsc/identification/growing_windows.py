@@ -26,9 +26,6 @@ TOLERANCE = 1e-12
 # Least weight of the prior over the size of the Jacobian. Where a clearance is not reached, a column is zero; without
 # full rank, SciPy makes every step as long as the trust region is, and does not converge.
 RIDGE = 1e-10
-# ... of the cost and of the step, while windows grow.
-ROUGH_COST = 1e-2
-ROUGH_STEP = 1e-3
 # A window is repeated at half its growth if its misfit is so many times that of the one before, and that of noise,
 # until it grows by less than this fraction of the record.
 RISE = 2.0
@@ -59,14 +56,18 @@ class Window(NamedTuple):
 
 
 class Precision(NamedTuple):
-    """How a fit ends: after so many ``steps`` (None: those of the case), with a prior, by rough tolerances."""
+    """How a fit ends: after so many ``steps`` (None: those of the case), or where cost or coordinates change less.
+
+    ``cost`` and ``step`` are relative changes. ``has_prior`` holds the coordinates near those at which the fit begins.
+    """
 
     steps: int | None = None
+    cost: float = TOLERANCE
+    step: float = TOLERANCE
     has_prior: bool = False
-    is_rough: bool = False
 
 
-GROWING = Precision(has_prior=True, is_rough=True)
+GROWING = Precision(cost=1e-2, step=1e-3, has_prior=True)
 FINAL = Precision()
 
 
@@ -238,14 +239,14 @@ class GrowingWindows:
         for number, (first, last, length) in enumerate(zip(self._first(), self.last, lengths, strict=True)):
             if number in self.misfit.states:
                 last = min(last, first + length)
-            onsets = self._onsets(z, number)
+            onsets = self.onsets(z, number)
             if len(onsets) > impacts:
                 last = min(last, float(onsets[impacts]) + self.misfit.offset(z, number))
             # However soon contacts follow each other, a window has data.
             ends.append(max(last, float(self.misfit.records[number].times[LEAST_SAMPLES - 1])))
         return ends
 
-    def _onsets(self, z: np.ndarray, number: int) -> np.ndarray:
+    def onsets(self, z: np.ndarray, number: int) -> np.ndarray:
         """The onsets in s of the model's contacts in a record, from its first sample on."""
         try:
             onsets = self.misfit.respond(z, number, self.last[number]).episodes["onset"]
@@ -259,7 +260,7 @@ class GrowingWindows:
         impacts = 0
         for number, end in enumerate(ends):
             if end > -np.inf:
-                impacts += int(np.sum(self._onsets(z, number) <= end - self.misfit.offset(z, number)))
+                impacts += int(np.sum(self.onsets(z, number) <= end - self.misfit.offset(z, number)))
         residuals = self.misfit.residuals(z, ends)
         return Window(max(ends), impacts, float(np.sqrt(np.mean(residuals**2))), z.copy())
 
@@ -371,8 +372,8 @@ class GrowingWindows:
             bounds=(self.low[active], self.high[active]),
             method="trf",
             x_scale=1.0,
-            xtol=ROUGH_STEP if precision.is_rough else TOLERANCE,
-            ftol=ROUGH_COST if precision.is_rough else TOLERANCE,
+            xtol=precision.step,
+            ftol=precision.cost,
             gtol=TOLERANCE,
             max_nfev=precision.steps or self.misfit.plan.options.steps,
         )

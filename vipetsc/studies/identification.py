@@ -6,9 +6,9 @@ stopped goes on where it was. The same files, to the bit, on any number of ranks
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from mpi4py import MPI
 
@@ -20,10 +20,10 @@ from vipetsc.case import CaseError
 from vipetsc.case.case_file import Problem
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import Measured, MeasuredError, read_measured
-from vipetsc.identification.growing_windows import GrowingWindows, Precision
+from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit import Misfit
+from vipetsc.identification.misfit_profile import SIDES, MisfitProfile, Side, profile_around, profile_costs
 from vipetsc.identification.motion import MotionError
-from vipetsc.identification.uncertainty import uncertainty_of
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import IDENTIFIED, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
@@ -33,13 +33,6 @@ from vipetsc.studies.identified import identified_values, summary_of, warnings_o
 from vipetsc.studies.identified_layout import LAYOUT
 from vipetsc.studies.recorded_runs import FAILURES, Key, RecordedRuns
 from vipetsc.studies.sweep import is_whole
-
-# Distance in standard errors of the outermost values of a profile.
-PROFILED = 3.0
-# Evaluations of one fit of a profile, which begins where the covariance puts it.
-PROFILE_STEPS = 10
-# Coordinates that differ by rounding.
-SAME = 1e-12
 
 
 def run_identification(
@@ -85,16 +78,6 @@ def read_records(plan: IdentifyCase) -> list[Measured]:
             raise CaseError([Problem(f"{at}.sha256", table.sha256, "the file has changed; omit this key")], plan.name)
         records.append(record)
     return records
-
-
-class MisfitProfile(NamedTuple):
-    """Coordinates ``places`` (parameter, place) at which each parameter is held.
-
-    All coordinates move ``along`` (parameter, coordinate) with it, by the covariance.
-    """
-
-    places: np.ndarray
-    along: np.ndarray
 
 
 class Identification:
@@ -171,29 +154,14 @@ class Identification:
         return windows, np.array(record["coordinates"])
 
     def profile(self, record: Record) -> MisfitProfile:
-        """The profiles to be taken around the fit of a ``record``."""
+        """The profiles to be taken of the misfit of a ``record``."""
         windows, z = self.placed(record)
-        known = uncertainty_of(windows.misfit.whole_jacobian(z, windows.last))
-        sought = range(windows.misfit.count)
-        reach = np.where(known.determined, PROFILED * known.errors, np.inf)
-        low = np.maximum(z - reach, windows.low)[sought]
-        high = np.minimum(z + reach, windows.high)[sought]
-        # The covariance says where the others go, as long as the problem is nearly linear.
-        along = (known.correlation * known.errors / known.errors[:, None])[sought]
-        along = np.where(known.determined[sought, None], along, 0.0)
-        return MisfitProfile(np.linspace(low, high, self.plan.options.profile, axis=1), along)
+        return profile_around(windows, z, self.plan.options.profile)
 
-    def profiled(self, record: Record, profile: MisfitProfile, number: int, place: int) -> Record:
-        """The least misfit with parameter ``number`` held at a ``place`` of its profile, and all others fitted."""
+    def profiled(self, record: Record, profile: MisfitProfile, number: int, side: Side) -> Record:
+        """The costs of the profile of parameter ``number`` on one ``side`` of the fit of a ``record``."""
         windows, z = self.placed(record)
-        value = float(profile.places[number, place])
-        held = np.clip(z + profile.along[number] * (value - z[number]), windows.low, windows.high)
-        held[number] = value
-        others = [other for other in range(len(z)) if other != number]
-        # In the middle of a profile is the fit itself.
-        if others and abs(value - z[number]) > SAME:
-            held = windows.solve(held, windows.last, others, Precision(steps=PROFILE_STEPS, is_rough=True))
-        return {"cost": windows.cost(held, windows.last)}
+        return {"costs": profile_costs(windows, z, profile, number, side)}
 
 
 def _identify(work: Identification, folder: Path, comm: MPI.Comm, progress: bool) -> None:
@@ -206,18 +174,27 @@ def _identify(work: Identification, folder: Path, comm: MPI.Comm, progress: bool
         raise RuntimeError(f"no start leads to a fit: {fits[0]['reason']}")
     best = min(fitted, key=lambda number: (fits[number]["deviance"], number))
     recorded = _recorded_runs(work, folder, comm, ranks=1)
-    places = on_root(comm, lambda: work.profile(fits[best]))
-    shape = places.places.shape
+    profile = on_root(comm, lambda: work.profile(fits[best]))
 
-    def profile(key: Key) -> Record:
-        _, number, place = str(key).split()
-        return work.profiled(fits[best], places, int(number), int(place))
+    def take_profile(key: Key) -> Record:
+        _, number, side = str(key).split()
+        return work.profiled(fits[best], profile, int(number), "below" if side == "below" else "above")
 
-    profiles = [f"profile {number} {place}" for number, place in np.ndindex(*shape)]
-    recorded.make(profiles, profile, what="profiles", progress=progress, failures=True)
-    costs = np.array([recorded.records[key].get("cost", np.nan) for key in profiles]).reshape(shape)
+    keys = [f"profile {number} {side}" for number in range(len(plan.parameters)) for side in SIDES]
+    recorded.make(keys, take_profile, what="profiles", progress=progress, failures=True)
+    costs = _profile_costs(recorded.records, profile, np.array(fits[best]["coordinates"]))
     recorded.finish()
-    on_root(comm, lambda: _write(work, fits, best, (places.places, costs), folder, comm))
+    on_root(comm, lambda: _write(work, fits, best, (profile.places, costs), folder, comm))
+
+
+def _profile_costs(records: Mapping[Key, Record], profile: MisfitProfile, z: np.ndarray) -> np.ndarray:
+    """The costs (parameter, place) of a ``profile`` about ``z``; NaN where a side could not be computed."""
+    costs = np.full(profile.places.shape, np.nan)
+    for number in range(len(costs)):
+        for side in SIDES:
+            places = profile.outwards(number, float(z[number]), side)
+            costs[number, places] = records[f"profile {number} {side}"].get("costs", np.nan)
+    return costs
 
 
 def _recorded_runs(work: Identification, folder: Path, comm: MPI.Comm, ranks: int) -> RecordedRuns:

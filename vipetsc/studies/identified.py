@@ -293,13 +293,13 @@ def _warnings_of_parameters(data: xr.Dataset) -> Iterator[str]:
 
 
 def _warnings_of_states(data: xr.Dataset) -> Iterator[str]:
-    """A sentence on each initial state of which the data tell a part only."""
+    """A sentence on each initial state of which the data determine only a part."""
     for record in np.unique(data["initial/of_record"].values):
         singular = data["initial/singular"].values[data["initial/of_record"].values == record]
-        told = int(np.sum(singular >= 1 / DETERMINED))
-        if told < len(singular):
+        determined = int(np.sum(singular >= 1 / DETERMINED))
+        if determined < len(singular):
             yield (
-                f"record {record}: of the {len(singular)} numbers of its initial state the data tell {told};"
+                f"record {record}: of the {len(singular)} numbers of its initial state the data determine {determined};"
                 " the others are bounded by the energy that was measured, and the intervals include them"
             )
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from vipetsc.case.nfrc import NfrcTable
 from vipetsc.modes.balance.hill import Perturbations, Stability
+from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.problem import SpecialKind
 from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
 from vipetsc.modes.response.stability_changes import StabilityChanges
@@ -37,7 +38,7 @@ class StatesOverKey(SteadyEquations):
     def __init__(self, build: Callable[[float], SteadyStates], over: str, amplitude: float, options: NfrcTable) -> None:
         self.options = options
         self._build = build
-        self._kept: dict[float, SteadyStates] = {}
+        self._kept = LatestValues[float, SteadyStates](KEPT_VALUES)
         low, high = options.range
         self._bounds = low, high
 
@@ -52,10 +53,7 @@ class StatesOverKey(SteadyEquations):
 
     def states_at(self, value: float) -> SteadyStates:
         """The equations of the lattice whose key has a ``value``; raises FlowError where there is none."""
-        if value not in self._kept:
-            self._kept = dict(list(self._kept.items())[1 - KEPT_VALUES :])
-            self._kept[value] = self._build(value)
-        return self._kept[value]
+        return self._kept.get(value, lambda: self._build(value))
 
     def linear_motion(self, omega: float) -> LinearMotion:
         """The motion of the linear lattice at the lower end of the range."""

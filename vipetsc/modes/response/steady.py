@@ -22,6 +22,7 @@ from vipetsc.lattice import ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.balance.hill import Hill, Perturbations, Stability
+from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.problem import FlowError, SpecialKind
 from vipetsc.modes.response.condensation import compliance_of, driven_points, forces_of
 from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
@@ -65,9 +66,9 @@ class SteadyStates(SteadyEquations):
         self.outputs = ResponseOutputs(case, self.compliance, self.forces.contacts)
 
         # Latest linear motions by frequency, and the latest determinant: neighbours on a curve over the amplitude.
-        self._motions: dict[float, LinearMotion] = {}
+        self._motions = LatestValues[float, LinearMotion](KEPT_MOTIONS)
         self._hill: Hill | None = None
-        self._stabilities: dict[bytes, Stability] = {}
+        self._stabilities = LatestValues[bytes, Stability](KEPT_STATES)
 
         clearance = self._unit()
         super().__init__(
@@ -115,10 +116,7 @@ class SteadyStates(SteadyEquations):
 
     def linear_motion(self, omega: float) -> LinearMotion:
         """The motion of the linear lattice for the amplitude 1; FlowError outside a wave's band."""
-        if omega not in self._motions:
-            self._motions = dict(list(self._motions.items())[1 - KEPT_MOTIONS :])
-            self._motions[omega] = self._evaluate_linear(omega)
-        return self._motions[omega]
+        return self._motions.get(omega, lambda: self._evaluate_linear(omega))
 
     def _evaluate_linear(self, omega: float) -> LinearMotion:
         pairs = self.forces.pairs
@@ -179,13 +177,12 @@ class SteadyStates(SteadyEquations):
 
     def stability(self, xi: np.ndarray) -> Stability:
         """The stability of a state; the latest are kept, since neighbours on a curve are compared."""
-        key = xi.tobytes()
-        if key not in self._stabilities:
-            self._stabilities = dict(list(self._stabilities.items())[1 - KEPT_STATES :])
-            omega, _ = self.drive(xi[-1])
-            series = self.balance.series(xi[:-1] * self.clearance, omega)
-            self._stabilities[key] = self.hill(omega).stability(series)
-        return self._stabilities[key]
+        return self._stabilities.get(xi.tobytes(), lambda: self._evaluate_stability(xi))
+
+    def _evaluate_stability(self, xi: np.ndarray) -> Stability:
+        omega, _ = self.drive(xi[-1])
+        series = self.balance.series(xi[:-1] * self.clearance, omega)
+        return self.hill(omega).stability(series)
 
     def _perturbations(self, xi: np.ndarray, series: ForceSeries) -> Perturbations:
         """The perturbations of a state with these forces that grow."""

@@ -62,15 +62,20 @@ class TurningSteps:
 
     def stuck(self, last: Response, attempt: Attempt | None, verdict: Verdict) -> str:
         """Message where and why the curve cannot go on, and which key to change."""
-        omega, amplitude = self.states.drive(last.xi[-1])
-        value = ""
-        if isinstance(self.states, StatesOverKey):
-            value = f", {self.states.parameter.over} = {last.xi[-1] * self.states.parameter.scale:.6g}"
+        states = self.states
+        omega, amplitude = states.drive(last.xi[-1])
+        at = f"{omega:.8g} rad/s at amplitude {amplitude:.6g}"
+        if isinstance(states, StatesOverKey):
+            value = last.xi[-1] * states.parameter.scale
+            at += f", {states.parameter.over} = {value:.6g}"
+            states = states.states_at(value)
+
         remedy = "increase nfrc.harmonics or nfrc.max_newton, or decrease nfrc.smallest_step"
-        return (
-            f"no step from the last good point, {omega:.8g} rad/s at amplitude {amplitude:.6g}{value}: "
-            f"{verdict.why}; {remedy}"
-        )
+        laws = [stops.law for stops in states.forces.contacts]
+        if any(law.damping and not law.approach_floor for law in laws):
+            # The damping factor is divided by the approach velocity, which vanishes where a contact begins.
+            remedy += "; a contact with loss that only grazes its stop needs contacts.approach_floor in m/s"
+        return f"no step from the last good point, {at}: {verdict.why}; {remedy}"
 
 
 def first_state(states: SteadyStates | StatesOverKey, is_ramp: bool = False) -> Response:

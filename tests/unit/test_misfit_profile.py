@@ -1,0 +1,73 @@
+"""Profiles of the misfit follow a valley whose motion loses a contact on either side of it."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vipetsc.identification.misfit_profile import MisfitProfile, profile_costs
+
+# The lattice has its second contact within this distance of the valley b = a + BEND a^2.
+WIDTH = 1.0
+BEND = 0.3
+JUMP = 50.0
+
+
+class BentValley:
+    """A fit of two coordinates (a, b) with cost a^2 + (b - a - BEND a^2)^2, and JUMP more without one contact."""
+
+    def __init__(self) -> None:
+        self.misfit = SimpleNamespace(records=[None])
+        self.last = [1.0]
+        self.low = np.full(2, -9.0)
+        self.high = np.full(2, 9.0)
+        self.solutions = 0
+
+    def distance(self, z: np.ndarray) -> float:
+        return float(z[1] - z[0] - BEND * z[0] ** 2)
+
+    def onsets(self, z: np.ndarray, number: int) -> np.ndarray:
+        return np.zeros(2 if abs(self.distance(z)) < WIDTH else 1)
+
+    def solve(self, z: np.ndarray, ends: Any, active: list[int], precision: Any) -> np.ndarray:
+        """The valley if it begins there: no derivative leads over the jump."""
+        assert active == [1]
+        self.solutions += 1
+        if abs(self.distance(z)) >= WIDTH:
+            return z
+        return np.array([z[0], z[1] - self.distance(z)])
+
+    def cost(self, z: np.ndarray, ends: Any) -> float:
+        missing = len(self.onsets(z, 0)) < 2
+        return float(z[0] ** 2 + self.distance(z) ** 2 + JUMP * missing)
+
+
+@pytest.mark.parametrize("side, places", [("below", [-1.5, -3.0]), ("above", [0.0, 1.5, 3.0])])
+def test_a_profile_keeps_the_contacts_of_the_fit(side, places):
+    windows = BentValley()
+    profile = MisfitProfile(np.linspace(-3, 3, 5)[None], np.ones((1, 2)))
+    costs = profile_costs(windows, np.zeros(2), profile, 0, side)
+    assert costs == pytest.approx(np.square(places), abs=1e-12)
+    # The line of the covariance and the line through two fits leave the valley: steps were halved, and not often.
+    assert windows.solutions <= 5
+
+
+def test_a_contact_that_no_motion_keeps_is_given_up():
+    """Beyond some place the motion has one contact whatever the others are, and the profile shows the jump."""
+
+    class Lost(BentValley):
+        def onsets(self, z: np.ndarray, number: int) -> np.ndarray:
+            return np.zeros(2 if z[0] > -2 else 1)
+
+    profile = MisfitProfile(np.linspace(-3, 3, 5)[None], np.ones((1, 2)))
+    costs = profile_costs(Lost(), np.zeros(2), profile, 0, "below")
+    assert costs == pytest.approx([1.5**2, 3**2 + JUMP])
+
+
+def test_places_that_bounds_cut_are_followed_from_the_fit():
+    """All places of a fit at its lower bound lie above it."""
+    profile = MisfitProfile(np.linspace(0, 3, 4)[None], np.ones((1, 2)))
+    assert profile.outwards(0, 0.0, "below").tolist() == []
+    assert profile.outwards(0, 0.0, "above").tolist() == [0, 1, 2, 3]
+    assert profile.outwards(0, 1.5, "below").tolist() == [1, 0]

@@ -1,0 +1,102 @@
+"""Profiles of the misfit: one parameter is held at some values, and all others are fitted to each of them.
+
+The fits of one side follow each other outwards, each from the one before. In the direction of the covariance alone the
+model may lose a contact that only grazes its stop. The misfit then jumps, and no derivative leads back to a motion with
+that contact, though the least misfit may have it.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from vipetsc.identification.growing_windows import GrowingWindows, Precision
+from vipetsc.identification.uncertainty import uncertainty_of
+
+# Distance in standard errors of the outermost values of a profile.
+REACH = 3.0
+# A profile rises by about ten over its reach. The tolerance is relative to the cost, which is about the number of data.
+PRECISION = Precision(steps=30, cost=1e-5)
+# Smallest part of the distance to the next value that is taken in one step to keep the contacts.
+SMALLEST_STEP = 1 / 16
+# Coordinates that differ by rounding.
+SAME = 1e-12
+
+Side = Literal["below", "above"]
+SIDES: tuple[Side, ...] = ("below", "above")
+
+
+class MisfitProfile(NamedTuple):
+    """Coordinates ``places`` (parameter, place) at which each parameter is held.
+
+    All coordinates move ``along`` (parameter, coordinate) with it, by the covariance.
+    """
+
+    places: np.ndarray
+    along: np.ndarray
+
+    def outwards(self, number: int, middle: float, side: Side) -> np.ndarray:
+        """The numbers of the places of a parameter on one ``side`` of the coordinate ``middle``, nearest first.
+
+        A place at the middle itself counts as one above it.
+        """
+        places = self.places[number]
+        if side == "above":
+            return np.flatnonzero(places >= middle - SAME)
+        return np.flatnonzero(places < middle - SAME)[::-1]
+
+
+def profile_around(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitProfile:
+    """The profiles with ``count`` places a parameter about the fit ``z`` (coordinate,), within the bounds."""
+    known = uncertainty_of(windows.misfit.whole_jacobian(z, windows.last))
+    sought = range(windows.misfit.count)
+    reach = np.where(known.determined, REACH * known.errors, np.inf)
+    low = np.maximum(z - reach, windows.low)[sought]
+    high = np.minimum(z + reach, windows.high)[sought]
+    # The covariance says where the others go, as long as the problem is nearly linear.
+    along = (known.correlation * known.errors / known.errors[:, None])[sought]
+    along = np.where(known.determined[sought, None], along, 0.0)
+    return MisfitProfile(np.linspace(low, high, count, axis=1), along)
+
+
+def profile_costs(
+    windows: GrowingWindows, z: np.ndarray, profile: MisfitProfile, number: int, side: Side
+) -> list[float]:
+    """The least costs at the places of parameter ``number`` on one ``side`` of the fit ``z``, nearest place first."""
+    held = z.copy()
+    slope = profile.along[number]
+    costs = []
+    for place in profile.outwards(number, float(z[number]), side):
+        held, slope = _follow(windows, held, slope, number, float(profile.places[number, place]))
+        costs.append(windows.cost(held, windows.last))
+    return costs
+
+
+def _follow(
+    windows: GrowingWindows, z: np.ndarray, slope: np.ndarray, number: int, value: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The fit with coordinate ``number`` held at ``value``, from the fit ``z``, and the ``slope`` of all coordinates.
+
+    The slopes are those over the coordinate that is held. Steps in which a contact comes or goes are halved.
+    """
+    others = [other for other in range(len(z)) if other != number]
+    contacts = _contacts(windows, z)
+    fraction = 1.0
+    while abs(value - z[number]) > SAME:
+        step = fraction * (value - z[number])
+        begin = np.clip(z + slope * step, windows.low, windows.high)
+        begin[number] = value if fraction == 1 else z[number] + step
+        if _contacts(windows, begin) != contacts and fraction > SMALLEST_STEP:
+            fraction /= 2
+            continue
+
+        fitted = windows.solve(begin, windows.last, others, PRECISION) if others else begin
+        slope = (fitted - z) / (fitted[number] - z[number])
+        z = fitted
+        contacts = _contacts(windows, z)
+        fraction = 1.0
+    return z, slope
+
+
+def _contacts(windows: GrowingWindows, z: np.ndarray) -> list[int]:
+    """The numbers of the model's contacts, one a record."""
+    return [len(windows.onsets(z, number)) for number in range(len(windows.misfit.records))]
