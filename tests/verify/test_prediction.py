@@ -17,7 +17,7 @@ from vipetsc.io.records import read_records
 from vipetsc.studies.composition import Network
 from vipetsc.studies.prediction import LINEAR, SITE, Records, amplitudes_of, composed, predict, site_points
 from vipetsc.studies.recorded_runs import RecordedRuns
-from vipetsc.studies.response import BINS, SiteResponse, in_contact
+from vipetsc.studies.response import BINS, SiteResponse, SiteResponses, in_contact
 
 
 class Prediction(NamedTuple):
@@ -37,7 +37,9 @@ class Prediction(NamedTuple):
         """What one site does to the waves that meet it."""
         _, answers = self.records()
         frequency = self.case.model().drive.frequency
-        return SiteResponse.of(answers, self.case.lattice.unit_cell(), frequency, answers[0]["largest"])
+        [kind] = self.case.kinds.kinds
+        cell = self.case.lattice.unit_cell()
+        return SiteResponse.of(answers, cell, frequency, answers[0]["largest"], kind.pair)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +52,7 @@ def prediction(tmp_path_factory) -> Prediction:
 
 def composed_from(case: PredictCase, linear: dict[str, Any], answers: list[dict[str, Any]]) -> xr.Dataset:
     """The prediction of a case from these records, without simulations to compare with."""
-    return composed(case, Records(linear, answers, [], answers[0]["largest"]))
+    return composed(case, Records(linear, [answers], [], answers[0]["largest"]))
 
 
 @pytest.mark.slow
@@ -106,7 +108,7 @@ def test_one_site_alone_is_what_its_run_gave(prediction):
 
     for record in answers[6::4]:
         amplitude = record["z"] * clearance / np.abs(network.linear).max()
-        outcome = network.compose(amplitude, site)
+        outcome = network.compose(amplitude, SiteResponses((site,), np.zeros(1, int)))
         # Totals are sums over samples of powers: lost, then by band.
         lost, *into = np.array(record["totals"]) * prediction.case.model().sample_interval
         assert outcome.dissipated == pytest.approx(lost, rel=0.2)

@@ -1,7 +1,8 @@
 """The case of the verb ``law``: cell, contact law and burst of a lattice run, and the section ``[law]``."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -9,6 +10,8 @@ from pydantic import Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Problem, Section, Table
+from vipetsc.case.contacts import gaps_of_sites, lists_of, values_of_sites
+from vipetsc.case.kinds import SiteKinds, lesser_clearances, mean_clearance, site_kinds
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import PRESETS, Positive
 from vipetsc.case.sites import ContactsTable
@@ -24,15 +27,18 @@ SLOWEST = 1e-9  # cells/s, so that a standing wave needs a run that is too large
 class LawTable(Section):
     """How the scattering law of one site is computed.
 
-    ``clearance`` in m (by default the geometric mean of the sites'), ``distance`` in cells from the driven cell to the
-    site (by default that of the leading site, or the length of the burst; at least so large that the burst ends before
-    a wave returns from the site). The law reaches up to ``largest`` relative displacement over clearance; between
-    neighbouring points it is refined until no fraction is further than ``tolerance`` from a straight line over log z,
-    or than the scatter, or the points are closer than ``finest``. At each, ``samples`` runs with amplitudes up to
-    ``jitter`` apart from it give mean and scatter. A run ends ``settle`` lengths of the burst after the first of the
-    slow waves reaches the site.
+    It is that of the kind of ``site``, a number in the list of the sites (by default the leading one): a kind is a law
+    with its restitution, the ratio of the clearances on both sides, and the masses that the contact joins.
+    ``clearance`` in m, the lesser one (by default the geometric mean of the sites of that kind), ``distance`` in cells
+    from the driven cell to the site (by default that of the leading site, or the length of the burst; at least so large
+    that the burst ends before a wave returns from the site). The law reaches up to ``largest`` relative displacement
+    over clearance; between neighbouring points it is refined until no fraction is further than ``tolerance`` from a
+    straight line over log z, or than the scatter, or the points are closer than ``finest``. At each, ``samples`` runs
+    with amplitudes up to ``jitter`` apart from it give mean and scatter. A run ends ``settle`` lengths of the burst
+    after the first of the slow waves reaches the site.
     """
 
+    site: int | None = Field(None, ge=1)
     clearance: Positive | None = None
     distance: int | None = Field(None, ge=1)
     largest: Annotated[float, Field(gt=1, le=1e6)] = 128.0
@@ -45,7 +51,9 @@ class LawTable(Section):
 
 @dataclass(frozen=True)
 class OneSite:
-    """A ring of ``cells`` driven at its first; the ``site`` (0-based) lies ``distance`` cells on; ``clearance`` in m.
+    """A ring of ``cells`` driven at its first; the ``site`` (0-based) lies ``distance`` cells on.
+
+    ``kind`` is the number of the site's kind; ``clearance`` in m is that on the side where it is less.
 
     Runs end at ``end`` s, after ``samples``. ``band`` (from 0) is the drive's, in which all but 1e-3 of the energy is
     faster than ``slow`` cells/s; ``towards`` is +1 if the site lies at higher cells than the drive, else -1.
@@ -54,6 +62,7 @@ class OneSite:
     cells: int
     site: int
     distance: int
+    kind: int
     clearance: float
     towards: int
     band: int
@@ -74,7 +83,6 @@ class LawCase(Case):
         "profiles": "the law compares the waves that arrive at a site and leave it, in equal cells",
         "scatter": "the law compares the waves that arrive at a site and leave it, in equal cells",
         "absorbing ends": "the runs of a law end before waves return, so that nothing has to absorb them",
-        "unlike sites": "not yet: the law is computed for one law of contact and equal stops on both sides",
         "touching stops": "the law is one of amplitude over clearance, which has no value without a clearance",
         "initial motion": "the law's fractions are of the work of the drive, in a lattice that starts at rest",
         "many drives": "the law is that of one wave",
@@ -94,18 +102,12 @@ class LawCase(Case):
         if problems:
             return sections, problems
 
-        contacts = sections["contacts"]
-        clearance = sections["law"].clearance
-        if clearance is None:
-            # Of sites that differ the geometric mean: the law is one of ratios.
-            gaps = contacts.clearance or _given_clearances(with_preset(table))
-            clearance = float(np.exp(np.mean(np.log(gaps)))) if gaps else None
+        problems = list(_check_sites(sections["law"], sections["contacts"]))
+        if problems:
+            return sections, problems
+        clearance = cls._clearance(sections, table)
         if clearance is None:
             problems.append(Problem("law.clearance", None, "missing; give the clearance of the site in m"))
-        if contacts.stiffness is None:
-            remedy = "missing; give it or contacts.modulus, radius and poisson"
-            problems.append(Problem("contacts.stiffness", None, remedy))
-        if problems:
             return sections, problems
 
         # Only a whole case has a model, by whose burst the distance is judged.
@@ -123,6 +125,44 @@ class LawCase(Case):
         changed = {**sections, "law": sections["law"].model_copy(update=update)}
         return cls.resolved({"name": "law", **changed})
 
+    @classmethod
+    def _clearance(cls, sections: Mapping[str, Any], table: Table) -> float | None:
+        """The clearance in m of the law of resolved ``sections``, read from ``table``; None where there is none."""
+        given = sections["law"].clearance
+        contacts = sections["contacts"]
+        if given is not None:
+            return float(given)
+        if contacts.clearance:
+            case = cls._of_sections(sections)
+            return case.mean_clearance(case._kind())
+        clearances = _given_clearances(with_preset(table))
+        if not clearances:
+            return None
+        return mean_clearance(contacts, clearances, range(len(clearances)))
+
+    @cached_property
+    def kinds(self) -> SiteKinds:
+        """The kinds of the sites; of a lattice without sites the one that a site would have."""
+        if self.contacts.sites:
+            return site_kinds(self.model())
+        clearance = self.law.clearance or 1.0
+        return site_kinds(self.varied(contacts={"sites": [1], "clearance": [clearance]}).model())
+
+    def _kind(self) -> int:
+        """The number of the kind whose law is computed."""
+        if self.law.site is not None:
+            return self.kinds.of[self.law.site - 1]
+        if not self.contacts.sites:
+            return 0
+        _, _, leading = self._nearest_site()
+        return self.kinds.of[leading]
+
+    def mean_clearance(self, kind: int) -> float:
+        """Geometric mean in m of the lesser clearances of the sites of the ``kind`` of that number."""
+        clearances = self.contacts.clearance
+        assert isinstance(clearances, list)
+        return mean_clearance(self.contacts, clearances, self.kinds.sites(kind))
+
     def warnings(self) -> list[str]:
         """Sentences about what is likely not meant in the wave; lattice, times and sites of the runs are others."""
         return list(wave_warnings(self.model()))
@@ -132,11 +172,20 @@ class LawCase(Case):
         cell = self.lattice.unit_cell()
         return max(max_group_velocity(cell, number + 1)[2] for number in range(cell.dofs))
 
-    def one_site(self) -> OneSite:
-        """The lattice and the times of the law's runs (see ``studies.ring``)."""
+    def one_site(self, kind: int | None = None) -> OneSite:
+        """The lattice and the times of the law's runs (see ``studies.ring``) with a site of the ``kind`` of a number.
+
+        Without a number it is that of ``law.site``, and the clearance that of the law.
+        """
         law = self.law
+        clearance = law.clearance
+        if kind is None:
+            kind = self._kind()
+        elif len(self.kinds.kinds) > 1:
+            # One clearance does not suit them all.
+            clearance = self.mean_clearance(kind)
         model = self.model()
-        assert law.distance is not None and law.clearance is not None
+        assert law.distance is not None and clearance is not None
         cell = model.chain.cell
         interval = model.sample_interval
         band, slow, _ = packet_speeds(cell, model.drive, model.drive_mass)
@@ -144,12 +193,13 @@ class LawCase(Case):
         samples = int(np.ceil(end / interval))
         # No wave that the site sends out returns along the ring before the end.
         cells = max(int(np.ceil(law.distance + self.fastest() * samples * interval)) + 1, SHORTEST)
-        _, towards = self._nearest_site()
+        _, towards, _ = self._nearest_site()
         return OneSite(
             cells=cells,
             site=towards * law.distance % cells,
             distance=law.distance,
-            clearance=law.clearance,
+            kind=kind,
+            clearance=clearance,
             towards=towards,
             band=band,
             slow=slow,
@@ -157,19 +207,23 @@ class LawCase(Case):
             samples=samples,
         )
 
-    def _nearest_site(self) -> tuple[int, int]:
-        """Cells from the driven one to the nearest site in another (0 without any), and whether up (1) or down (-1)."""
+    def _nearest_site(self) -> tuple[int, int, int]:
+        """Cells from the driven one to the nearest site in another (0 without any), whether up (1) or down (-1), which.
+
+        The third is the number of that site, from 0.
+        """
         drive = self.drive.cell
         cells = self.lattice.cells
         assert isinstance(self.contacts.sites, list)
-        offsets = [site - drive for site in self.contacts.sites if site != drive]
+        offsets = [site - drive for site in self.contacts.sites]
         if self.lattice.ends == "periodic":  # along the shorter arc of the ring
             offsets = [(offset + cells // 2) % cells - cells // 2 for offset in offsets]
 
-        offset = min(offsets, key=abs, default=0)
-        if offset == 0:  # towards the farther end
-            return 0, 1 if 2 * drive <= cells + 1 else -1
-        return abs(offset), 1 if offset > 0 else -1
+        numbers = [number for number, offset in enumerate(offsets) if offset != 0]
+        if not numbers:  # towards the farther end
+            return 0, 1 if 2 * drive <= cells + 1 else -1, 0
+        nearest = min(numbers, key=lambda number: abs(offsets[number]))
+        return abs(offsets[nearest]), 1 if offsets[nearest] > 0 else -1, nearest
 
     def _least_distance(self) -> int:
         """Cells from the driven one to the site such that the burst is over before a wave is back from there."""
@@ -179,7 +233,7 @@ class LawCase(Case):
     def _default_distance(self) -> int:
         """The distance of the nearest site, without sites the length of the burst, but no less than the least."""
         model = self.model()
-        distance, _ = self._nearest_site()
+        distance, _, _ = self._nearest_site()
         if not distance:
             length = model.drive.duration * packet_speeds(model.chain.cell, model.drive, model.drive_mass)[1]
             distance = int(min(length, LARGEST))
@@ -206,6 +260,28 @@ class LawCase(Case):
             f" {setting.samples} samples; more cycles, another frequency or a shorter law.distance reduce these numbers"
         )
         return [Problem("drive.frequency", self.drive.frequency, remedy)]
+
+
+def _check_sites(law: LawTable, contacts: ContactsTable) -> Iterator[Problem]:
+    """Problems with the sites of resolved ``contacts`` whose law is to be computed."""
+    sites = contacts.sites
+    clearances = contacts.clearance
+    assert isinstance(sites, list) and isinstance(clearances, list)
+    if law.site is not None and law.site > len(sites):
+        yield Problem("law.site", law.site, f"sites are numbered from 1 to {len(sites)}")
+    if contacts.stiffness is None and "stiffness" not in lists_of(contacts):
+        yield Problem("contacts.stiffness", None, "missing; give it or contacts.modulus, radius and poisson")
+
+    pressed = values_of_sites(contacts, "precompression", len(sites))
+    lesser = lesser_clearances(gaps_of_sites(contacts, clearances), clearances)
+    for number, clearance in enumerate(lesser):
+        if clearance <= 0:
+            remedy = (
+                f"site {number + 1} is pressed at rest and acts on the weakest wave; the law is one of amplitude over"
+                " clearance, which has no value there; omit it"
+            )
+            yield Problem("contacts.precompression", pressed[number], remedy)
+            return
 
 
 def _given_clearances(table: Table) -> list[float]:

@@ -18,8 +18,9 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from vipetsc.case import Model
+from vipetsc.case.kinds import lesser_clearances
 from vipetsc.lattice import ToneBurst, WaveCompliance, bloch
-from vipetsc.studies.response import DECAY, SiteResponse, fastest_wave, in_contact, self_response, unit_phase
+from vipetsc.studies.response import DECAY, SiteResponses, fastest_wave, in_contact, self_response, unit_phase
 
 WIDTH = 14  # of the burst's line, half of what is followed about a frequency
 WIDEST = 0.45  # of the drive's frequency, the largest half width: the followed line reaches neither 0 nor 2 Om
@@ -59,7 +60,9 @@ class Network:
     """The sites of a ``model`` and the linear lattice between them; solved once for all amplitudes.
 
     The frequencies ``offset`` in rad/s are relative to the middle of a line; their transform is over ``time`` in s,
-    twice as long as the run. Arrays (site, site, offset) have the site that sends first.
+    twice as long as the run. Arrays (site, site, offset) have the site that sends first. ``clearance`` (site,) in m is
+    that of the side where it is less. ``power`` and ``power3`` (site, 1) are the powers in W/m^2 of travelling waves at
+    the drive's frequency and three times it over the |w|^2 of each site's pair.
     """
 
     def __init__(self, model: Model) -> None:
@@ -69,7 +72,7 @@ class Network:
         self.model = model
         self.cell = chain.cell
         self.om = drive.frequency
-        self.clearance = np.array(chain.clearances)
+        self.clearance = lesser_clearances(model.gaps, chain.clearances)
 
         length = 2 * model.end
         half = min(WIDTH * 2 * np.pi / drive.duration, WIDEST * drive.frequency)
@@ -88,20 +91,28 @@ class Network:
         inside = self._propagates(self.om)
         radiated = 1j * g.imag  # the part of g that leaves as waves
         eye = np.eye(len(chain.sites))
-        self.between = np.where(inside, (response[:, :, :-1] - g[:, None, None] * eye).T / radiated, 0)
-        self.radiated = radiated[most]
+        # Over what the site that sends, the last axis, radiates.
+        others = (response[:, :, :-1] - g.T[:, :, None] * eye) / radiated.T[:, None]
+        self.between = np.where(inside, others.T, 0)
+        self.radiated = _of_sites(radiated[:, most])
+        self.power = self._powers(self.om)
 
-        self.third = fastest_wave(self.cell, 3 * self.om)
+        self.third = fastest_wave(self.cell, 3 * self.om, chain.contact_pairs[0])
         if self.third:
             response, g = self._responses(3 * self.om)
             inside = self._propagates(3 * self.om)
+            self.power3 = self._powers(3 * self.om)
             self.g3 = g
-            self.centre = g[most]
+            self.centre = _of_sites(g[:, most])
             self.response3 = response[:, :, :-1].T
-            self.between3 = np.where(inside, self.response3 / g - eye[:, :, None], 0)
+            # Over the g of the site that receives a wave, or of the one that sends it: the same for equal pairs.
+            received = response[:, :, :-1] / g.T[:, :, None]
+            sent = response[:, :, :-1] / g.T[:, None]
+            self.received3 = np.where(inside, received.T - eye[:, :, None], 0)
+            self.between3 = np.where(inside, sent.T - eye[:, :, None], 0)
 
-    def compose(self, amplitude: float, site: SiteResponse) -> Composed:
-        """The energies at the end under ``amplitude`` (N), from the response of one ``site``."""
+    def compose(self, amplitude: float, sites: SiteResponses) -> Composed:
+        """The energies at the end under ``amplitude`` (N), from the response of each of the ``sites`` alone."""
         linear = np.where(self.during, abs(amplitude) * self.linear, 0)
         size = float(np.abs(linear).max())
         c = linear.copy()
@@ -112,11 +123,11 @@ class Network:
         for i in range(MOST):
             z = self._over_clearance(c, c3)
             if i < HELD:
-                on = in_contact(z, site.over_bursts(z.max(axis=1)).release) & self.during
+                on = in_contact(z, sites.over_bursts(z.max(axis=1)).release) & self.during
             if not on.any():
                 break
 
-            state = site.at(z)
+            state = sites.at(z)
             # The last c is near the next: GMRES begins with it.
             arriving = self._solve(self.between, self.radiated * state.fundamental * on, linear, c)
             change = float(np.abs(arriving - c).max()) / size
@@ -125,21 +136,28 @@ class Network:
 
             if self.third:
                 f3 = state.third * np.abs(c) * unit_phase(c) ** 3 * on
-                sent = self._sent(self.between3, f3) * self.centre
+                sent = self._sent(self.received3, f3) * self.centre
                 c3 = c3 + 0.5 * (self._solve(self.between3, -1.0 * on, sent, c3) - c3)
             if change < CLOSE and i >= LEAST:
                 break
-        return self._energies(Arriving(c, c3, on), site, change)
+        return self._energies(Arriving(c, c3, on), sites, change)
 
     def _responses(self, middle: float) -> tuple[np.ndarray, np.ndarray]:
         """Response of w at the sites to forces at the sites and the drive (frequency, site, site and 1); of one alone.
 
-        The second (frequency) is that of a site in an infinite lattice to a pair of forces at itself.
+        The second (site, frequency) is that of a site in an infinite lattice to a pair of forces at itself.
         """
         omega = middle + self.offset - 1j * self.decay
         drive = (self.model.drive_cell, self.model.drive_mass)
         response = WaveCompliance(self.model.chain, points=(drive,)).response(omega)
-        return response, self_response(self.cell, omega)
+        pairs = self.model.chain.contact_pairs
+        alone = {pair: self_response(self.cell, omega, pair) for pair in {*pairs}}
+        return response, np.array([alone[pair] for pair in pairs])
+
+    def _powers(self, omega: float) -> np.ndarray:
+        """Power (site, 1) in W/m^2 of the wave at ``omega`` in rad/s over the |w|^2 of each site's pair."""
+        waves = [fastest_wave(self.cell, omega, pair) for pair in self.model.chain.contact_pairs]
+        return np.array([[wave.power_per_area] for wave in waves if wave])
 
     def _propagates(self, middle: float) -> np.ndarray:
         """Whether a wave of each frequency near ``middle`` exists."""
@@ -180,25 +198,23 @@ class Network:
         """z (site, time)."""
         return np.asarray((np.abs(c) + np.abs(c3)) / self.clearance[:, None])
 
-    def _energies(self, waves: Arriving, site: SiteResponse, change: float) -> Composed:
+    def _energies(self, waves: Arriving, sites: SiteResponses, change: float) -> Composed:
         """The energies at the end, of ``waves`` that arrive at the sites."""
         c = waves.first
         z = self._over_clearance(c, waves.third)
         step = float(self.time[1])
-        wave = fastest_wave(self.cell, self.om)
-        assert wave is not None
 
-        state = site.at(z)
-        burst = site.over_bursts(z.max(axis=1))
+        state = sites.at(z)
+        burst = sites.over_bursts(z.max(axis=1))
         lost = state.lost * burst.lost[:, None]
         into = state.into * burst.into[:, :, None]
-        power = wave.power_per_area * np.abs(c) ** 2 * waves.on
+        power = self.power * np.abs(c) ** 2 * waves.on
         emitted = power * into
         dissipated = float((power * lost).sum()) * step
         bands = emitted.sum(axis=(1, 2)) * step
 
         if self.third:
-            absorbed = self._absorbed(emitted.sum(axis=0), waves.on, site) * step
+            absorbed = self._absorbed(emitted.sum(axis=0), waves.on, sites) * step
             total = float(bands.sum())
             if total:
                 bands = bands * (1 - absorbed / total)
@@ -217,7 +233,7 @@ class Network:
         together = self._backward(rate * np.einsum("jkt,jt->kt", self.response3, self._forward(force)))
         return 0.5 * float(((force * together.conj()).real - (alone * apart.conj()).real).sum())
 
-    def _absorbed(self, emitted: np.ndarray, on: np.ndarray, site: SiteResponse) -> float:
+    def _absorbed(self, emitted: np.ndarray, on: np.ndarray, sites: SiteResponses) -> float:
         """Sum over time of the power in W that sites in contact take from what others have ``emitted`` (site, time)."""
         assert self.third
         cells = np.array(self.model.chain.sites)
@@ -230,8 +246,14 @@ class Network:
                 passing = np.interp(late, self.time, passing, left=0.0)
                 last = k
 
-                z = np.sqrt(np.maximum(passing, 0) / self.third.power_per_area) / self.clearance[k]
-                fraction = np.minimum(site.at(np.maximum(z, WEAK)).lost, 1) * on[k]
+                z = np.sqrt(np.maximum(passing, 0) / self.power3[k]) / self.clearance[k]
+                fraction = np.minimum(sites.of_site(k).at(np.maximum(z, WEAK)).lost, 1) * on[k]
                 total += float((passing * fraction).sum())
                 passing = passing * (1 - fraction) + emitted[k] / 2  # half of it in each direction
         return total
+
+
+def _of_sites(values: np.ndarray) -> np.ndarray:
+    """The ``values`` (site,) as factors of arrays (site, time): one number where all sites have the same."""
+    # A product with a number and one with equal numbers in an array differ by rounding.
+    return values[0] if np.all(values == values[0]) else values[:, None]

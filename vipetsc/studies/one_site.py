@@ -36,7 +36,6 @@ from vipetsc.io.netcdf import tabulated, write_netcdf
 from vipetsc.io.records import Record
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.directions import by_direction, wave_energies
-from vipetsc.studies.pair_motion import PairMotion
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.ring import Ring
 from vipetsc.studies.scattering_law import BACKWARD, FORWARD, LAYOUT, NEAR, POINT_LAYOUT, ScatteringLaw
@@ -120,11 +119,11 @@ class ScatteringRuns:
         late = (speed * setting.towards > 0) & (np.abs(speed) * since_burst < setting.distance)
 
         # The run is simulated twice: its last sample in all cells and all samples of the site fit where all would not.
-        motion = PairMotion.of(self.ring.run_at_site(1.0, with_site=False), self.cell)
+        motion = self.ring.motion(self.ring.run_at_site(1.0, with_site=False))
         w = motion.displacement[:, 0]
         rate = motion.velocity[:, 0]
         return {
-            "peak": motion.largest()[0],
+            "peak": self.ring.peak_of(motion),
             "time": motion.time.tolist(),
             "envelope": np.hypot(w, rate / drive.frequency).tolist(),
             "energy": by_direction(energy, setting.towards * speed).tolist(),

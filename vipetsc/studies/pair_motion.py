@@ -8,12 +8,13 @@ import xarray as xr
 from scipy.interpolate import CubicHermiteSpline
 
 from vipetsc.lattice import UnitCell
+from vipetsc.lattice.chain import Pair
 
 
 class PairMotion(NamedTuple):
-    """Motion of the resonators relative to the hosts of the recorded cells.
+    """Relative motion of pairs of masses, as those that contacts join.
 
-    ``displacement`` (time, cell) is w in m, resonator less host, ``velocity`` (time, cell) its rate in m/s, at ``time``
+    ``displacement`` (time, pair) is w in m, resonator less host, ``velocity`` (time, pair) its rate in m/s, at ``time``
     in s.
     """
 
@@ -23,7 +24,10 @@ class PairMotion(NamedTuple):
 
     @classmethod
     def of(cls, run: xr.Dataset, cell: UnitCell, columns: Sequence[int] | slice = slice(None)) -> Self:
-        """The motion in a ``run`` with all samples of both fields, in those ``columns`` of its recorded cells."""
+        """The motion of the pair of ``cell`` in those ``columns`` of the recorded cells of a ``run``.
+
+        The run has all samples of both fields.
+        """
         displacement = run["displacement"].values[:, columns]
         velocity = run["velocity"].values[:, columns]
         return cls(
@@ -32,16 +36,48 @@ class PairMotion(NamedTuple):
             velocity=velocity[..., cell.resonator] - velocity[..., cell.host],
         )
 
+    @classmethod
+    def between(cls, run: xr.Dataset, columns: Sequence[int], pairs: Sequence[Pair]) -> Self:
+        """The motion of ``pairs``, each with its host in one of the ``columns`` of the recorded cells of a ``run``.
+
+        A pair that joins cells has its resonator in the next column, behind the last one in the first.
+        """
+        motions = []
+        for name in ("displacement", "velocity"):
+            field = run[name].values
+            relative = []
+            for column, pair in zip(columns, pairs, strict=True):
+                w = field[:, (column + pair.next_cell) % field.shape[1], pair.resonator]
+                # The ground does not move.
+                relative.append(w - field[:, column, pair.host] if pair.host >= 0 else w)
+            motions.append(np.stack(relative, axis=1))
+        displacement, velocity = motions
+        return cls(time=run["time"].values, displacement=displacement, velocity=velocity)
+
     def largest(self) -> list[float]:
-        """Largest |w| (cell) in m at or between the samples."""
-        pairs = zip(self.displacement.T, self.velocity.T, strict=True)
-        return [largest_between(self.time, w, rate) for w, rate in pairs]
+        """Largest |w| (pair) in m at or between the samples."""
+        return self.reached([(1.0, 1.0)] * self.displacement.shape[1])
+
+    def reached(self, gaps: Sequence[tuple[float, float]]) -> list[float]:
+        """Largest w (pair) on either side, at or between the samples, over the clearance there.
+
+        ``gaps`` (pair) are the clearances on the sides + and -, in any unit.
+        """
+        pairs = zip(self.displacement.T, self.velocity.T, gaps, strict=True)
+        return [largest_between(self.time, w, rate, sides) for w, rate, sides in pairs]
 
 
-def largest_between(times: np.ndarray, w: np.ndarray, rate: np.ndarray) -> float:
-    """Largest |w| at or between samples at ``times``, from the cubic through ``w`` with slopes ``rate``."""
+def largest_between(
+    times: np.ndarray, w: np.ndarray, rate: np.ndarray, gaps: tuple[float, float] = (1.0, 1.0)
+) -> float:
+    """Largest of w and -w at or between samples at ``times``, over the ``gaps`` of both sides; at least 0.
+
+    It is that of the cubic through ``w`` with slopes ``rate``.
+    """
     curve = CubicHermiteSpline(times, w, rate)
     extrema = curve.derivative().roots(extrapolate=False)
     # A piece on which w is constant has NaN for its root.
     candidates = np.concatenate([times, extrema[np.isfinite(extrema)]])
-    return float(np.abs(curve(candidates)).max())
+    values = curve(candidates)
+    plus, minus = gaps
+    return float(max(values.max() / plus, -values.min() / minus, 0.0))

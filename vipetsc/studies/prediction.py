@@ -8,7 +8,6 @@ are those of linear modes at the last sample, over the drive's work.
 
 import time
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +17,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case
+from vipetsc.case.kinds import NO_SITES
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.folder import PREDICTION, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
@@ -28,7 +28,7 @@ from vipetsc.spectra import ModalParts
 from vipetsc.studies.composition import Network
 from vipetsc.studies.pair_motion import PairMotion
 from vipetsc.studies.recorded_runs import RecordedRuns
-from vipetsc.studies.response import Burst, SiteResponse, SiteRun
+from vipetsc.studies.response import Burst, SiteResponse, SiteResponses, SiteRun
 from vipetsc.studies.ring import Ring
 
 LINEAR, SITE, MEMBER = "linear", "site", "member"
@@ -41,6 +41,7 @@ LAYOUT = {
     "band": ("band", "1", "pass band, from 1"),
     "site": ("site", "1", "contact site"),
     "sites/cell": ("site", "1", "cell (1-based) of a site"),
+    "sites/kind": ("site", "1", "kind of a site, from 1: sites of one kind have the response of one run alone"),
     "predicted/bands": ("amplitude band", "1", "energy of a pass band at the end over the work"),
     "predicted/upper": ("amplitude", "1", "energy of the bands above the driven one at the end over the work"),
     "predicted/other": ("amplitude", "1", "energy of all bands except the driven one at the end over the work"),
@@ -58,20 +59,21 @@ LAYOUT["simulated/contact_episodes"] = ("amplitude", "1", "contact episodes; NaN
 
 
 class Job(NamedTuple):
-    """A run to be simulated: its ``kind``, and its amplitude in N or, of the one site, its z."""
+    """A run to be simulated: its ``kind``, and its amplitude in N or, of the one site, its z and its kind of site."""
 
     kind: str
     at: float
+    of: int = 0
 
 
 class Records(NamedTuple):
-    """Records of the runs of a prediction: the ``linear`` one, those of one ``site`` by z, those to compare with.
+    """Records of the runs of a prediction: the ``linear`` one, those of one site by z, those to compare with.
 
-    ``largest`` is the largest z of the runs of one site.
+    Of the runs of one site there is a list for each kind of ``sites``; ``largest`` is their largest z.
     """
 
     linear: Record
-    site: list[Record]
+    sites: list[list[Record]]
     members: list[Record]
     largest: float
 
@@ -136,7 +138,8 @@ class PredictionRuns:
         self.case = case
         self.model = case.model()
         self.recorded = RecordedRuns("prediction-runs", folder, comm, stop).read()
-        self.ring = Ring(case, self.recorded)
+        self.rings = [Ring(case, self.recorded, kind) for kind in range(len(case.kinds.kinds))]
+        self.bursts: dict[int, tuple[Burst, float]] = {}
         self.progress = progress
 
     def make_all(self) -> Records:
@@ -145,11 +148,15 @@ class PredictionRuns:
         linear = self.make([Job(LINEAR, 1.0)])[0]
         amplitudes = amplitudes_of(self.case, linear)
         largest = max(float(amplitudes[-1] * max(linear["reached"])), HIGH) * BEYOND
-        site = self.make([Job(SITE, z) for z in site_points(self.case, largest)], largest)
+        points = site_points(self.case, largest)
+        kinds = range(len(self.rings))
+        # The runs of all kinds together: they keep more ranks busy than those of one.
+        made = self.make([Job(SITE, z, kind) for kind in kinds for z in points], largest)
+        sites = [made[kind * len(points) : (kind + 1) * len(points)] for kind in kinds]
         members: list[Record] = []
         if self.case.predict.simulate:
             members = self.make([Job(MEMBER, amplitude) for amplitude in amplitudes.tolist()])
-        return Records(linear, site, members, largest)
+        return Records(linear, sites, members, largest)
 
     def make(self, jobs: Sequence[Job], largest: float = 0.0) -> list[Record]:
         """The records of ``jobs``; the missing ones are simulated now. Collective; raises RuntimeError if one fails.
@@ -162,10 +169,10 @@ class PredictionRuns:
             if job.kind == LINEAR:
                 record = self._linear(job.at)
             elif job.kind == SITE:
-                record = self._site(job.at, largest)
+                record = self._site(job.at, job.of, largest)
             else:
                 record = self._member(job.at)
-            return {"kind": job.kind, "at": job.at} | record
+            return {"kind": job.kind, "at": job.at, "of": job.of} | record
 
         self.recorded.make(jobs, work, what=f"{jobs[0].kind} runs", progress=self.progress)
         return [self.recorded.records[job] for job in jobs]
@@ -173,21 +180,20 @@ class PredictionRuns:
     def _linear(self, amplitude: float) -> Record:
         """The lattice without contacts: the largest w at the sites over the clearances, work, energies."""
         chain = self.model.chain
-        linear = self.case.varied(
-            without=("output",), drive={"amplitude": amplitude}, contacts={"sites": [], "clearance": []}
-        )
+        linear = self.case.varied(without=("output",), drive={"amplitude": amplitude}, contacts=NO_SITES)
         run, statistics = self._run(linear)
-        largest = PairMotion.of(run, chain.cell, chain.sites).largest()
-        reached = [w / clearance for w, clearance in zip(largest, chain.clearances, strict=True)]
+        motion = PairMotion.between(run, chain.sites, chain.contact_pairs)
+        reached = motion.reached(self.model.gaps or [(gap, gap) for gap in chain.clearances])
         return {"reached": reached, "work": statistics["work"], "bands": self._band_energies(run)}
 
-    def _site(self, z: float, largest: float) -> Record:
-        """Record of one site under a burst that reaches ``z`` clearances: sums over its time in contact."""
-        burst, peak = self._burst
-        clearance = self.ring.setting.clearance
-        amplitude = self.ring.amplitude(z, peak)
-        run = self.ring.run_at_site(amplitude, with_site=True)
-        w = PairMotion.of(run, self.model.chain.cell).displacement[:, 0]
+    def _site(self, z: float, kind: int, largest: float) -> Record:
+        """Record of one site of a ``kind`` under a burst that reaches ``z`` clearances: sums over its contact."""
+        ring = self.rings[kind]
+        burst, peak = self._burst(kind)
+        clearance = ring.setting.clearance
+        amplitude = ring.amplitude(z, peak)
+        run = ring.run_at_site(amplitude, with_site=True)
+        w = ring.motion(run).displacement[:, 0]
         separation = run["impacts/separation"].values
         touched = SiteRun(
             amplitude=amplitude,
@@ -198,13 +204,15 @@ class PredictionRuns:
         )
         return {"z": z, "amplitude": amplitude, "largest": largest} | burst.sums(touched, largest)
 
-    @cached_property
-    def _burst(self) -> tuple[Burst, float]:
-        """The linear wave at the one site under 1 N, and its largest |w| in m."""
-        cell = self.model.chain.cell
-        motion = PairMotion.of(self.ring.run_at_site(1.0, with_site=False), cell)
-        burst = Burst(cell, self.model.drive.frequency, motion.time, motion.displacement[:, 0])
-        return burst, motion.largest()[0]
+    def _burst(self, kind: int) -> tuple[Burst, float]:
+        """The linear wave at one site of a ``kind`` under 1 N, and its peak in m; simulated once."""
+        if kind not in self.bursts:
+            ring = self.rings[kind]
+            motion = ring.motion(ring.run_at_site(1.0, with_site=False))
+            w = motion.displacement[:, 0]
+            burst = Burst(self.model.chain.cell, self.model.drive.frequency, motion.time, w, ring.kind.pair)
+            self.bursts[kind] = burst, ring.peak_of(motion)
+        return self.bursts[kind]
 
     def _member(self, amplitude: float) -> Record:
         """The case under ``amplitude``, for the comparison."""
@@ -245,17 +253,24 @@ def composed(case: PredictCase, records: Records) -> xr.Dataset:
     driven = next(i for i, band in enumerate(pass_bands(cell)) if model.drive.frequency <= band.high)
     onset = 1 / max(linear["reached"])
 
-    response = SiteResponse.of(records.site, cell, model.drive.frequency, records.largest)
-    predicted = _predicted(Network(model), response, amplitudes, linear, driven)
+    kinds = case.kinds
+    responses = [
+        SiteResponse.of(rows, cell, model.drive.frequency, records.largest, kind.pair)
+        for rows, kind in zip(records.sites, kinds.kinds, strict=True)
+    ]
+    every_site = SiteResponses(of_kind=tuple(responses), kind=np.array(kinds.of))
+    predicted = _predicted(Network(model), every_site, amplitudes, linear, driven)
     values = {f"predicted/{name}": value for name, value in predicted.items()}
     values |= {
         "amplitude": amplitudes,
         "band": np.arange(1, cell.dofs + 1),
         "site": np.arange(1, len(model.chain.sites) + 1),
         "sites/cell": np.array(model.chain.sites) + 1,
+        "sites/kind": np.array(kinds.of) + 1,
     }
     about: dict[str, Any] = {"case": case.to_toml(), "onset_amplitude": onset, "drive_band": driven + 1}
-    in_runs = sum(record["cpu_seconds"] for record in [linear, *records.site])
+    of_sites = [record for rows in records.sites for record in rows]
+    in_runs = sum(record["cpu_seconds"] for record in [linear, *of_sites])
     about["cpu_seconds"] = in_runs + time.process_time() - begin
 
     if records.members:
@@ -266,7 +281,7 @@ def composed(case: PredictCase, records: Records) -> xr.Dataset:
 
 
 def _predicted(
-    network: Network, response: SiteResponse, amplitudes: np.ndarray, linear: Record, driven: int
+    network: Network, sites: SiteResponses, amplitudes: np.ndarray, linear: Record, driven: int
 ) -> dict[str, np.ndarray]:
     """Predicted values at every amplitude, by their names in ``LAYOUT``; ``driven`` is the drive's band from 0."""
     onset = 1 / max(linear["reached"])
@@ -279,7 +294,7 @@ def _predicted(
         z = amplitude * np.array(linear["reached"])
         change = 0.0
         if amplitude > onset:
-            composition = network.compose(float(amplitude), response)
+            composition = network.compose(float(amplitude), sites)
             bands += composition.into / work
             dissipated = composition.dissipated / work
             z = composition.z

@@ -22,7 +22,7 @@ from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.progress import Progress
 from vipetsc.studies.pool import TaskPool
 
-Key = str | float | tuple[str, float]
+Key = str | float | tuple[str, float] | tuple[str, float, int]
 # Failures of a single run. Too little memory (also as CaseError) or disk is not among them: another attempt
 # with more of it may succeed.
 FAILURES = (RuntimeError, ArithmeticError)

@@ -17,6 +17,7 @@ import numpy as np
 
 from vipetsc.io.records import Record
 from vipetsc.lattice import Band, Chain, UnitCell, WaveCompliance, bloch, pass_bands, waves_at
+from vipetsc.lattice.chain import Pair
 
 LOWEST = 0.15  # z of the first of the bins
 BINS = 40
@@ -29,28 +30,33 @@ THIRD_LINE = 0.4
 TOP = 1.02
 
 
-def self_response(cell: UnitCell, omega: np.ndarray) -> np.ndarray:
-    """g (omega) in m/N of an infinite lattice at frequencies ``omega`` in rad/s, below the real axis."""
-    return WaveCompliance(Chain(cell, 1, sites=(0,)), infinite=True).at(omega)[:, 0, 0]
+def self_response(cell: UnitCell, omega: np.ndarray, pair: Pair) -> np.ndarray:
+    """g (omega) in m/N of a ``pair`` in an infinite lattice at frequencies ``omega`` in rad/s, below the real axis."""
+    return WaveCompliance(Chain(cell, 1, sites=(0,), pairs=(pair,)), infinite=True).at(omega)[:, 0, 0]
 
 
 class TravellingWave(NamedTuple):
-    """The fastest wave at a frequency: its ``band`` from 0, |v_g| ``speed`` in cells/s, power over |w|^2 in W/m^2."""
+    """The fastest wave at a frequency: its ``band`` from 0, |v_g| ``speed`` in cells/s, power over |w|^2 in W/m^2.
+
+    w is the relative displacement of a pair of masses.
+    """
 
     band: int
     speed: float
     power_per_area: float
 
 
-def fastest_wave(cell: UnitCell, omega: float) -> TravellingWave | None:
-    """The fastest wave at ``omega`` in rad/s; None in a gap."""
+def fastest_wave(cell: UnitCell, omega: float, pair: Pair) -> TravellingWave | None:
+    """The fastest wave at ``omega`` in rad/s, with the relative displacement of a ``pair``; None in a gap."""
     waves = waves_at(cell, omega)
     if not waves:
         return None
 
     number, kappa, speed = max(waves, key=lambda wave: wave[2])
     vector = bloch(cell, kappa).vectors[:, number - 1]
-    relative = abs(vector[cell.resonator] - vector[cell.host])
+    # Bloch's factor of the next cell; the ground does not move.
+    resonator = vector[pair.resonator] * (np.exp(1j * kappa) if pair.next_cell else 1.0)
+    relative = abs(resonator - (vector[pair.host] if pair.host >= 0 else 0.0))
     return TravellingWave(number - 1, speed, speed * omega**2 / (2 * max(relative, TINY) ** 2))
 
 
@@ -92,7 +98,7 @@ class Burst:
     the envelope at the frequency ``drive``.
     """
 
-    def __init__(self, cell: UnitCell, drive: float, time: np.ndarray, w: np.ndarray) -> None:
+    def __init__(self, cell: UnitCell, drive: float, time: np.ndarray, w: np.ndarray, pair: Pair) -> None:
         self.cell = cell
         self.drive = drive
         self.time = time
@@ -101,7 +107,7 @@ class Burst:
         self.padded = 2 * len(time)
         self.decay = DECAY / (self.padded * self.step)
         self.omega = 2 * np.pi * np.fft.rfftfreq(self.padded, self.step)
-        self.g = self_response(cell, self.omega - 1j * self.decay)
+        self.g = self_response(cell, self.omega - 1j * self.decay, pair)
         self.bands: tuple[Band, ...] = pass_bands(cell)
         self.linear = self.spectrum(w)
         self.c = self.envelope(self.linear, drive, FIRST_LINE * drive)
@@ -215,15 +221,15 @@ class SiteResponse(NamedTuple):
     release: np.ndarray
 
     @classmethod
-    def of(cls, records: list[Record], cell: UnitCell, drive: float, largest: float) -> Self:
-        """The response from the sums of all runs, in any order; zero if there was no contact."""
+    def of(cls, records: list[Record], cell: UnitCell, drive: float, largest: float, pair: Pair) -> Self:
+        """The response of a ``pair`` from the sums of all runs, in any order; zero if there was no contact."""
         # Rising peaks, which interpolation needs; and the same sums whatever the order in which runs ended.
         records = sorted(records, key=lambda record: record["z"])
         x = np.linspace(np.log(LOWEST), np.log(largest), BINS)
         sums = np.array([record["sums"] for record in records])
         peaks = np.log([record["z"] for record in records])
         release = np.array([record["release"] for record in records])
-        wave = fastest_wave(cell, drive)
+        wave = fastest_wave(cell, drive, pair)
         squares = sums[:, 0]  # |c|^2, by run
         total = sums.sum(axis=0)
         seen = total[0] > 0
@@ -284,3 +290,37 @@ class SiteResponse(NamedTuple):
         x = np.log(np.maximum(largest, 1e-9))
         factors = np.array([np.interp(x, self.peaks, row) for row in self.factor])
         return BurstState(lost=factors[0], into=factors[1:], release=np.interp(x, self.peaks, self.release))
+
+
+class SiteResponses(NamedTuple):
+    """The response of every site: ``of_kind`` are those of the kinds of sites, ``kind`` (site,) the number of each."""
+
+    of_kind: tuple[SiteResponse, ...]
+    kind: np.ndarray
+
+    def of_site(self, site: int) -> SiteResponse:
+        """The response of one ``site`` (from 0)."""
+        return self.of_kind[self.kind[site]]
+
+    def at(self, z: np.ndarray) -> ContactState:
+        """State of the sites in contact at ``z`` (site, time)."""
+        if len(self.of_kind) == 1:
+            return self.of_kind[0].at(z)
+        states = [self.of_site(site).at(row) for site, row in enumerate(z)]
+        return ContactState(
+            fundamental=np.array([state.fundamental for state in states]),
+            third=np.array([state.third for state in states]),
+            lost=np.array([state.lost for state in states]),
+            into=np.stack([state.into for state in states], axis=1),
+        )
+
+    def over_bursts(self, largest: np.ndarray) -> BurstState:
+        """Factors and release of bursts with these ``largest`` z (site)."""
+        if len(self.of_kind) == 1:
+            return self.of_kind[0].over_bursts(largest)
+        states = [self.of_site(site).over_bursts(np.asarray(z)) for site, z in enumerate(largest)]
+        return BurstState(
+            lost=np.array([state.lost for state in states]),
+            into=np.stack([state.into for state in states], axis=1),
+            release=np.array([state.release for state in states]),
+        )

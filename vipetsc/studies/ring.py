@@ -9,39 +9,63 @@ ring infinite. The drive works as without a site if the burst is over before a w
 drive is in the midst of the lattice, not at a wall. ``LawCase.one_site`` chooses N, d and t_e.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import xarray as xr
 
+from vipetsc.case.kinds import NO_SITES, contacts_of_one
 from vipetsc.case.law import LawCase
+from vipetsc.studies.pair_motion import PairMotion
 from vipetsc.studies.recorded_runs import RecordedRuns
 
 
 class Ring:
-    """Runs of ``case`` on the ring, simulated by the teams of ``recorded``; ``setting`` holds its sizes and times."""
+    """Runs of ``case`` on the ring, simulated by the teams of ``recorded``; ``setting`` holds its sizes and times.
 
-    def __init__(self, case: LawCase, recorded: RecordedRuns) -> None:
+    The site is of the ``kind`` of that number, by default that of ``law.site``.
+    """
+
+    def __init__(self, case: LawCase, recorded: RecordedRuns, kind: int | None = None) -> None:
         self.case = case
-        self.setting = case.one_site()
+        self.setting = case.one_site(kind)
+        self.kind = case.kinds.kinds[self.setting.kind]
         self.recorded = recorded
 
     def amplitude(self, z: float, peak: float) -> float:
-        """Amplitude in N at which the linear wave reaches ``z`` clearances at the site; ``peak`` is its |w| at 1 N."""
+        """Amplitude in N at which the linear wave reaches ``z`` clearances at the site; ``peak`` is that of 1 N in m.
+
+        Of sides that differ the peak is that of the side whose stop the wave reaches first, as ``peak_of`` has it.
+        """
         return z * self.setting.clearance / peak
+
+    def peak_of(self, motion: PairMotion) -> float:
+        """Largest w in m of a ``motion``, each side's over that side's clearance in lesser clearances."""
+        return motion.reached([self.kind.sides])[0]
+
+    def motion(self, run: xr.Dataset) -> PairMotion:
+        """The relative motion of the site's masses in a ``run_at_site``."""
+        return PairMotion.between(run, [0], [self.kind.pair])
 
     def run_to_end(self, amplitude: float, *, with_site: bool) -> xr.Dataset:
         """A run under ``amplitude`` in N of which all cells are kept at the first and the last sample."""
         return self._run(amplitude, with_site, {"stride": self.setting.samples})
 
     def run_at_site(self, amplitude: float, *, with_site: bool) -> xr.Dataset:
-        """A run under ``amplitude`` in N of which all samples of the site's cell are kept."""
+        """A run under ``amplitude`` in N of which all samples of the site's cells are kept."""
         cell = self.setting.site + 1
-        return self._run(amplitude, with_site, {"window": [cell, cell]})
+        return self._run(amplitude, with_site, {"window": [cell, cell + self.kind.pair.next_cell]})
 
-    def _run(self, amplitude: float, with_site: bool, output: dict[str, object]) -> xr.Dataset:
+    def _contacts(self) -> dict[str, Any]:
+        """The changes of ``[contacts]`` that leave one site of the kind."""
+        sites = self.case.kinds.sites(self.setting.kind)
+        cell = self.setting.site + 1
+        # Every run has the law's one clearance: z is changed by the amplitude alone.
+        return contacts_of_one(self.case.contacts, sites[0], self.kind, cell, self.setting.clearance)
+
+    def _run(self, amplitude: float, with_site: bool, output: Mapping[str, object]) -> xr.Dataset:
         setting = self.setting
-        contacts: dict[str, list[float]] = {"sites": [], "clearance": []}
-        if with_site:
-            # Every run has the law's one clearance: z is changed by the amplitude alone.
-            contacts = {"sites": [setting.site + 1], "clearance": [setting.clearance]}
+        contacts = self._contacts() if with_site else NO_SITES
         case = self.case.varied(
             without=("output",),
             lattice={"cells": setting.cells, "ends": "periodic"},
