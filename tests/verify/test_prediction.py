@@ -147,6 +147,39 @@ def test_a_site_that_nothing_reaches_changes_nothing(prediction):
     np.testing.assert_allclose(data["predicted/bands"], prediction.data["predicted/bands"], atol=2e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("contacts", "kinds"),
+    [
+        ({"each": {"restitution": [0.9, 0.4]}}, [1, 2]),
+        ({"side": "plus"}, [1, 1]),
+        ({"pair": [0, 2]}, [1, 1]),
+        ({"pair": [1, 1], "next_cell": True}, [1, 1]),
+    ],
+    ids=["two restitutions", "one-sided", "ground", "next cell"],
+)
+def test_sites_that_differ_are_predicted_as_simulated(contacts, kinds, tmp_path):
+    """Nothing is fitted: the bounds are those of the small prediction, but for the loss of one-sided stops."""
+    amplitudes = {"amplitudes": [30.0, 120.0]}
+    data = predict(prediction_case(contacts={"restitution": 0.7} | contacts, predict=amplitudes), tmp_path)
+
+    assert data["sites/kind"].values.tolist() == kinds
+    assert data.attrs["rms_upper"] < 0.15
+    assert data.attrs["worst_dissipated"] < 0.07
+
+
+def test_equal_values_in_lists_are_one_kind(prediction):
+    """The same kind, and the same bits of what is composed, as with one value for all sites."""
+    linear, answers = prediction.records()
+    restitution = prediction.case.contacts.restitution
+    listed = prediction_case(contacts={"each": {"restitution": [restitution] * 2}})
+    assert listed.kinds == prediction.case.kinds
+
+    data = composed_from(listed, linear, answers)
+
+    np.testing.assert_array_equal(data["predicted/bands"], prediction.data["predicted/bands"])
+
+
 def test_contact_goes_on_until_release():
     """Contact begins above z = 1 and ends where z falls below the release, which differs from site to site."""
     z = np.array([[0.9, 1.1, 0.9, 0.41, 0.39, 0.9]] * 2)
