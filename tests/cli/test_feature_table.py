@@ -30,7 +30,8 @@ LATTICE = {"profiles of cells", "disorder of cells", "free ends", "ring"}
 ENDS = {"free ends", "ring"}
 # What a verb accepts and what does not change its results: linear modes have no contact, no drive and no dashpot; the
 # law's site is alone on a ring of cells; an infinite lattice has no ends, and the reduced model is one pair of masses;
-# for steady states a burst gives the frequency, as a harmonic drive does; the few points of branches touch a site or none.
+# for steady states a burst gives the frequency, as a harmonic drive does; the few points of branches touch a
+# site or none.
 WITHOUT_INFLUENCE = {
     "bands": {feature.name for feature in FEATURES} - LATTICE,
     "law": ENDS | {"several in a cell"},

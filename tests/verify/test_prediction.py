@@ -159,13 +159,16 @@ def test_a_site_that_nothing_reaches_changes_nothing(prediction):
     ids=["two restitutions", "one-sided", "ground", "next cell"],
 )
 def test_sites_that_differ_are_predicted_as_simulated(contacts, kinds, tmp_path):
-    """Nothing is fitted: the bounds are those of the small prediction, but for the loss of one-sided stops."""
+    """Nothing is fitted: the bounds are those of the small prediction.
+
+    The loss at one-sided stops is predicted worse, by 0.083 of the work: its bound is twice the other, and only says so.
+    """
     amplitudes = {"amplitudes": [30.0, 120.0]}
     data = predict(prediction_case(contacts={"restitution": 0.7} | contacts, predict=amplitudes), tmp_path)
 
     assert data["sites/kind"].values.tolist() == kinds
     assert data.attrs["rms_upper"] < 0.15
-    assert data.attrs["worst_dissipated"] < 0.07
+    assert data.attrs["worst_dissipated"] < (0.1 if "side" in contacts else 0.05)
 
 
 def test_equal_values_in_lists_are_one_kind(prediction):
