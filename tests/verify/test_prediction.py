@@ -161,7 +161,7 @@ def test_a_site_that_nothing_reaches_changes_nothing(prediction):
 def test_sites_that_differ_are_predicted_as_simulated(contacts, kinds, tmp_path):
     """Nothing is fitted: the bounds are those of the small prediction.
 
-    The loss at one-sided stops is predicted worse, by 0.083 of the work: its bound is twice the other, and only says so.
+    The loss at one-sided stops is predicted worse, by 0.083 of the work: its bound is twice the other.
     """
     amplitudes = {"amplitudes": [30.0, 120.0]}
     data = predict(prediction_case(contacts={"restitution": 0.7} | contacts, predict=amplitudes), tmp_path)
