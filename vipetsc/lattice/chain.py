@@ -75,6 +75,12 @@ class Chain:
         return self.pairs or (Pair(self.cell.host, self.cell.resonator),) * len(self.sites)
 
     @property
+    def resonator_cells(self) -> tuple[int, ...]:
+        """The cell of each site's resonator; behind the last cell of a ring comes the first."""
+        cells = [site + pair.next_cell for site, pair in zip(self.sites, self.contact_pairs, strict=True)]
+        return tuple(cell % self.cells if self.ends == "periodic" else cell for cell in cells)
+
+    @property
     def is_joined(self) -> bool:
         """Whether contacts join cells."""
         return any(pair.next_cell for pair in self.pairs)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
 from vipetsc.lattice.bands import waves_at
-from vipetsc.lattice.chain import Chain, Pair
+from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.waves import NEUTRAL, BlochWaves, bloch_waves, cell_between, coupling_blocks, energy_flux
 
 RIGID = 1e-12  # squared frequencies below this fraction of the largest are those of rigid motions
@@ -125,8 +125,7 @@ class WaveCompliance:
     def cells(self) -> list[int]:
         """The cells that are loaded, and the ends."""
         loaded = {*self.chain.sites, *(cell for cell, _ in self.points)}
-        for site, pair in zip(self.chain.sites, self.chain.contact_pairs, strict=True):
-            loaded.add(self._resonator_cell(site, pair))
+        loaded |= {*self.chain.resonator_cells}
         if not self.infinite and self.chain.ends != "periodic":
             loaded |= {0, self.chain.cells - 1}
         return sorted(loaded) or [0]
@@ -256,19 +255,16 @@ class WaveCompliance:
         first_row = {number: i * cell.dofs for i, number in enumerate(self.cells)}
 
         loads = np.zeros((len(first_row) * cell.dofs, pairs + len(self.points)))
-        for j, (site, pair) in enumerate(zip(self.chain.sites, self.chain.contact_pairs, strict=True)):
-            loads[first_row[self._resonator_cell(site, pair)] + pair.resonator, j] = 1
+        chain = self.chain
+        places = zip(chain.sites, chain.resonator_cells, chain.contact_pairs, strict=True)
+        for j, (site, resonator_cell, pair) in enumerate(places):
+            loads[first_row[resonator_cell] + pair.resonator, j] = 1
             # The ground does not move.
             if pair.host >= 0:
                 loads[first_row[site] + pair.host, j] = -1
         for j, (number, mass) in enumerate(self.points, pairs):
             loads[first_row[number] + mass, j] = 1
         return loads
-
-    def _resonator_cell(self, site: int, pair: Pair) -> int:
-        """The cell of a site's resonator; behind the last cell of a ring comes the first."""
-        cell = site + pair.next_cell
-        return cell if self.infinite else cell % self.chain.cells
 
     def _load_of(self, forces: np.ndarray) -> np.ndarray:
         """The load (cells and dofs, 1) that ``forces``, as of ``field``, amount to."""
