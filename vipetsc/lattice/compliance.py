@@ -124,8 +124,7 @@ class WaveCompliance:
     @property
     def cells(self) -> list[int]:
         """The cells that are loaded, and the ends."""
-        loaded = {*self.chain.sites, *(cell for cell, _ in self.points)}
-        loaded |= {*self.chain.resonator_cells}
+        loaded = {*self.chain.sites, *self.chain.resonator_cells, *(cell for cell, _ in self.points)}
         if not self.infinite and self.chain.ends != "periodic":
             loaded |= {0, self.chain.cells - 1}
         return sorted(loaded) or [0]
