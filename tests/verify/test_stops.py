@@ -112,12 +112,11 @@ def test_what_sites_cannot_be_is_refused_with_its_key(contacts, key):
     assert [problem.key for problem in error.value.problems] == [key]
 
 
-@pytest.mark.parametrize("kind", [LawCase, NnmCase])
-def test_verbs_of_alike_sites_refuse_others(kind):
+def test_modes_of_a_lattice_refuse_sites_that_differ():
     table = {"lattice": {"preset": "four-band", "cells": 40}, "contacts": {"sites": [20], "clearance": 1e-3}}
     for key, value in (("side", "plus"), ("clearance_minus", 2e-3), ("each", {"restitution": [0.5]})):
         with pytest.raises(CaseError) as error:
-            kind.from_table(table | {"contacts": table["contacts"] | {key: value}})
+            NnmCase.from_table(table | {"contacts": table["contacts"] | {key: value}})
         assert [problem.key for problem in error.value.problems] == [f"contacts.{key}"]
 
 
