@@ -19,8 +19,10 @@ from vipetsc.figures.registry import draw
 from vipetsc.figures.response_family import legend_of
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.response_layout import measure
+from vipetsc.modes.response.isolated import places_of
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.swept import motions
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -143,3 +145,78 @@ def test_legends_number_isolas_beside_the_keys(curves):
 def test_a_curve_over_the_amplitude_has_no_such_search():
     with pytest.raises(CaseError, match="along which this curve runs itself"):
         absorber(over="amplitude", fixed=[1.7], range=[0.1, 0.3])
+
+
+# A hardening oscillator under a force; the range ends between its two folds, at 1.32 and 1.83 rad/s.
+DUFFING: dict[str, Any] = {
+    "name": "duffing",
+    "lattice": {
+        "cells": 1,
+        "cell": {
+            "masses": [1.0],
+            "springs": [{"start": 1, "end": 1, "stiffness": 0.5, "cubic": 0.5, "damping": 0.05, "next_cell": True}],
+            "contact": [1, 1],
+        },
+    },
+    "contacts": {"sites": []},
+    "drive": {"waveform": "harmonic", "amplitude": 0.3, "frequency": 1.0, "cell": 1},
+    "time": {"end": 10.0},
+}
+
+
+def duffing(**nfrc: Any) -> NfrcCase:
+    options = {"source": "force", "over": "frequency", "range": [0.8, 1.6], "fixed": [0.3], "harmonics": 9}
+    sweeps = {"isolas": 4, "isola_search": ["sweeps"], "isola_periods": 30}
+    return NfrcCase.from_table(DUFFING | {"nfrc": options | sweeps | nfrc})
+
+
+def test_a_sweep_down_finds_the_states_that_the_curve_from_below_does_not_meet(tmp_path):
+    """At 1.5 rad/s the curve has the large motion; a lattice at rest settles to the small one."""
+    main, isola, back = follow_all(duffing(), tmp_path, MPI.COMM_SELF)
+    assert (isola.name, back.name) == (f"{main.name}-isola-1", f"{main.name}-isola-1-back")
+    first = isola.points[0]
+    assert first.measured.frequency == pytest.approx(1.5)
+    # From there up to the end of the range, and down to the fold from which a sweep down jumps to the curve.
+    assert measure(isola, "frequency").max() == pytest.approx(1.6)
+    (fold,) = [point.measured.frequency for point in back.points if point.kind == "fold"]
+    assert fold == measure(back, "frequency").min()
+    assert back.points[-1].measured.frequency == pytest.approx(1.6)
+
+    # The cubic oscillator's first harmonic, of which the third is a correction: (1 - Om^2 + 3/4 a^2) a = F, c = 0.1.
+    outputs = first.measured.outputs
+    a = np.hypot(outputs["spring_harmonics"][0, 1], outputs["spring_harmonics_imaginary"][0, 1])
+    stiffness = 1 - 1.5**2 + 0.75 * a**2
+    assert a == pytest.approx(0.3 / abs(stiffness + 0.15j), rel=1e-3)
+
+
+@pytest.mark.parametrize("periods", [10, 40])
+def test_slow_sweeps_pass_near_steady_states(periods):
+    """The motion differs from a steady state by what the sweep moves in the time in which the motion settles."""
+    case = duffing(isola_periods=periods, range=[0.5, 0.9])
+    states = SteadyStates(case, 1.0, 0.3)
+    places = places_of(states, 4)
+    for direction in (1, -1):
+        for p, harmonics in zip(places[::direction], motions(states, 4, direction), strict=True):
+            guess = np.append(states.balance.pack(harmonics) / states.clearance, p)
+            difference = np.linalg.norm(states.at(guess, p) - guess) / np.linalg.norm(guess)
+            assert difference < 1.5 / periods
+
+
+@pytest.mark.parametrize(
+    ("nfrc", "text"),
+    [
+        ({"infinite": True}, "a run is one of a lattice with its ends"),
+        ({"over": "contacts.stiffness", "range": [1.0, 2.0]}, "sweeps vary the frequency"),
+    ],
+)
+def test_sweeps_need_ends_and_a_frequency(nfrc, text):
+    springs = [{"start": 1, "end": 1, "stiffness": 0.5, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 0.1}]
+    table = DUFFING | {
+        "lattice": {"cells": 4, "cell": {"masses": [1.0, 1.0], "springs": springs, "contact": [1, 2]}},
+        "contacts": {"law": "bilinear", "stiffness": 1.0, "restitution": 1.0, "sites": [2], "clearance": 0.5},
+    }
+    options = {"source": "force", "over": "frequency", "range": [0.8, 1.6], "fixed": [0.3], "infinite": False}
+    sweeps = {"isolas": 2, "isola_search": ["sweeps"]}
+    assert NfrcCase.from_table(table | {"nfrc": options | sweeps})
+    with pytest.raises(CaseError, match=text):
+        NfrcCase.from_table(table | {"nfrc": options | sweeps | nfrc})

@@ -1,13 +1,13 @@
 """Two masses of which one meets a stop, forced and damped: the third example of NLvib (Krack and Gross 2019).
 
 Masses 1 kg, springs 1 N/m from one to the other and from the second to the ground, dampers 0.03 of the springs, a stop
-of 100 N/m for the first mass beyond 1 m on one side, 0.1 N cos(Om t) on the second. The example's springs belong to no
-unit cell, so that the equations of ``nfrc`` are given the compliance here.
+of 100 N/m for the first mass beyond 1 m on one side, 0.1 N cos(Om t) on the second.
 M. Krack, J. Gross, Harmonic Balance for Nonlinear Vibration Problems, Springer 2019; github.com/maltekrack/NLvib.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +15,11 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from vipetsc.lattice import Contact
-from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import SiteForces, Stops
-from vipetsc.modes.balance.hill import Hill
-from vipetsc.modes.response.equations import ContinuationParameter, LinearMotion, SteadyEquations
+import vipetsc
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.modes.response.steady import SteadyStates
 
+EXAMPLE = Path(vipetsc.__file__).parent / "examples" / "nlvib.toml"
 K = np.array([[1.0, -1.0], [-1.0, 2.0]])
 STOP = 100.0
 GAP = 1.0
@@ -35,28 +34,11 @@ def dynamic_stiffness(omega: float) -> np.ndarray:
     return K + 1j * omega * C - omega**2 * np.eye(2)
 
 
-class Damped:
-    """The compliance of the first mass, to the forces on both."""
-
-    def at(self, omegas, column=0):
-        compliance = [np.linalg.inv(dynamic_stiffness(omega)) for omega in np.atleast_1d(omegas)]
-        return np.array([matrix[:1, column : column + 1] for matrix in compliance])
-
-
-class Example(SteadyEquations):
-    """The steady states of the example over the frequency."""
-
-    def __init__(self):
-        self.compliance = Damped()
-        forces = SiteForces([Stops(Contact("bilinear", STOP), plus=GAP, minus=np.inf)])
-        balance = HarmonicBalance(self.compliance, forces, LAST, odd=False, cosines=False)
-        over = ContinuationParameter("frequency", fixed=1.0, scale=0.15)
-        super().__init__(balance, GAP, over, tolerance=1e-12, max_newton=12)
-
-    def linear_motion(self, omega):
-        z = np.zeros((1, LAST + 1), complex)
-        z[0, 1] = FORCE * self.compliance.at(omega, 1)[0, 0, 0]
-        return LinearMotion(z, None)
+def steady_states() -> SteadyStates:
+    """The equations of the example's curve."""
+    case = NfrcCase.load(EXAMPLE)
+    options = case.nfrc.model_copy(update={"harmonics": LAST})
+    return SteadyStates(case.model_copy(update={"nfrc": options}), restitution=1.0, fixed=FORCE)
 
 
 class Arc(NamedTuple):
@@ -106,7 +88,7 @@ def flow(omega: float, start: np.ndarray, instants: np.ndarray | None = None) ->
     return Arc(y, derivative, between)
 
 
-def fundamentals(states: Example, xi: np.ndarray) -> np.ndarray:
+def fundamentals(states: SteadyStates, xi: np.ndarray) -> np.ndarray:
     """Harmonics of order 1 of the displacements of the two masses."""
     omega, _ = states.drive(xi[-1])
     stop = -states.balance.series(xi[:-1], omega).forces[0, 1]
@@ -157,12 +139,11 @@ def test_shooting_and_harmonic_balance_find_the_published_stability(attractor, o
     spectrum = np.fft.rfft(flow(omega, state, np.arange(512) / 512).between[:2]) / 256
     harmonics = spectrum[:1, : LAST + 1].copy()
     harmonics[0, 0] /= 2
-    states = Example()
+    states = steady_states()
     xi = states.at(np.append(states.balance.pack(harmonics), 0.0), omega / states.parameter.scale)
     assert fundamentals(states, xi) == pytest.approx(spectrum[:, 1], rel=1e-6)
 
-    hill = Hill(states.compliance, omega, LAST, odd=False, finite=True)
-    fastest = hill.fastest(states.balance.series(xi[:-1], omega))
+    fastest = states.hill(omega).fastest(states.balance.series(xi[:-1], omega))
     assert (fastest == 0) == (stability == "stable")
     if fastest:
         # Of a conjugate pair Hill's method gives the one above the real axis.

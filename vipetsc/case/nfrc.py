@@ -4,81 +4,25 @@ import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import tomli_w
-from pydantic import AfterValidator, Field
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import CaseError, Problem, Section, Table, Valid, read_section
+from vipetsc.case.case_file import CaseError, Problem, Table, Valid, read_section
 from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites
 from vipetsc.case.family import FamilyMember, family_of
 from vipetsc.case.names import distinct
+from vipetsc.case.nfrc_table import NfrcTable
 from vipetsc.case.resolve import build_chain, check_cell, check_stiffness
-from vipetsc.case.schema import Positive, once
 from vipetsc.case.sites import ContactsTable
-from vipetsc.case.varied_key import PARAMETERS, TRIED, is_key, key_problems, table_at
+from vipetsc.case.varied_key import NO_SWEEPS, PARAMETERS, TRIED, is_key, key_problems, table_at
 from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_places, waves_at
 from vipetsc.lattice.contact import least_restitution
 from vipetsc.lattice.modal_compliance import MOST_DOFS
 
 MOST_UNKNOWNS = 6000  # harmonics of all places: a dense matrix of 300 MB
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Restitution = Annotated[float, Field(ge=0, le=1)]
-
-
-class NfrcTable(Section):
-    """Steady responses of the sites to an incident ``wave`` of a ``band``, or to a ``force`` on the driven mass.
-
-    With ``drive.end`` the force is that of the wall, which moves. ``over`` the amplitude (of a wave: the relative
-    displacement that it alone would make at the first site, over the clearance there; of a force: N; of a wall: m) or
-    the frequency (rad/s), within the ``range`` [low, high]: a curve for each of the others in ``fixed`` (frequencies:
-    by default the drive's) and each of the ``restitutions`` (by default that of ``[contacts]``), and of these for each
-    combination of the values of further keys in ``family``, which are lists or ranges as in ``[sweep]``. Over the path
-    of a key (``contacts.clearance``, in the key's unit) ``fixed`` are amplitudes, at the drive's frequency, and the
-    case is resolved anew at each value. The lattice is ``infinite``, or ends where its cells do: always if it has
-    dashpots, cells that differ, or contacts between other masses than the cell's pair. With ``open_ends`` it goes on
-    for ever as the reference cell in the place of its absorbing ends. ``harmonics`` is the number of the last one;
-    motions that are not ``symmetric`` (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have
-    even ones too. Besides folds the
-    points are located where states become stable or unstable (``special_points``: Neimark-Sacker, period doubling,
-    branch points), or ``all`` where the number of growing perturbations changes. At ``isolas`` places within the range
-    isolated curves are looked for, by way of amplitudes up to ``isola_reach`` times larger or smaller. Steps are in
-    units of the clearance and of the amplitude that touches, or half the range of frequencies.
-    """
-
-    source: Literal["wave", "force"] = "wave"
-    infinite: bool | None = None
-    open_ends: bool = False
-    band: Annotated[int, Field(ge=1)] | None = None
-    direction: Literal["forward", "backward"] = "forward"
-    over: str = "amplitude"
-    range: list[Finite] = Field([0.5, 2.0], min_length=2, max_length=2)
-    fixed: Annotated[list[Positive], AfterValidator(once)] = Field([])
-    restitutions: Annotated[list[Restitution], AfterValidator(once)] = Field([])
-    family: dict[str, Any] | None = None
-    harmonics: int = Field(41, ge=1, le=2000)
-    symmetric: bool | None = None
-    isolas: int = Field(0, ge=0, le=1000)
-    isola_reach: float = Field(10.0, gt=1, le=1e3)
-    special_points: Literal["stability", "all"] = "stability"
-    points: int = Field(1000, ge=1)
-    first_step: Positive = 0.02
-    smallest_step: Positive = 1e-9
-    largest_step: Positive = 0.1
-    tolerance: Positive = 1e-11
-    max_newton: int = Field(10, ge=1)
-
-    @property
-    def varies_key(self) -> bool:
-        """Whether a key of the case varies along the curves."""
-        return is_key(self.over)
-
-    @property
-    def towards(self) -> int:
-        """+1 for a wave to higher cells, -1 to lower ones."""
-        return 1 if self.direction == "forward" else -1
 
 
 class ResponseCurve(NamedTuple):
@@ -148,7 +92,7 @@ class NfrcCase(Case):
             first = nfrc.fixed[0] if nfrc.over == "amplitude" else nfrc.range[0]
             fastest = max(waves_at(cell, first), key=lambda wave: wave[2], default=None)
             nfrc = nfrc.model_copy(update={"band": fastest and fastest[0]})
-        return sections | {"nfrc": nfrc}, list(_check_waves(nfrc, cell))
+        return sections | {"nfrc": nfrc}, [*_check_waves(nfrc, cell), *_check_sweeps(nfrc, chain)]
 
     @classmethod
     def _read_family(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -374,6 +318,21 @@ def _check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:
         yield Problem("nfrc.open_ends", True, remedy)
     elif moved and absorbing.end in (moved, "both"):
         yield Problem("drive.end", moved, "no wall moves where the lattice goes on; set lattice.absorbing.end")
+
+
+def _check_sweeps(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
+    """Problems with runs that look for isolated curves."""
+    if not nfrc.isolas or "sweeps" not in nfrc.isola_search:
+        return
+    remedy = ""
+    if nfrc.source == "wave" or nfrc.infinite or nfrc.open_ends:
+        remedy = "a run is one of a lattice with its ends; omit sweeps, or drive a mass, with nfrc.infinite = false"
+    elif nfrc.over != "frequency":
+        remedy = NO_SWEEPS
+    elif chain.cells * chain.cell.dofs > MOST_DOFS:
+        remedy = f"sweeps are made of up to {MOST_DOFS} masses; omit them"
+    if remedy:
+        yield Problem("nfrc.isola_search", nfrc.isola_search, remedy)
 
 
 def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:

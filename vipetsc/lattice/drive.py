@@ -180,14 +180,25 @@ class Pieces:
     def force(self, t: ArrayLike) -> np.ndarray:
         """Force in N at time t in s."""
         t = np.asarray(t, float)
-        number = np.searchsorted(self.table["start"], t, side="right") - 1
-        piece = self.table[np.maximum(number, 0)]
+        piece = self._piece(t)
         x = t - piece["start"]
         value = np.zeros_like(t)
         for name in reversed(COEFFICIENTS):
             value = value * x + piece[name]
-        value = value * np.sin(piece["phase"] + x * (piece["frequency"] + 0.5 * piece["rate"] * x))
-        return np.where((number >= 0) & (t < self.duration), value, 0.0)
+        value = value * np.sin(self.phase(t))
+        return np.where((t >= self.table["start"][0]) & (t < self.duration), value, 0.0)
+
+    def phase(self, t: ArrayLike) -> np.ndarray:
+        """Phase in rad of the sine at time t in s."""
+        t = np.asarray(t, float)
+        piece = self._piece(t)
+        x = t - piece["start"]
+        return np.asarray(piece["phase"] + x * (piece["frequency"] + 0.5 * piece["rate"] * x))
+
+    def _piece(self, t: np.ndarray) -> np.ndarray:
+        """The piece at each time t in s; before the beginning the first one."""
+        number = np.searchsorted(self.table["start"], t, side="right") - 1
+        return self.table[np.maximum(number, 0)]
 
     @property
     def repeats(self) -> bool:

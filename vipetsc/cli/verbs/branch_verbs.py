@@ -135,13 +135,17 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
 
 
 def _isola_rows(case: NfrcCase) -> Rows:
-    """Where isolated curves are looked for, if they are."""
-    count = case.nfrc.isolas
-    places = "1 place" if count == 1 else f"{count} places"
-    reach = case.nfrc.isola_reach
-    return (
-        [("isolas", f"looked for at {places}, by amplitudes up to {reach:g} times larger or smaller")] if count else []
-    )
+    """Where and how isolated curves are looked for, if they are."""
+    options = case.nfrc
+    if not options.isolas:
+        return []
+    places = "1 place" if options.isolas == 1 else f"{options.isolas} places"
+    searches = []
+    if "amplitudes" in options.isola_search:
+        searches.append(f"by amplitudes up to {options.isola_reach:g} times larger or smaller")
+    if "sweeps" in options.isola_search:
+        searches.append(f"by sweeps of {options.isola_periods} periods from one place to the next")
+    return [("isolas", f"looked for at {places}, {' and '.join(searches)}")]
 
 
 def _family_rows(case: NfrcCase) -> Rows:

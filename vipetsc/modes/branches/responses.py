@@ -15,15 +15,17 @@ from vipetsc.io.netcdf import Variables, variable
 from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.method import CrossingBranch, Method
-from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem
+from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.modes.response.condensation import compliance_of
-from vipetsc.modes.response.isolated import CLOSED, ClosingSteps, places_of, unknown_states
+from vipetsc.modes.response.equations import FAILURES
+from vipetsc.modes.response.isolated import CLOSED, ClosingSteps, over_amplitudes, places_of, unknown_states
 from vipetsc.modes.response.keyed_case import KeyedCase
 from vipetsc.modes.response.outputs import WALLS
 from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import TurningSteps, first_state
+from vipetsc.modes.response.swept import swept_states
 from vipetsc.spectra.measures import JOINT
 
 # Between the name of a curve and the number of an isolated one beside it.
@@ -36,7 +38,7 @@ class ResponseMethod(Method[Response]):
     """Curves of ``SteadyStates``: one for each restitution and each value of the parameter that is fixed."""
 
     kind = RESPONSES
-    failures = ContinuationError, FlowError, ArithmeticError, ValueError
+    failures = FAILURES
     keeps_empty = False  # pictures and tables of curves need a first state
 
     case: NfrcCase
@@ -106,9 +108,18 @@ class ResponseMethod(Method[Response]):
         def known() -> list[list[Response]]:
             return [branch.points, *(other.points for other in followed)]
 
+        search = self.case.nfrc.isola_search
+        places = places_of(states, self.case.nfrc.isolas)
+        swept: list[list[np.ndarray]] = [[] for _ in places]
+        if "sweeps" in search:
+            assert isinstance(states, SteadyStates)  # checked in the case: they sweep the frequency
+            swept = swept_states(states, places)
+
         number = 0
-        for p in places_of(states, self.case.nfrc.isolas):
-            for xi in unknown_states(states, known, float(p)):
+        for p, candidates in zip(places.tolist(), swept, strict=True):
+            if "amplitudes" in search:
+                candidates += over_amplitudes(states, known(), p)
+            for xi in unknown_states(states, known, candidates):
                 number += 1
                 start = Response(xi=xi, next_step=states.options.first_step)
                 first = replace(start, tangent=states.first_tangent(start, 1))

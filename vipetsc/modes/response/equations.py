@@ -15,6 +15,8 @@ from vipetsc.modes.response.state import Response
 
 # Relative step of a difference in frequency.
 SLOPE = 1e-6
+# What may end a curve of steady states, or keep Newton's method from one.
+FAILURES = ContinuationError, FlowError, ArithmeticError, ValueError
 
 
 class LinearMotion(NamedTuple):

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.problem import ContinuationError, FlowError
+from vipetsc.modes.response.equations import FAILURES
 from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
@@ -24,8 +24,6 @@ from vipetsc.modes.response.steps import TurningSteps
 MOST_STATES = 1000
 # Difference of unknowns, over their size, above which two states are not the same.
 DIFFERENT = 1e-6
-# What may end a line, or keep Newton's method from a state.
-FAILURES = ContinuationError, FlowError, ArithmeticError, ValueError
 
 Equations = SteadyStates | StatesOverKey
 Curves = Sequence[Sequence[Response]]
@@ -37,22 +35,26 @@ def places_of(states: Equations, count: int) -> np.ndarray:
     return np.asarray(low + (high - low) * (np.arange(count) + 0.5) / count)
 
 
-def unknown_states(states: Equations, known: Callable[[], Curves], p: float) -> Iterator[np.ndarray]:
-    """Unknowns of states at the scaled parameter ``p`` that lie on none of the ``known`` curves.
+def unknown_states(
+    states: Equations, known: Callable[[], Curves], candidates: Sequence[np.ndarray]
+) -> Iterator[np.ndarray]:
+    """Unknowns of those of the ``candidates`` that lie on none of the ``known`` curves.
 
-    These are asked for before each state, since curves may be added between two states.
+    The curves are asked for before each state, since curves may be added between two states.
     """
-    states_found: list[np.ndarray] = []
-    passed: list[np.ndarray] = []
-    for begin in states_on(states, known(), p):
-        # A line that has come by this state has followed its line already.
-        if not _is_among(begin, passed):
-            on_line = list(_states_over_amplitude(states, begin))
-            passed += on_line
-            states_found += on_line
-    for xi in states_found:
-        if not _is_among(xi, states_on(states, known(), p)):
+    for xi in candidates:
+        if not _is_among(xi, states_on(states, known(), float(xi[-1]))):
             yield xi
+
+
+def over_amplitudes(states: Equations, curves: Curves, p: float) -> list[np.ndarray]:
+    """Unknowns of states at the scaled parameter ``p`` to which other amplitudes lead from those of the ``curves``."""
+    states_found: list[np.ndarray] = []
+    for begin in states_on(states, curves, p):
+        # A line that has come by this state has followed its line already.
+        if not _is_among(begin, states_found):
+            states_found += _states_over_amplitude(states, begin)
+    return states_found
 
 
 def states_on(states: Equations, curves: Curves, p: float) -> list[np.ndarray]:

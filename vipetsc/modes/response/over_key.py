@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vipetsc.case.nfrc import NfrcTable
+from vipetsc.case.nfrc_table import NfrcTable
 from vipetsc.modes.balance.hill import Perturbations, Stability
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.problem import SpecialKind
