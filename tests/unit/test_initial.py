@@ -21,6 +21,7 @@ from vipetsc.lattice.packet import gaussian_packet
 from vipetsc.studies.linear_run import linear_case
 
 PACKET = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 12, "width": 2, "energy": 1e-3}
+STRUCK = {"kind": "velocity", "cell": 5, "velocity": 1.0}
 FOUR_BAND = {"preset": "four-band", "cells": 24}
 TABLE = {"name": "t", "lattice": FOUR_BAND, "contacts": {"sites": 0}}
 
@@ -194,13 +195,24 @@ def test_a_rigid_motion_is_no_mode_to_begin_with():
         case_with(lattice=FOUR_BAND | {"ends": "free"}, initial={"kind": "mode", "number": 1, "amplitude": 1e-3})
 
 
-def test_scattering_laws_and_searches_begin_at_rest():
+def test_scattering_laws_begin_at_rest():
     with pytest.raises(CaseError, match=r"initial\.kind"):
         LawCase.from_table(TABLE | {"initial": PACKET, "drive": {"amplitude": 1.0}, "law": {}})
+
+
+@pytest.mark.parametrize(
+    ("initial", "search", "sentence"),
+    [
+        (PACKET, {"start": "matched"}, "there is no scattering law by which clearances could be matched"),
+        (STRUCK, {}, "masses that are struck send waves of all bands"),
+    ],
+)
+def test_searches_say_what_a_free_motion_does_not_have(initial, search, sentence):
     contacts = {"sites": [6], "clearance": 1e-3}
-    search = {"variables": {"clearance": [1e-4, 1e-2]}}
-    with pytest.raises(CaseError, match="starts at rest"):
-        OptimiseCase.from_table(TABLE | {"initial": PACKET, "contacts": contacts, "optimise": search})
+    search = {"variables": {"clearance": [1e-4, 1e-2]}} | search
+    table = TABLE | {"initial": initial, "contacts": contacts, "time": {"end": 0.1}, "optimise": search}
+    with pytest.raises(CaseError, match=sentence):
+        OptimiseCase.from_table(table)
 
 
 def put_branch(path: Path, size: float = 1e-4) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.conftest import datasets, search_table, simulated, small_case
+from tests.conftest import datasets, search_table, simulated, small_case, with_sections
 from vipetsc.case import Case
+from vipetsc.case.amplitude import amplitude_changes, amplitude_of
 from vipetsc.case.objective import ObjectiveTable
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.lattice import gaps, pass_bands
@@ -57,6 +59,80 @@ def test_shares_of_the_work_sum_to_one():
     assert values[lower_part.name] > 0
     assert values[upper_part.name] > 0
     assert values[lower_part.name] + values[upper_part.name] == pytest.approx(values["bands"][3], rel=1e-12)
+
+
+FREE = {"drive": {"amplitude": 0.0}, "time": {"end": 0.03, "engine": "auto", "rtol": 1e-9}}
+PACKET = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 9, "width": 1, "amplitude": 1e-3}
+STRUCK = {"kind": "velocity", "cell": 5, "velocity": -3.0, "more": [{"cell": 9, "mass": 3, "velocity": 1.5}]}
+
+
+def free_table(initial: dict[str, Any], **sections) -> dict[str, Any]:
+    """The small lattice without a drive, with a motion at t = 0."""
+    table = small_case(**sections).model_dump(by_alias=True, exclude_none=True)
+    return {key: table[key] for key in ("name", "lattice", "contacts")} | {"initial": initial} | FREE
+
+
+def free_case(initial: dict[str, Any], **sections) -> Case:
+    """The case of ``free_table``."""
+    return Case.from_table(free_table(initial, **sections))
+
+
+@pytest.mark.parametrize("initial", [PACKET, STRUCK], ids=["packet", "struck"])
+def test_fractions_of_a_free_motion_are_of_its_energy_at_the_start(initial):
+    """The energy at t = 0 of what nothing drives is in bands or in contacts at the end, or lost."""
+    values, run = judged(free_case(initial))
+
+    at_start = float(run["energy/kinetic"][0] + run["energy/spring"][0])
+    assert values["episodes"] > 5
+    assert values["dissipated"] == pytest.approx(float(run["energy/dissipated"][-1]) / at_start)
+    outside = 1 - sum(values["bands"]) - values["dissipated"]
+    assert abs(outside - float(run["energy/contact"][-1]) / at_start) < 0.01
+
+
+@pytest.mark.parametrize("initial", [PACKET, STRUCK], ids=["packet", "struck"])
+def test_the_amplitude_of_a_free_motion_multiplies_the_whole_motion(initial):
+    """Where nothing touches, half the amplitude is half of every displacement and velocity."""
+    case = free_case(initial, contacts={"clearance": 1.0})
+    half = case.varied(**amplitude_changes(case, 0.5 * amplitude_of(case)))
+    assert amplitude_of(half) == pytest.approx(0.5 * amplitude_of(case), rel=1e-15)
+
+    motion = simulated(case)[0]["velocity"].values
+    assert np.abs(simulated(half)[0]["velocity"].values - 0.5 * motion).max() < 1e-9 * np.abs(motion).max()
+
+
+def test_a_free_motion_is_searched_over_its_amplitude(tmp_path):
+    """Runs are at the amplitudes of the motion at t = 0, and the best design is a case of the same motion."""
+    options = {"budget": 3, "population": 4, "curve": [5e-4], "variables": {"restitution": [0.3, 0.9]}}
+    options["objective"] = [{"measure": "band_share", "band": 1, "amplitudes": [5e-4, 1e-3]}]
+    plan = OptimiseCase.from_table(free_table(PACKET) | {"optimise": options})
+    summary = optimum_search.run_search(plan, tmp_path)
+
+    found = datasets(tmp_path / "optimum.h5")
+    assert "the worst at 0.0005, 0.001 m" in summary
+    assert found["amplitude"].tolist() == [5e-4, 1e-3]
+    best = Case.load(tmp_path / "best.toml")
+    assert best.initial == plan.base.initial
+    worst = [judged(best.varied(initial={"amplitude": a}), plan.options.objective[0])[0] for a in (5e-4, 1e-3)]
+    assert found["value"].max() == min(values["band_share 1"] for values in worst)
+
+
+def test_designs_keep_what_differs_from_site_to_site():
+    """Laws, restitutions, sides, clearances of the side - and pairs of sites are those of the case in every design."""
+    each = {
+        "law": ["bilinear", "hertz", "hertz"],
+        "stiffness": [1e5, 1e7, 2e7],
+        "restitution": [0.9, 0.7, 0.5],
+        "side": ["plus", "both", "minus"],
+        "pair": [[1, 2], [0, 3], [3, 4]],
+    }
+    material = dict.fromkeys(("modulus", "radius", "poisson"))
+    plan = OptimiseCase.from_table(with_sections(TABLE, {"contacts": {"each": each, "stiffness": 1.0} | material}))
+    design = plan.design(np.array([1e-4, 2e-4, 3e-4]))
+
+    assert design.contacts.each == plan.base.contacts.each
+    assert design.model().laws == plan.base.model().laws
+    assert design.model().gaps == ((1e-4, np.inf), (2e-4, 2e-4), (np.inf, 3e-4))
+    assert design.model().chain.pairs == plan.base.model().chain.pairs
 
 
 # Driven from the left the cells behind site 11 are beyond it, driven from the right those before site 14.

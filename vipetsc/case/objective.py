@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from vipetsc.case.amplitude import has_free_amplitude
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.schema import Finite, Positive
@@ -14,6 +15,8 @@ from vipetsc.spectra.measures import PART, RunMeasure, measures_of
 
 # Measures of searches alone; all others are those of every run, by their names.
 OF_SEARCHES = ("upper_share_at_end", "ibtet", "band_share", "entropy", "transmitted")
+ABOVE_DRIVEN = ("upper_share_at_end", "ibtet")
+FILE_AMPLITUDE = "a state from a file is taken as it is, with the amplitude that it has"
 # Of a run's analysis, but no number about the lattice's motion.
 NO_GOAL = ("ledger_error", "entropy/start", "bands/modal_energy")
 Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
@@ -22,11 +25,12 @@ Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 class MeasuredTable(Section):
     """A measure of a design: of a band or a part of one, at some amplitudes.
 
-    ``measure``: at the run's end over the drive's work, the energy in the pass bands above the driven one
-    (``upper_share_at_end``), in the pass band ``band`` or in ``part`` of it in rad/s (``band_share``), beyond the last
-    site (``transmitted``); or ``ibtet``, or the energy-weighted ``entropy`` in bit; or any other number of a run by its
-    name, ``peak_velocity/tip`` of a point, ``band_transmission/base-tip`` with the ``band``. Of the ``amplitudes`` in
-    N, by default the case's, the ``worst`` or the ``mean`` counts.
+    ``measure``: at the run's end, over the energy that the lattice received (the drive's work, and the energy of its
+    motion at t = 0), the energy in the pass bands above the driven one (``upper_share_at_end``), in the pass band
+    ``band`` or in ``part`` of it in rad/s (``band_share``), beyond the last site (``transmitted``); or ``ibtet``, or
+    the energy-weighted ``entropy`` in bit; or any other number of a run by its name, ``peak_velocity/tip`` of a point,
+    ``band_transmission/base-tip`` with the ``band``. Of the ``amplitudes`` of the drive, or of the motion at t = 0
+    where nothing is driven, by default the case's, the ``worst`` or the ``mean`` counts.
     """
 
     measure: Literal[OF_SEARCHES] | str = "upper_share_at_end"  # type: ignore[valid-type]  # the names above
@@ -50,12 +54,12 @@ class MeasuredTable(Section):
         """Whether it is a number of every run, not one that searches alone measure."""
         return self.measure not in OF_SEARCHES
 
-    def at_amplitudes(self) -> str:
-        """Which amplitudes count, in words."""
+    def at_amplitudes(self, unit: str) -> str:
+        """Which amplitudes count, in words; they have a ``unit``."""
         if not self.amplitudes:
             return ""
         amplitudes = ", ".join(f"{amplitude:g}" for amplitude in self.amplitudes)
-        return f", the {self.over} at {amplitudes} N"
+        return f", the {self.over} at {amplitudes} {unit}"
 
 
 class ObjectiveTable(MeasuredTable):
@@ -63,9 +67,9 @@ class ObjectiveTable(MeasuredTable):
 
     goal: Literal["maximise", "minimise"] = "maximise"
 
-    def describe(self) -> str:
-        """The objective in words."""
-        return f"{self.goal} {self.name}{self.at_amplitudes()}"
+    def describe(self, unit: str) -> str:
+        """The objective in words; amplitudes have a ``unit``."""
+        return f"{self.goal} {self.name}{self.at_amplitudes(unit)}"
 
 
 class ConstraintTable(MeasuredTable):
@@ -74,11 +78,11 @@ class ConstraintTable(MeasuredTable):
     at_least: Finite | None = None
     at_most: Finite | None = None
 
-    def describe(self) -> str:
-        """The constraint in words."""
+    def describe(self, unit: str) -> str:
+        """The constraint in words; amplitudes have a ``unit``."""
         bounds = [f"at least {self.at_least:g}" if self.at_least is not None else ""]
         bounds.append(f"at most {self.at_most:g}" if self.at_most is not None else "")
-        return f"{self.name} {' and '.join(filter(None, bounds))}{self.at_amplitudes()}"
+        return f"{self.name} {' and '.join(filter(None, bounds))}{self.at_amplitudes(unit)}"
 
     def excess(self, value: float) -> float:
         """By how much a ``value`` is outside the bounds, over the bound's size (or 1 for a bound of 0); 0 inside."""
@@ -89,6 +93,8 @@ class ConstraintTable(MeasuredTable):
 
 def measured_problems(objective: MeasuredTable, at: str, base: Case, varied: bool) -> Iterator[Problem]:
     """Problems with an objective or a constraint, of a cell that stays as it is unless ``varied``."""
+    if objective.amplitudes and not has_free_amplitude(base):
+        yield Problem(f"{at}.amplitudes", objective.amplitudes, f"{FILE_AMPLITUDE}; omit them")
     if objective.is_of_runs:
         yield from _problems_of_runs(objective, at, base)
         return
@@ -98,7 +104,7 @@ def measured_problems(objective: MeasuredTable, at: str, base: Case, varied: boo
     part = objective.part
 
     # The top of the driven band and of those that overlap it.
-    top = base.drive.frequency or 0.0
+    top = base.wave_frequency or 0.0
     for other in sorted(bands, key=lambda band: band.low):
         if other.low <= top:
             top = max(top, other.high)
@@ -106,7 +112,10 @@ def measured_problems(objective: MeasuredTable, at: str, base: Case, varied: boo
     if objective.measure == "transmitted" and base.lattice.ends == "periodic":
         remedy = "nothing lies beyond the last site of a ring; lattice.ends = fixed or free, or another measure"
         yield Problem(f"{at}.measure", objective.measure, remedy)
-    elif objective.measure in ("upper_share_at_end", "ibtet") and top >= max(b.high for b in bands):
+    elif objective.measure in ABOVE_DRIVEN and base.wave_frequency is None:
+        remedy = "masses that are struck send waves of all bands, and none is the driven one; band_share of a band"
+        yield Problem(f"{at}.measure", objective.measure, remedy)
+    elif objective.measure in ABOVE_DRIVEN and top >= max(b.high for b in bands):
         remedy = f"the driven band is the highest of {len(bands)}; band_share of another, or a drive on a lower one"
         yield Problem(f"{at}.measure", objective.measure, remedy)
     elif (objective.measure == "band_share") != (band is not None):

@@ -1,19 +1,27 @@
 """The case of the verb ``optimise``: the variables with their bounds, the objectives and the constraints."""
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import tomli_w
 from pydantic import Field
 
+from vipetsc.case.amplitude import amplitude_changes, amplitude_of, amplitude_unit, has_free_amplitude
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
 from vipetsc.case.disorder import with_cell
-from vipetsc.case.features import refusals
-from vipetsc.case.objective import ConstraintTable, MeasuredTable, ObjectiveTable, Pair, measured_problems
+from vipetsc.case.law import LawCase
+from vipetsc.case.objective import (
+    FILE_AMPLITUDE,
+    ConstraintTable,
+    MeasuredTable,
+    ObjectiveTable,
+    Pair,
+    measured_problems,
+)
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import Positive
 from vipetsc.case.study import StudyCase, with_fastest_engine
@@ -94,11 +102,6 @@ class OptimiseCase(StudyCase):
     base: Case
 
     verb = section = "optimise"
-    refuses: ClassVar[Mapping[str, str]] = {
-        "unlike sites": "not yet: designs have one law for all sites and equal stops on both sides",
-        "touching stops": "not yet: clearances of designs are searched by their logarithm, and 0 has none",
-        "initial motion": "not yet: designs are compared at amplitudes of the drive, and the lattice starts at rest",
-    }
 
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -118,7 +121,8 @@ class OptimiseCase(StudyCase):
             return {}, problems + error.problems
 
         wrong = list(_problems(options, base, "disorder" in table))
-        wrong += refusals(cls, dict(base), lambda *keys: True)
+        if options.start == "matched":
+            wrong += _matched_problems(table)
         invalid = tuple(problem.key for problem in problems)
         problems += [p for p in wrong if not invalid or not p.key.startswith(("optimise.variables", *invalid))]
         return {"table": table, "options": options, "base": base}, problems
@@ -135,6 +139,16 @@ class OptimiseCase(StudyCase):
     def runs(self) -> list[CaseFile]:
         """The case to begin with, of which designs are variations."""
         return [self.base]
+
+    @property
+    def amplitude(self) -> float:
+        """The amplitude of the case to begin with, of its drive or of its initial motion, in ``amplitude_unit``."""
+        return amplitude_of(self.base)
+
+    @property
+    def amplitude_unit(self) -> str:
+        """The unit of amplitudes."""
+        return amplitude_unit(self.base)
 
     @property
     def wants_pictures(self) -> bool:
@@ -227,8 +241,8 @@ class OptimiseCase(StudyCase):
         return _case(table | {"contacts": contacts})
 
     def run(self, design: Case, amplitude: float, sample: int | None = None) -> Case:
-        """A run of a ``design`` at ``amplitude`` in N, recorded whole, with the scatter number ``sample`` if given."""
-        changes = {"drive": {"amplitude": float(amplitude)}}
+        """A run of a ``design`` at an ``amplitude``, recorded whole, with the scatter number ``sample`` if given."""
+        changes = amplitude_changes(design, amplitude)
         disorder = self.table.get("disorder")
         if sample is not None and disorder is not None:
             # The seed depends on the sample alone, so that all designs meet the same scatter.
@@ -259,6 +273,8 @@ def _problems(options: OptimiseTable, base: Case, disorder: bool) -> Iterator[Pr
         yield Problem("optimise.samples", options.samples, "there is no [disorder] from which to draw samples")
     if options.start == "matched" and not (bounds.clearance or bounds.profile):
         yield Problem("optimise.start", options.start, "the start matches clearances: let clearance or profile vary")
+    if options.curve and not has_free_amplitude(base):
+        yield Problem("optimise.curve", options.curve, f"{FILE_AMPLITUDE}; omit it")
     varied = bool(bounds.masses or bounds.springs)
     for number, objective in enumerate(options.objective, 1):
         yield from measured_problems(objective, f"optimise.objective[{number}]", base, varied)
@@ -270,6 +286,21 @@ def _problems(options: OptimiseTable, base: Case, disorder: bool) -> Iterator[Pr
             yield Problem(at, None, "has no bound; give at_least, at_most or both")
         elif low is not None and high is not None and low > high:
             yield Problem(f"{at}.at_least", low, f"is above at_most = {high:g}")
+
+
+def _matched_problems(table: Table) -> Iterator[Problem]:
+    """Problems with clearances that are matched by the scattering law of a case that has none."""
+    without_scatter = {key: section for key, section in table.items() if key != "disorder"}
+    try:
+        law = LawCase.from_table(without_scatter | {"name": "law"})
+    except CaseError as error:
+        for problem in error.problems:
+            remedy = f"there is no scattering law by which clearances could be matched: {problem}"
+            yield Problem("optimise.start", "matched", remedy)
+        return
+    if law.model().laws or law.model().chain.pairs:
+        remedy = "clearances are matched by the scattering law of one site, and these sites differ; begin with the case"
+        yield Problem("optimise.start", "matched", remedy)
 
 
 def _bounds_problems(bounds: VariablesTable, base: Case, sites: int) -> Iterator[Problem]:

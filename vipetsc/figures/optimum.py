@@ -61,10 +61,11 @@ def _compared(optimum: xr.Dataset) -> list[ComparedDesign]:
 
 def convergence(optimum: xr.Dataset) -> Figure:
     """Draw the values of all designs, in their order or over both objectives, and what else became of them."""
-    options = OptimiseCase.of(optimum).options
+    plan = OptimiseCase.of(optimum)
+    options = plan.options
     objectives = options.objective
-    sought = [objective.describe() for objective in objectives]
-    sought += [constraint.describe() for constraint in options.constraint or []]
+    sought = [objective.describe(plan.amplitude_unit) for objective in objectives]
+    sought += [constraint.describe(plan.amplitude_unit) for constraint in options.constraint or []]
     figure = style.new_figure(style.PAGE, 2.8, "; ".join(sought))
     values, others = figure.subplots(1, 2)
     if len(objectives) == 1:
@@ -172,7 +173,7 @@ def compared_curves(optimum: xr.Dataset) -> Figure:
     for axes, i in zip(curves, measures.values(), strict=True):
         _draw_measure(axes, optimum, plan, i)
     curves[0].legend(loc="best")
-    _draw_energies(at_case, optimum, plan.base.drive.amplitude)
+    _draw_energies(at_case, optimum, plan)
     panels.label_panels([*curves, at_case])
     return figure
 
@@ -189,16 +190,21 @@ def _draw_measure(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: in
     searched = set()
     for other in objectives:
         if other.name == objective.name:
-            searched.update(other.amplitudes or [plan.base.drive.amplitude])
+            searched.update(other.amplitudes or [plan.amplitude])
     for amplitude in searched:
         axes.axvline(amplitude, color=style.GREY, lw=0.5, ls=style.DOTTED)
-    axes.set(xscale="log", xlabel="Amplitude (N)", ylabel=_label(objective), title="dotted: amplitudes of the search")
+    axes.set(
+        xscale="log",
+        xlabel=f"Amplitude ({plan.amplitude_unit})",
+        ylabel=_label(objective),
+        title="dotted: amplitudes of the search",
+    )
 
 
-def _draw_energies(axes: Axes, optimum: xr.Dataset, amplitude: float) -> None:
-    """Draw bars of the energy in every band, and what was lost, of each design at the ``amplitude`` (N), or near it."""
+def _draw_energies(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase) -> None:
+    """Draw bars of the energy in every band, and what was lost, of each design at the case's amplitude, or near it."""
     amplitudes = optimum["amplitude"].values
-    nearest = int(np.argmin(np.abs(np.log(amplitudes / amplitude))))
+    nearest = int(np.argmin(np.abs(np.log(amplitudes / plan.amplitude))))
     labels = [*(f"band {band}" for band in optimum["band"].values), "lost"]
 
     designs = _compared(optimum)
@@ -209,4 +215,4 @@ def _draw_energies(axes: Axes, optimum: xr.Dataset, amplitude: float) -> None:
         x = np.arange(len(energies)) + (i - (len(designs) - 1) / 2) * width
         axes.bar(x, energies, width, color=COLOURS[design.name])
     axes.set_xticks(np.arange(len(labels)), labels)
-    axes.set(ylabel="fraction of the work at the end", title=f"At {amplitudes[nearest]:.4g} N")
+    axes.set(ylabel="fraction of the work at the end", title=f"At {amplitudes[nearest]:.4g} {plan.amplitude_unit}")

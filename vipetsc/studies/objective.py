@@ -52,13 +52,8 @@ class ObjectiveRuns:
         self.plan = plan
         self.recorded = RecordedRuns("optimum-runs", folder, comm, stop, plan.options.ranks).read()
 
-    @property
-    def amplitude(self) -> float:
-        """Amplitude in N of the case to begin with."""
-        return float(self.plan.base.drive.amplitude)
-
     def runs(self, design: Case) -> dict[tuple[float, int], Case]:
-        """The runs of a ``design`` by amplitude in N and number of the disorder's sample; raises CaseError."""
+        """The runs of a ``design`` by amplitude and number of the disorder's sample; raises CaseError."""
         # A dictionary names each amplitude once and keeps the order, which is the same on all ranks.
         amplitudes: dict[float, None] = {}
         for measured_table in self.plan.options.measured:
@@ -67,8 +62,8 @@ class ObjectiveRuns:
         return {(amplitude, sample): self.plan.run(design, amplitude, sample) for amplitude, sample in pairs}
 
     def _amplitudes(self, objective: MeasuredTable) -> list[float]:
-        """Amplitudes in N that an ``objective`` or a constraint is measured at."""
-        return objective.amplitudes or [self.amplitude]
+        """Amplitudes that an ``objective`` or a constraint is measured at."""
+        return objective.amplitudes or [self.plan.amplitude]
 
     def make(self, runs: Iterable[Case]) -> None:
         """Simulate those ``runs`` that have no record; all ranks must call it. Raises StoppedError on all."""
@@ -93,7 +88,7 @@ class ObjectiveRuns:
                 return Judgement(
                     losses=[np.nan] * len(options.objective),
                     constraints=[np.nan] * len(constraints),
-                    reason=f"{amplitude:g} N: {reason}",
+                    reason=f"{amplitude:g} {self.plan.amplitude_unit}: {reason}",
                 )
 
         losses = []
@@ -140,10 +135,11 @@ class ObjectiveRuns:
 def measured(run: xr.Dataset, statistics: dict[str, Any], tables: Sequence[MeasuredTable]) -> dict[str, Any]:
     """Values of a ``run`` that objectives and constraints, the ``tables``, need, by their names; and some of all runs.
 
-    ``upper_share_at_end``, ``bands`` (pass band): energy at the end over the work; ``transmitted``: that beyond the
-    last site; ``dissipated``, ``episodes``.
+    ``upper_share_at_end``, ``bands`` (pass band): energy at the end over the work and the energy at t = 0;
+    ``transmitted``: that beyond the last site; ``dissipated``, ``episodes``.
     """
     model = Case.of(run).model()
+    # The ledger counts the energy of the motion at t = 0 as work.
     work = float(run["energy/work"][-1])
     u, v = (run[name].values[-1:] for name in ("displacement", "velocity"))
     modal = ModalParts.of(model.chain)

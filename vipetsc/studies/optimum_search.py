@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case, CaseError, LawCase, case_id
+from vipetsc.case.amplitude import amplitude_of, has_free_amplitude
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import OPTIMUM, claimed, provenance
@@ -26,6 +27,7 @@ from vipetsc.progress import Progress
 from vipetsc.studies.linear_run import LinearRun, linear_case
 from vipetsc.studies.objective import ObjectiveRuns
 from vipetsc.studies.one_site import make_law
+from vipetsc.studies.optimum_layout import LAYOUT
 from vipetsc.studies.recorded_runs import run_in_memory
 from vipetsc.studies.sampler import CmaEs, Nsga2, Sampler, front, knee, smooth
 from vipetsc.studies.scattering_law import matched_clearances
@@ -37,38 +39,6 @@ CURVE_POINTS = 11
 CURVE_SPREAD = 4.0
 # Shown for every design with any objective: a large transfer may come with a large loss.
 SHOWN = ("upper_share_at_end", "dissipated")
-
-# Dimensions, units and description of every variable.
-LAYOUT = {
-    "design": ("design", "1", "number of a design; 0 is the initial case"),
-    "variable": ("variable", "1", "what varies"),
-    "objective": ("objective", "1", "objective"),
-    "unit": ("variable", "1", "unit of the variable"),
-    "low": ("variable", "1", "lower bound"),
-    "high": ("variable", "1", "upper bound"),
-    "generation": ("design", "1", "generation; 0 contains the case and the initial design"),
-    "parameter": ("design variable", "1", "value of a variable, in its unit"),
-    "value": ("design objective", "1", "value of an objective; NaN for a design that failed"),
-    "constraint": ("constraint", "1", "what is bounded"),
-    "constrained": ("design constraint", "1", "value of what is bounded, in its unit; NaN for a design that failed"),
-    "excess": ("design", "1", "by how much bounds are missed, over the bounds; 0 for a design that misses none"),
-    "upper_share_at_end": ("design", "1", "energy of the bands above the driven one at the end, mean over its runs"),
-    "dissipated": ("design", "1", "dissipated energy over the work, mean over its runs"),
-    "reason": ("design", "1", "reason why a design failed"),
-    "front": ("front", "1", "number of a design on the Pareto front"),
-    "compared": ("compared", "1", "compared designs"),
-    "comparison/number": ("compared", "1", "number of a compared design"),
-    "site": ("site", "1", "contact site"),
-    "comparison/cell": ("compared site", "1", "cell (1-based) of a site"),
-    "comparison/clearance": ("compared site", "m", "clearance"),
-    "band": ("band", "1", "pass band"),
-    "amplitude": ("amplitude", "N", "amplitude of the drive"),
-    "curve/bands": ("compared amplitude band", "1", "energy of a pass band at the end over the work"),
-    "curve/upper_share_at_end": ("compared amplitude", "1", "energy of the bands above the driven one at the end"),
-    "curve/transmitted": ("compared amplitude", "1", "energy beyond the last site at the end over the work"),
-    "curve/dissipated": ("compared amplitude", "1", "dissipated energy over the work"),
-    "curve/value": ("compared amplitude objective", "1", "measure of the objective"),
-}
 
 
 @dataclass
@@ -275,9 +245,9 @@ def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:
 def _curves(search: OptimumSearch) -> dict[str, list[Case]]:
     """The runs of the compared designs over the amplitude."""
     options = search.plan.options
-    case_amplitude = search.objective.amplitude
+    case_amplitude = search.plan.amplitude
     amplitudes = options.curve
-    if not amplitudes:
+    if not amplitudes and has_free_amplitude(search.plan.base):
         asked = [a for table in options.measured for a in table.amplitudes or [case_amplitude]]
         amplitudes = np.geomspace(min(asked) / CURVE_SPREAD, max(asked) * CURVE_SPREAD, CURVE_POINTS).tolist()
     amplitudes = sorted({*amplitudes, case_amplitude})
@@ -308,6 +278,7 @@ def _write(search: OptimumSearch, folder: Path) -> None:
     runs = {case_id(run) for design in search.designs for run in design.runs}
     about = provenance(search.objective.recorded.comm) | {"case": plan.to_toml(), "runs": len(runs)}
     data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
+    data["amplitude"].attrs["units"] = plan.amplitude_unit
     write_netcdf(folder / "optimum.h5", data.assign_attrs(summary=_summary(data, plan)))
 
 
@@ -332,7 +303,9 @@ def _design_values(search: OptimumSearch) -> dict[str, Any]:
     }
     constraints = search.plan.options.constraint or []
     if constraints:
-        values["constraint"] = [f"{number}: {table.describe()}" for number, table in enumerate(constraints, 1)]
+        values["constraint"] = [
+            f"{number}: {table.describe(search.plan.amplitude_unit)}" for number, table in enumerate(constraints, 1)
+        ]
         values["constrained"] = [design.constraints for design in designs]
         values["excess"] = [design.excess for design in designs]
 
@@ -369,7 +342,7 @@ def _curve_values(search: OptimumSearch) -> dict[str, Any]:
     bands = len(search.plan.base.lattice.unit_cell().masses)
     names = [objective.name for objective in search.plan.options.objective]
     values: dict[str, Any] = {
-        "amplitude": [run.drive.amplitude for run in curves["case"]],
+        "amplitude": [amplitude_of(run) for run in curves["case"]],
         "band": np.arange(1, bands + 1),
         "curve/bands": [[row.get("bands", [np.nan] * bands) for row in rows] for rows in measured],
         "curve/value": [[[row.get(name, np.nan) for name in names] for row in rows] for rows in measured],
@@ -381,11 +354,12 @@ def _curve_values(search: OptimumSearch) -> dict[str, Any]:
 
 def _summary(data: xr.Dataset, plan: OptimiseCase) -> str:
     """A table of the results, with a line for every compared design."""
+    unit = plan.amplitude_unit
     reasons = [reason for reason in data["reason"].values if reason]
     lines = [f"{data.sizes['design']} designs, {data.attrs['runs']} runs; {len(reasons)} designs failed"]
     if reasons:
         lines.append(f"  such as: {reasons[0]}")
-    lines += [f"  {number}: {objective.describe()}" for number, objective in enumerate(plan.options.objective, 1)]
+    lines += [f"  {number}: {objective.describe(unit)}" for number, objective in enumerate(plan.options.objective, 1)]
     if "excess" in data:
         met = int(((data["excess"] == 0) & (data["reason"] == "")).sum())
         lines += [f"  {met} designs meet the constraints:", *(f"    {text}" for text in data["constraint"].values)]

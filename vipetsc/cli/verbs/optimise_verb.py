@@ -21,8 +21,8 @@ def optimise_rows(plan: OptimiseCase, ranks: int) -> Rows:
     variables = first_few([variable.name for variable in plan.variables()])
     return [
         ("optimise", f"{plan.options.budget} designs of {variables}"),
-        *(("objective", objective.describe()) for objective in plan.options.objective),
-        *(("constraint", constraint.describe()) for constraint in plan.options.constraint or []),
+        *(("objective", objective.describe(plan.amplitude_unit)) for objective in plan.options.objective),
+        *(("constraint", constraint.describe(plan.amplitude_unit)) for constraint in plan.options.constraint or []),
     ]
 
 

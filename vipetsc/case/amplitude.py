@@ -1,0 +1,58 @@
+"""The amplitude of a case: that of its drive or, where nothing is driven, that of the motion at t = 0."""
+
+from typing import Any
+
+from vipetsc.case.case import Case
+
+Changes = dict[str, dict[str, Any]]
+
+
+def amplitude_of(case: Case) -> float:
+    """The amplitude of the first drive; of a lattice that nothing drives, that of its motion at t = 0.
+
+    The latter is the largest displacement in m of a mode, of a packet or of a state from a file, or the speed in m/s of
+    the first of the masses that are struck.
+    """
+    initial = case.initial
+    if case.drive.amplitude or initial is None:
+        return case.drive.amplitude
+    if initial.kind == "velocity":
+        assert initial.velocity is not None
+        return abs(initial.velocity)
+    assert initial.amplitude is not None
+    return initial.amplitude
+
+
+def amplitude_unit(case: Case) -> str:
+    """The unit of ``amplitude_of``."""
+    initial = case.initial
+    if case.drive.amplitude or initial is None:
+        return "m" if case.drive.end else case.drive.record.unit
+    return "m/s" if initial.kind == "velocity" else "m"
+
+
+def has_free_amplitude(case: Case) -> bool:
+    """Whether the case can have any amplitude: a state from a file is taken as it is."""
+    return bool(case.drive.amplitude) or case.initial is None or case.initial.kind != "file"
+
+
+def amplitude_changes(case: Case, amplitude: float) -> Changes:
+    """The changes, as ``Case.varied`` takes them, that bring a resolved ``case`` to an ``amplitude``.
+
+    Masses that are struck keep the ratios of their velocities. Of a state from a file there are none.
+    """
+    initial = case.initial
+    if case.drive.amplitude or initial is None:
+        return {"drive": {"amplitude": float(amplitude)}}
+    if initial.kind == "file":
+        return {}
+    if initial.kind != "velocity":
+        return {"initial": {"amplitude": float(amplitude)}}
+
+    assert initial.velocity is not None and initial.amplitude is not None
+    factor = float(amplitude) / abs(initial.velocity)
+    changes: dict[str, Any] = {"velocity": factor * initial.velocity, "amplitude": factor * initial.amplitude}
+    if initial.more:
+        struck = [strike.model_copy(update={"velocity": factor * strike.velocity}) for strike in initial.more]
+        changes["more"] = [strike.model_dump() for strike in struck]
+    return {"initial": changes}

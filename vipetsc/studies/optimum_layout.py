@@ -1,0 +1,33 @@
+"""Variables of ``optimum.h5``."""
+
+LAYOUT = {
+    "design": ("design", "1", "number of a design; 0 is the initial case"),
+    "variable": ("variable", "1", "what varies"),
+    "objective": ("objective", "1", "objective"),
+    "unit": ("variable", "1", "unit of the variable"),
+    "low": ("variable", "1", "lower bound"),
+    "high": ("variable", "1", "upper bound"),
+    "generation": ("design", "1", "generation; 0 contains the case and the initial design"),
+    "parameter": ("design variable", "1", "value of a variable, in its unit"),
+    "value": ("design objective", "1", "value of an objective; NaN for a design that failed"),
+    "constraint": ("constraint", "1", "what is bounded"),
+    "constrained": ("design constraint", "1", "value of what is bounded, in its unit; NaN for a design that failed"),
+    "excess": ("design", "1", "by how much bounds are missed, over the bounds; 0 for a design that misses none"),
+    "upper_share_at_end": ("design", "1", "energy of the bands above the driven one at the end, mean over its runs"),
+    "dissipated": ("design", "1", "dissipated energy over the work, mean over its runs"),
+    "reason": ("design", "1", "reason why a design failed"),
+    "front": ("front", "1", "number of a design on the Pareto front"),
+    "compared": ("compared", "1", "compared designs"),
+    "comparison/number": ("compared", "1", "number of a compared design"),
+    "site": ("site", "1", "contact site"),
+    "comparison/cell": ("compared site", "1", "cell (1-based) of a site"),
+    "comparison/clearance": ("compared site", "m", "clearance"),
+    "band": ("band", "1", "pass band"),
+    "amplitude": ("amplitude", "N", "amplitude of the drive, or of the motion at t = 0"),
+    "curve/bands": ("compared amplitude band", "1", "energy of a pass band at the end over the work"),
+    "curve/upper_share_at_end": ("compared amplitude", "1", "energy of the bands above the driven one at the end"),
+    "curve/transmitted": ("compared amplitude", "1", "energy beyond the last site at the end over the work"),
+    "curve/dissipated": ("compared amplitude", "1", "dissipated energy over the work"),
+    "curve/value": ("compared amplitude objective", "1", "measure of the objective"),
+}
+"""Dimensions, unit and text of every variable, by its name."""
