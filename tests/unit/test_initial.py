@@ -205,6 +205,7 @@ def test_scattering_laws_begin_at_rest():
     [
         (PACKET, {"start": "matched"}, "there is no scattering law by which clearances could be matched"),
         (STRUCK, {}, "masses that are struck send waves of all bands"),
+        (PACKET | {"band": 4}, {}, "the driven band is the highest of 4"),
     ],
 )
 def test_searches_say_what_a_free_motion_does_not_have(initial, search, sentence):

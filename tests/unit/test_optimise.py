@@ -130,7 +130,7 @@ def test_the_start_is_the_case():
     values = search.begin()
 
     assert case_id(search.design(values)) == case_id(search.base)
-    assert np.allclose(search.from_unit(search.to_unit(values)), values, rtol=1e-12)
+    assert np.allclose(search.space.from_unit(search.space.to_unit(values)), values, rtol=1e-12)
 
 
 def test_a_profile_is_log_spaced_and_a_cell_takes_its_masses_and_springs():
@@ -167,7 +167,7 @@ def test_sites_are_distinct_in_order_and_within_their_bounds(point, bounds):
     low, high = bounds
     search = plan("optimise.variables.clearance=", f"optimise.variables.sites=[{low}, {high}]")
 
-    cells = search.from_unit(np.array(point))
+    cells = search.space.from_unit(np.array(point))
 
     assert np.all(np.diff(cells) >= 1)
     assert cells[0] >= low
@@ -211,7 +211,7 @@ def spend(search):
 
 def recorder(plan):
     """Return a sampler of three clearances that begins with those of the case."""
-    return Recorder(plan.to_unit(plan.begin()), np.zeros(3), smooth(3), 0.2, seed=1, population=None)
+    return Recorder(plan.space.to_unit(plan.begin()), np.zeros(3), smooth(3), 0.2, seed=1, population=None)
 
 
 @pytest.mark.slow

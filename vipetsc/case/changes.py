@@ -1,4 +1,4 @@
-"""Changes of keys in a table: the text of a value that `--set` gives, and the place of a key."""
+"""Keys of a table by their paths: their values, changes of them, and the text of a value that `--set` gives."""
 
 import re
 import tomllib
@@ -34,18 +34,20 @@ def value_of(text: str) -> Any:
 def put(table: dict[str, Any], path: str, value: Any) -> list[Problem]:
     """Set the key ``path`` of ``table`` in place, or remove it (None); returns the problem if this fails.
 
-    A path is "a.b.c", or "a.b[2].c" with an entry of a list, counted from 1.
+    A path is "a.b.c", or "a.b[2].c" with an entry of a list, counted from 1. A key of the table may have dots itself.
     """
-    *parents, key = path.split(".")
     place: Any = table
-    for parent in parents:
-        place = _below(place, parent)
+    key, rest = _divided(place, path)
+    while rest:
+        place = _below(place, key, put_missing=True)
+        key, rest = _divided(place, rest)
+
     item = ITEM.fullmatch(key)
     if item and isinstance(place, dict) and isinstance(place.get(item[1]), list):
         return _put_item(place[item[1]], int(item[2]) - 1, path, value)
     if not isinstance(place, dict):
         kind = "does not exist" if place is None else "is a value, not a section"
-        return [Problem(path, value, f"{'.'.join(parents)} {kind}")]
+        return [Problem(path, value, f"{path.removesuffix(f'.{key}')} {kind}")]
     if value is None and key not in place:
         return [Problem(path, None, "is not in the case, so that it cannot be removed")]
 
@@ -56,8 +58,27 @@ def put(table: dict[str, Any], path: str, value: Any) -> list[Problem]:
     return []
 
 
-def _below(place: Any, key: str) -> Any:
-    """What the table ``place`` has at ``key``, perhaps an entry of a list; an empty table is put where nothing is."""
+def value_at(table: dict[str, Any], path: str) -> Any:
+    """The value that ``table`` has at ``path``, as ``put`` takes it; None if it has none."""
+    place: Any = table
+    rest = path
+    while rest:
+        key, rest = _divided(place, rest)
+        place = _below(place, key) if isinstance(place, dict) else None
+    return place
+
+
+def _divided(place: Any, path: str) -> tuple[str, str]:
+    """The first key of a ``path`` in the table ``place``, which may have dots itself, and the rest of the path."""
+    dotted: list[str] = []
+    if isinstance(place, dict):
+        dotted = [key for key in place if "." in key and f"{path}.".startswith(f"{key}.")]
+    key = max(dotted, key=len, default=path.partition(".")[0])
+    return key, path[len(key) + 1 :]
+
+
+def _below(place: Any, key: str, put_missing: bool = False) -> Any:
+    """What the table ``place`` has at ``key``, perhaps an entry of a list; where nothing is, an empty table or None."""
     if not isinstance(place, dict):
         return place
     item = ITEM.fullmatch(key)
@@ -65,7 +86,7 @@ def _below(place: Any, key: str) -> Any:
     if item and isinstance(entries, list):
         number = int(item[2])
         return entries[number - 1] if number <= len(entries) else None
-    return place.setdefault(key, {})
+    return place.setdefault(key, {}) if put_missing else place.get(key)
 
 
 def _put_item(entries: list[Any], index: int, path: str, value: Any) -> list[Problem]:

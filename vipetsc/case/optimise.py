@@ -1,9 +1,8 @@
 """The case of the verb ``optimise``: the variables with their bounds, the objectives and the constraints."""
 
-import copy
 from collections.abc import Iterator, Sequence
-from itertools import islice
-from typing import Annotated, Any, Literal, NamedTuple
+from functools import cached_property
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomli_w
@@ -12,38 +11,16 @@ from pydantic import Field
 from vipetsc.case.amplitude import amplitude_changes, amplitude_of, amplitude_unit, has_free_amplitude
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
-from vipetsc.case.disorder import with_cell
 from vipetsc.case.law import LawCase
-from vipetsc.case.objective import (
-    FILE_AMPLITUDE,
-    ConstraintTable,
-    MeasuredTable,
-    ObjectiveTable,
-    Pair,
-    measured_problems,
-)
-from vipetsc.case.resolve import with_preset
+from vipetsc.case.objective import FILE_AMPLITUDE, ConstraintTable, MeasuredTable, ObjectiveTable, measured_problems
 from vipetsc.case.schema import Positive
+from vipetsc.case.search_space import SearchSpace, case_of, search_space
 from vipetsc.case.study import StudyCase, with_fastest_engine
+from vipetsc.case.variable_problems import variable_problems
+from vipetsc.case.variables import Variable, VariablesTable
 
 MOST_DESIGNS = 100_000
-Share = Annotated[float, Field(ge=0, le=1)]
-
-
-class VariablesTable(Section):
-    """The variables, each with bounds [low, high]; all except sites and restitution are searched by their logarithm.
-
-    ``clearance`` in m of each site independently, or ``profile``, those of the first and of the last site with the
-    others log-spaced between; ``sites``: the cells (1-based), whole numbers that differ; ``restitution``; ``masses`` in
-    kg and ``springs`` in N/m of the cell by their number in it (from 1).
-    """
-
-    clearance: Pair | None = None
-    profile: Pair | None = None
-    sites: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
-    restitution: Annotated[list[Share], Field(min_length=2, max_length=2)] | None = None
-    masses: dict[str, Pair] = Field({})
-    springs: dict[str, Pair] = Field({})
+AMPLITUDES = ("drive.amplitude", "initial.amplitude", "initial.energy", "initial.velocity")
 
 
 class OptimiseTable(Section):
@@ -70,29 +47,15 @@ class OptimiseTable(Section):
     @property
     def measured(self) -> list[MeasuredTable]:
         """All that a design is measured for: the objectives, then the constraints."""
-        return [*self.objective, *(self.constraint or [])]
+        return [table for _, table in self.measured_at]
 
-
-class Variable(NamedTuple):
-    """A number that varies between ``low`` and ``high``: searched by its logarithm, as it is, or a whole one."""
-
-    name: str
-    low: float
-    high: float
-    unit: str
-    kind: Literal["log", "linear", "whole"]
-
-    def to_unit(self, value: float) -> float:
-        """The position between the bounds, 0 to 1, of a ``value``."""
-        if self.kind == "log":
-            return float(np.log(value / self.low) / np.log(self.high / self.low))
-        return (value - self.low) / (self.high - self.low)
-
-    def from_unit(self, position: float) -> float:
-        """The value at a ``position`` between the bounds, 0 to 1."""
-        if self.kind == "log":
-            return float(self.low * (self.high / self.low) ** position)
-        return self.low + (self.high - self.low) * position
+    @property
+    def measured_at(self) -> list[tuple[str, MeasuredTable]]:
+        """The paths of the objectives and of the constraints, with these."""
+        rows: list[tuple[str, MeasuredTable]] = []
+        rows += [(f"optimise.objective[{i}]", objective) for i, objective in enumerate(self.objective, 1)]
+        rows += [(f"optimise.constraint[{i}]", bound) for i, bound in enumerate(self.constraint or [], 1)]
+        return rows
 
 
 class OptimiseCase(StudyCase):
@@ -114,13 +77,13 @@ class OptimiseCase(StudyCase):
 
         options, problems = read_section(OptimiseTable, section, "optimise")
         try:
-            base = _case(table)
+            base = case_of(table)
             # Designs are built without scatter, and run with it: both must be possible.
-            _case(table, table.get("disorder"))
+            case_of(table, table.get("disorder"))
         except CaseError as error:
             return {}, problems + error.problems
 
-        wrong = list(_problems(options, base, "disorder" in table))
+        wrong = list(_problems(options, base, table))
         if options.start == "matched":
             wrong += _matched_problems(table)
         invalid = tuple(problem.key for problem in problems)
@@ -160,85 +123,22 @@ class OptimiseCase(StudyCase):
         """Cells (1-based) of the sites of the case to begin with."""
         return [site + 1 for site in self.base.model().chain.sites]
 
+    @cached_property
+    def space(self) -> SearchSpace:
+        """What varies."""
+        return search_space(self.options.variables, self.table, self.base)
+
     def variables(self) -> list[Variable]:
         """Variables of the search, in the order of the values of a design."""
-        bounds = self.options.variables
-        numbers = range(1, len(self.sites) + 1)
-        rows: list[tuple[list[str], Any, str, Any]] = [
-            ([f"clearance {i}" for i in numbers], bounds.clearance, "m", "log"),
-            (["first clearance", "last clearance"], bounds.profile, "m", "log"),
-            ([f"site {i}" for i in numbers], bounds.sites, "1", "whole"),
-            (["restitution"], bounds.restitution, "1", "linear"),
-            *(([f"mass {number}"], pair, "kg", "log") for number, pair in bounds.masses.items()),
-            *(([f"spring {number}"], pair, "N/m", "log") for number, pair in bounds.springs.items()),
-        ]
-        return [Variable(n, float(p[0]), float(p[1]), *of) for names, p, *of in rows if p for n in names]
+        return self.space.variables
 
     def begin(self, clearance: Sequence[float] = ()) -> np.ndarray:
         """The values (variable) of the case to begin with, or with other clearances in m, within the bounds."""
-        bounds = self.options.variables
-        cell = self.base.lattice.unit_cell()
-        gaps = list(clearance or self.base.model().chain.clearances)
-        values: list[float] = []
-        if bounds.clearance:
-            values += gaps
-        if bounds.profile:
-            values += [gaps[0], gaps[-1]]
-        if bounds.sites:
-            values += self.sites
-        if bounds.restitution:
-            values.append(self.base.contacts.restitution)
-        values += [cell.masses[int(number) - 1] for number in bounds.masses]
-        values += [cell.springs[int(number) - 1].stiffness for number in bounds.springs]
-        # The case may lie outside the bounds; the search does not.
-        return np.clip(values, *np.transpose([(v.low, v.high) for v in self.variables()]))
-
-    def to_unit(self, values: np.ndarray) -> np.ndarray:
-        """The point in the unit cube (variable) of ``values``."""
-        return np.array([variable.to_unit(x) for x, variable in zip(values, self.variables(), strict=True)])
-
-    def from_unit(self, point: np.ndarray) -> np.ndarray:
-        """The values (variable) at a ``point`` of the unit cube; sites in rising order, no two in one cell."""
-        variables = self.variables()
-        inside = np.clip(point, 0.0, 1.0)
-        values = np.array([variable.from_unit(x) for x, variable in zip(inside, variables, strict=True)])
-
-        whole = [i for i, variable in enumerate(variables) if variable.kind == "whole"]
-        if whole:
-            # Rising without the number of those before, then with it: no two are the same.
-            order = np.arange(len(whole))
-            last = variables[whole[0]].high
-            cells = np.maximum.accumulate(np.sort(np.round(values[whole])) - order)
-            values[whole] = np.minimum(cells, last - order[-1]) + order
-        return values
+        return self.space.begin(clearance)
 
     def design(self, values: np.ndarray) -> Case:
         """The case with ``values`` (variable); raises CaseError if it is impossible."""
-        bounds = self.options.variables
-        count = len(self.sites)
-        # Values carry no names: they are consumed in the order of ``variables`` and ``begin``.
-        left = iter(map(float, values))
-        table = with_preset(copy.deepcopy(self.table))
-        contacts = table["contacts"] | {"sites": self.sites, "clearance": [*self.base.model().chain.clearances]}
-        if bounds.clearance:
-            contacts["clearance"] = [*islice(left, count)]
-        if bounds.profile:
-            contacts["clearance"] = np.geomspace(next(left), next(left), count).tolist()
-        if bounds.sites:
-            contacts["sites"] = [int(cell) for cell in islice(left, count)]
-        if bounds.restitution:
-            contacts["restitution"] = next(left)
-
-        if bounds.masses or bounds.springs:
-            cell = self.base.lattice.undamped_cell()
-            masses = list(cell.masses)
-            stiffness = [spring.stiffness for spring in cell.springs]
-            for number in bounds.masses:
-                masses[int(number) - 1] = next(left)
-            for number in bounds.springs:
-                stiffness[int(number) - 1] = next(left)
-            table["lattice"] = with_cell(table["lattice"], cell, {"masses": masses, "springs": stiffness})
-        return _case(table | {"contacts": contacts})
+        return case_of(self.space.table_at(values))
 
     def run(self, design: Case, amplitude: float, sample: int | None = None) -> Case:
         """A run of a ``design`` at an ``amplitude``, recorded whole, with the scatter number ``sample`` if given."""
@@ -250,42 +150,39 @@ class OptimiseCase(StudyCase):
         return design.varied(name="design", without=("output",), output=design.output.of_points(), **changes)
 
 
-def _case(table: Table, disorder: Any = None) -> Case:
-    """The run in a ``table``, under one name, with ``disorder`` if that is given; raises CaseError."""
-    scatter = {} if disorder is None else {"disorder": disorder}
-    return Case.from_table({k: table[k] for k in table if k in Case.model_fields} | {"name": "design"} | scatter)
-
-
-def _problems(options: OptimiseTable, base: Case, disorder: bool) -> Iterator[Problem]:
+def _problems(options: OptimiseTable, base: Case, given: Table) -> Iterator[Problem]:
     """Problems between the keys of the section and the case to begin with."""
     bounds = options.variables
     sites = base.model().chain.sites
     if not sites:
         yield Problem("contacts.sites", base.contacts.sites, "no sites: without contacts there is nothing to optimise")
-    if not any(bounds.model_dump(exclude_none=True).values()):
-        valid = ", ".join(VariablesTable.model_fields)
-        yield Problem(
-            "optimise.variables", None, f"contains no quantity that varies; give [low, high] for any of {valid}"
-        )
-    yield from _bounds_problems(bounds, base, len(sites))
+    yield from variable_problems(bounds, given, base)
+    yield from _amplitude_problems(options)
 
-    if options.samples > 1 and not disorder:
+    if options.samples > 1 and "disorder" not in given:
         yield Problem("optimise.samples", options.samples, "there is no [disorder] from which to draw samples")
     if options.start == "matched" and not (bounds.clearance or bounds.profile):
         yield Problem("optimise.start", options.start, "the start matches clearances: let clearance or profile vary")
     if options.curve and not has_free_amplitude(base):
         yield Problem("optimise.curve", options.curve, f"{FILE_AMPLITUDE}; omit it")
-    varied = bool(bounds.masses or bounds.springs)
-    for number, objective in enumerate(options.objective, 1):
-        yield from measured_problems(objective, f"optimise.objective[{number}]", base, varied)
+    for at, table in options.measured_at:
+        yield from measured_problems(table, at, base, bounds.varies_cell)
     for number, constraint in enumerate(options.constraint or [], 1):
         at = f"optimise.constraint[{number}]"
-        yield from measured_problems(constraint, at, base, varied)
         low, high = constraint.at_least, constraint.at_most
         if low is None and high is None:
             yield Problem(at, None, "has no bound; give at_least, at_most or both")
         elif low is not None and high is not None and low > high:
             yield Problem(f"{at}.at_least", low, f"is above at_most = {high:g}")
+
+
+def _amplitude_problems(options: OptimiseTable) -> Iterator[Problem]:
+    """Problems with amplitudes that are given where the amplitude itself varies."""
+    varying = [key for key in options.variables.keys_of_case() if key in AMPLITUDES]
+    for at, table in options.measured_at:
+        if varying and table.amplitudes:
+            remedy = f"would take the place of {varying[0]}, which varies; omit one of them"
+            yield Problem(f"{at}.amplitudes", table.amplitudes, remedy)
 
 
 def _matched_problems(table: Table) -> Iterator[Problem]:
@@ -301,28 +198,3 @@ def _matched_problems(table: Table) -> Iterator[Problem]:
     if law.model().laws or law.model().chain.pairs:
         remedy = "clearances are matched by the scattering law of one site, and these sites differ; begin with the case"
         yield Problem("optimise.start", "matched", remedy)
-
-
-def _bounds_problems(bounds: VariablesTable, base: Case, sites: int) -> Iterator[Problem]:
-    """Problems with the bounds of what varies in a case with so many ``sites``."""
-    at = "optimise.variables"
-    if bounds.clearance and bounds.profile:
-        yield Problem(f"{at}.profile", bounds.profile, "give clearance or profile, not both")
-
-    cell = base.lattice.unit_cell()
-    given = bounds.model_dump(exclude_none=True)
-    pairs = {key: pair for key, pair in given.items() if isinstance(pair, list)}
-    for kind, count in (("masses", len(cell.masses)), ("springs", len(cell.springs))):
-        for number, pair in given[kind].items():
-            pairs[f"{kind}.{number}"] = pair
-            if not (number.isdecimal() and 1 <= int(number) <= count):
-                yield Problem(f"{at}.{kind}.{number}", pair, f"the cell's {kind} are numbered from 1 to {count}")
-
-    for key, (low, high) in pairs.items():
-        if key != "sites" and not low < high:
-            yield Problem(f"{at}.{key}", [low, high], "must be [low, high] with low below high")
-    if bounds.sites:
-        low, high = bounds.sites
-        if not 1 <= low < high <= base.lattice.cells or high - low + 1 < sites:
-            remedy = f"must lie within cells 1 to {base.lattice.cells} and have room for all {sites} sites"
-            yield Problem(f"{at}.sites", bounds.sites, remedy)

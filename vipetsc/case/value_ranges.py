@@ -12,6 +12,7 @@ from vipetsc.case.disorder import SEED
 MOST_MEMBERS = 1_000_000
 DIGITS = 12  # of numbers that a range is meant to meet
 ROUNDINGS = 8  # by which a value of a range may miss such a number
+RANGES = {"log", "linear", "whole"}  # the last one only in searches
 Values = dict[str, tuple[Any, ...]]  # the values of each key; an axis has those of keys that vary together
 
 
@@ -26,7 +27,7 @@ def leaves(tree: Table, path: str = "") -> Iterator[tuple[str, Any]]:
     """Keys as "a.b.c" with their values; a range is one value."""
     for key, value in tree.items():
         # The seed may be { count = n } alone, which is a range and no table.
-        if isinstance(value, dict) and not value.keys() & {"log", "linear"} and path + key != SEED:
+        if isinstance(value, dict) and not value.keys() & RANGES and path + key != SEED:
             yield from leaves(value, f"{path}{key}.")
         else:
             yield path + key, value

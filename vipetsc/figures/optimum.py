@@ -150,7 +150,7 @@ def compared_designs(optimum: xr.Dataset) -> Figure:
         )
 
         # A little apart, so that designs of equal values are all seen.
-        position = plan.to_unit(optimum["parameter"].values[int(row["comparison/number"])])
+        position = plan.space.to_unit(optimum["parameter"].values[int(row["comparison/number"])])
         variables.plot(position, np.arange(len(position)) + 0.12 * i, marker, color=colour, ms=3.5)
     sites.set(xlabel="Cell", ylabel="Clearance (mm)", ylim=(0, None), title="Sites")
     sites.legend(loc="best")

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case, Model, case_id
+from vipetsc.case.amplitude import amplitude_of
 from vipetsc.case.objective import MeasuredTable
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.io.records import Record
@@ -57,13 +58,9 @@ class ObjectiveRuns:
         # A dictionary names each amplitude once and keeps the order, which is the same on all ranks.
         amplitudes: dict[float, None] = {}
         for measured_table in self.plan.options.measured:
-            amplitudes |= dict.fromkeys(self._amplitudes(measured_table))
+            amplitudes |= dict.fromkeys(_amplitudes(measured_table, design))
         pairs = itertools.product(amplitudes, range(self.plan.options.samples))
         return {(amplitude, sample): self.plan.run(design, amplitude, sample) for amplitude, sample in pairs}
-
-    def _amplitudes(self, objective: MeasuredTable) -> list[float]:
-        """Amplitudes that an ``objective`` or a constraint is measured at."""
-        return objective.amplitudes or [self.plan.amplitude]
 
     def make(self, runs: Iterable[Case]) -> None:
         """Simulate those ``runs`` that have no record; all ranks must call it. Raises StoppedError on all."""
@@ -94,14 +91,14 @@ class ObjectiveRuns:
         losses = []
         for objective in options.objective:
             sign = -1 if objective.goal == "maximise" else 1
-            by_amplitude = [sign * mean for mean in self._means(objective, records)]
+            by_amplitude = [sign * mean for mean in _means(objective, design, records)]
             # Losses are small for good designs, so the worst is the largest.
             losses.append(max(by_amplitude) if objective.over == "worst" else float(np.mean(by_amplitude)))
 
         bounded = []
         excess = 0.0
         for constraint in constraints:
-            means = self._means(constraint, records)
+            means = _means(constraint, design, records)
             # The worst is the one that is farthest outside the bounds.
             worst = max(means, key=constraint.excess)
             value = worst if constraint.over == "worst" else float(np.mean(means))
@@ -119,17 +116,23 @@ class ObjectiveRuns:
                 return "; ".join([f"{table.name} has no value", *values.get("warnings", [])])
         return ""
 
-    def _means(self, table: MeasuredTable, records: Mapping[tuple[float, int], Record]) -> list[float]:
-        """The mean over the samples at each amplitude of a measure; ``records`` by amplitude and sample."""
-        means = []
-        for amplitude in self._amplitudes(table):
-            samples = [row["values"][table.name] for (at, _), row in records.items() if at == amplitude]
-            means.append(float(np.mean(samples)))
-        return means
-
     def values(self, run: Case) -> dict[str, Any]:
         """Values measured of a ``run`` that has a record; none of one that failed."""
         return dict(self.recorded.records[case_id(run)].get("values", {}))
+
+
+def _amplitudes(table: MeasuredTable, design: Case) -> list[float]:
+    """Amplitudes at which a ``design`` is measured for an objective or a constraint, the ``table``."""
+    return table.amplitudes or [amplitude_of(design)]
+
+
+def _means(table: MeasuredTable, design: Case, records: Mapping[tuple[float, int], Record]) -> list[float]:
+    """The mean over the samples at each amplitude of a measure; ``records`` by amplitude and sample."""
+    means = []
+    for amplitude in _amplitudes(table, design):
+        samples = [row["values"][table.name] for (at, _), row in records.items() if at == amplitude]
+        means.append(float(np.mean(samples)))
+    return means
 
 
 def measured(run: xr.Dataset, statistics: dict[str, Any], tables: Sequence[MeasuredTable]) -> dict[str, Any]:

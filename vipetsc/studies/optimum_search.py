@@ -4,6 +4,7 @@ Rank 0 asks the sampler for designs and reports their losses in that order; all 
 a run is recorded at once, so a search that was stopped or killed repeats the same exchange and goes on.
 """
 
+import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ import xarray as xr
 
 from vipetsc.case import Case, CaseError, LawCase, case_id
 from vipetsc.case.amplitude import amplitude_of, has_free_amplitude
+from vipetsc.case.keys import unit_of
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import OPTIMUM, claimed, provenance
@@ -108,7 +110,7 @@ class OptimumSearch:
         if generation:  # generation 0 is the case and the start, which the sampler did not ask for
             self._tell()
         points = self.sampler.ask()[:left]
-        self.asked = [self._design(self.plan.from_unit(point), generation + 1) for point in points]
+        self.asked = [self._design(self.plan.space.from_unit(point), generation + 1) for point in points]
         self.designs += self.asked
         return True
 
@@ -228,17 +230,18 @@ def _start(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) 
 def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:
     """The sampler of ``plan`` from the values ``start`` (variable) on."""
     options = plan.options
-    point = plan.to_unit(start)
+    point = plan.space.to_unit(start)
     if len(options.objective) == 2:
         return Nsga2(point, options.step, options.seed, options.population or POPULATION)
 
     variables = plan.variables()
     # Whole numbers need a least deviation, or the search would stay at one of them.
-    steps = np.array([1 / (v.high - v.low) if v.kind == "whole" else 0.0 for v in variables])
-    # Of clearances, what the row of sites has in common is searched first.
-    clearances = np.array([v.name.startswith("clearance") for v in variables])
+    steps = np.array([variable.step for variable in variables])
+    # Of a row of sites, what they have in common is searched first.
     directions = np.eye(len(point))
-    directions[np.ix_(clearances, clearances)] = smooth(int(clearances.sum()))
+    for row in {variable.row for variable in variables if variable.row}:
+        members = np.array([variable.row == row for variable in variables])
+        directions[np.ix_(members, members)] = smooth(int(members.sum()))
     return CmaEs(point, steps, directions, options.step, options.seed, options.population)
 
 
@@ -294,13 +297,15 @@ def _design_values(search: OptimumSearch) -> dict[str, Any]:
         "objective": [f"{number}: {objective.name}" for number, objective in enumerate(objectives, 1)],
         "low": [float(v.low) for v in variables],
         "high": [float(v.high) for v in variables],
-        "unit": [v.unit for v in variables],
+        "unit": [unit_of(v.path, search.plan.table) or "1" for v in variables],
         "generation": [design.generation for design in designs],
         "parameter": [design.values for design in designs],
         "value": signs * search.losses(),
         "reason": [design.reason for design in designs],
         "front": front(search.feasible_losses()),
     }
+    if any(variable.choices for variable in variables):
+        values["choices"] = [json.dumps(v.choices) if v.choices else "" for v in variables]
     constraints = search.plan.options.constraint or []
     if constraints:
         values["constraint"] = [

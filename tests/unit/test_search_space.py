@@ -1,0 +1,238 @@
+"""Variables that are keys of a case: their places in designs, their values in the unit cube, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.conftest import search_table, with_sections
+from vipetsc.case import CaseError, case_id
+from vipetsc.case.changes import put, value_at
+from vipetsc.case.keys import unit_of
+from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.search_space import SearchSpace
+from vipetsc.case.variables import Variable
+from vipetsc.studies.sampler import CmaEs
+
+OWN_CELL = {
+    "masses": [4e-3, 2e-3],
+    "springs": [
+        {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True},
+        {"start": 1, "end": 2, "stiffness": 5e3, "damping": 0.1},
+    ],
+}
+TABLE = {
+    "name": "own",
+    "lattice": {
+        "cells": 24,
+        "cell": OWN_CELL,
+        "profiles": {"masses[1]": {"first": 4e-3, "last": 4e-3}, "springs[1].stiffness": {"first": 1e4, "last": 2e4}},
+    },
+    "contacts": {"law": "hertz", "stiffness": 1e7, "sites": [6, 12, 14], "clearance": 1e-4, "restitution": 0.7},
+    "drive": {"amplitude": 3.0, "frequency": 1000.0, "cycles": 3, "cell": 4, "more": [{"frequency": 900.0, "cell": 5}]},
+    "time": {"end": 0.05},
+    "optimise": {"objective": [{"measure": "entropy"}]},
+}
+
+
+def plan_of(variables: dict, **sections) -> OptimiseCase:
+    """The search of ``TABLE`` over these variables."""
+    table = with_sections(TABLE, sections)
+    return OptimiseCase.from_table(table | {"optimise": table["optimise"] | {"variables": variables}})
+
+
+def test_every_key_has_its_place_in_a_design():
+    """Each value is at its path in the design, of its type, and all that does not vary is that of the case."""
+    profiles = {"springs[1].stiffness": {"last": {"log": [1e3, 1e5]}}}
+    plan = plan_of(
+        {
+            "lattice": {"cell": {"springs[2]": {"damping": {"linear": [0.0, 1.0]}}}, "profiles": profiles},
+            "contacts": {"each": {"restitution": {"linear": [0.3, 0.9]}}, "law": ["hertz", "bilinear"]},
+            "drive": {"cycles": {"whole": [2, 9]}, "more[1]": {"amplitude": {"log": [0.1, 10.0]}}},
+            "time": {"end": [0.04, 0.05]},
+        }
+    )
+    values = {
+        "lattice.cell.springs[2].damping": 0.4,
+        "lattice.profiles.springs[1].stiffness.last": 3e4,
+        "contacts.each.restitution[1]": 0.4,
+        "contacts.each.restitution[2]": 0.5,
+        "contacts.each.restitution[3]": 0.6,
+        "contacts.law": 2,
+        "drive.cycles": 7,
+        "drive.more[1].amplitude": 0.3,
+        "time.end": 1,
+    }
+    assert [variable.name for variable in plan.variables()] == [*values]
+
+    design = plan.design(np.array([*values.values()]))
+    expected = with_sections(
+        {key: section for key, section in TABLE.items() if key != "optimise"},
+        {"contacts": {"law": "bilinear", "each": {"restitution": [0.4, 0.5, 0.6]}}, "time": {"end": 0.04}},
+    )
+    expected["lattice"] = TABLE["lattice"] | {
+        "cell": OWN_CELL | {"springs": [OWN_CELL["springs"][0], OWN_CELL["springs"][1] | {"damping": 0.4}]},
+        "profiles": TABLE["lattice"]["profiles"] | {"springs[1].stiffness": {"first": 1e4, "last": 3e4}},
+    }
+    more = [{"frequency": 900.0, "cell": 5, "amplitude": 0.3}]
+    expected["drive"] = TABLE["drive"] | {"cycles": 7, "more": more}
+    expected["time"]["engine"] = "auto"
+    assert case_id(design) == case_id(type(design).from_table(expected | {"name": "design"}))
+    assert type(design.drive.cycles) is int
+
+
+def test_the_case_is_the_start_and_survives_the_unit_cube():
+    """At the values of the case the design is the case, and values return from the cube as they were."""
+    plan = plan_of(
+        {
+            "clearance": [1e-5, 1e-2],
+            "contacts": {"each": {"stiffness": {"log": [1e6, 1e8]}}, "damping": ["exact", "paper"]},
+            "drive": {"cycles": {"whole": [2, 9]}},
+        },
+        contacts={"damping": "paper"},
+    )
+    values = plan.begin()
+    assert values.tolist() == [1e-4] * 3 + [1e7] * 3 + [2, 3]
+    assert np.allclose(plan.space.from_unit(plan.space.to_unit(values)), values, rtol=1e-12)
+    design = plan.design(values)
+    assert {*design.model().laws} == {plan.base.model().contact}
+    assert design.model().chain == plan.base.model().chain
+
+
+def test_names_are_keys_of_the_case():
+    """A variable with a name of its own is that of the key's path: both give the same design, to its hash."""
+    by_name = plan_of({"profile": [1e-5, 1e-2], "restitution": [0.1, 0.9], "masses": {"2": [1e-3, 1e-2]}})
+    by_key = plan_of(
+        {
+            "lattice": {"cell": {"masses[2]": {"log": [1e-3, 1e-2]}}},
+            "contacts": {"clearance": {s: {"log": [1e-5, 1e-2]} for s in ("first", "last")}}
+            | {"restitution": {"linear": [0.1, 0.9]}},
+        },
+        contacts={"clearance": {"first": 1e-4, "last": 1e-4}},
+    )
+    values = {"contacts.clearance.first": 2e-4, "contacts.clearance.last": 3e-4, "contacts.restitution": 0.5}
+    values["lattice.cell.masses[2]"] = 3e-3
+    ids = []
+    for plan in (by_name, by_key):
+        ids.append(case_id(plan.design(np.array([values[variable.path] for variable in plan.variables()]))))
+    assert ids[0] == ids[1]
+
+
+def test_choices_and_whole_numbers_have_equal_parts_of_the_cube():
+    """Every choice has the same part of the range; whole numbers are the nearest ones; ends of the cube are inside."""
+    choice = Variable("law", "contacts.law", 1, 3, "choice", 1, choices=("a", "b", "c"))
+    whole = Variable("cycles", "drive.cycles", 2, 5, "whole", 3)
+    grid = np.linspace(0, 1, 3001)
+    numbers = np.array([choice.from_unit(x) for x in grid])
+    assert [np.mean(numbers == n) for n in (1, 2, 3)] == pytest.approx([1 / 3] * 3, abs=1e-3)
+    for near in (-0.16, 0.0, 0.16):
+        found = [choice.in_case(choice.from_unit(choice.to_unit(n) + near)) for n in (1, 2, 3)]
+        assert found == ["a", "b", "c"]
+    assert {whole.from_unit(x) for x in grid} == {2, 3, 4, 5}
+    assert whole.in_case(whole.from_unit(whole.to_unit(4))) == 4
+
+
+@pytest.mark.slow
+def test_a_search_of_mixed_kinds_finds_the_best_of_each():
+    """A function of a real number, a whole number and a choice, with its least value known, is minimised."""
+    kinds = [
+        Variable("x", "x", 1e-3, 1e3, "log", 1e-2),
+        Variable("n", "n", 1, 30, "whole", 3),
+        Variable("c", "c", 1, 5, "choice", 1, choices=(5, 3, 0, 4, 9)),
+    ]
+    space = SearchSpace({}, kinds)
+    steps = np.array([variable.step for variable in kinds])
+    search = CmaEs(space.to_unit(space.begin()), steps, np.eye(3), 0.3, seed=1, population=None)
+    best = np.inf, None
+    for _ in range(60):
+        values = [space.from_unit(point) for point in search.ask()]
+        losses = [np.log10(x / 2) ** 2 + 0.05 * (n - 21) ** 2 + kinds[2].choices[int(c) - 1] for x, n, c in values]
+        search.tell(np.array(losses)[:, None])
+        best = min(best, (min(losses), values[int(np.argmin(losses))]), key=lambda pair: pair[0])
+    assert best[1][1:].tolist() == [21, 3]
+    assert best[1][0] == pytest.approx(2.0, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("variables", "key", "message"),
+    [
+        ({"contacts": {"restitutions": {"linear": [0.1, 0.9]}}}, "contacts.restitutions", "did you mean"),
+        ({"contacts": {"restitution": {"linear": [0.1, 1.9]}}}, "contacts.restitution", "less than or equal to 1"),
+        ({"contacts": {"restitution": {"log": [0.0, 0.9]}}}, "contacts.restitution", "linear bounds may be 0"),
+        ({"contacts": {"restitution": {"linear": [0.9, 0.1]}}}, "contacts.restitution", "low below high"),
+        ({"contacts": {"restitution": {"linear": [0.9]}}}, "contacts.restitution", "{ whole = [low, high] }"),
+        ({"contacts": {"restitution": [0.9]}}, "contacts.restitution", "two values or more"),
+        ({"contacts": {"law": ["hertz", "herz"]}}, "contacts.law", "did you mean 'hertz'"),
+        ({"drive": {"cycles": {"whole": [1.5, 3.5]}}}, "drive.cycles", "whole numbers"),
+        ({"drive": {"bandwidth": {"log": [1.0, 3.0]}}}, "drive.bandwidth", "does not apply to the waveform"),
+        ({"lattice": {"damping": {"mass": {"log": [0.1, 1.0]}}}}, "lattice.damping.mass", "has no number in the case"),
+        ({"lattice": {"cell": {"masses[3]": {"log": [0.1, 1.0]}}}}, "lattice.cell.masses[3]", "has the entries 1 to 2"),
+        ({"drive": {"cell": {"whole": [1, 25]}}}, "drive.cell", "outside the lattice"),
+        (
+            {"restitution": [0.1, 0.9], "contacts": {"restitution": {"linear": [0.1, 0.9]}}},
+            "contacts.restitution",
+            "varies by another variable",
+        ),
+        (
+            {"clearance": [1e-5, 1e-2], "contacts": {"clearance": {"log": [1e-5, 1e-2]}}},
+            "contacts.clearance",
+            "varies by another variable",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_key_is_one_problem_with_its_path(variables, key, message):
+    with pytest.raises(CaseError) as error:
+        plan_of(variables)
+    (problem,) = error.value.problems
+    assert problem.key == f"optimise.variables.{key}"
+    assert message in str(problem)
+
+
+@pytest.mark.parametrize("variables", [{"restitution": [0.1, 0.9]}, {"contacts": {"restitution": [0.1, 0.9]}}])
+def test_a_key_that_the_sites_do_not_take_is_no_variable(variables):
+    """Where each site has a restitution of its own, that of all sites has no effect."""
+    with pytest.raises(CaseError, match=r"contacts\.each\.restitution, which can vary instead"):
+        plan_of(variables, contacts={"each": {"restitution": [0.5, 0.6, 0.7]}})
+
+
+def test_an_amplitude_that_varies_is_that_of_the_runs():
+    """Measures at given amplitudes would not depend on it, and are refused."""
+    variables = {"drive": {"amplitude": {"log": [1.0, 10.0]}}}
+    plan = plan_of(variables)
+    assert plan.design(np.array([7.0])).drive.amplitude == 7.0
+    with pytest.raises(CaseError, match=r"would take the place of drive\.amplitude"):
+        plan_of(variables, optimise={"objective": [{"measure": "entropy", "amplitudes": [2.0]}]})
+
+
+def test_keys_with_dots_are_found_and_changed():
+    """The key of a table may have dots itself; a path to a value returns what was put there."""
+    table = {"profiles": {"springs[1].stiffness": {"first": 1.0}, "masses[1]": [1.0, 2.0]}, "list": [{"a": 1}]}
+    for path, value in (
+        ("profiles.springs[1].stiffness.first", 3.0),
+        ("profiles.springs[1].stiffness", [4.0]),
+        ("profiles.masses[1][2]", 5.0),
+        ("list[1].a", 6),
+        ("new.b.c", 7),
+    ):
+        assert put(table, path, value) == []
+        assert value_at(table, path) == value
+    assert table == {
+        "profiles": {"springs[1].stiffness": [4.0], "masses[1]": [1.0, 5.0]},
+        "list": [{"a": 6}],
+        "new": {"b": {"c": 7}},
+    }
+    assert value_at(table, "list[2].a") is value_at(table, "no.such") is value_at(table, "list.a") is None
+
+
+def test_the_text_of_a_search_over_keys_gives_the_same_search():
+    """It is written out and read back, dotted keys among them; units are those of the keys."""
+    table = search_table(40, [10, 20], lattice={"profiles": {"springs[1].stiffness": {"first": 4e3, "last": 5e3}}})
+    profiles = {"springs[1].stiffness": {"last": {"log": [1e3, 1e4]}}}
+    table["optimise"]["variables"] = {"clearance": [1e-5, 1e-3], "lattice": {"profiles": profiles}}
+    first = OptimiseCase.from_table(table)
+    second = OptimiseCase.from_toml(first.to_toml())
+    assert second == first
+    assert second.variables() == first.variables()
+    units = {"contacts.clearance[1]": "m", "contacts.clearance.first": "m", "lattice.cell.masses[1]": "kg"}
+    units |= {"lattice.cell.springs[2].stiffness": "N/m", "contacts.each.restitution[1]": ""}
+    assert {path: unit_of(path, {}) for path in units} == units

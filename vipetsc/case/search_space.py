@@ -1,0 +1,198 @@
+"""The space that a search explores: the values of its variables, and the tables of the cases that have them."""
+
+import copy
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vipetsc.case.case import Case
+from vipetsc.case.case_file import LARGEST, Table, put
+from vipetsc.case.changes import value_at
+from vipetsc.case.contacts import values_of_sites
+from vipetsc.case.disorder import with_cell
+from vipetsc.case.resolve import with_preset
+from vipetsc.case.schema import number
+from vipetsc.case.value_ranges import RANGES
+from vipetsc.case.variables import Kind, Variable, VariablesTable
+
+IN_ROWS = ("contacts.", "lattice.profiles.")  # keys with lists over the sites or the cells
+FORMS = "give { log = [low, high] }, { linear = [low, high] }, { whole = [low, high] } or a list of values"
+
+
+@dataclass(frozen=True)
+class SearchSpace:
+    """The ``variables`` of a search, and the ``table`` of the case in which their paths lead to values."""
+
+    table: Table
+    variables: list[Variable]
+
+    def begin(self, clearance: Sequence[float] = ()) -> np.ndarray:
+        """The values (variable) of the case to begin with, or with other clearances in m, within the bounds."""
+        values = [variable.start for variable in self.variables]
+        if clearance:
+            at = {f"contacts.clearance[{i}]": gap for i, gap in enumerate(clearance, 1)}
+            at |= {"contacts.clearance.first": clearance[0], "contacts.clearance.last": clearance[-1]}
+            values = [at.get(variable.path, variable.start) for variable in self.variables]
+        # The case may lie outside the bounds; the search does not.
+        return np.clip(values, [v.low for v in self.variables], [v.high for v in self.variables])
+
+    def to_unit(self, values: np.ndarray) -> np.ndarray:
+        """The point in the unit cube (variable) of ``values``."""
+        return np.array([variable.to_unit(x) for x, variable in zip(values, self.variables, strict=True)])
+
+    def from_unit(self, point: np.ndarray) -> np.ndarray:
+        """The values (variable) at a ``point`` of the unit cube; sites in rising order, no two in one cell."""
+        inside = np.clip(point, 0.0, 1.0)
+        values = np.array([variable.from_unit(x) for x, variable in zip(inside, self.variables, strict=True)])
+
+        sites = [i for i, variable in enumerate(self.variables) if variable.kind == "site"]
+        if sites:
+            # Rising without the number of those before, then with it: no two are the same.
+            order = np.arange(len(sites))
+            last = self.variables[sites[0]].high
+            cells = np.maximum.accumulate(np.sort(np.round(values[sites])) - order)
+            values[sites] = np.minimum(cells, last - order[-1]) + order
+        return values
+
+    def table_at(self, values: Iterable[float]) -> Table:
+        """The table of the case with ``values`` (variable)."""
+        table = copy.deepcopy(self.table)
+        for variable, value in zip(self.variables, values, strict=True):
+            put(table, variable.path, variable.in_case(value))
+        return table
+
+
+class VariableRow(NamedTuple):
+    """Variables of one kind and with the same bounds: a name and a path for each."""
+
+    names: list[str]
+    paths: list[str]
+    low: float
+    high: float
+    kind: Kind
+    choices: tuple[Any, ...] = ()
+
+
+def search_space(bounds: VariablesTable, table: Table, base: Case) -> SearchSpace:
+    """The search space of a case ``base``, which was read from the ``table``; keys with an invalid range are left out.
+
+    A variable of which the case has no number begins with NaN.
+    """
+    rows = _named_rows(bounds, len(base.model().chain.sites))
+    given = bounds.keys_of_case()
+    table = _with_entries(table, base, [*(path for row in rows for path in row.paths), *given])
+    if bounds.profile:
+        # Whatever the clearances are: those between the first and the last one follow from these two.
+        gaps = base.model().chain.clearances
+        table["contacts"] = table["contacts"] | {"clearance": {"first": gaps[0], "last": gaps[-1]}}
+
+    for key, value in given.items():
+        try:
+            rows.append(row_of(key, value, table))
+        except ValueError:
+            continue  # as ``variable_problems`` reports
+
+    resolved = base.model_dump(by_alias=True, exclude_none=True)
+    variables: list[Variable] = []
+    for row in rows:
+        is_row = len(row.paths) > 1 and row.kind in ("log", "linear")
+        for name, path in zip(row.names, row.paths, strict=True):
+            in_row = row.paths[0] if is_row and path.startswith(IN_ROWS) and path.endswith("]") else ""
+            start = _start(row, path, (table, resolved))
+            variables.append(Variable(name, path, row.low, row.high, row.kind, start, in_row, row.choices))
+    return SearchSpace(table, variables)
+
+
+def _named_rows(bounds: VariablesTable, count: int) -> list[VariableRow]:
+    """The variables that have names of their own, of a case with ``count`` sites."""
+    numbers = range(1, count + 1)
+    rows: list[VariableRow] = []
+
+    def add(pair: Sequence[float] | None, names: list[str], paths: list[str], kind: Kind) -> None:
+        if pair:
+            rows.append(VariableRow(names, paths, float(pair[0]), float(pair[1]), kind))
+
+    add(bounds.clearance, [f"clearance {i}" for i in numbers], [f"contacts.clearance[{i}]" for i in numbers], "log")
+    ends = ["first", "last"]
+    add(bounds.profile, [f"{end} clearance" for end in ends], [f"contacts.clearance.{end}" for end in ends], "log")
+    add(bounds.sites, [f"site {i}" for i in numbers], [f"contacts.sites[{i}]" for i in numbers], "site")
+    add(bounds.restitution, ["restitution"], ["contacts.restitution"], "linear")
+    for mass, pair in bounds.masses.items():
+        add(pair, [f"mass {mass}"], [f"lattice.cell.masses[{mass}]"], "log")
+    for spring, pair in bounds.springs.items():
+        add(pair, [f"spring {spring}"], [f"lattice.cell.springs[{spring}].stiffness"], "log")
+    return rows
+
+
+def _with_entries(table: Table, base: Case, paths: Sequence[str]) -> Table:
+    """The ``table`` with the cell, and with the lists over sites, to whose entries the ``paths`` lead."""
+    table = copy.deepcopy(table)
+    if any(path.startswith("lattice.cell.") for path in paths) and "cell" not in table.get("lattice", {}):
+        table = with_preset(table)
+        table["lattice"] = with_cell(table["lattice"], base.lattice.undamped_cell(), {})
+
+    chain = base.model().chain
+    contacts = dict(table.get("contacts", {}))
+    for path in paths:
+        if path.startswith("contacts.clearance["):
+            contacts["clearance"] = list(chain.clearances)
+        if path.startswith("contacts.sites["):
+            contacts["sites"] = [site + 1 for site in chain.sites]
+        of_each_site = re.match(r"contacts\.each\.(\w+)", path)
+        if of_each_site and hasattr(base.contacts, of_each_site[1]):
+            values = values_of_sites(base.contacts, of_each_site[1], len(chain.sites))
+            if None not in values:
+                contacts["each"] = {of_each_site[1]: values} | contacts.get("each", {})
+    return table | {"contacts": contacts}
+
+
+def row_of(key: str, given: Any, table: Table) -> VariableRow:
+    """The variables of the ``key`` of a case, from its range or list of values; raises ValueError with the remedy."""
+    if isinstance(given, list):
+        if len(given) < 2:
+            raise ValueError("give two values or more")
+        return VariableRow([key], [key], 1.0, float(len(given)), "choice", tuple(given))
+
+    kind, low, high = _range_of(given)
+    value = value_at(table, key)
+    paths = [f"{key}[{i}]" for i in range(1, len(value) + 1)] if isinstance(value, list) else [key]
+    return VariableRow(paths, paths, low, high, kind)
+
+
+def _range_of(given: Any) -> tuple[Kind, float, float]:
+    """The kind and the bounds of a range; raises ValueError with the remedy."""
+    if not isinstance(given, dict) or len(given) != 1:
+        raise ValueError(FORMS)
+    ((kind, pair),) = given.items()
+    if kind not in RANGES or not isinstance(pair, list) or len(pair) != 2:
+        raise ValueError(FORMS)
+    types = (int,) if kind == "whole" else (int, float)
+    if not all(type(end) in types and abs(end) <= LARGEST for end in pair):
+        raise ValueError(f"the bounds must be {'whole ' if kind == 'whole' else ''}numbers up to {LARGEST:g}")
+
+    low, high = map(float, pair)
+    if not low < high:
+        raise ValueError("must be [low, high] with low below high")
+    if kind == "log" and low <= 0:
+        raise ValueError("bounds of a logarithm must be positive; linear bounds may be 0")
+    return kind, low, high
+
+
+def _start(row: VariableRow, path: str, tables: Iterable[Table]) -> float:
+    """The value of the variable at ``path`` in the first of the ``tables`` that has one; NaN without a number."""
+    values = [value for table in tables if (value := value_at(table, path)) is not None]
+    if row.kind == "choice":
+        chosen = [row.choices.index(value) + 1 for value in values if value in row.choices]
+        return float(chosen[0]) if chosen else 1.0
+    # Wavenumbers may be text with pi.
+    numbers = [read for value in values if type(read := number(value)) in (int, float)]
+    return float(numbers[0]) if numbers else np.nan
+
+
+def case_of(table: Table, disorder: Any = None) -> Case:
+    """The run in a ``table``, under one name, with ``disorder`` if that is given; raises CaseError."""
+    scatter = {} if disorder is None else {"disorder": disorder}
+    return Case.from_table({k: table[k] for k in table if k in Case.model_fields} | {"name": "design"} | scatter)
