@@ -19,7 +19,8 @@ from vipetsc.figures.registry import draw
 from vipetsc.figures.response_family import legend_of
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.response_layout import measure
-from vipetsc.modes.response.isolated import places_of
+from vipetsc.modes.response.free_motions import resonance, states_near_free_motions
+from vipetsc.modes.response.isolated import over_amplitude, places_of
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.swept import motions
@@ -40,9 +41,9 @@ TABLE: dict[str, Any] = {
 
 
 def absorber(force: float = 0.18, **nfrc: Any) -> NfrcCase:
-    """Curves at a ``force`` in N, with isolated ones looked for at two frequencies."""
+    """Curves at a ``force`` in N, with isolated ones looked for at 1.725 rad/s."""
     options = {"source": "force", "over": "frequency", "range": [1.55, 1.9], "fixed": [force], "harmonics": 7}
-    return NfrcCase.from_table(TABLE | {"nfrc": options | {"isolas": 2, "largest_step": 0.3} | nfrc})
+    return NfrcCase.from_table(TABLE | {"nfrc": options | {"isolas": 1, "largest_step": 0.3} | nfrc})
 
 
 @pytest.fixture(scope="module")
@@ -189,6 +190,46 @@ def test_a_sweep_down_finds_the_states_that_the_curve_from_below_does_not_meet(t
     assert a == pytest.approx(0.3 / abs(stiffness + 0.15j), rel=1e-3)
 
 
+def test_each_free_motion_leads_to_the_states_above_and_below_its_frequency():
+    """At 1.5 rad/s: from the free motion a^2 = 4/3 (Om^2 - 1) to the three states of the cubic oscillator."""
+    states = SteadyStates(duffing(), 1.0, 0.3)
+    p = 1.5 / states.parameter.scale
+    (candidates,) = states_near_free_motions(states, np.array([p]))
+    sizes = sorted(np.abs(states.balance.unpack(xi[:-1] * states.clearance)[0, 1]) for xi in candidates)
+    # (a (1 - Om^2 + 3/4 a^2))^2 + (c Om a)^2 = F^2 of the first harmonic alone, in b = a^2.
+    polynomial = [0.5625, 1.5 * (1 - 1.5**2), (1 - 1.5**2) ** 2 + 0.15**2, -(0.3**2)]
+    expected = np.sqrt(np.sort(np.roots(polynomial).real))
+    np.testing.assert_allclose(sizes, expected, rtol=0.02)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_at_resonance_the_force_makes_up_for_the_loss(sign):
+    """F = c Om a, at the size a of the free motion, a quarter of a period ahead of it."""
+    states = SteadyStates(duffing(), 1.0, 0.3)
+    line = over_amplitude(states, 1.5 / states.parameter.scale)
+    a = np.sqrt(4 / 3 * (1.5**2 - 1))
+    free = np.zeros((2, 10))
+    # The mass moves away from the one wall and towards the other.
+    free[:, 1] = [sign * a, -sign * a]
+    xi = resonance(line, free)
+    _, amplitude = line.drive(xi[-1])
+    first = line.balance.unpack(xi[:-1] * line.clearance)[0, 1]
+    assert amplitude == pytest.approx(0.1 * 1.5 * abs(first), rel=0.02)
+    assert abs(first) == pytest.approx(a, rel=0.02)
+    # The elongation of the first spring is the mass's displacement, which follows the force.
+    assert np.degrees(np.angle(first)) == pytest.approx(-90, abs=2)
+
+
+def test_breathers_lead_to_the_isolated_curve_too(curves, tmp_path):
+    _, (main, isola) = curves
+    other = follow_all(absorber(isola_search=["breathers"]), tmp_path, MPI.COMM_SELF)
+    assert [(curve.name, curve.ending) for curve in other] == [(curve.name, curve.ending) for curve in (main, isola)]
+    folds = [
+        [point.measured.frequency for point in curve.points if point.kind == "fold"] for curve in (isola, other[1])
+    ]
+    np.testing.assert_allclose(np.sort(folds[0]), np.sort(folds[1]), rtol=1e-7)
+
+
 @pytest.mark.parametrize("periods", [10, 40])
 def test_slow_sweeps_pass_near_steady_states(periods):
     """The motion differs from a steady state by what the sweep moves in the time in which the motion settles."""
@@ -205,8 +246,8 @@ def test_slow_sweeps_pass_near_steady_states(periods):
 @pytest.mark.parametrize(
     ("nfrc", "text"),
     [
-        ({"infinite": True}, "a run is one of a lattice with its ends"),
-        ({"over": "contacts.stiffness", "range": [1.0, 2.0]}, "sweeps vary the frequency"),
+        ({"infinite": True}, "are motions of a lattice that ends"),
+        ({"over": "contacts.stiffness", "range": [1.0, 2.0]}, "are looked for over the frequency"),
     ],
 )
 def test_sweeps_need_ends_and_a_frequency(nfrc, text):

@@ -17,7 +17,7 @@ from vipetsc.case.names import distinct
 from vipetsc.case.nfrc_table import NfrcTable
 from vipetsc.case.resolve import build_chain, check_cell, check_stiffness
 from vipetsc.case.sites import ContactsTable
-from vipetsc.case.varied_key import NO_SWEEPS, PARAMETERS, TRIED, is_key, key_problems, table_at
+from vipetsc.case.varied_key import OVER_FREQUENCY, PARAMETERS, TRIED, is_key, key_problems, table_at
 from vipetsc.lattice import Chain, Contact, UnitCell, nonlinear_places, waves_at
 from vipetsc.lattice.contact import least_restitution
 from vipetsc.lattice.modal_compliance import MOST_DOFS
@@ -92,7 +92,7 @@ class NfrcCase(Case):
             first = nfrc.fixed[0] if nfrc.over == "amplitude" else nfrc.range[0]
             fastest = max(waves_at(cell, first), key=lambda wave: wave[2], default=None)
             nfrc = nfrc.model_copy(update={"band": fastest and fastest[0]})
-        return sections | {"nfrc": nfrc}, [*_check_waves(nfrc, cell), *_check_sweeps(nfrc, chain)]
+        return sections | {"nfrc": nfrc}, [*_check_waves(nfrc, cell), *_check_searches(nfrc, chain)]
 
     @classmethod
     def _read_family(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -320,17 +320,17 @@ def _check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:
         yield Problem("drive.end", moved, "no wall moves where the lattice goes on; set lattice.absorbing.end")
 
 
-def _check_sweeps(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
-    """Problems with runs that look for isolated curves."""
-    if not nfrc.isolas or "sweeps" not in nfrc.isola_search:
+def _check_searches(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
+    """Problems with searches for isolated curves by motions of the whole lattice."""
+    if not nfrc.isolas or nfrc.isola_search == ["amplitudes"]:
         return
     remedy = ""
     if nfrc.source == "wave" or nfrc.infinite or nfrc.open_ends:
-        remedy = "a run is one of a lattice with its ends; omit sweeps, or drive a mass, with nfrc.infinite = false"
+        remedy = "sweeps and breathers are motions of a lattice that ends; drive a mass, with nfrc.infinite = false"
     elif nfrc.over != "frequency":
-        remedy = NO_SWEEPS
+        remedy = OVER_FREQUENCY
     elif chain.cells * chain.cell.dofs > MOST_DOFS:
-        remedy = f"sweeps are made of up to {MOST_DOFS} masses; omit them"
+        remedy = f"sweeps and breathers are computed for up to {MOST_DOFS} masses; omit them"
     if remedy:
         yield Problem("nfrc.isola_search", nfrc.isola_search, remedy)
 

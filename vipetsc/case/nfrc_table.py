@@ -9,7 +9,7 @@ from vipetsc.case.schema import Finite, Positive, once
 from vipetsc.case.varied_key import is_key
 
 Restitution = Annotated[float, Field(ge=0, le=1)]
-IsolaSearch = Literal["amplitudes", "sweeps"]
+IsolaSearch = Literal["amplitudes", "sweeps", "breathers"]
 
 
 class NfrcTable(Section):
@@ -32,8 +32,9 @@ class NfrcTable(Section):
     Besides folds the points are located where states become stable or unstable (``special_points``: Neimark-Sacker,
     period doubling, branch points), or ``all`` where the number of growing perturbations changes. At ``isolas`` places
     within the range isolated curves are looked for as ``isola_search`` says: by ``amplitudes`` up to ``isola_reach``
-    times larger or smaller, or from the motion in ``sweeps`` up and down of ``isola_periods`` periods from one place to
-    the next. Steps are in units of the clearance and of the amplitude that touches, or half the range of frequencies.
+    times larger or smaller, from the motion in ``sweeps`` up and down of ``isola_periods`` periods from one place to
+    the next, or near ``breathers``, the free motions of the lattice without loss. Steps are in units of the clearance
+    and of the amplitude that touches, or half the range of frequencies.
     """
 
     source: Literal["wave", "force"] = "wave"

@@ -10,7 +10,7 @@ SECTIONS = ("lattice", "contacts", "disorder")  # whose keys can vary along a cu
 # Places in the range at which the case is read before a curve is followed: a key that counts is invalid between them.
 TRIED = (0.0, 0.381966, 1.0)
 
-NO_SWEEPS = "sweeps vary the frequency; omit them, or take curves over it"
+OVER_FREQUENCY = "sweeps and breathers are looked for over the frequency; omit them, or take curves over it"
 
 
 def is_key(over: Any) -> bool:
@@ -45,6 +45,6 @@ def key_problems(table: Table) -> list[Problem]:
         problems.append(Problem("nfrc.fixed", [], "give the amplitudes of the curves; their frequency is the drive's"))
     if key == "contacts.restitution" and "restitutions" in nfrc:
         problems.append(Problem("nfrc.restitutions", nfrc["restitutions"], f"{key} varies along the curve; omit it"))
-    if "sweeps" in nfrc.get("isola_search", []):
-        problems.append(Problem("nfrc.isola_search", nfrc["isola_search"], NO_SWEEPS))
+    if nfrc.get("isola_search", ["amplitudes"]) != ["amplitudes"]:
+        problems.append(Problem("nfrc.isola_search", nfrc["isola_search"], OVER_FREQUENCY))
     return problems

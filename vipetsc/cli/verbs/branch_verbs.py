@@ -145,6 +145,8 @@ def _isola_rows(case: NfrcCase) -> Rows:
         searches.append(f"by amplitudes up to {options.isola_reach:g} times larger or smaller")
     if "sweeps" in options.isola_search:
         searches.append(f"by sweeps of {options.isola_periods} periods from one place to the next")
+    if "breathers" in options.isola_search:
+        searches.append("near free motions without loss")
     return [("isolas", f"looked for at {places}, {' and '.join(searches)}")]
 
 

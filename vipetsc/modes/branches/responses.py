@@ -18,6 +18,7 @@ from vipetsc.modes.branches.method import CrossingBranch, Method
 from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.modes.response.condensation import compliance_of
 from vipetsc.modes.response.equations import FAILURES
+from vipetsc.modes.response.free_motions import states_near_free_motions
 from vipetsc.modes.response.isolated import CLOSED, ClosingSteps, over_amplitudes, places_of, unknown_states
 from vipetsc.modes.response.keyed_case import KeyedCase
 from vipetsc.modes.response.outputs import WALLS
@@ -110,13 +111,15 @@ class ResponseMethod(Method[Response]):
 
         search = self.case.nfrc.isola_search
         places = places_of(states, self.case.nfrc.isolas)
-        swept: list[list[np.ndarray]] = [[] for _ in places]
-        if "sweeps" in search:
-            assert isinstance(states, SteadyStates)  # checked in the case: they sweep the frequency
-            swept = swept_states(states, places)
+        of_places: list[list[np.ndarray]] = [[] for _ in places]
+        for name, near in (("sweeps", swept_states), ("breathers", states_near_free_motions)):
+            if name in search:
+                assert isinstance(states, SteadyStates)  # checked in the case: the frequency varies
+                for candidates, more in zip(of_places, near(states, places), strict=True):
+                    candidates += more
 
         number = 0
-        for p, candidates in zip(places.tolist(), swept, strict=True):
+        for p, candidates in zip(places.tolist(), of_places, strict=True):
             if "amplitudes" in search:
                 candidates += over_amplitudes(states, known(), p)
             for xi in unknown_states(states, known, candidates):

@@ -79,24 +79,36 @@ def _is_among(xi: np.ndarray, others: Sequence[np.ndarray]) -> bool:
 
 def _states_over_amplitude(states: Equations, begin: np.ndarray) -> Iterator[np.ndarray]:
     """Unknowns of further states with the curve's amplitude, on the line over the amplitude through ``begin``."""
-    line = _line(states, begin[-1])
+    line = over_amplitude(states, begin[-1])
     _, amplitude = states.drive(begin[-1])
-    p = amplitude / line.parameter.scale
+    unit = states.clearance / line.clearance
+    xi = np.append(begin[:-1] * unit, amplitude / line.parameter.scale)
+    return with_amplitude(states, line, xi, begin[-1])
+
+
+def with_amplitude(states: Equations, line: SteadyStates, begin: np.ndarray, p: float) -> Iterator[np.ndarray]:
+    """Unknowns of states at the scaled parameter ``p`` with the curve's amplitude, on the ``line`` through ``begin``.
+
+    ``begin`` are unknowns of the line, near one of its states, which is left out if it has that amplitude itself.
+    """
+    _, amplitude = states.drive(p)
+    crossed = amplitude / line.parameter.scale
     unit = states.clearance / line.clearance
     for direction in (1, -1):
         with suppress(*FAILURES):
-            start = Response(xi=line.at(np.append(begin[:-1] * unit, p), p), next_step=line.options.first_step)
+            start = Response(xi=line.at(begin, float(begin[-1])), next_step=line.options.first_step)
             last = start
             for point in Continuation(line, start, TurningSteps(line, MOST_STATES), direction):
                 # The first step leaves the amplitude itself.
-                if last is not start and (last.xi[-1] - p) * (point.xi[-1] - p) <= 0:
-                    place = (p - last.xi[-1]) / (point.xi[-1] - last.xi[-1])
-                    xi = line.at(last.xi + place * (point.xi - last.xi), p)
-                    yield np.append(xi[:-1] / unit, begin[-1])
+                is_left = last is start and start.xi[-1] == crossed
+                if not is_left and (last.xi[-1] - crossed) * (point.xi[-1] - crossed) <= 0:
+                    place = (crossed - last.xi[-1]) / (point.xi[-1] - last.xi[-1])
+                    xi = line.at(last.xi + place * (point.xi - last.xi), crossed)
+                    yield np.append(xi[:-1] / unit, p)
                 last = point
 
 
-def _line(states: Equations, p: float) -> SteadyStates:
+def over_amplitude(states: Equations, p: float) -> SteadyStates:
     """The equations over the amplitude at the scaled parameter ``p``, from 1/reach to reach times the curve's."""
     omega, amplitude = states.drive(p)
     lattice = states if isinstance(states, SteadyStates) else states.states_at(p * states.parameter.scale)
