@@ -28,6 +28,9 @@ CUBIC_CELL = {
         ({"clearance": 1e-4, "clearance_minus": 4e-4, "side": "minus"}, [0.5]),
         # To ground, of whose motion the envelope, that of the cell's pair, shows nothing.
         ({"clearance": 4e-4, "pair": [0, 2]}, np.inf),
+        # Pressed at rest: there is no linear motion without the contact.
+        ({"clearance": 1e-4, "precompression": 3e-4, "side": "plus", "restitution": 1.0}, np.inf),
+        ({"clearance": 0.0, "side": "plus", "restitution": 1.0}, np.inf),
     ],
 )
 def test_a_member_comes_as_near_as_its_smaller_clearance_permits(contacts, expected):

@@ -39,6 +39,15 @@ class Model:
         return self.laws or (self.contact,)
 
     @property
+    def effective_restitution(self) -> float | list[float]:
+        """The effective restitution of each site's law, or of all where they are alike."""
+        if not self.laws:
+            return self.contact.effective_restitution
+        # A root search each: sites have few laws.
+        values = {law: law.effective_restitution for law in set(self.laws)}
+        return [values[law] for law in self.laws]
+
+    @property
     def drive(self) -> Waveform:
         """The waveform of the first drive, by which frequency, wave and times are judged."""
         return self.drives[0].waveform

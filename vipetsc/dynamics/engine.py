@@ -34,6 +34,7 @@ class Engine(ABC):
 
     name: ClassVar[str]
     dashpots: ClassVar[bool] = False  # whether what they dissipate is integrated, as ``Layout`` says
+    opens: ClassVar[bool] = False  # whether a run may ``open`` with samples of another one
     state: PETSc.Vec
     time: float
 
@@ -75,6 +76,10 @@ class Engine(ABC):
     @abstractmethod
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Go back to a checkpoint, given the parts of all ranks that wrote it, in order; their number may differ."""
+
+    def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Go on from a checkpoint of a run without sites, given the parts of all its ranks; sites stand at rest."""
+        raise NotImplementedError(f"{self.name} does not open with samples of another run")
 
     @abstractmethod
     def destroy(self) -> None:

@@ -113,7 +113,10 @@ class Layout:
         return {"cells": cells, "work": works, "losses": losses}
 
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]], y: np.ndarray) -> None:
-        """Fill this rank's part ``y`` of the state from the checkpoints of all ranks that wrote one."""
+        """Fill this rank's part ``y`` of the state from the checkpoints of all ranks that wrote one.
+
+        Sites that these do not name have dissipated nothing.
+        """
         motion = y[: self.rows * self.owned].reshape(self.rows, self.owned)
         at = 0
         for checkpoint in checkpoints:  # one after the other: no rank holds all cells
@@ -125,8 +128,11 @@ class Layout:
             at += len(cells)
 
         tables = join(checkpoints, {"work": "number", "losses": "number"})
-        ledger = np.concatenate([tables["work"][list(self.drives)], tables["losses"][list(self.sites)]])
-        y[self.rows * self.owned : self.size] = ledger["energy"]
+        y[self.rows * self.owned : self.dissipated] = tables["work"]["energy"][list(self.drives)]
+        losses = tables["losses"]
+        named = np.isin(self.sites, losses["number"])
+        y[self.dissipated : self.size] = 0.0
+        y[self.dissipated : self.size][named] = losses["energy"][np.isin(losses["number"], self.sites)]
 
 
 def cell_cuts(cells: int, ranks: int) -> list[int]:

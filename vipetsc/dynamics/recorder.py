@@ -12,8 +12,10 @@ import numpy as np
 from vipetsc.case import CaseError, Model, Problem
 from vipetsc.case.points import PointTable
 from vipetsc.case.schema import OutputTable
+from vipetsc.contact.tracker import EPISODE
 from vipetsc.dynamics.energies import ENERGY_SUMS, Energies
 from vipetsc.dynamics.observers import Observer, Setup
+from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.points import PointMotion
 from vipetsc.dynamics.samples import Block, Samples
 from vipetsc.io.chunks import DAMPED, FORCES, LOSSES, MOTION, Recording, ranges
@@ -95,7 +97,7 @@ class Recorder(Observer):
         numbers = len(output.fields) * layout.dofs * local.size + len(self._of_sites) * len(layout.sites)
         # Gathered chunks lie on rank 0 together.
         most = layout.comm.allreduce(numbers, MPI.MAX if together else MPI.SUM)
-        self._length = chunk_samples(8 * most)
+        self._length = min(chunk_samples(8 * most), setup.output.longest)
         self._stride = output.stride
         self._shape = len(output.fields), self._length, layout.dofs, local.size
         self._moving = np.array([name == "velocity" for name in output.fields], np.int64)
@@ -155,6 +157,30 @@ class Recorder(Observer):
         self._number = block.first - self._held
         self._held = here.stop
         self._rows = rows
+
+    def record(self, opening: Opening) -> None:
+        """Store the samples of an ``opening`` as a chunk of rank 0; all ranks must call it."""
+        output = self.setup.output
+        output.append(self._opened(opening) if self.setup.layout.comm.rank == 0 else None)
+        self._begin_chunk()
+
+    def _opened(self, opening: Opening) -> dict[str, np.ndarray]:
+        """The chunk of an ``opening``, as ``_gather`` gives it on rank 0."""
+        recording = self.setup.output.recording
+        cells = recorded_cells(self.setup.case.output, self.setup.model.chain.cells)
+        rows = -(-opening.samples // self._stride)
+        fields = self.setup.output.room((len(recording.fields), rows, self.setup.layout.dofs, len(cells)))
+        for field, name in zip(fields, recording.fields, strict=True):
+            opening.put_field(name, slice(cells.start, cells.stop, cells.step), self._stride, out=field)
+
+        time = np.arange(opening.samples) * self.setup.model.sample_interval
+        sites = len(self.setup.model.chain.sites)
+        chunk = {name: opening.values(name) for name in recording.sampled if name not in ("time", "field_time")}
+        chunk |= {"time": time, "field_time": time[:: self._stride]}
+        chunk |= {name: np.zeros((opening.samples, sites)) for name in self._of_sites}
+        chunk |= {"sites": np.array([[0, sites]]), "columns": np.array([[0, len(cells)]])}
+        chunk |= {"impacts": np.zeros(0, EPISODE)}
+        return chunk | dict(zip(recording.fields, fields, strict=True))
 
     @property
     def due(self) -> bool:

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,10 +18,12 @@ from vipetsc.case.html import html_table
 from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine, FillResult
+from vipetsc.dynamics.fastest_cell import fastest_cell
 from vipetsc.dynamics.initial import set_in_motion
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_memory
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, ProgressReport, RunawayError, Setup
+from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.options import check_options, options_of, petsc_options, with_database
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
@@ -115,6 +117,7 @@ def simulate(
     stop: StopRequest | None = None,
     progress: bool = False,
     observers: Sequence[type[Observer]] = (),
+    opening: Callable[[], Opening | None] | None = None,
 ) -> Result:
     """Simulate ``case`` on all ranks of ``comm``, in memory or into ``folder`` (``run.h5`` and ``summary.json``).
 
@@ -135,6 +138,9 @@ def simulate(
         Report progress on rank 0: a bar on a terminal or in a notebook, elsewhere lines on stderr.
     observers
         Further observers, which see all good samples.
+    opening
+        Gives the samples that a new run begins with, if any, instead of simulating them; all ranks call it. Engines
+        without exact steps, and runs with further observers, do not use it.
 
     Raises
     ------
@@ -164,7 +170,8 @@ def simulate(
     watching: list[type[Observer]] = [Guard, *observers, Ledger]
     if progress:
         watching.append(ProgressReport)
-    simulation = Simulation(case, model, kind, refusal, stop, watching)
+    opens = opening if kind.opens and not observers else None
+    simulation = Simulation(case, model, kind, refusal, stop, watching, opens)
     if isinstance(target, RunOutput):
         result = simulation.make(target)
         return replace(result, held=memory.dataset) if folder is None else result
@@ -193,7 +200,7 @@ def result_of(attributes: Mapping[str, Any], resumable: bool, folder: Path | Non
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation: the case and its model, the engine and why it is not the one asked for, the observers."""
+    """A simulation: case and model, engine and why it is not the one asked for, observers, opening of a new run."""
 
     case: Case
     model: Model
@@ -201,11 +208,15 @@ class Simulation:
     refusal: str | None
     stop: StopRequest | None
     watching: Sequence[type[Observer]]
+    opening: Callable[[], Opening | None] | None = None
 
     def make(self, output: RunOutput) -> Result:
         """Simulate into ``output``, from its last checkpoint on if it has one; all ranks must call it."""
-        begin = Begin(time.perf_counter(), time.process_time(), compiling.seconds)
         output.begin(self.case.to_toml())
+        checkpoints = output.last_state()
+        opening = self.opening() if self.opening and checkpoints is None else None
+
+        begin = Begin(time.perf_counter(), time.process_time(), compiling.seconds)
         sys.audit("vipetsc.set-up", self.case.name)
         with log.SET_UP, petsc_options(options_of(self.case)):
             layout = Layout(self.model, output.comm, self.kind.dashpots)
@@ -213,9 +224,10 @@ class Simulation:
         with released(engine, output.comm):
             meter = EnergyMeter(self.model, layout)
             run = Run(Setup(self.case, self.model, layout, meter, engine, output), self.watching)
-            checkpoints = output.last_state()
             if checkpoints is not None:
                 run.restore(checkpoints)
+            elif opening is not None:
+                run.open(opening)
             elif self.model.initial is not None:
                 set_in_motion(run.setup)
             with log.SAMPLES:
@@ -268,7 +280,17 @@ class Run:
         """Go on after a checkpoint, given the parts of all ranks that wrote it; their number may differ."""
         # The engine first: observers may ask it for its time.
         self.setup.engine.restore(checkpoints)
-        state = checkpoints[0]
+        self._go_on(checkpoints[0])
+
+    def open(self, opening: Opening) -> None:
+        """Begin with the samples of an ``opening``; all ranks must call it."""
+        checkpoints = opening.checkpoint()
+        self.recorder.record(opening)
+        self.setup.engine.open(checkpoints)
+        self._go_on(checkpoints[0])
+
+    def _go_on(self, state: Mapping[str, np.ndarray]) -> None:
+        """Restore the observers from what a checkpoint has of them, the same on all ranks."""
         self.samples = int(state["samples"])
         self.last = self.setup.engine.time
         for observer in self.observers:
@@ -330,7 +352,7 @@ class Run:
             for observer in self.observers:
                 observer.flush()
         sys.audit("vipetsc.checkpoint")
-        if self.setup.output.folder is None:
+        if not self.setup.output.saves_states:
             return
         state = self.setup.engine.checkpoint() | {"samples": np.array(self.samples)}
         for observer in self.observers:
@@ -346,7 +368,7 @@ class Run:
             self.checkpoint()
             sentence += "; the same command continues from there"
         statistics = {"samples": self.samples, "end": self.last or 0.0, "engine": engine.name} | engine.statistics()
-        statistics["effective_restitution"] = _effective_restitution(self.setup.model)
+        statistics["effective_restitution"] = self.setup.model.effective_restitution
 
         warnings = self.setup.case.warnings()
         for observer in self.observers:
@@ -371,30 +393,3 @@ class Run:
         if ending != STOPPED:
             output.finish(attributes, {"case": self.setup.case.model_dump(by_alias=True)})
         return result_of(attributes, ending == STOPPED, output.folder)
-
-
-def _effective_restitution(model: Model) -> float | list[float]:
-    """The effective restitution of each site's law, or of all where they are alike."""
-    if not model.laws:
-        return model.contact.effective_restitution
-    # A root search each: sites have few laws.
-    values = {law: law.effective_restitution for law in set(model.laws)}
-    return [values[law] for law in model.laws]
-
-
-def fastest_cell(setup: Setup) -> str:
-    """The cell that moves fastest, or is not finite, and the site nearest to it; all ranks must call it."""
-    layout = setup.layout
-    u, v = setup.engine.state.array_r[: 2 * layout.dofs * layout.owned].reshape(2, layout.dofs, layout.owned)
-    speed = np.where(np.isfinite(u) & np.isfinite(v), np.abs(v), np.inf)
-    local = (-1.0, layout.start)
-    if layout.owned:
-        local = float(speed.max()), layout.start + int(speed.max(axis=0).argmax())
-    _, fastest = max(layout.comm.allgather(local))
-
-    cell = f"cell {fastest + 1}"
-    sites = setup.model.chain.sites
-    if not sites:
-        return cell
-    nearest = min(range(len(sites)), key=lambda i: abs(sites[i] - fastest))
-    return f"{cell}, nearest site {nearest + 1} in cell {sites[nearest] + 1}"

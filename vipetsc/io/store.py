@@ -52,10 +52,12 @@ class RunFolder:
     """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after.
 
     It stores the ``count`` chunks of the run, on all ranks of ``comm``, and puts them together at the end;
-    ``recording`` describes their contents.
+    ``recording`` describes their contents. A chunk has at most ``longest`` samples.
     """
 
     recording: Recording
+    saves_states = True
+    longest = sys.maxsize
 
     def __init__(self, folder: Path, comm: MPI.Comm) -> None:
         self.folder = Path(folder)
@@ -240,14 +242,18 @@ class RunMemory:
     It is used as a ``RunFolder``. Fields are gathered whatever the case's writer is; a run that is stopped is lost.
     Fields lie in memory as (t, dof, cell): on one rank the engine writes them where they stay. ``end`` are the
     displacements and velocities (cell, 2 dof) at the last sample of a run that is complete; the dataset has them as
-    ``end/displacement`` and ``end/velocity``.
+    ``end/displacement`` and ``end/velocity``. With ``states_every`` so many samples, all ranks have the parts of the
+    checkpoints in ``states``.
     """
 
     folder = None
     recording: Recording
 
-    def __init__(self, comm: MPI.Comm = MPI.COMM_SELF) -> None:
+    def __init__(self, comm: MPI.Comm = MPI.COMM_SELF, states_every: int | None = None) -> None:
         self.comm = comm
+        self.saves_states = states_every is not None
+        self.longest = states_every or sys.maxsize
+        self.states: list[list[Arrays]] = []
         self.count = 0
         self.dataset: xr.Dataset | None = None
         self.end: np.ndarray | None = None
@@ -256,6 +262,7 @@ class RunMemory:
         """Make ready for a run of ``case`` (TOML)."""
         self.case = case
         self.count = 0
+        self.states = []
         self._rows = 0
         self._chunks: list[Arrays] = []
         vars(self).pop("_fields", None)  # of the run before
@@ -294,10 +301,11 @@ class RunMemory:
         return self._chunks[number]
 
     def save_state(self, state: Arrays) -> None:
-        """Do nothing: a run in memory cannot be resumed."""
+        """Keep the parts of a checkpoint of all ranks; all ranks must call it."""
+        self.states.append(self.comm.allgather(state))
 
     def last_state(self) -> None:
-        """Return None: a run in memory has no checkpoint."""
+        """Return None: a run in memory cannot be resumed."""
 
     def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
         """Create the dataset; all ranks must call it."""

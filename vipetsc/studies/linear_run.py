@@ -28,6 +28,7 @@ from vipetsc.studies.recorded_runs import RecordPaths
 # A member is scaled where its linear wave stays below this fraction of every clearance: the largest w between samples
 # exceeds the sampled envelope by less than what is left, for any burst of a few cycles.
 MARGIN = 0.9
+REFERENCE = 1.0  # amplitude of a linear run, in N or m
 MEMBERS = "members"  # what the records of a sweep are called
 
 # Measures of a member in the ensemble: further dimension, units and description.
@@ -54,13 +55,9 @@ class LinearRun(NamedTuple):
 
         They are measured for each of the first ``sites`` (cells; 0 for none).
         """
-        model = Case.of(run).model()
-        motion = PairMotion.of(run, model.chain.cell)
-        # With the rate in it, the envelope does not depend on where the samples fall.
-        squares = motion.displacement**2 + (motion.velocity / model.drive.frequency) ** 2
-        host_velocity = run["velocity"].values[..., model.chain.cell.host]
+        host_velocity = run["velocity"].values[..., Case.of(run).model().chain.cell.host]
         wave = cls(
-            envelope=np.sqrt(np.max(squares, axis=0)),
+            envelope=np.sqrt(np.max(envelope_squares(run), axis=0)),
             arrival=field_time(run)[np.argmax(np.abs(host_velocity), axis=0)],
             statistics=statistics | {"work": float(run["energy/work"][-1])},
             measures={},
@@ -78,16 +75,7 @@ class LinearRun(NamedTuple):
 
         It is inf where contacts join other masses than the cell's pair, to which the envelope does not apply.
         """
-        contacts = case.contacts
-        sites = np.asarray(contacts.sites, int) - 1
-        if _pairs(case):
-            return np.full(len(sites), np.inf)
-
-        clearance = np.asarray(contacts.clearance or [], float)
-        gaps = gaps_of_sites(contacts, clearance.tolist())
-        if gaps:
-            clearance = np.min(gaps, axis=1)
-        return factor(case) * self.envelope[sites] / clearance
+        return reached(self.envelope, case)
 
     def joined(self, other: "LinearRun | str | None") -> "LinearRun":
         """The run with the measures that another record of it holds as well."""
@@ -115,6 +103,33 @@ class LinearRun(NamedTuple):
             statistics=record["statistics"],
             measures={int(site): row for site, row in record["measures"].items()},  # JSON has no numbers as keys
         )
+
+
+def envelope_squares(run: xr.Dataset) -> np.ndarray:
+    """Squares (t, cell) in m^2 of w^2 + (w'/Om)^2 of each cell's contact pair in a linear ``run`` with both fields."""
+    model = Case.of(run).model()
+    motion = PairMotion.of(run, model.chain.cell)
+    # With the rate in it, the envelope does not depend on where the samples fall.
+    return np.asarray(motion.displacement**2 + (motion.velocity / model.drive.frequency) ** 2)
+
+
+def reached(envelope: np.ndarray, case: Case) -> np.ndarray:
+    """Linear relative displacement over the lesser clearance (..., site) of ``case``, from an ``envelope`` (..., cell).
+
+    The envelope in m is that of the linear run. It does not apply, and the result is inf, where contacts join other
+    masses than the cell's pair, and at sites that touch their stop at rest.
+    """
+    contacts = case.contacts
+    sites = np.asarray(contacts.sites, int) - 1
+    waves = factor(case) * envelope[..., sites]
+    if other_pairs(case):
+        return np.full(waves.shape, np.inf)
+
+    clearance = np.asarray(contacts.clearance or [], float)
+    gaps = gaps_of_sites(contacts, clearance.tolist())
+    if gaps:
+        clearance = np.min(gaps, axis=1)
+    return np.divide(waves, clearance, out=np.full(waves.shape, np.inf), where=clearance > 0)
 
 
 def measured(analysis: xr.Dataset) -> Record:
@@ -155,7 +170,7 @@ def of_motion(names: Iterable[str]) -> list[str]:
     return [name for name in names if is_measure(name) and group_of(name) == "motion"]
 
 
-def _pairs(case: Case) -> tuple[Pair, ...]:
+def other_pairs(case: Case) -> tuple[Pair, ...]:
     """The masses that contacts join, if not everywhere those of the cell's pair."""
     sites = case.contacts.sites if isinstance(case.contacts.sites, list) else []
     return pairs_of_sites(case.contacts, case.lattice.unit_cell(), len(sites))
@@ -163,14 +178,19 @@ def _pairs(case: Case) -> tuple[Pair, ...]:
 
 def is_proportional(case: Case) -> bool:
     """Whether the motion is proportional to the amplitude of a single drive until the first contact."""
-    if case.initial or case.drive.more or _pairs(case):
+    if case.initial or case.drive.more or other_pairs(case):
         return False
     return case.lattice.unit_cell().is_linear
 
 
+def signed_factor(case: Case) -> float:
+    """Ratio of the motion of ``case`` before its first contact to that of its linear run."""
+    return case.drive.amplitude / REFERENCE if is_proportional(case) else 1.0
+
+
 def factor(case: Case) -> float:
     """Ratio of the wave of ``case`` to that of its linear run."""
-    return abs(case.drive.amplitude) if is_proportional(case) else 1.0
+    return abs(signed_factor(case))
 
 
 def linear_case(case: Case) -> Case:
@@ -179,10 +199,10 @@ def linear_case(case: Case) -> Case:
     Unless it ``is_proportional``, the drives are those of the case. Contacts that join other masses than the cell's
     pair may be all that joins the cells: they stay.
     """
-    amplitude = 1.0 if is_proportional(case) else case.drive.amplitude
+    amplitude = REFERENCE if is_proportional(case) else case.drive.amplitude
     output = case.output.of_points()
     drive = {"amplitude": amplitude}
-    if _pairs(case):
+    if other_pairs(case):
         return case.varied(name="linear", without=("output",), drive=drive, output=output)
     without = ("output", "contacts")
     return case.varied(name="linear", without=without, drive=drive, contacts={"sites": 0}, output=output)

@@ -15,6 +15,7 @@ import xarray as xr
 import vipetsc
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
+from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.run import Result
 from vipetsc.io.records import Line, Record, RecordFile, merge_records, read_records
 from vipetsc.io.store import RunMemory, RunOutput
@@ -148,12 +149,12 @@ class RecordedRuns:
 
         on_root(self.team, append)
 
-    def simulate(self, case: Case, output: RunOutput) -> Result:
-        """Run ``case`` on all ranks of the team into ``output``.
+    def simulate(self, case: Case, output: RunOutput, opening: Callable[[], Opening | None] | None = None) -> Result:
+        """Run ``case`` on all ranks of the team into ``output``, with an ``opening`` as in ``dynamics.simulate``.
 
         Raises StoppedError if the run was stopped, RuntimeError if it failed.
         """
-        return completed(simulate(case, output, self.team, stop=self.stop))
+        return completed(simulate(case, output, self.team, stop=self.stop, opening=opening))
 
     def run_in_memory(self, case: Case) -> tuple[xr.Dataset, Result]:
         """Dataset of a run of ``case`` by the team, empty on all ranks but its first, and how it ended.

@@ -223,20 +223,30 @@ class _Survey(NamedTuple):
     lost: list[str]
 
     def order(self, linear: dict[str, LinearRun | str]) -> list[int]:
-        """The missing members, the longest first: contacts at every site that the linear wave would reach cost most."""
+        """The missing members: linear run by linear run, since ranks keep few of them, and the longest first.
+
+        Contacts at every site that the linear wave would reach cost most.
+        """
         numbers = [-1]
         costs = [0.0]
+        runs = [""]
         for member in self.drawn:
             run = linear.get(member.linear)
             if isinstance(run, LinearRun):
                 contacts = float(np.minimum(run.reached(member.case), 10.0).sum())
                 numbers.append(member.number)
                 costs.append(contacts + 1e-3 * float(member.case.time.end))
+                runs.append(member.linear)
+
+        dearest: dict[str, float] = {}
+        for name, cost in zip(runs, costs, strict=True):
+            dearest[name] = max(cost, dearest.get(name, 0.0))
+        ranking = {name: rank for rank, name in enumerate(sorted(dearest, key=lambda name: (-dearest[name], name)))}
         # One that was not drawn costs what the last one before it does that was: its neighbour in the sweep.
         nearest = np.searchsorted(numbers, self.missing, "right") - 1
         # Stable, so that equal ones stay in their order, the same in every call.
-        dearest_first = np.argsort(-np.array(costs)[nearest], kind="stable")
-        return list(self.missing[dearest_first].tolist())
+        order = np.lexsort((-np.array(costs)[nearest], np.array([ranking[name] for name in runs])[nearest]))
+        return list(self.missing[order].tolist())
 
 
 def _survey(plan: Sweep, folder: Path) -> _Survey:

@@ -2,7 +2,8 @@
 
 import json
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 
 from mpi4py import MPI
@@ -12,6 +13,7 @@ import xarray as xr
 
 import vipetsc
 from vipetsc.case import Case, Sweep
+from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.recorder import recorded_cells
 from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.folder import origin
@@ -23,16 +25,8 @@ from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.measures import can_be_scaled
 from vipetsc.studies.analysis import WHOLE, analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
-from vipetsc.studies.linear_run import (
-    MARGIN,
-    MEMBERS,
-    LinearRun,
-    factor,
-    leading_cell,
-    linear_case,
-    linear_name,
-    measured,
-)
+from vipetsc.studies.linear_history import LinearHistories, LinearHistory, begins_linearly
+from vipetsc.studies.linear_run import MARGIN, MEMBERS, LinearRun, factor, leading_cell, linear_name, measured
 from vipetsc.studies.recorded_runs import RecordedRuns
 
 FIELDS = ("displacement", "velocity")
@@ -56,6 +50,7 @@ class SweepRuns:
         # Any exception is the member's own, but a full disk: a sweep goes on past failures.
         self.recorded = RecordedRuns(MEMBERS, folder, comm, stop, plan.options.ranks, failures=(Exception,))
         self.linear: dict[str, LinearRun | str] = {}
+        self._histories = LinearHistories()
 
     def make_linear(self, case: Case, sites: Collection[int]) -> None:
         """Simulate the linear run of ``case``, and measure it for members with each of the first ``sites`` (cells).
@@ -68,18 +63,44 @@ class SweepRuns:
             raise RuntimeError(earlier)
 
         try:
-            data, result = self.recorded.run_in_memory(linear_case(case))
+            history = self._make_history(case)
 
             def measure() -> LinearRun:
-                linear = LinearRun.of(data, result.statistics, sites, self.measures)
+                linear = LinearRun.of(history.run, history.statistics, sites, self.measures)
                 self.recorded.file.append(linear.record(name))
                 return linear
 
             self.linear[name] = on_root(self.recorded.team, measure).joined(earlier)
+            self._keep(name, history, case)
         except Exception as error:
             # Every member that needs it fails with this reason, without another try.
             self.linear[name] = str(error) or type(error).__name__
             raise
+
+    def _make_history(self, case: Case) -> LinearHistory:
+        """Simulate the linear run of ``case``; raises StoppedError, or RuntimeError if it does not come out."""
+        return LinearHistory.of(case, self.recorded.team, self.recorded.stop)
+
+    def _keep(self, name: str, history: LinearHistory, case: Case) -> None:
+        """Keep the ``history`` of the linear run ``name`` of ``case`` for the members that begin from it."""
+        if not begins_linearly(self.plan, case):
+            return
+        if not self.plan.options.fields:
+            history = history.with_velocity_alone()
+        self._histories.keep(name, history, case)
+
+    def _opening(self, case: Case, name: str) -> Opening | None:
+        """The samples with which ``case`` begins, from the linear run ``name``, which is simulated if it is not kept.
+
+        Raises as ``_make_history``.
+        """
+        if not begins_linearly(self.plan, case):
+            return None
+        if self._histories.get(name) is None:
+            self._keep(name, self._make_history(case), case)
+        history = self._histories.get(name)
+        assert history
+        return history.opening(case)
 
     def make(self, number: int) -> None:
         """Simulate the member ``number``, or scale it; raises as ``make_linear``, for an impossible case too."""
@@ -98,7 +119,8 @@ class SweepRuns:
         if quiet:
             record = _scaled(case, linear, name, site)
         else:
-            record = self._simulate(case, self.folder / self.ids[number], linear.arrival_at(site))
+            opening = partial(self._opening, case, name)
+            record = self._simulate(case, self.folder / self.ids[number], linear.arrival_at(site), opening)
         record |= {"rtol": case.time.rtol, "cpu_seconds": round(time.process_time() - begin, 4)}
         on_root(self.recorded.team, lambda: self._append(number, SCALED if quiet else COMPLETE, record))
 
@@ -128,7 +150,9 @@ class SweepRuns:
         }
         self.recorded.file.append(about | record)
 
-    def _simulate(self, case: Case, folder: Path, arrival: float | None) -> Record:
+    def _simulate(
+        self, case: Case, folder: Path, arrival: float | None, opening: Callable[[], Opening | None]
+    ) -> Record:
         """Simulate and measure a member with all its samples and cells; what is kept of them is cut out after that."""
         fields = self.plan.options.fields
         all_kept = keeps_all(case) and "displacement" in case.output.fields
@@ -148,7 +172,7 @@ class SweepRuns:
         # Measures need all samples and cells, also those that the member does not keep.
         simulated = case if fields and all_kept else everything
         output = RunFolder(folder, self.recorded.team) if fields else memory
-        result = self.recorded.simulate(simulated, output)
+        result = self.recorded.simulate(simulated, output, opening)
 
         def measure() -> Record:
             with open_run(folder / "run.h5") if memory.dataset is None else memory.dataset as run:

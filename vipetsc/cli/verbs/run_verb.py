@@ -36,10 +36,15 @@ def load(options: argparse.Namespace) -> Case:
     if options.member is None:
         return Case.load(options.case, options.set)
 
-    path = Path(options.case or "the case of a sweep")
-    plan = Sweep.load(path / "case.toml" if path.is_dir() else path)
+    plan = _sweep_of(options)
     number = plan.number(options.member)
     return plan.case(number).varied(name=f"{plan.name}-{plan.ids()[number]}", overrides=options.set)
+
+
+def _sweep_of(options: argparse.Namespace) -> Sweep:
+    """The sweep whose file or folder is given; raises CaseError."""
+    path = Path(options.case or "the case of a sweep")
+    return Sweep.load(path / "case.toml" if path.is_dir() else path)
 
 
 def simulate_and_measure(case: Case, work: Work) -> Outcome:
@@ -47,9 +52,14 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     from vipetsc.dynamics import simulate
     from vipetsc.dynamics.cost import estimate
     from vipetsc.io.export import has_xdmf, write_xdmf
+    from vipetsc.studies.linear_history import opening_of
     from vipetsc.studies.reanalysis import is_measured, measure_run
 
-    result = simulate(case, work.folder, work.comm, **work.keywords)
+    opening = None
+    if work.options.member:
+        # As in the sweep, the member begins from its linear run.
+        opening = opening_of(_sweep_of(work.options), case, work.comm, work.stop)
+    result = simulate(case, work.folder, work.comm, opening=opening, **work.keywords)
     work.warn(result.warnings)
     faster = on_root(work.comm, lambda: estimate(case, work.comm.size).faster)
     work.report(run_table(result, faster))

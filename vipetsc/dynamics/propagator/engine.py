@@ -178,6 +178,7 @@ class Propagator(Engine):
     """Advances a lattice from sample to sample; see ``Engine``."""
 
     name = "propagator"
+    opens = True
 
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         series = step_series(model)
@@ -303,9 +304,17 @@ class Propagator(Engine):
         return state | {"steps": np.array(self.steps)} | self._forces.checkpoint()
 
     def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
-        steps = int(shares[0]["steps"])
-        self._layout.restore(shares, self._components[steps % 2])
         self._forces.restore(shares)
+        self._begin_after(int(shares[0]["steps"]), shares)
+
+    def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
+        self._forces.open(checkpoints)
+        # Steps of this engine up to the last sample: the other run's may have another length.
+        self._begin_after((int(checkpoints[0]["samples"]) - 1) * self._record.parts, checkpoints)
+
+    def _begin_after(self, steps: int, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Go to the state of ``checkpoints``, as if after so many ``steps``."""
+        self._layout.restore(checkpoints, self._components[steps % 2])
         self._record.progress["steps"] = steps
         self.state = self._states[steps % 2]
         self.time = self._time_after(steps)

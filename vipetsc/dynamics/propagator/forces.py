@@ -212,6 +212,14 @@ class Forces:
         self.clusters.state[:] = forces["cluster"][self.dofs.first[:-1]]
         self.tracker.restore(tables["sites"])
 
+    def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Go on from the ``checkpoints`` of a run that has the drives alone; the sites stay at rest."""
+        forces = join(checkpoints, {"forces": "number"})["forces"]
+        driven = np.flatnonzero(self._numbers < 0)
+        rows = forces[np.searchsorted(forces["number"], self._numbers[driven])]
+        self.clusters.energy[driven] = rows["energy"]
+        self.clusters.state[np.searchsorted(self.dofs.first, driven, side="right") - 1] = rows["cluster"]
+
 
 def _create_clusters(groups: Groups, dofs: DofTables, model: Model, series: StepSeries) -> Cluster:
     """Create the record of all clusters at rest, one for each of ``groups``."""

@@ -1,0 +1,191 @@
+"""A run that begins with the scaled samples of a linear run, up to its first contact, is the run from rest."""
+
+from __future__ import annotations
+
+import json
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from tests.conftest import assert_same_bits, datasets, with_sections
+from vipetsc.case import Case, Sweep
+from vipetsc.dynamics import simulate
+from vipetsc.dynamics.opening import Opening
+from vipetsc.io.store import RunMemory
+from vipetsc.parallel import StopRequest
+from vipetsc.studies.linear_history import LinearHistory, begins_linearly, opening_of
+from vipetsc.studies.sweep import run_sweep
+
+TABLE = {
+    "name": "opens",
+    "lattice": {"preset": "four-band", "cells": 40},
+    "contacts": {"sites": [20, 26], "clearance": [2e-4, 3e-4]},
+    "drive": {"cycles": 4, "cell": 3, "amplitude": 30.0},
+    "time": {"end": 0.06, "rtol": 1e-9, "sample_interval": 1e-4, "engine": "propagator"},
+}
+COUNTS = ("steps", "substeps", "rejected", "landings", "switches", "episodes", "samples", "terms", "method")
+FAR_DRIVE = {"drive": {"more": [{"waveform": "step", "amplitude": 0.1, "ramp": 1e-3, "cell": 36}]}}
+
+
+def case_of(sections: dict) -> Case:
+    """The case of the table with ``sections``, of which None removes a key."""
+    table = with_sections(TABLE, sections)
+    table["drive"] = {key: value for key, value in table["drive"].items() if value is not None}
+    return Case.from_table(table)
+
+
+def run_of(case: Case, begins: bool):
+    """The dataset and the statistics of a run, and how many samples of the linear run it ``begins`` with."""
+    opening = LinearHistory.of(case, MPI.COMM_SELF, StopRequest()).opening(case) if begins else None
+    memory = RunMemory(MPI.COMM_SELF)
+    result = simulate(case, memory, opening=lambda: opening)
+    assert result.complete
+    return memory.dataset, result.statistics, opening.samples if opening else 0
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        {},
+        {"drive": {"amplitude": -30.0}},
+        {"contacts": {"law": "bilinear", "restitution": 0.8}},
+        {"lattice": {"absorbing": {"cells": 8, "reflection": 0.1}}},
+        {"output": {"points": [{"name": "a", "cell": 12, "mass": 1}, {"name": "b", "cell": 26, "mass": 2}]}},
+        {"output": {"fields": ["velocity"], "window": [5, 33], "every": 4, "stride": 3, "forces": True}},
+        FAR_DRIVE,
+        {"drive": {"end": "left", "amplitude": 1e-2, "cell": None}},
+    ],
+    ids=["plain", "negative", "bilinear", "damped", "points", "thin", "two drives", "wall"],
+)
+def pair(request):
+    """The case, its run from rest, and its run from the linear one."""
+    case = case_of(request.param)
+    return case, run_of(case, begins=False), run_of(case, begins=True)
+
+
+def test_the_contacts_are_those_of_the_whole_run(pair):
+    case, (whole, statistics, _), (begun, numbers, samples) = pair
+    first = whole["impacts/onset"].values.min()
+    assert whole.sizes["episode"] > 3
+    # The last of the checkpoints, 64 samples apart, before the wave is near a stop.
+    assert 0 < first / case.time.sample_interval - samples < 64 + 40
+
+    assert {key: numbers[key] for key in COUNTS} == {key: statistics[key] for key in COUNTS}
+    np.testing.assert_allclose(begun["impacts/onset"].values, whole["impacts/onset"].values, rtol=1e-9)
+    for name in ("site", "side"):
+        np.testing.assert_array_equal(begun[f"impacts/{name}"].values, whole[f"impacts/{name}"].values)
+    np.testing.assert_allclose(begun["impacts/loss"].values, whole["impacts/loss"].values, rtol=1e-6)
+
+
+def test_every_variable_is_that_of_the_whole_run(pair):
+    _, (whole, _, _), (begun, _, samples) = pair
+    assert begun.variables.keys() == whole.variables.keys()
+    for name, variable in whole.variables.items():
+        found = begun[name]
+        assert found.dims == variable.dims
+        if variable.dtype == object:
+            assert found.values.tolist() == variable.values.tolist()
+        elif not name.startswith("impacts/"):
+            # What dashpots dissipate is the remainder of the other energies.
+            whole_of = whole["energy/work"] if name.startswith("energy/") else variable
+            scale = np.abs(whole_of.values).max(initial=1e-300)
+            np.testing.assert_allclose(found.values, variable.values, rtol=0, atol=1e-9 * scale, err_msg=name)
+
+    # Before the contacts both are the same linear motion but for rounding.
+    before = slice(samples)
+    for name in ("energy/kinetic", "energy/spring", "energy/work"):
+        values = whole[name].values[before]
+        np.testing.assert_allclose(begun[name].values[before], values, rtol=0, atol=1e-12 * np.abs(values).max())
+
+
+def test_the_ledger_closes(pair):
+    """To 1e-9 of the work, of which the drive did a part before the run began."""
+    case, _, (begun, numbers, _) = pair
+    if not case.model().chain.is_damped:
+        kinetic, spring, contact, dissipated, work = (
+            begun[f"energy/{name}"].values for name in ("kinetic", "spring", "contact", "dissipated", "work")
+        )
+        error = np.abs(work - dissipated - kinetic - spring - contact).max() / np.abs(work).max()
+        assert numbers["ledger_error"] < 1e-9
+        assert numbers["ledger_error"] == pytest.approx(error, rel=0.1)
+    assert numbers["work"] == begun["energy/work"].values[-1]
+
+
+def test_a_run_that_may_touch_at_once_begins_at_rest():
+    """Next to a strong drive, and with sites that touch their stops, no checkpoint lies before a contact."""
+    history = LinearHistory.of(case_of({}), MPI.COMM_SELF, StopRequest())
+    assert history.opening(case_of({})) is not None
+    assert history.opening(case_of({"drive": {"amplitude": 3e3}, "contacts": {"sites": [3, 26]}})) is None
+    assert history.opening(case_of({"contacts": {"clearance": 0.0, "restitution": 1.0, "side": "plus"}})) is None
+
+
+@pytest.mark.parametrize(
+    ("sweep", "sections", "begins"),
+    [
+        ({"drive": {"amplitude": [1.0, 2.0, 3.0]}}, {}, True),
+        ({"drive": {"amplitude": [1.0, 2.0]}}, {}, False),
+        ({"contacts": {"clearance": [2e-4, 3e-4]}, "drive": {"amplitude": [1.0, 2.0]}}, {}, True),
+        # Each has a linear run of its own.
+        ({"drive": {"cycles": [3, 4, 5]}}, {}, False),
+        (
+            {"zip": [["drive.amplitude", "drive.cycles"]], "drive": {"amplitude": [1, 2, 3], "cycles": [3, 4, 5]}},
+            {},
+            False,
+        ),
+        ({"drive": {"amplitude": [1.0, 2.0, 3.0]}}, FAR_DRIVE, False),
+        ({"disorder": {"seed": {"count": 4}}}, {"disorder": {"clearance": {"relative": 0.1}}}, True),
+        ({"disorder": {"seed": {"count": 4}}}, {"disorder": {"masses": {"relative": 0.01}}}, False),
+        # Contacts that join cells are a part of the linear run.
+        ({"drive": {"amplitude": [1.0, 2.0, 3.0]}}, {"contacts": {"next_cell": True}}, False),
+    ],
+)
+def test_members_begin_from_a_linear_run_that_several_have_in_common(sweep, sections, begins):
+    plan = Sweep.from_table(with_sections(TABLE, sections) | {"sweep": sweep})
+    assert begins_linearly(plan, plan.case(0)) == begins
+
+
+@pytest.mark.slow
+def test_a_member_has_the_same_bits_in_every_sweep_and_alone(tmp_path):
+    """What else there is of a sweep, what it keeps, and an own run of the member do not change a bit."""
+    amplitudes = [1.0, 30.0, 40.0, 50.0]
+    folders = {"all": amplitudes, "some": amplitudes[1:], "fields": amplitudes[1:]}
+    records = {}
+    for name, values in folders.items():
+        sweep = {"drive": {"amplitude": values}, "measures": ["transfer"], "fields": name == "fields"}
+        plan = Sweep.from_table(TABLE | {"sweep": sweep})
+        assert run_sweep(plan, tmp_path / name).complete
+        lines = (tmp_path / name / "members.jsonl").read_text().splitlines()
+        members = [json.loads(line) for line in lines]
+        records[name] = {row["id"]: row for row in members if "id" in row}
+
+    # Sweeps of the same base case give the same names to equal members.
+    for name, row in records["some"].items():
+        other = records["all"][name]
+        assert row["measures"] == other["measures"]
+        assert row["statistics"]["dissipated"] == other["statistics"]["dissipated"]
+
+    name = plan.ids()[0]
+    case = plan.case(0)
+    simulate(case, tmp_path / "alone", opening=opening_of(plan, case, MPI.COMM_SELF, StopRequest()))
+    alone = datasets(tmp_path / "alone" / "run.h5")
+    assert_same_bits(alone, datasets(tmp_path / "fields" / name / "run.h5"))
+    assert records["some"][name]["statistics"]["work"] == alone["energy/work"][-1]
+    # It is not by chance that they agree: a run from rest differs in the last bits.
+    simulate(case, tmp_path / "rest")
+    assert datasets(tmp_path / "rest" / "run.h5")["velocity"].tobytes() != alone["velocity"].tobytes()
+
+
+def test_a_checkpoint_is_scaled_by_what_its_numbers_are():
+    """Motion goes with the amplitude, energies with its square, and counts stay."""
+    work = np.array([(0, 5.0)], dtype=[("number", np.int64), ("energy", float)])
+    part = {"samples": np.array(7), "cells": np.ones((2, 4)), "work": work, "ledger/worst": np.array(2.0)}
+    (scaled,) = Opening(xr.Dataset(), [part], -3.0).checkpoint()
+    assert scaled["samples"] == 7
+    assert (scaled["cells"] == -3.0).all()
+    assert scaled["work"].tolist() == [(0, 45.0)]
+    assert scaled["ledger/worst"] == 18.0
+    # The checkpoint stays for other members.
+    assert part["work"].tolist() == [(0, 5.0)]

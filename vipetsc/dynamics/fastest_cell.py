@@ -1,0 +1,23 @@
+"""The cell that moves fastest, for the sentence about a run that fails."""
+
+import numpy as np
+
+from vipetsc.dynamics.observers import Setup
+
+
+def fastest_cell(setup: Setup) -> str:
+    """The cell that moves fastest, or is not finite, and the site nearest to it; all ranks must call it."""
+    layout = setup.layout
+    u, v = setup.engine.state.array_r[: 2 * layout.dofs * layout.owned].reshape(2, layout.dofs, layout.owned)
+    speed = np.where(np.isfinite(u) & np.isfinite(v), np.abs(v), np.inf)
+    local = (-1.0, layout.start)
+    if layout.owned:
+        local = float(speed.max()), layout.start + int(speed.max(axis=0).argmax())
+    _, fastest = max(layout.comm.allgather(local))
+
+    cell = f"cell {fastest + 1}"
+    sites = setup.model.chain.sites
+    if not sites:
+        return cell
+    nearest = min(range(len(sites)), key=lambda i: abs(sites[i] - fastest))
+    return f"{cell}, nearest site {nearest + 1} in cell {sites[nearest] + 1}"

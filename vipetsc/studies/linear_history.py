@@ -1,0 +1,139 @@
+"""Histories of linear runs, from which the members of a sweep begin that differ in amplitude and contacts alone.
+
+Whether members begin so depends on the sweep's case, not on which members are missing nor on the number of ranks: a
+member has the same bits in every sweep that has it, after an interruption, and where it is repeated alone.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Self
+
+from mpi4py import MPI
+
+import numpy as np
+import xarray as xr
+
+from vipetsc.case import Case, Sweep
+from vipetsc.dynamics import simulate
+from vipetsc.dynamics.opening import Opening
+from vipetsc.dynamics.propagator.engine import Propagator
+from vipetsc.io.atomic import Arrays
+from vipetsc.io.store import RunMemory
+from vipetsc.parallel import StopRequest
+from vipetsc.studies.linear_run import (
+    MARGIN,
+    envelope_squares,
+    is_proportional,
+    linear_case,
+    other_pairs,
+    reached,
+    signed_factor,
+)
+from vipetsc.studies.recorded_runs import completed
+
+FEWEST_MEMBERS = 3  # of a linear run whose history is worth its computation
+STATES_EVERY = 64  # samples between those that members may begin after
+MOST_BYTES = 2**28  # of the histories that are kept
+# Keys of contacts and of the amplitude, in which members of one linear run differ; those drawn for contacts.
+CONTACTS = "contacts."
+AMPLITUDE = "drive.amplitude"
+SEED = "disorder.seed"
+DRAWN_OF_CONTACTS = {"seed", "clearance", "sites", "restitution", "stiffness", "modulus"}
+
+
+class LinearHistory(NamedTuple):
+    """A linear run with all samples of its motion: the dataset ``run``, empty on all ranks but the first.
+
+    ``checkpoints`` are the parts of all ranks; ``envelope`` (checkpoint, cell) in m is that of ``LinearRun``, of the
+    samples before each checkpoint. ``statistics`` are the run's.
+    """
+
+    run: xr.Dataset
+    checkpoints: list[list[Arrays]]
+    envelope: np.ndarray
+    statistics: dict[str, Any]
+
+    @classmethod
+    def of(cls, case: Case, comm: MPI.Comm, stop: StopRequest) -> Self:
+        """Simulate the linear run of ``case`` on all ranks of ``comm``; raises StoppedError, or RuntimeError."""
+        memory = RunMemory(comm, states_every=STATES_EVERY)
+        result = completed(simulate(linear_case(case), memory, comm, stop=stop))
+
+        envelope = None
+        if memory.dataset is not None:
+            largest = np.sqrt(np.maximum.accumulate(envelope_squares(memory.dataset), axis=0))
+            last = [int(parts[0]["samples"]) - 1 for parts in memory.states]
+            envelope = largest[last]
+        run = xr.Dataset() if memory.dataset is None else memory.dataset
+        return cls(run, memory.states, comm.bcast(envelope), result.statistics)
+
+    def with_velocity_alone(self) -> Self:
+        """The history without displacements, which takes half of the memory."""
+        run = self.run.drop_vars("displacement", errors="ignore")
+        # A copy: both fields lie in one array.
+        return self._replace(run=run.copy(deep=True))
+
+    def opening(self, case: Case) -> Opening | None:
+        """The samples before the first contact with which ``case`` begins; None without any, or without exact steps."""
+        if self.statistics["engine"] != Propagator.name:
+            return None
+        waves = reached(self.envelope, case)
+        before_contact = np.count_nonzero((waves < MARGIN).all(axis=1))
+        if not before_contact:
+            return None
+        return Opening(self.run, self.checkpoints[before_contact - 1], signed_factor(case))
+
+
+def begins_linearly(plan: Sweep, case: Case) -> bool:
+    """Whether the member ``case`` of ``plan`` begins from a linear run, which enough members have in common."""
+    if other_pairs(case):
+        return False
+    members = 1
+    for axis in plan.axes:
+        if all(_keeps_linear_run(key, plan, case) for key in axis):
+            members *= len(next(iter(axis.values())))
+    return members >= FEWEST_MEMBERS and history_bytes(case) <= MOST_BYTES
+
+
+def opening_of(plan: Sweep, case: Case, comm: MPI.Comm, stop: StopRequest) -> Callable[[], Opening | None]:
+    """A function that simulates the linear run of the member ``case`` of ``plan``, and returns the member's opening."""
+
+    def opening() -> Opening | None:
+        return LinearHistory.of(case, comm, stop).opening(case) if begins_linearly(plan, case) else None
+
+    return opening
+
+
+def _keeps_linear_run(key: str, plan: Sweep, case: Case) -> bool:
+    """Whether members that differ in ``key`` have one linear run."""
+    if key == AMPLITUDE:
+        return is_proportional(case)
+    if key == SEED:
+        return plan.table.get("disorder", {}).keys() <= DRAWN_OF_CONTACTS
+    return key.startswith(CONTACTS)
+
+
+def history_bytes(case: Case) -> int:
+    """Bytes of the motion in the history of the linear run of ``case``."""
+    model = case.model()
+    return 16 * model.samples * model.chain.cells * model.chain.cell.dofs
+
+
+class LinearHistories:
+    """The histories of a team of ranks by the names of the linear runs: the latest ones, up to ``MOST_BYTES``."""
+
+    def __init__(self) -> None:
+        self._histories: dict[str, LinearHistory] = {}
+        self._bytes: dict[str, int] = {}
+
+    def get(self, name: str) -> LinearHistory | None:
+        """The history of that ``name``, if it is kept."""
+        return self._histories.get(name)
+
+    def keep(self, name: str, history: LinearHistory, case: Case) -> None:
+        """Keep the ``history`` of the linear run of ``case``, which is the same on all ranks, as what goes for it."""
+        self._histories[name] = history
+        self._bytes[name] = history_bytes(case)
+        while sum(self._bytes.values()) > MOST_BYTES:
+            oldest = next(iter(self._histories))
+            del self._histories[oldest]
+            del self._bytes[oldest]
