@@ -147,7 +147,7 @@ def test_bad_cases_write_nothing(on_ranks, case, tmp_path, ranks):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", ["clearances", "amplitudes", "band", "gate"])
+@pytest.mark.parametrize("name", ["clearances", "amplitudes", "band", "gate", "absorber"])
 def test_the_cases_in_runs_are_valid(in_process, name):
     """Each search in ``runs`` is valid, with the number of its designs."""
     done = in_process("validate", f"runs/examples/optimise-{name}.toml")

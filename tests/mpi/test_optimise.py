@@ -6,7 +6,8 @@ from mpi4py import MPI
 
 import pytest
 
-from tests.conftest import TWO, StopAt, assert_same_bits, datasets, on_two, search_table
+from tests.conftest import TWO, StopAt, assert_same_bits, datasets, on_two, search_table, with_sections
+from tests.verify.test_optimise_responses import TABLE
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.parallel import StoppedError, StopRequest
 from vipetsc.studies.optimum_search import run_search
@@ -65,3 +66,16 @@ def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder,
 
     assert_same_bits(datasets(folder / "optimum.h5"), whole)
     comm.Barrier()
+
+
+@pytest.mark.parallel([2])
+def test_responses_do_not_depend_on_the_ranks(folder, tmp_path_factory):
+    """Designs fall to different ranks, or the curves of each to the ranks of a team; a search that goes on too."""
+    alone = tmp_path_factory.mktemp("alone")
+    table = with_sections(TABLE, {"nfrc": {"fixed": [1.0, 2.0], "largest_step": 0.3}, "optimise": {"budget": 3}})
+    run_search(OptimiseCase.from_table(table), alone, MPI.COMM_SELF)
+    for ranks in (1, 2):
+        case = OptimiseCase.from_table(table, [f"optimise.ranks={ranks}"])
+        run_search(case, folder / str(ranks), MPI.COMM_WORLD)
+        assert_same_bits(datasets(folder / str(ranks) / "optimum.h5"), datasets(alone / "optimum.h5"))
+    MPI.COMM_WORLD.Barrier()

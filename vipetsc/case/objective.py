@@ -1,7 +1,7 @@
 """Objectives and constraints of a search for a design, and their checks."""
 
 import difflib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -9,6 +9,8 @@ from pydantic import Field
 from vipetsc.case.amplitude import has_free_amplitude
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import Problem, Section
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.response_measures import RESPONSE, response_measures
 from vipetsc.case.schema import Finite, Positive
 from vipetsc.lattice import pass_bands
 from vipetsc.spectra.measures import PART, RunMeasure, measures_of
@@ -31,6 +33,10 @@ class MeasuredTable(Section):
     the energy-weighted ``entropy`` in bit; or any other number of a run by its name, ``peak_velocity/tip`` of a point,
     ``band_transmission/base-tip`` with the ``band``. Of the ``amplitudes`` of the drive, or of the motion at t = 0
     where nothing is driven, by default the case's, the ``worst`` or the ``mean`` counts.
+
+    Measures that begin with ``response/`` are those of the curves of ``[nfrc]``: the largest value of a curve, or with
+    ``below`` the width of the widest range of the parameter in which the value is below that level; in ``part`` of the
+    range of ``[nfrc]``. Of several curves the ``worst`` or the ``mean`` counts.
     """
 
     measure: Literal[OF_SEARCHES] | str = "upper_share_at_end"  # type: ignore[valid-type]  # the names above
@@ -38,21 +44,27 @@ class MeasuredTable(Section):
     part: Pair | None = None
     amplitudes: list[Positive] = Field([])
     over: Literal["worst", "mean"] = "worst"
+    below: Positive | None = None
 
     @property
     def name(self) -> str:
-        """The measure, with its band and part."""
+        """The measure, with its band, part and level."""
         name = str(self.measure)
         if self.band:
             name += f" {self.band}"
         if self.part:
             name += f" {self.part[0]:g}-{self.part[1]:g}"
-        return name
+        return f"width of {name} below {self.below:g}" if self.below else name
 
     @property
     def is_of_runs(self) -> bool:
         """Whether it is a number of every run, not one that searches alone measure."""
-        return self.measure not in OF_SEARCHES
+        return self.measure not in OF_SEARCHES and not self.is_of_responses
+
+    @property
+    def is_of_responses(self) -> bool:
+        """Whether it is a number of frequency responses, which ``[nfrc]`` describes."""
+        return str(self.measure).startswith(RESPONSE)
 
     def at_amplitudes(self, unit: str) -> str:
         """Which amplitudes count, in words; they have a ``unit``."""
@@ -91,10 +103,20 @@ class ConstraintTable(MeasuredTable):
         return max(below, above, 0.0)
 
 
-def measured_problems(objective: MeasuredTable, at: str, base: Case, varied: bool) -> Iterator[Problem]:
-    """Problems with an objective or a constraint, of a cell that stays as it is unless ``varied``."""
+def measured_problems(
+    objective: MeasuredTable, at: str, base: Case, varied: bool, responses: NfrcCase | None
+) -> Iterator[Problem]:
+    """Problems with an objective or a constraint, of a cell that stays as it is unless ``varied``.
+
+    ``responses`` is the case of the frequency responses, None for a case without ``[nfrc]``, or with an invalid one.
+    """
     if objective.amplitudes and not has_free_amplitude(base):
         yield Problem(f"{at}.amplitudes", objective.amplitudes, f"{FILE_AMPLITUDE}; omit them")
+    if objective.below and not objective.is_of_responses:
+        yield Problem(f"{at}.below", objective.below, "only measures of responses have a range below a level; omit it")
+    if objective.is_of_responses:
+        yield from _problems_of_responses(objective, at, responses)
+        return
     if objective.is_of_runs:
         yield from _problems_of_runs(objective, at, base)
         return
@@ -109,7 +131,9 @@ def measured_problems(objective: MeasuredTable, at: str, base: Case, varied: boo
         if other.low <= top:
             top = max(top, other.high)
 
-    if objective.measure == "transmitted" and base.lattice.ends == "periodic":
+    if objective.measure == "transmitted" and not base.model().chain.sites:
+        yield Problem(f"{at}.measure", objective.measure, "there is no site, beyond which energy could be; another one")
+    elif objective.measure == "transmitted" and base.lattice.ends == "periodic":
         remedy = "nothing lies beyond the last site of a ring; lattice.ends = fixed or free, or another measure"
         yield Problem(f"{at}.measure", objective.measure, remedy)
     elif objective.measure in ABOVE_DRIVEN and base.wave_frequency is None:
@@ -133,6 +157,36 @@ def measured_problems(objective: MeasuredTable, at: str, base: Case, varied: boo
             )
 
 
+def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | None) -> Iterator[Problem]:
+    """Problems with a measure of frequency responses."""
+    name = str(objective.measure)
+    if case is None:
+        remedy = "is one of frequency responses; give their [nfrc], with its range and what is fixed"
+        yield Problem(f"{at}.measure", name, remedy)
+        return
+
+    measures = response_measures(case)
+    if name not in measures:
+        outputs = "" if case.output.points else "; those of points need output.points, forces output.forces"
+        remedy = f"is no measure of these responses; {_nearest(name, [*measures])}{outputs}"
+        yield Problem(f"{at}.measure", name, remedy)
+    if objective.amplitudes:
+        remedy = "the amplitudes of responses are those of [nfrc]; omit them"
+        yield Problem(f"{at}.amplitudes", objective.amplitudes, remedy)
+    if objective.band:
+        yield Problem(f"{at}.band", objective.band, "responses have no bands; part is a part of nfrc.range")
+    low, high = case.nfrc.range
+    if objective.part and not low <= objective.part[0] < objective.part[1] <= high:
+        yield Problem(f"{at}.part", objective.part, f"must be [low, high] within nfrc.range, {low:g} to {high:g}")
+
+
+def _nearest(name: str, valid: Sequence[str]) -> str:
+    """The nearest of the ``valid`` names if there is one, and all of them."""
+    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.6)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return f"{hint}There are {', '.join(valid)}"
+
+
 def measures_of_runs(base: Case) -> dict[str, RunMeasure]:
     """The measures, by name, that every run of a case like ``base`` has, and that may be an objective."""
     points = [point.name for point in base.output.points or []]
@@ -147,10 +201,8 @@ def _problems_of_runs(objective: MeasuredTable, at: str, base: Case) -> Iterator
     name = str(objective.measure)
     if name not in measures:
         valid = [*OF_SEARCHES, *(name for name in measures if name not in OF_SEARCHES)]
-        near = difflib.get_close_matches(name, valid, n=1, cutoff=0.6)
-        hint = f"did you mean {near[0]!r}? " if near else ""
         points = "" if base.output.points else "; those of points need output.points"
-        yield Problem(f"{at}.measure", name, f"is no measure of this case; {hint}There are {', '.join(valid)}{points}")
+        yield Problem(f"{at}.measure", name, f"is no measure of this case; {_nearest(name, valid)}{points}")
         return
 
     is_of_bands = measures[name].dimension == PART

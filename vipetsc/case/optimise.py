@@ -12,6 +12,7 @@ from vipetsc.case.amplitude import amplitude_changes, amplitude_of, amplitude_un
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, read_section
 from vipetsc.case.law import LawCase
+from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.objective import FILE_AMPLITUDE, ConstraintTable, MeasuredTable, ObjectiveTable, measured_problems
 from vipetsc.case.schema import Positive
 from vipetsc.case.search_space import SearchSpace, case_of, search_space
@@ -50,6 +51,16 @@ class OptimiseTable(Section):
         return [table for _, table in self.measured_at]
 
     @property
+    def measures_responses(self) -> bool:
+        """Whether something is measured of frequency responses."""
+        return any(table.is_of_responses for table in self.measured)
+
+    @property
+    def measures_runs(self) -> bool:
+        """Whether something is measured of runs."""
+        return not all(table.is_of_responses for table in self.measured)
+
+    @property
     def measured_at(self) -> list[tuple[str, MeasuredTable]]:
         """The paths of the objectives and of the constraints, with these."""
         rows: list[tuple[str, MeasuredTable]] = []
@@ -80,10 +91,13 @@ class OptimiseCase(StudyCase):
             base = case_of(table)
             # Designs are built without scatter, and run with it: both must be possible.
             case_of(table, table.get("disorder"))
+            responses = None
+            if options.measures_responses and "nfrc" in table:
+                responses = responses_of(base, table["nfrc"])
         except CaseError as error:
             return {}, problems + error.problems
 
-        wrong = list(_problems(options, base, table))
+        wrong = list(_problems(options, base, table, responses))
         if options.start == "matched":
             wrong += _matched_problems(table)
         invalid = tuple(problem.key for problem in problems)
@@ -142,20 +156,40 @@ class OptimiseCase(StudyCase):
 
     def run(self, design: Case, amplitude: float, sample: int | None = None) -> Case:
         """A run of a ``design`` at an ``amplitude``, recorded whole, with the scatter number ``sample`` if given."""
-        changes = amplitude_changes(design, amplitude)
-        disorder = self.table.get("disorder")
-        if sample is not None and disorder is not None:
-            # The seed depends on the sample alone, so that all designs meet the same scatter.
-            changes["disorder"] = disorder | {"seed": disorder.get("seed", 0) + sample}
+        changes = amplitude_changes(design, amplitude) | self._scatter(sample)
         return design.varied(name="design", without=("output",), output=design.output.of_points(), **changes)
 
+    def responses(self, design: Case, sample: int | None = None) -> NfrcCase:
+        """The frequency responses of a ``design``, with the scatter number ``sample`` if given; raises CaseError."""
+        scatter = self._scatter(sample)
+        scattered = design.varied(**scatter) if scatter else design  # type: ignore[arg-type]  # changes by section
+        return responses_of(scattered, self.table["nfrc"])
 
-def _problems(options: OptimiseTable, base: Case, given: Table) -> Iterator[Problem]:
+    def text_of(self, design: Case) -> str:
+        """The ``design`` as TOML, with ``[nfrc]`` if frequency responses are measured."""
+        return self.responses(design).to_toml() if self.options.measures_responses else design.to_toml()
+
+    def _scatter(self, sample: int | None) -> dict[str, Table]:
+        """The changes of a design that bring in the scatter number ``sample``, if any."""
+        disorder = self.table.get("disorder")
+        if sample is None or disorder is None:
+            return {}
+        # The seed depends on the sample alone, so that all designs meet the same scatter.
+        return {"disorder": disorder | {"seed": disorder.get("seed", 0) + sample}}
+
+
+def responses_of(design: Case, nfrc: Any) -> NfrcCase:
+    """The frequency responses of a ``design`` by the section ``nfrc``; raises CaseError."""
+    table = design.model_dump(by_alias=True, exclude_none=True, include={*Case.model_fields})
+    return NfrcCase.from_table(table | {"nfrc": nfrc})
+
+
+def _problems(options: OptimiseTable, base: Case, given: Table, responses: NfrcCase | None) -> Iterator[Problem]:
     """Problems between the keys of the section and the case to begin with."""
     bounds = options.variables
     sites = base.model().chain.sites
-    if not sites:
-        yield Problem("contacts.sites", base.contacts.sites, "no sites: without contacts there is nothing to optimise")
+    if not sites and (bounds.clearance or bounds.profile or bounds.sites):
+        yield Problem("contacts.sites", base.contacts.sites, "no sites, whose clearances or cells could vary")
     yield from variable_problems(bounds, given, base)
     yield from _amplitude_problems(options)
 
@@ -166,7 +200,7 @@ def _problems(options: OptimiseTable, base: Case, given: Table) -> Iterator[Prob
     if options.curve and not has_free_amplitude(base):
         yield Problem("optimise.curve", options.curve, f"{FILE_AMPLITUDE}; omit it")
     for at, table in options.measured_at:
-        yield from measured_problems(table, at, base, bounds.varies_cell)
+        yield from measured_problems(table, at, base, bounds.varies_cell, responses)
     for number, constraint in enumerate(options.constraint or [], 1):
         at = f"optimise.constraint[{number}]"
         low, high = constraint.at_least, constraint.at_most

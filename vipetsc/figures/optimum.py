@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.objective import ObjectiveTable
 from vipetsc.case.optimise import OptimiseCase
+from vipetsc.case.response_measures import RESPONSE, response_measures
 from vipetsc.figures import panels, style
 from vipetsc.spectra.measures import row_of
 
@@ -33,6 +34,8 @@ class ComparedDesign(NamedTuple):
 
 def _label(objective: ObjectiveTable) -> str:
     """Return what an objective measures, for an axis."""
+    if objective.is_of_responses:
+        return objective.name.replace(RESPONSE, "")
     if objective.is_of_runs:
         _, unit, _ = row_of(str(objective.measure))
         return objective.name if unit == "1" else f"{objective.name} ({unit})"
@@ -67,20 +70,26 @@ def convergence(optimum: xr.Dataset) -> Figure:
     sought = [objective.describe(plan.amplitude_unit) for objective in objectives]
     sought += [constraint.describe(plan.amplitude_unit) for constraint in options.constraint or []]
     figure = style.new_figure(style.PAGE, 2.8, "; ".join(sought))
-    values, others = figure.subplots(1, 2)
+    values, *others = figure.subplots(1, 2 if options.measures_runs else 1, squeeze=False)[0]
     if len(objectives) == 1:
         _draw_one_objective(values, optimum, objectives[0])
     else:
         _draw_two_objectives(values, optimum, objectives[0], objectives[1])
     values.legend(loc="best", fontsize=6)
 
+    for axes in others:
+        _draw_fractions(axes, optimum)
+    panels.label_panels([values, *others])
+    return figure
+
+
+def _draw_fractions(axes: Axes, optimum: xr.Dataset) -> None:
+    """Draw the energies of the upper bands and the losses of all designs."""
     number = optimum["design"].values
     for name, colour in (("upper_share_at_end", style.PURPLE), ("dissipated", style.ORANGE)):
-        others.plot(number, optimum[name].values, ".", color=colour, ms=3, label=name.replace("_", " "))
-    others.set(xlabel="Design", ylabel="fraction of the work, mean", ylim=(0, None), title="All designs")
-    others.legend(loc="best")
-    panels.label_panels([values, others])
-    return figure
+        axes.plot(number, optimum[name].values, ".", color=colour, ms=3, label=name.replace("_", " "))
+    axes.set(xlabel="Design", ylabel="fraction of the work, mean", ylim=(0, None), title="All designs")
+    axes.legend(loc="best")
 
 
 def _draw_one_objective(axes: Axes, optimum: xr.Dataset, objective: ObjectiveTable) -> None:
@@ -164,18 +173,52 @@ def compared_designs(optimum: xr.Dataset) -> Figure:
 
 
 def compared_curves(optimum: xr.Dataset) -> Figure:
-    """Draw what the objectives measure over the amplitude, and the band energies, of the compared designs."""
+    """Draw what the objectives measure, over the amplitude or along responses, and energies, of compared designs."""
     plan = OptimiseCase.of(optimum)
     # Objectives of one measure, at different amplitudes, have one panel and the curve of the last of them.
     measures = {objective.name: i for i, objective in enumerate(plan.options.objective)}
+    has_energies = plan.options.measures_runs
     figure = style.new_figure(style.PAGE, 2.6)
-    *curves, at_case = figure.subplots(1, len(measures) + 1, squeeze=False)[0]
-    for axes, i in zip(curves, measures.values(), strict=True):
-        _draw_measure(axes, optimum, plan, i)
-    curves[0].legend(loc="best")
-    _draw_energies(at_case, optimum, plan)
-    panels.label_panels([*curves, at_case])
+    drawn = figure.subplots(1, len(measures) + has_energies, squeeze=False)[0]
+    for axes, i in zip(drawn, measures.values(), strict=False):
+        if plan.options.objective[i].is_of_responses:
+            _draw_response(axes, optimum, plan, i)
+        else:
+            _draw_measure(axes, optimum, plan, i)
+    drawn[0].legend(loc="best")
+    if has_energies:
+        _draw_energies(drawn[-1], optimum, plan)
+    panels.label_panels(drawn)
     return figure
+
+
+def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: int) -> None:
+    """Draw the frequency responses of which objective number ``index`` is a number; unstable states thin."""
+    objective = plan.options.objective[index]
+    of_line = optimum["response/of"].values
+    lines = optimum["response/compared"].values
+    for design in _compared(optimum):
+        label = design.name
+        for line in np.flatnonzero(lines == design.name):
+            points = np.flatnonzero(of_line == line)
+            parameter = optimum["response/parameter"].values[points]
+            value = optimum["response/value"].values[points, index]
+            is_stable = optimum["response/unstable"].values[points] == 0
+            axes.plot(parameter, value, color=COLOURS[design.name], lw=0.4)
+            axes.plot(parameter, np.where(is_stable, value, np.nan), color=COLOURS[design.name], lw=1.2, label=label)
+            label = "_"  # of several curves the first one is named
+
+    for bound in objective.part or []:
+        axes.axvline(bound, color=style.GREY, lw=0.5, ls=style.DOTTED)
+    if objective.below:
+        axes.axhline(objective.below, color=style.GREY, lw=0.5, ls=style.DASHED)
+    case = plan.responses(plan.base)
+    unit = response_measures(case)[str(objective.measure)].unit
+    label = str(objective.measure).removeprefix(RESPONSE)
+    over = case.nfrc.over
+    axes.set_xlabel("Frequency (rad/s)" if over == "frequency" else over.capitalize())
+    axes.set_title("Responses (thin: unstable)")
+    axes.set_ylabel(label if unit == "1" else f"{label} ({unit})")
 
 
 def _draw_measure(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: int) -> None:

@@ -13,6 +13,7 @@ import xarray as xr
 
 from vipetsc.case import Case, Model, case_id
 from vipetsc.case.amplitude import amplitude_of
+from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.objective import MeasuredTable
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.io.records import Record
@@ -22,8 +23,10 @@ from vipetsc.spectra.measures import group_of
 from vipetsc.spectra.modal_energies import ModalParts
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.recorded_runs import Key, RecordedRuns
+from vipetsc.studies.response_objective import measured_responses
 
 SHARE = "band_share"
+Condition = tuple[float | None, int]  # an amplitude, or None for the frequency responses, and the number of the sample
 # The measures requested of ``analyse``, by the group of a measure.
 ANALYSED = {"entropy": "entropy", "transfer": "bands", "motion": "motion", "statistics": "statistics"}
 # Names in searches of measures that have another one in results.
@@ -45,47 +48,64 @@ class Judgement(NamedTuple):
 class ObjectiveRuns:
     """Computes ``recorded`` runs of designs in ``folder`` on the ranks of ``comm``, and judges designs by them.
 
-    The record of a run by the hash of its case: its ``values``, or why it failed (``reason``).
-    All ranks must construct one.
+    The record of a run, or of the frequency responses of a design, by the hash of its case: its ``values``, or why it
+    failed (``reason``). All ranks must construct one.
     """
 
     def __init__(self, plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:
         self.plan = plan
         self.recorded = RecordedRuns("optimum-runs", folder, comm, stop, plan.options.ranks).read()
 
-    def runs(self, design: Case) -> dict[tuple[float, int], Case]:
-        """The runs of a ``design`` by amplitude and number of the disorder's sample; raises CaseError."""
+    def runs(self, design: Case) -> dict[Condition, Case]:
+        """The runs of a ``design`` by amplitude and number of the disorder's sample, and its frequency responses.
+
+        Raises CaseError.
+        """
         # A dictionary names each amplitude once and keeps the order, which is the same on all ranks.
-        amplitudes: dict[float, None] = {}
-        for measured_table in self.plan.options.measured:
-            amplitudes |= dict.fromkeys(_amplitudes(measured_table, design))
-        pairs = itertools.product(amplitudes, range(self.plan.options.samples))
-        return {(amplitude, sample): self.plan.run(design, amplitude, sample) for amplitude, sample in pairs}
+        conditions: dict[float | None, None] = {}
+        for table in self.plan.options.measured:
+            conditions |= dict.fromkeys(_conditions(table, design))
+
+        runs: dict[Condition, Case] = {}
+        for condition, sample in itertools.product(conditions, range(self.plan.options.samples)):
+            if condition is None:
+                runs[condition, sample] = self.plan.responses(design, sample)
+            else:
+                runs[condition, sample] = self.plan.run(design, condition, sample)
+        return runs
 
     def make(self, runs: Iterable[Case]) -> None:
         """Simulate those ``runs`` that have no record; all ranks must call it. Raises StoppedError on all."""
         cases: dict[Key, Case] = {case_id(case): case for case in runs}
         # With failures: a design that fails is a bad one, and the search goes on.
-        self.recorded.make(cases, lambda name: {"values": self._measure(cases[name])}, failures=True)
+        self.recorded.make(cases, lambda name: self._record(cases[name]), failures=True)
 
-    def _measure(self, case: Case) -> dict[str, Any]:
-        """Values measured of a run, by its whole team."""
+    def _record(self, case: Case) -> Record:
+        """What is measured of a run, or of frequency responses, by its whole team."""
+        if isinstance(case, NfrcCase):
+            return measured_responses(case, self._tables(case), self.recorded.team, self.recorded.stop)
         data, result = self.recorded.run_in_memory(case)
-        tables = self.plan.options.measured
-        return on_root(self.recorded.team, lambda: measured(data, result.statistics, tables))
+        return {"values": on_root(self.recorded.team, lambda: measured(data, result.statistics, self._tables(case)))}
+
+    def _tables(self, case: Case) -> list[MeasuredTable]:
+        """The objectives and constraints that are measured of a run, or of the frequency responses, of a ``case``."""
+        is_of_responses = isinstance(case, NfrcCase)
+        return [table for table in self.plan.options.measured if table.is_of_responses == is_of_responses]
 
     def judge(self, design: Case) -> Judgement:
         """The judgement of a ``design`` whose runs are recorded."""
         options = self.plan.options
         constraints = options.constraint or []
-        records = {key: self.recorded.records[case_id(run)] for key, run in self.runs(design).items()}
-        for (amplitude, _), record in records.items():
-            reason = self._failure(record)
+        records: dict[Condition, Record] = {}
+        for (condition, sample), run in self.runs(design).items():
+            records[condition, sample] = self.recorded.records[case_id(run)]
+            reason = self._failure(run)
             if reason:
+                at = "" if condition is None else f"{condition:g} {self.plan.amplitude_unit}: "
                 return Judgement(
                     losses=[np.nan] * len(options.objective),
                     constraints=[np.nan] * len(constraints),
-                    reason=f"{amplitude:g} {self.plan.amplitude_unit}: {reason}",
+                    reason=at + reason,
                 )
 
         losses = []
@@ -106,13 +126,14 @@ class ObjectiveRuns:
             excess += constraint.excess(value)
         return Judgement(losses, bounded, excess)
 
-    def _failure(self, record: Record) -> str:
-        """The reason why a run cannot be used; empty if it can."""
+    def _failure(self, run: Case) -> str:
+        """The reason why a ``run`` that has a record cannot be used; empty if it can."""
+        record = self.recorded.records[case_id(run)]
         if "reason" in record:
             return str(record["reason"])
         values = record["values"]
-        for table in self.plan.options.measured:
-            if np.isnan(values[table.name]):
+        for table in self._tables(run):
+            if np.isnan(values[table.name]).any():
                 return "; ".join([f"{table.name} has no value", *values.get("warnings", [])])
         return ""
 
@@ -120,18 +141,24 @@ class ObjectiveRuns:
         """Values measured of a ``run`` that has a record; none of one that failed."""
         return dict(self.recorded.records[case_id(run)].get("values", {}))
 
+    def curves(self, responses: NfrcCase) -> list[dict[str, Any]]:
+        """The curves of frequency ``responses`` that have a record, as ``measured_responses`` returns them."""
+        return list(self.recorded.records[case_id(responses)].get("curves", []))
 
-def _amplitudes(table: MeasuredTable, design: Case) -> list[float]:
-    """Amplitudes at which a ``design`` is measured for an objective or a constraint, the ``table``."""
-    return table.amplitudes or [amplitude_of(design)]
+
+def _conditions(table: MeasuredTable, design: Case) -> list[float | None]:
+    """The amplitudes at which a ``design`` is measured for an objective or a constraint; None for responses."""
+    if table.is_of_responses:
+        return [None]
+    return [*table.amplitudes] or [amplitude_of(design)]
 
 
-def _means(table: MeasuredTable, design: Case, records: Mapping[tuple[float, int], Record]) -> list[float]:
-    """The mean over the samples at each amplitude of a measure; ``records`` by amplitude and sample."""
-    means = []
-    for amplitude in _amplitudes(table, design):
-        samples = [row["values"][table.name] for (at, _), row in records.items() if at == amplitude]
-        means.append(float(np.mean(samples)))
+def _means(table: MeasuredTable, design: Case, records: Mapping[Condition, Record]) -> list[float]:
+    """The mean over samples of a measure, at each amplitude or of each curve; ``records`` by condition and sample."""
+    means: list[float] = []
+    for condition in _conditions(table, design):
+        samples = [row["values"][table.name] for (at, _), row in records.items() if at == condition]
+        means += np.atleast_1d(np.mean(samples, axis=0)).tolist()
     return means
 
 
@@ -206,9 +233,11 @@ def _energy_beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray)
     """Energy in J of the cells beyond the site that is farthest from the drive.
 
     Springs between these cells count in full; the spring k at the boundary counts as k u_b (u_b - u_a)/2, u_b beyond
-    it.
+    it. NaN without a site.
     """
     chain = model.chain
+    if not chain.sites:
+        return np.nan
     sites = np.array(chain.sites)
     farthest = sites[np.argmax(np.abs(sites - model.drive_cell))]
     cells = np.arange(chain.cells)

@@ -33,6 +33,14 @@ LAYOUT = {
     "curve/upper_share_at_end": ("compared amplitude", "1", "energy of the bands above the driven one at the end"),
     "curve/transmitted": ("compared amplitude", "1", "energy beyond the last site at the end over the work"),
     "curve/dissipated": ("compared amplitude", "1", "dissipated energy over the work"),
+    "response/line": ("response/line", "1", "line of a frequency response of a compared design"),
+    "response/name": ("response/line", "1", "name of its curve, as that of the file that nfrc writes"),
+    "response/compared": ("response/line", "1", "name of the compared design"),
+    "response/point": ("response/point", "1", "point of a line, one line after the other"),
+    "response/of": ("response/point", "1", "line of a point, from 0"),
+    "response/parameter": ("response/point", "1", "parameter that varies along the curves, in its unit"),
+    "response/unstable": ("response/point", "1", "number of growing perturbations; -1: unknown"),
+    "response/value": ("response/point objective", "1", "what the objective measures; NaN for an objective of runs"),
     "curve/value": ("compared amplitude objective", "1", "measure of the objective"),
 }
 """Dimensions, unit and text of every variable, by its name."""

@@ -17,10 +17,18 @@ def search_designs(plan: OptimiseCase, work: Work) -> Outcome:
 
 
 def optimise_rows(plan: OptimiseCase, ranks: int) -> Rows:
-    """Number of designs, the variables, and the objectives."""
+    """Number of designs, the variables, the frequency responses that are measured, and the objectives."""
+    responses: Rows = []
+    if plan.options.measures_responses:
+        case = plan.responses(plan.base)
+        count = len(case.every_curve())
+        low, high = case.nfrc.range
+        curves = "1 curve" if count == 1 else f"{count} curves"
+        responses = [("responses", f"{curves} of each design over the {case.nfrc.over}, {low:g} to {high:g}")]
     variables = first_few([variable.name for variable in plan.variables()])
     return [
         ("optimise", f"{plan.options.budget} designs of {variables}"),
+        *responses,
         *(("objective", objective.describe(plan.amplitude_unit)) for objective in plan.options.objective),
         *(("constraint", constraint.describe(plan.amplitude_unit)) for constraint in plan.options.constraint or []),
     ]

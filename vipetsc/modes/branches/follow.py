@@ -63,13 +63,13 @@ def method_of(case: BranchCase) -> type[Method[Any]]:
 
 def follow_all(
     case: BranchCase,
-    folder: Path,
+    folder: Path | None,
     comm: MPI.Comm,
     resume: bool = False,
     listener: Listener | None = None,
     stop: StopRequest | None = None,
 ) -> list[Branch[Any]]:
-    """All branches of ``case``, written into ``folder``; rank r follows every size-th one, from r on.
+    """All branches of ``case``, written into ``folder`` if there is one; rank r follows every size-th one, from r on.
 
     Each branch is computed on one rank, so that its bits do not depend on the number of ranks, or on all ranks together
     where a lattice is shot without dense matrices. A branch that fails is written as far as it came, says why in its
@@ -99,12 +99,15 @@ def follow_all(
 
 
 class Follower:
-    """Follows the branches of a case into a folder, on the ranks ``comm``; ``about`` are attributes of the files."""
+    """Follows the branches of a case on the ranks ``comm``, into a folder or, without one, in memory alone.
+
+    ``about`` are attributes of the files.
+    """
 
     def __init__(
         self,
         case: BranchCase,
-        folder: Path,
+        folder: Path | None,
         about: dict[str, Any],
         listener: Listener | None = None,
         stop: StopRequest | None = None,
@@ -129,7 +132,7 @@ class Follower:
             self._save(branch, lambda: self._follow(branch, job))
         # The branch's file now holds the part below the start. That part's own files are removed only after it is
         # written: a kill leaves at least one of them.
-        if branch.points:
+        if branch.points and self.folder:
             for suffix in ("h5", "csv"):
                 part = self.folder / f"branch-{branch.name}-down.{suffix}"
                 on_root(self.comm, partial(part.unlink, missing_ok=True))
@@ -148,8 +151,10 @@ class Follower:
             self.write(branch)
 
     def write(self, branch: Branch[Any]) -> None:
-        """Write a branch; one that ranks follow together is written by one of them."""
-        on_root(self.comm, lambda: write_branch(branch, self.folder, self.about))
+        """Write a branch into the folder; one that ranks follow together is written by one of them."""
+        folder = self.folder
+        if folder:
+            on_root(self.comm, lambda: write_branch(branch, folder, self.about))
 
     def _follow(self, branch: Branch[Any], job: int) -> None:
         """Compute the points of a branch, then the quantities of the whole branch that its file holds as well."""
@@ -246,14 +251,17 @@ class Follower:
     def _begun(self, name: str) -> Branch[Any]:
         """The branch as it is in its file when results are resumed, else one without points."""
         fresh = self.method.new_branch(name)
-        path = self.folder / f"branch-{name}.h5"
+        folder = self.folder
+        if folder is None:
+            return fresh
+        path = folder / f"branch-{name}.h5"
         if self.resume and on_root(self.comm, path.exists):
             try:
                 # Read by one rank: the others must not find another file, or none.
                 stored = on_root(self.comm, lambda: read_branch(path))
                 branch = replace(stored, case=fresh.case, about=fresh.about, extra=fresh.extra)
                 # A branch that is complete is not computed again, and its table would stay away.
-                on_root(self.comm, lambda: restore_table(branch, self.folder))
+                on_root(self.comm, lambda: restore_table(branch, folder))
                 return branch
             except OSError as error:
                 logger.warning("vipetsc: warning: %s; computed again", error)

@@ -1,6 +1,6 @@
 """Files of curves of steady states."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -11,57 +11,7 @@ from vipetsc.modes.branches.kinds import stored_kinds
 from vipetsc.modes.branches.layout import Table
 from vipetsc.modes.branches.sweeps import ParameterSweep, swept, with_stable_folds
 from vipetsc.modes.response.state import Measures, Response
-
-
-class Stored(NamedTuple):
-    """A measure in a file: its dimensions after that of the points, its units and text."""
-
-    dimensions: str
-    units: str
-    text: str
-
-
-LAYOUT = {
-    "frequency": Stored("", "rad/s", "frequency"),
-    "amplitude": Stored(
-        "", "1", "amplitude: of a wave over the first site's clearance, of a force in N, of a wall in m"
-    ),
-    "largest": Stored("site", "m", "largest relative displacement"),
-    "share": Stored("way", "1", "outgoing or dissipated energy over the incident energy"),
-    "unstable": Stored("", "1", "number of growing perturbations (Hill's method); -1: unknown"),
-    "growth": Stored("", "1", "largest growth rate over the frequency; 0 if none, NaN if not found"),
-    "sideband": Stored("", "1", "frequency of the fastest growing perturbation over that of the drive; 1/2 at most"),
-    "closed": Stored("site", "1", "fraction of the time in contact"),
-    "episodes": Stored("", "1", "contact episodes per period"),
-    "truncation": Stored("", "1", "estimated size of the neglected harmonics over those included"),
-    "harmonics": Stored("site order", "m", "harmonics Z of w = Re sum Z exp(i k Om t), real part"),
-    "harmonics_imaginary": Stored("site order", "m", "harmonics of w, imaginary part"),
-}
-
-OUTPUTS = {
-    "parameter": Stored("", "", "value of the key that varies along the curve, see the attribute over"),
-    "peak_displacement": Stored("location", "m", "largest displacement"),
-    "peak_velocity": Stored("location", "m/s", "largest velocity"),
-    "peak_acceleration": Stored("location", "m/s2", "largest acceleration"),
-    "first_displacement": Stored("location", "m", "first harmonic of the displacement"),
-    "first_velocity": Stored("location", "m/s", "first harmonic of the velocity"),
-    "first_acceleration": Stored("location", "m/s2", "first harmonic of the acceleration"),
-    "lag": Stored("location", "degree", "phase of the first harmonic of the displacement behind the drive"),
-    "largest_elongation": Stored("spring", "m", "largest elongation of a spring that is not linear"),
-    "spring_harmonics": Stored("spring order", "m", "harmonics of the elongation, real part"),
-    "spring_harmonics_imaginary": Stored("spring order", "m", "harmonics of the elongation, imaginary part"),
-    "location_harmonics": Stored("location order", "m", "harmonics of the displacement, real part"),
-    "location_harmonics_imaginary": Stored("location order", "m", "harmonics of the displacement, imaginary part"),
-    "transmission": Stored("pair", "1", "rms velocity of the second location over that of the first"),
-    "steady_transmission": Stored("pair", "1", "first harmonic at the second location over that at the first"),
-    "largest_force": Stored("site", "N", "largest contact force"),
-    "first_force": Stored("site", "N", "first harmonic of the contact force"),
-    "force_lag": Stored("site", "degree", "phase of the first harmonic of the contact force behind the drive"),
-    "largest_wall_force": Stored("wall", "N", "largest force on the wall"),
-    "first_wall_force": Stored("wall", "N", "first harmonic of the force on the wall"),
-    "wall_force_lag": Stored("wall", "degree", "phase of the first harmonic of the force on the wall behind the drive"),
-}
-"""What ``[output]`` asks for, and a key that varies; a file has those that its case asked for."""
+from vipetsc.spectra.responses import LAYOUT, OUTPUTS, Stored
 
 
 def outputs_of(branch: Branch[Response]) -> dict[str, Stored]:

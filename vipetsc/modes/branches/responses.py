@@ -10,6 +10,7 @@ import numpy as np
 
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.response_measures import WALLS, WAYS
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
@@ -21,7 +22,6 @@ from vipetsc.modes.response.equations import FAILURES
 from vipetsc.modes.response.free_motions import states_near_free_motions
 from vipetsc.modes.response.isolated import CLOSED, ClosingSteps, over_amplitudes, places_of, unknown_states
 from vipetsc.modes.response.keyed_case import KeyedCase
-from vipetsc.modes.response.outputs import WALLS
 from vipetsc.modes.response.over_key import StatesOverKey
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
@@ -31,8 +31,6 @@ from vipetsc.spectra.measures import JOINT
 
 # Between the name of a curve and the number of an isolated one beside it.
 ISOLA = "-isola-"
-# Where energy goes that comes in.
-CHANNELS = "transmitted", "reflected", "upper", "lost"
 
 
 class ResponseMethod(Method[Response]):
@@ -156,7 +154,7 @@ def _axes(case: NfrcCase) -> Variables:
     axes = {
         "site": variable("site", np.array(chain.sites) + 1, "1", "cell of the site, counted from 1"),
         "order": variable("order", orders, "1", "harmonic"),
-        "way": variable("way", np.array(CHANNELS), "1", "destination of the energy"),
+        "way": variable("way", np.array(WAYS), "1", "destination of the energy"),
         "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
     }
     if not chain.cell.is_linear:

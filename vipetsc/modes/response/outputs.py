@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.response_measures import WALLS
 from vipetsc.lattice import Chain, ModalCompliance, WaveCompliance
 from vipetsc.modes.balance.harmonics import Episode, Stops
 from vipetsc.spectra.measures import QUANTITIES
@@ -19,7 +20,6 @@ from vipetsc.spectra.measures import QUANTITIES
 # Samples a harmonic of the period in which a largest value is looked for, and those of a contact episode.
 SAMPLES_A_HARMONIC = 16
 SAMPLES_AN_EPISODE = 129
-WALLS = "left", "right"
 
 
 class HarmonicMotion(NamedTuple):

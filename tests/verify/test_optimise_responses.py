@@ -1,0 +1,198 @@
+"""Searches by frequency responses: an absorber whose best values are known, and the files of a small search."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.conftest import assert_same_bits, datasets, with_sections
+from vipetsc.case import Case, CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.objective import ObjectiveTable
+from vipetsc.case.optimise import OptimiseCase
+from vipetsc.figures.optimum import compared_curves, convergence
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.parallel import StopRequest
+from vipetsc.spectra.responses import CurvePart, largest_response
+from vipetsc.studies.optimum_search import run_search
+from vipetsc.studies.response_objective import measured_responses
+
+PEAK = "response/peak_displacement/mass"
+RATIO = 0.05  # of the absorber's mass to that of the mass on a spring of 1 N/m
+BOUNDS = {"stiffness": {"log": [0.02, 0.1]}, "damping": {"log": [2e-3, 5e-2]}}
+TABLE: dict[str, Any] = {
+    "name": "absorber",
+    "lattice": {
+        "cells": 1,
+        "cell": {
+            "masses": [1.0, RATIO],
+            "springs": [
+                {"start": 1, "end": 1, "stiffness": 0.5, "next_cell": True},
+                {"start": 1, "end": 2, "stiffness": 0.06, "damping": 0.01},
+            ],
+        },
+    },
+    "contacts": {"law": "bilinear", "stiffness": 20.0, "sites": [1], "pair": [0, 1], "clearance": 40.0},
+    "drive": {"waveform": "harmonic", "amplitude": 1.0, "frequency": 1.0},
+    "time": {"end": 10.0},
+    "output": {"points": [{"name": "mass", "cell": 1}]},
+    "nfrc": {"source": "force", "over": "frequency", "range": [0.75, 1.2], "fixed": [1.0], "harmonics": 1},
+    "optimise": {
+        "budget": 5,
+        "population": 4,
+        "variables": {"lattice": {"cell": {"springs[2]": BOUNDS}}},
+        "objective": [{"measure": PEAK, "goal": "minimise"}],
+    },
+}
+
+
+def displacement(frequency: np.ndarray, stiffness: float, damping: float) -> np.ndarray:
+    """Amplitude of the mass under 1 N with an absorber, from the equations of motion of both."""
+    joined = stiffness + 1j * frequency * damping
+    absorber = joined - RATIO * frequency**2
+    return np.abs(absorber / ((1 - frequency**2 + joined) * absorber - joined**2))
+
+
+def absorber(stiffness: float, damping: float, **nfrc: Any) -> NfrcCase:
+    """The responses with an absorber of that stiffness in N/m and dashpot in N s/m."""
+    plan = OptimiseCase.from_table(with_sections(TABLE, {"nfrc": nfrc}))
+    return plan.responses(plan.design(np.array([stiffness, damping])))
+
+
+def measured(case: NfrcCase, **table: Any) -> list[float]:
+    """What an objective measures of every curve."""
+    objective = ObjectiveTable.model_validate({"measure": PEAK} | table)
+    return measured_responses(case, [objective], MPI.COMM_SELF, StopRequest())["values"][objective.name]
+
+
+def test_the_peak_is_least_at_the_absorber_of_den_hartog():
+    """Frequency 1/(1 + mu), damping (3 mu/(8 (1 + mu)^3))^(1/2): a peak of (1 + 2/mu)^(1/2), larger on all sides."""
+    frequency = 1 / (1 + RATIO)
+    damping = 2 * RATIO * np.sqrt(3 * RATIO / (8 * (1 + RATIO) ** 3))
+    (least,) = measured(absorber(RATIO * frequency**2, damping))
+    assert least == pytest.approx(np.sqrt(1 + 2 / RATIO), rel=2e-3)
+
+    for factor in (0.94, 1.06):
+        assert measured(absorber(factor * RATIO * frequency**2, damping))[0] > 1.02 * least
+        assert measured(absorber(RATIO * frequency**2, factor**3 * damping))[0] > 1.005 * least
+
+
+def test_peaks_and_gaps_are_those_of_the_equations_of_motion():
+    """The largest value, that of a part of the range, and widths below a level, of curves at two forces."""
+    case = absorber(0.045, 0.01, fixed=[1.0, 2.0], largest_step=0.05)
+    grid = np.linspace(0.75, 1.2, 200_001)
+    exact = displacement(grid, 0.045, 0.01)
+    assert measured(case) == pytest.approx([exact.max(), 2 * exact.max()], rel=1e-4)
+    inside = (grid >= 0.95) & (grid <= 1.02)
+    assert measured(case, part=[0.95, 1.02])[0] == pytest.approx(exact[inside].max(), rel=2e-3)
+
+    for level in (4.0, 6.5):
+        below = np.append(np.flatnonzero(np.diff((exact < level).astype(int))), len(grid) - 1)
+        edges = np.append(0, below)
+        widths = [grid[b] - grid[a] for a, b in itertools.pairwise(edges) if exact[(a + b) // 2] < level]
+        assert measured(case, below=level)[0] == pytest.approx(max(widths), rel=5e-3)
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory):
+    """A small search, its folder and its summary."""
+    folder = tmp_path_factory.mktemp("search")
+    plan = OptimiseCase.from_table(TABLE)
+    return plan, folder, run_search(plan, folder, MPI.COMM_SELF)
+
+
+def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
+    """The verb nfrc of best.toml gives the curve whose largest value the search has found, to the bit."""
+    _, folder, summary = searched
+    found = datasets(folder / "optimum.h5")
+    best = int(found["comparison/number"][1])
+    assert "5 designs, 5 frequency responses; 0 designs failed" in summary
+    assert found["value"][best, 0] == found["value"].min()
+
+    follow_all(NfrcCase.load(folder / "best.toml"), tmp_path, MPI.COMM_SELF)
+    (path,) = tmp_path.glob("branch-*.h5")
+    with open_netcdf(path, "branch") as file:
+        curve = file.load()
+    steps = np.linalg.norm(np.diff(curve["xi"].values, axis=0), axis=1)
+    values = curve["peak_displacement"].values[:, 0]
+    length = np.append(0.0, np.cumsum(steps))
+    whole = CurvePart(curve["frequency"].values, values, length, curve["kind"].values == 0)
+    assert largest_response([whole], 0.75, 1.2) == found["value"][best, 0]
+
+    # The file of the search has the same curve for its picture.
+    points = found["response/of"] == list(found["response/compared"]).index(b"best")
+    assert found["response/value"][points, 0].tolist() == values.tolist()
+    assert found["response/parameter"][points].tolist() == curve["frequency"].values.tolist()
+    assert Case.load(folder / "best.toml").lattice.cell.springs[1].damping == found["parameter"][best, 1]
+
+
+def test_an_interrupted_search_goes_on_to_the_same_bits(searched, tmp_path):
+    plan, folder, _ = searched
+    records = (folder / "optimum-runs.jsonl").read_bytes()
+    (tmp_path / "case.toml").write_bytes((folder / "case.toml").read_bytes())
+    (tmp_path / "optimum-runs-0.jsonl").write_bytes(records[: len(records) // 2])
+    run_search(plan, tmp_path, MPI.COMM_SELF, resume=True)
+    assert_same_bits(datasets(tmp_path / "optimum.h5"), datasets(folder / "optimum.h5"))
+    assert (tmp_path / "best.toml").read_text() == (folder / "best.toml").read_text()
+
+
+def test_the_pictures_of_responses_have_a_panel_for_them_alone(searched):
+    """Without runs there are neither energies nor fractions of the work to draw."""
+    _, folder, _ = searched
+    with open_netcdf(folder / "optimum.h5", "search") as file:
+        optimum = file.load()
+    (responses,) = compared_curves(optimum).axes
+    assert responses.get_ylabel() == "peak_displacement/mass (m)"
+    assert [text.get_text() for text in responses.get_legend().get_texts()] == ["case", "best"]
+    (objective,) = convergence(optimum).axes
+    assert objective.get_ylabel() == "peak_displacement/mass"
+
+
+def test_a_curve_that_ends_early_is_a_design_that_fails(tmp_path):
+    """Its reason is the sentence of the curve, and runs of the same search are measured all the same."""
+    table = with_sections(TABLE, {"nfrc": {"points": 5}, "time": {"end": 20.0}})
+    table["optimise"] |= {"budget": 2, "curve": [1.0]}
+    table["optimise"]["constraint"] = [{"measure": "peak_displacement/mass", "at_most": 100.0}]
+    summary = run_search(OptimiseCase.from_table(table), tmp_path, MPI.COMM_SELF)
+    found = datasets(tmp_path / "optimum.h5")
+    assert np.isnan(found["value"]).all()
+    assert b"points reached: increase nfrc.points" in found["reason"][0]
+    assert "2 designs, 2 runs, 2 frequency responses; 2 designs failed" in summary
+    assert np.isfinite(found["curve/dissipated"]).all()
+
+
+@pytest.mark.parametrize(
+    ("objective", "nfrc", "key", "sentence"),
+    [
+        ({"measure": "response/peak_velocity/mas"}, {}, "measure", "did you mean 'response/peak_velocity/mass'?"),
+        ({"measure": "response/largest_force"}, {}, "measure", "is no measure of these responses"),
+        ({"measure": PEAK}, None, "measure", "give their [nfrc]"),
+        ({"measure": PEAK, "amplitudes": [2.0]}, {}, "amplitudes", "are those of [nfrc]"),
+        ({"measure": PEAK, "part": [0.5, 1.0]}, {}, "part", "within nfrc.range, 0.75 to 1.2"),
+        ({"measure": PEAK, "band": 1}, {}, "band", "responses have no bands"),
+        ({"measure": "peak_velocity/mass", "below": 1.0}, {}, "below", "only measures of responses"),
+        ({"measure": PEAK}, {"over": "frequency", "fixed": []}, "", "give the amplitudes of the curves"),
+    ],
+)
+def test_what_is_wrong_with_a_measure_of_responses_is_named(objective, nfrc, key, sentence):
+    table = with_sections(TABLE, {"nfrc": nfrc or {}})
+    if nfrc is None:
+        del table["nfrc"]
+    table["optimise"]["objective"] = [objective]
+    with pytest.raises(CaseError) as raised:
+        OptimiseCase.from_table(table)
+    (problem,) = raised.value.problems
+    assert sentence in str(problem)
+    assert problem.key == (f"optimise.objective[1].{key}" if key else "nfrc.fixed")
+
+
+def test_responses_of_a_case_that_begins_in_motion_are_refused():
+    """The physics of steady states gives the reason, as for the verb nfrc."""
+    with pytest.raises(CaseError, match="whatever the motion at t = 0"):
+        OptimiseCase.from_table(TABLE | {"initial": {"kind": "mode", "number": 1, "amplitude": 1e-3}})

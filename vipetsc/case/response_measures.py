@@ -1,0 +1,54 @@
+"""Measures of whole frequency responses, for searches: their names, and what they are of."""
+
+from typing import NamedTuple
+
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.spectra.measures import JOINT
+from vipetsc.spectra.responses import LAYOUT, OUTPUTS
+
+RESPONSE = "response/"  # begins the names
+WAYS = ("transmitted", "reflected", "upper", "lost")
+WALLS = ("left", "right")
+OF_POINTS = tuple(f"{kind}_{of}" for kind in ("peak", "first") for of in ("displacement", "velocity", "acceleration"))
+
+
+class ResponseMeasure(NamedTuple):
+    """A quantity of the states of a curve: of the ``member`` (from 0) of its dimension, the largest of all without one.
+
+    ``quantity`` is the name in the curve's file, ``unit`` its unit there.
+    """
+
+    name: str
+    quantity: str
+    member: int | None
+    unit: str
+
+
+def response_measures(case: NfrcCase) -> dict[str, ResponseMeasure]:
+    """The measures, by name, of the curves of a ``case``: those of its sites, and of what ``[output]`` asks for."""
+    output = case.output
+    sites = [str(number) for number in range(1, len(case.model().chain.sites) + 1)]
+    members: dict[str, list[str]] = {}
+    if sites:
+        members |= {"largest": sites, "closed": sites}
+    if case.nfrc.infinite:
+        members["share"] = list(WAYS)
+    if output.points:
+        points = [point.name for point in output.points]
+        members |= dict.fromkeys(OF_POINTS, points)
+    if output.transmission:
+        pairs = [JOINT.join(pair) for pair in output.transmission]
+        members |= dict.fromkeys(("transmission", "steady_transmission"), pairs)
+    if output.forces:
+        members |= dict.fromkeys(("largest_force", "first_force"), sites)
+        if case.lattice.ends == "fixed" and not (case.nfrc.infinite or case.nfrc.open_ends):
+            members |= {quantity: list(WALLS) for quantity in ("largest_wall_force", "first_wall_force")}
+
+    measures: list[ResponseMeasure] = []
+    for quantity, names in members.items():
+        unit = (LAYOUT | OUTPUTS)[quantity].units
+        if names is sites:
+            measures.append(ResponseMeasure(f"{RESPONSE}{quantity}", quantity, None, unit))
+        for member, name in enumerate(names):
+            measures.append(ResponseMeasure(f"{RESPONSE}{quantity}/{name}", quantity, member, unit))
+    return {measure.name: measure for measure in measures}

@@ -1,0 +1,143 @@
+"""Curves of steady states: what their files hold, and the numbers that a whole curve has."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Stored(NamedTuple):
+    """A measure in a file: its dimensions after that of the points, its units and text."""
+
+    dimensions: str
+    units: str
+    text: str
+
+
+LAYOUT = {
+    "frequency": Stored("", "rad/s", "frequency"),
+    "amplitude": Stored(
+        "", "1", "amplitude: of a wave over the first site's clearance, of a force in N, of a wall in m"
+    ),
+    "largest": Stored("site", "m", "largest relative displacement"),
+    "share": Stored("way", "1", "outgoing or dissipated energy over the incident energy"),
+    "unstable": Stored("", "1", "number of growing perturbations (Hill's method); -1: unknown"),
+    "growth": Stored("", "1", "largest growth rate over the frequency; 0 if none, NaN if not found"),
+    "sideband": Stored("", "1", "frequency of the fastest growing perturbation over that of the drive; 1/2 at most"),
+    "closed": Stored("site", "1", "fraction of the time in contact"),
+    "episodes": Stored("", "1", "contact episodes per period"),
+    "truncation": Stored("", "1", "estimated size of the neglected harmonics over those included"),
+    "harmonics": Stored("site order", "m", "harmonics Z of w = Re sum Z exp(i k Om t), real part"),
+    "harmonics_imaginary": Stored("site order", "m", "harmonics of w, imaginary part"),
+}
+"""What every curve of steady states has."""
+
+OUTPUTS = {
+    "parameter": Stored("", "", "value of the key that varies along the curve, see the attribute over"),
+    "peak_displacement": Stored("location", "m", "largest displacement"),
+    "peak_velocity": Stored("location", "m/s", "largest velocity"),
+    "peak_acceleration": Stored("location", "m/s2", "largest acceleration"),
+    "first_displacement": Stored("location", "m", "first harmonic of the displacement"),
+    "first_velocity": Stored("location", "m/s", "first harmonic of the velocity"),
+    "first_acceleration": Stored("location", "m/s2", "first harmonic of the acceleration"),
+    "lag": Stored("location", "degree", "phase of the first harmonic of the displacement behind the drive"),
+    "largest_elongation": Stored("spring", "m", "largest elongation of a spring that is not linear"),
+    "spring_harmonics": Stored("spring order", "m", "harmonics of the elongation, real part"),
+    "spring_harmonics_imaginary": Stored("spring order", "m", "harmonics of the elongation, imaginary part"),
+    "location_harmonics": Stored("location order", "m", "harmonics of the displacement, real part"),
+    "location_harmonics_imaginary": Stored("location order", "m", "harmonics of the displacement, imaginary part"),
+    "transmission": Stored("pair", "1", "rms velocity of the second location over that of the first"),
+    "steady_transmission": Stored("pair", "1", "first harmonic at the second location over that at the first"),
+    "largest_force": Stored("site", "N", "largest contact force"),
+    "first_force": Stored("site", "N", "first harmonic of the contact force"),
+    "force_lag": Stored("site", "degree", "phase of the first harmonic of the contact force behind the drive"),
+    "largest_wall_force": Stored("wall", "N", "largest force on the wall"),
+    "first_wall_force": Stored("wall", "N", "first harmonic of the force on the wall"),
+    "wall_force_lag": Stored("wall", "degree", "phase of the first harmonic of the force on the wall behind the drive"),
+}
+"""What ``[output]`` asks for, and a key that varies; a file has those that its case asked for."""
+
+
+class CurvePart(NamedTuple):
+    """A part of a curve (point,): the ``parameter`` that varies, the ``values`` of a response, the ``length`` along it.
+
+    ``is_regular`` are points of the continuation itself, whose distances vary slowly.
+    """
+
+    parameter: np.ndarray
+    values: np.ndarray
+    length: np.ndarray
+    is_regular: np.ndarray
+
+
+# Between points whose distances differ by more a parabola may overshoot.
+UNEVEN = 4.0
+
+
+def largest_response(parts: list[CurvePart], low: float, high: float) -> float:
+    """The largest value at parameters from ``low`` to ``high`` of all ``parts`` of a curve; NaN if none lies there.
+
+    Between points it is that of the parabola over the length through the largest value and its two neighbours.
+    """
+    largest = -np.inf
+    for part in parts:
+        inside = (part.parameter >= low) & (part.parameter <= high)
+        largest = max(largest, part.values[inside].max(initial=-np.inf), *_at_ends(part, low, high))
+
+        regular = part.is_regular & inside
+        s = part.length[regular]
+        y = part.values[regular]
+        if len(y) > 2:
+            middle = int(np.argmax(y[1:-1])) + 1
+            largest = max(largest, _vertex(s[middle - 1 : middle + 2], y[middle - 1 : middle + 2]))
+    return float(largest) if np.isfinite(largest) else np.nan
+
+
+def _at_ends(part: CurvePart, low: float, high: float) -> list[float]:
+    """Values where a curve passes the ends of a range, linear between points; and -inf, for a part that passes none."""
+    values = [-np.inf]
+    for end in (low, high):
+        beyond = part.parameter - end
+        for i in np.flatnonzero(beyond[:-1] * beyond[1:] < 0):
+            fraction = beyond[i] / (beyond[i] - beyond[i + 1])
+            values.append(float(part.values[i] + fraction * (part.values[i + 1] - part.values[i])))
+    return values
+
+
+def _vertex(s: np.ndarray, y: np.ndarray) -> float:
+    """The largest value of the parabola through three points, of which the middle one is the largest; or its value."""
+    before, after = np.diff(s)
+    if not (y[1] >= y[0] and y[1] >= y[2] and 0 < max(before, after) < UNEVEN * min(before, after)):
+        return float(y[1])
+    rise = (y[1] - y[0]) / before
+    fall = (y[2] - y[1]) / after
+    bend = (fall - rise) / (before + after)
+    if bend == 0:
+        return float(y[1])
+    slope = rise + bend * before
+    return float(y[1] - slope**2 / (4 * bend))
+
+
+def widest_gap(parts: list[CurvePart], level: float, low: float, high: float) -> float:
+    """The width of the widest range of the parameter, from ``low`` to ``high``, in which responses are below a level.
+
+    Between points responses are linear. Where a curve has several states, the largest one counts.
+    """
+    above: list[tuple[float, float]] = []
+    for part in parts:
+        for i in range(len(part.values) - 1):
+            ends = part.parameter[i : i + 2]
+            excess = part.values[i : i + 2] - level
+            if max(excess) < 0:
+                continue
+            if min(excess) < 0:
+                crossing = ends[0] + (ends[1] - ends[0]) * excess[0] / (excess[0] - excess[1])
+                ends = np.array([ends[int(np.argmax(excess))], crossing])
+            above.append((float(min(ends)), float(max(ends))))
+
+    # What is left between the intervals in which some state is above the level.
+    widest = 0.0
+    reached = low
+    for begin, end in sorted(above):
+        widest = max(widest, min(begin, high) - reached)
+        reached = max(reached, end)
+    return max(widest, high - reached)

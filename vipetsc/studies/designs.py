@@ -1,0 +1,120 @@
+"""The designs that a search has tried, and the exchange with the sampler that asks for more."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vipetsc.case import Case, CaseError, case_id
+from vipetsc.case.optimise import OptimiseCase
+from vipetsc.studies.objective import ObjectiveRuns
+from vipetsc.studies.sampler import Sampler, front, knee
+
+
+@dataclass
+class Design:
+    """A design that was tried: its ``values`` (variable) and its results.
+
+    ``case`` and ``runs`` are None and empty for an impossible one; ``losses`` (objective) are small for a good one, NaN
+    if it failed for a ``reason``. ``constraints`` are the values of what is bounded, ``excess`` is by how much they are
+    out of bounds.
+    """
+
+    values: np.ndarray
+    generation: int
+    case: Case | None = None
+    runs: Sequence[Case] = ()
+    reason: str = ""
+    losses: list[float] = field(default_factory=list)
+    constraints: list[float] = field(default_factory=list)
+    excess: float = 0.0
+
+
+class OptimumSearch:
+    """The ``designs`` tried so far, on one rank; 0 is the case to begin with, 1 the start if that differs.
+
+    ``asked`` are those that are not judged yet, by ``objective``, the runs of all designs.
+    """
+
+    def __init__(self, plan: OptimiseCase, objective: ObjectiveRuns, sampler: Sampler, start: np.ndarray) -> None:
+        self.plan = plan
+        self.objective = objective
+        self.sampler = sampler
+        self.designs = [Design(plan.begin(), 0, plan.base, [*objective.runs(plan.base).values()])]
+        first = self._design(start, 0)
+        if first.case is None or case_id(first.case) != case_id(plan.base):
+            self.designs.append(first)
+        self.asked = self.designs
+
+    def _design(self, values: np.ndarray, generation: int) -> Design:
+        try:
+            case = self.plan.design(values)
+            return Design(values, generation, case, [*self.objective.runs(case).values()])
+        except CaseError as error:
+            return Design(values, generation, reason="; ".join(map(str, error.problems)))
+
+    def runs(self) -> list[Case]:
+        """The runs of the designs that are not judged yet."""
+        return [run for design in self.asked for run in design.runs]
+
+    def tell_and_ask(self) -> bool:
+        """Judge the designs whose runs are recorded, report to the sampler, and ask for more; whether there are any."""
+        for design in self.asked:
+            options = self.plan.options
+            design.losses = [np.nan] * len(options.objective)
+            design.constraints = [np.nan] * len(options.constraint or [])
+            if design.case:
+                judgement = self.objective.judge(design.case)
+                design.losses = judgement.losses
+                design.constraints = judgement.constraints
+                design.excess = judgement.excess
+                design.reason = judgement.reason
+
+        left = self.plan.options.budget - len(self.designs)
+        if left <= 0:
+            return False
+
+        generation = self.asked[0].generation
+        if generation:  # generation 0 is the case and the start, which the sampler did not ask for
+            self._tell()
+        points = self.sampler.ask()[:left]
+        self.asked = [self._design(self.plan.space.from_unit(point), generation + 1) for point in points]
+        self.designs += self.asked
+        return True
+
+    def _tell(self) -> None:
+        """Give the sampler the losses of the designs that it asked for.
+
+        One that misses a constraint is worse than all that miss none, the more so the more it misses (Deb 2000, Comput.
+        Methods Appl. Mech. Eng. 186, 311); one that failed is worse than all others.
+        """
+        judged = self.feasible_losses()
+        worst = np.max(judged, axis=0, initial=0.0, where=np.isfinite(judged)) + 1
+        most = max(design.excess for design in self.designs)
+        losses = []
+        for design in self.asked:
+            row = np.array(design.losses)
+            if design.excess > 0:
+                row = worst + design.excess
+            losses.append(np.where(np.isfinite(row), row, worst + most))
+        self.sampler.tell(np.array(losses))
+
+    def losses(self) -> np.ndarray:
+        """Losses of all designs (design, objective)."""
+        return np.array([design.losses for design in self.designs])
+
+    def feasible_losses(self) -> np.ndarray:
+        """Losses of all designs (design, objective), NaN for those that miss a constraint."""
+        is_feasible = np.array([design.excess == 0 for design in self.designs])
+        return np.where(is_feasible[:, None], self.losses(), np.nan)
+
+    def compared(self) -> dict[str, int]:
+        """The numbers of the designs to be compared by name: the case, and the best or the front's ends and knee."""
+        losses = self.feasible_losses()
+        best = front(losses)
+        if not best.size:
+            return {"case": 0}
+        if losses.shape[1] == 1:
+            return {"case": 0, "best": int(best[0])}
+        middle = int(best[knee(losses[best])])
+        return {"case": 0, "best-1": int(best[0]), "best": middle, "best-2": int(best[-1])}
