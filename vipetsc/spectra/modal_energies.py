@@ -7,8 +7,9 @@ from typing import Any, Self
 import numpy as np
 
 from vipetsc.lattice import Chain, Drive, Waveform, pass_bands
-from vipetsc.lattice.modes import Modes, linear_modes
+from vipetsc.lattice.modes import Modes
 from vipetsc.spectra.band_energies import Parts
+from vipetsc.spectra.kept_modes import kept_modes
 from vipetsc.spectra.pooling import blocks
 from vipetsc.spectra.wavelet import BINS
 
@@ -32,7 +33,7 @@ class ModalParts:
     @classmethod
     def of(cls, chain: Chain) -> Self:
         """The modes of ``chain`` without its sites, sorted; they are computed once."""
-        modes = linear_modes(chain)
+        modes = kept_modes(chain)
         parts = Parts.of(pass_bands(chain.cell))
         is_band = np.array([bool(numbers) for numbers in parts.bands])
 

@@ -1,0 +1,83 @@
+"""Arrays that take long to compute and follow from little, kept between runs in the user's cache.
+
+The folder is ``vipetsc`` in ``$XDG_CACHE_HOME``, by default in ``~/.cache``. A file is named by a hash of what its
+arrays follow from. Several processes may read and write there at once: files are complete or absent, and what cannot be
+read is computed.
+"""
+
+import hashlib
+import os
+import platform
+import zlib
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import scipy
+
+import vipetsc
+from vipetsc.io.atomic import Arrays, remove_abandoned, save_arrays
+
+LARGEST = 2**28  # bytes of all files together; those that were not used for the longest time go first
+CHECKSUM = "checksum"
+
+
+def kept_arrays(kind: str, content: Iterable[bytes], compute: Callable[[], Arrays]) -> dict[str, np.ndarray]:
+    """The arrays that ``compute`` gives, from an earlier call with the same ``content`` if they are still kept.
+
+    ``kind`` names what they are. They are not taken over from other hosts and other versions of this package, numpy and
+    SciPy, whose last digits may differ. A cache that cannot be read or written is no error.
+    """
+    versions = f"{kind} {vipetsc.__version__} {np.__version__} {scipy.__version__} {platform.node()}"
+    digest = hashlib.sha256(versions.encode())
+    for part in content:
+        digest.update(hashlib.sha256(part).digest())
+
+    path = cache_folder() / f"{kind}-{digest.hexdigest()[:32]}.npy"
+    arrays = _read(path)
+    if arrays is None:
+        arrays = dict(compute())
+        with suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_arrays(path, arrays | {CHECKSUM: _checksum(arrays)})
+            remove_abandoned(path.parent)
+            _remove_oldest(path.parent)
+    return arrays
+
+
+def cache_folder() -> Path:
+    """The folder of the user's cache, which need not exist."""
+    # The standard ignores a path that is not absolute.
+    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    parent = named if named.is_absolute() else Path(os.path.expanduser("~/.cache"))
+    return parent / "vipetsc"
+
+
+def _read(path: Path) -> dict[str, np.ndarray] | None:
+    """The arrays in a file, of which this notes that they are used; None if it is absent or damaged."""
+    try:
+        # Read rather than mapped: another process may remove the file meanwhile.
+        record = np.load(path)
+        arrays = {name: record[name] for name in record.dtype.names or ()}
+        os.utime(path)
+        checksum = arrays.pop(CHECKSUM)
+    # A damaged header gives numpy's ValueError, EOFError or SyntaxError, a lost name KeyError.
+    except (OSError, ValueError, EOFError, SyntaxError, KeyError):
+        return None
+    return arrays if np.array_equal(checksum, _checksum(arrays)) else None
+
+
+def _checksum(arrays: Arrays) -> np.ndarray:
+    """The checksums of ``arrays`` (array)."""
+    return np.array([zlib.crc32(np.ascontiguousarray(values).data) for values in arrays.values()])
+
+
+def _remove_oldest(folder: Path) -> None:
+    """Remove the files that were not used for the longest time until the others take ``LARGEST`` bytes at most."""
+    total = 0
+    entries = [(path, path.stat()) for path in folder.glob("*.npy")]
+    for path, status in sorted(entries, key=lambda entry: entry[1].st_mtime, reverse=True):
+        total += status.st_size
+        if total > LARGEST:
+            path.unlink(missing_ok=True)
