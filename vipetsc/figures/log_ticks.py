@@ -1,19 +1,18 @@
 """Labels of logarithmic axes: three or more on each, at round numbers that have room."""
 
-import re
 from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogFormatter, LogLocator, MaxNLocator, NullFormatter
 
 LEAST_TICKS = 3
 MOST_TICKS = 8
 LETTER = 0.062  # inches of a letter of a tick's label
 LINE = 0.14  # inches of its height
 PLAIN = 1e-3, 1e4  # numbers that need no power of ten
-MARKUP = re.compile(r"[${}^]|\\cdot")
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 PART = 0.8  # of the room of axes before they are laid out, that is left for what they show
 
 
@@ -33,9 +32,18 @@ def tick_text(value: float) -> str:
     low, high = PLAIN
     if low <= abs(value) < high:
         return f"{value:.4g}"
+    return power_text(value)
+
+
+def power_text(value: float) -> str:
+    """Return a number that is not 0 with a power of ten: 10⁻³, 2·10⁵.
+
+    These are letters of the font: to typeset formulas for them takes longer than all else in the layout of a picture.
+    """
     exponent = int(np.floor(np.log10(abs(value)) + 1e-9))
     factor = f"{value / 10.0**exponent:.3g}"
-    return f"$10^{{{exponent}}}$" if factor == "1" else rf"${factor}\cdot 10^{{{exponent}}}$"
+    power = f"10{str(exponent).translate(RAISED)}"
+    return power if factor == "1" else f"{factor}·{power}"
 
 
 def has_room(positions: np.ndarray, texts: Sequence[str], length: float, is_horizontal: bool) -> bool:
@@ -58,7 +66,7 @@ def label_log_axis(axis: Axis, low: float, high: float, length: float) -> None:
     without_label = set(ticks)
     is_horizontal = axis.axis_name == "x"
     while len(ticks) > LEAST_TICKS:
-        texts = [MARKUP.sub("", tick_text(tick)) for tick in ticks]
+        texts = [tick_text(tick) for tick in ticks]
         if has_room(np.log(ticks), texts, length * np.log(ticks[-1] / ticks[0]) / np.log(high / low), is_horizontal):
             break
         ticks = ticks[::2] if len(ticks) >= 2 * LEAST_TICKS - 1 else [ticks[0], ticks[len(ticks) // 2], ticks[-1]]
@@ -70,7 +78,7 @@ def label_log_axis(axis: Axis, low: float, high: float, length: float) -> None:
 
 
 def label_log_axes(figure: Figure) -> None:
-    """Label the logarithmic axes of ``figure`` on which fewer than three powers of ten lie; thin out the minor ticks.
+    """Label the logarithmic axes of ``figure``, with powers of ten where three or more of these lie on an axis.
 
     Eight minor ticks a decade would be most of what a page of panels costs to draw: two stay.
     """
@@ -83,6 +91,9 @@ def label_log_axes(figure: Figure) -> None:
                 minor.set_params(subs=(2.0, 5.0))
             if axis.get_scale() != "log" or isinstance(axis.get_major_formatter(), NullFormatter):
                 continue
+            if isinstance(axis.get_major_formatter(), LogFormatter):
+                axis.set_major_formatter(FuncFormatter(lambda value, _: power_text(value)))
+
             low, high = sorted(axis.get_view_interval())
             ticks = np.asarray(axis.get_majorticklocs())
             # Those that a figure has set are its own affair.
