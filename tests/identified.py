@@ -20,7 +20,7 @@ def lattice_table(**sections: dict[str, Any]) -> dict[str, Any]:
         "lattice": {"preset": "four-band", "cells": 6},
         "contacts": {"sites": [2, 3, 5], "clearance": [5e-4, 4e-4, 3e-4], "restitution": 0.7},
         "drive": {"cycles": 4, "amplitude": 60.0},
-        "time": {"end": 0.02, "sample_interval": 2.5e-4, "engine": "propagator", "rtol": 1e-12},
+        "time": {"end": 0.02, "sample_interval": 2.5e-4, "engine": "propagator", "rtol": 1e-9},
         "output": {"points": POINTS},
     }
     return with_sections(table, sections)
