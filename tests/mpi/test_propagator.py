@@ -34,12 +34,15 @@ def test_same_bits_where_the_band_is_wider_than_a_rank(folder):
     runs_alike(folder, case)
 
 
-@pytest.mark.parallel(2)
-def test_same_bits_with_dashpots(folder):
+@pytest.mark.parallel([2, 3])
+@pytest.mark.parametrize("disorder", [*on_two({}), {"seed": 2, "cells": {"masses[1]": {"relative": 0.02}}}])
+def test_same_bits_with_dashpots(folder, disorder):
+    """Energies of dashpots, too: of uniform cells 8 and more a rank, and of cells that all differ."""
     damping = {"mass": 10.0, "stiffness": 5e-6}
-    sites = [1, 7, 12, 13, 16, 17]
-    time = {"end": 0.02, "engine": "propagator"}
-    runs_alike(folder, small_case(lattice={"damping": damping}, contacts={"sites": sites}, time=time))
+    sections = {"lattice": {"cells": 60, "damping": damping}, "time": {"end": 0.02, "engine": "propagator"}}
+    if disorder:
+        sections["disorder"] = disorder
+    runs_alike(folder, small_case(contacts={"sites": [1, 7, 20, 21, 30, 31, 41]}, **sections))
 
 
 @pytest.mark.parallel([2, 3])

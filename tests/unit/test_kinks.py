@@ -10,6 +10,7 @@ from vipetsc.contact.law import CLOSED
 from vipetsc.contact.search import MOST_ATTEMPTS
 from vipetsc.dynamics.propagator import advance
 from vipetsc.dynamics.propagator.advance import CUT, DONE, SHORTEST, advance_cluster, first_kink
+from vipetsc.dynamics.propagator.loss_tables import no_losses
 from vipetsc.dynamics.propagator.nodes import EXIT
 from vipetsc.dynamics.propagator.substeps import Substep
 
@@ -76,7 +77,8 @@ def test_substeps_end_where_a_pressed_contact_opens_and_closes(side):
     cluster.taylor[0, 1] = -side * speed * interval
     cluster.state["length"] = 1.0
 
-    assert advance_cluster(cluster, may_rest=False) == (DONE, -1)
+    _, losses = no_losses(dofs=1, clusters=1)
+    assert advance_cluster(cluster, losses, may_rest=False) == (DONE, -1)
 
     # The phase at which it opens, the time in the air, and the rest of the step on the stop again.
     opening = np.arcsin(depth * RATE / speed) / RATE

@@ -59,7 +59,7 @@ def test_rates_and_energies_are_those_of_the_equations(ends, has_dashpots):
     u[SITE - 1, resonator] = 1e-5
     lost = 1e-3 * rng.uniform(size=CELLS * has_dashpots)
 
-    layout = Layout(model, MPI.COMM_SELF, Integrator.dashpots)
+    layout = Layout(model, MPI.COMM_SELF, dashpots=True)
     engine = Integrator(model, layout)
     sites = engine.lattice.contacts
     sites["mode"][0] = CLOSED

@@ -137,8 +137,7 @@ def add_energy(sums: np.ndarray, energy: float, unit: float) -> None:
 class Energies:
     """Energies in J of samples, arrays (sample,): kinetic, spring and contact energy, work of the drives, dissipated.
 
-    The work begins with the energy of the initial state. ``dissipated`` is that of contacts; that of dashpots is
-    ``balanced`` where it is computed as the remainder of the other energies: the residual then has no meaning.
+    The work begins with the energy of the initial state. ``dissipated`` is that of contacts.
     """
 
     kinetic: np.ndarray
@@ -147,7 +146,6 @@ class Energies:
     work: np.ndarray
     dissipated: np.ndarray
     dissipated_by_damping: np.ndarray
-    balanced: bool = False
 
     @property
     def total(self) -> np.ndarray:
@@ -156,8 +154,8 @@ class Energies:
 
     @property
     def residual(self) -> np.ndarray:
-        """Work - dissipated - total: zero for an exact solution; NaN where dashpots are ``balanced``."""
-        return self.work - self.dissipated - self.dissipated_by_damping - self.total + (np.nan if self.balanced else 0)
+        """Work - dissipated - total: zero for an exact solution."""
+        return self.work - self.dissipated - self.dissipated_by_damping - self.total
 
 
 class EnergyMeter:
@@ -170,7 +168,6 @@ class EnergyMeter:
     def __init__(self, model: Model, layout: Layout) -> None:
         self.comm = layout.comm
         self.lattice = create_record(model, layout)
-        self._balanced = model.chain.is_damped and not layout.damped
 
         speed = model.scale * model.drive.frequency
         # Cells that the packet covers; of an initial state, perhaps all.
@@ -196,7 +193,4 @@ class EnergyMeter:
 
         whole, fine, works = np.split(total, [ENERGY_SUMS, 2 * ENERGY_SUMS])
         kinetic, spring, contact, dissipated, damping = whole * self.unit + fine * (self.unit / _FINE)
-        work = works.sum(axis=0)
-        if self._balanced:
-            damping = work - dissipated - (kinetic + spring + contact)
-        return Energies(kinetic, spring, contact, work, dissipated, damping, self._balanced)
+        return Energies(kinetic, spring, contact, works.sum(axis=0), dissipated, damping)

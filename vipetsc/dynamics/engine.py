@@ -33,7 +33,6 @@ class Engine(ABC):
     """
 
     name: ClassVar[str]
-    dashpots: ClassVar[bool] = False  # whether what they dissipate is integrated, as ``Layout`` says
     opens: ClassVar[bool] = False  # whether a run may ``open`` with samples of another one
     state: PETSc.Vec
     time: float

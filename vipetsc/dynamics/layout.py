@@ -1,8 +1,8 @@
 """The partition of cells over ranks, the order of a rank's part of the state, and its ghosts.
 
 A rank's part of the state holds, one after another: displacements by mass (all owned cells of mass 1, then of
-mass 2, ...), velocities likewise, then its ledger components (where an engine integrates it, what the dashpots of each
-owned cell have dissipated; work of each drive whose cell it owns; dissipated energy of each owned site). Behind
+mass 2, ...), velocities likewise, then its ledger components (what the dashpots of each owned cell have dissipated, if
+there are any; work of each drive whose cell it owns; dissipated energy of each owned site). Behind
 them lie the ghosts: displacements of the neighbouring cell on the left, with velocities where there are dashpots to
 integrate or contacts with the next cell, then on the right. Mass by mass keeps every inner loop contiguous.
 """
@@ -30,8 +30,8 @@ class Layout:
     and ``offsets`` are the cells and the first state component of every rank. This rank's part of the state has
     ``size`` components; the component of the first owned site's dissipated energy is ``dissipated``. ``sites`` are the
     numbers of the owned sites, ``contacts`` of all sites that act on its masses. A cell has ``rows`` components, and
-    ``ghost_rows`` as a ghost. With ``dashpots``, for an engine that integrates their dissipation, a damped lattice has
-    one more component a cell, and velocities in the ghosts.
+    ``ghost_rows`` as a ghost. With ``dashpots``, where their dissipation is wanted, a damped lattice has one more
+    component a cell, and velocities in the ghosts.
     """
 
     def __init__(self, model: Model, comm: MPI.Comm, dashpots: bool = False) -> None:
@@ -104,27 +104,33 @@ class Layout:
         return y[: 2 * self.dofs * self.owned].reshape(2 * self.dofs, self.owned).T.copy()
 
     def checkpoint(self, y: np.ndarray) -> dict[str, np.ndarray]:
-        """The part ``y`` of the state in natural order: ``cells`` (cell, rows), and the ledger."""
-        cells = y[: self.rows * self.owned].reshape(self.rows, self.owned).T.copy()
+        """The part ``y`` of the state in natural order: ``cells`` (cell, 2 dofs), ``dashpots`` (cell,), and the ledger.
+
+        ``dashpots`` in J is empty where their dissipation is not integrated.
+        """
+        dashpots = y[2 * self.dofs * self.owned : self.rows * self.owned].copy()
         ledger = np.zeros(len(self.drives) + len(self.sites), LEDGER)
         ledger["number"] = (*self.drives, *self.sites)
         ledger["energy"] = y[self.rows * self.owned : self.size]
         works, losses = np.split(ledger, [len(self.drives)])
-        return {"cells": cells, "work": works, "losses": losses}
+        return {"cells": self.motion(y), "dashpots": dashpots, "work": works, "losses": losses}
 
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]], y: np.ndarray) -> None:
         """Fill this rank's part ``y`` of the state from the checkpoints of all ranks that wrote one.
 
         Sites that these do not name have dissipated nothing.
         """
-        motion = y[: self.rows * self.owned].reshape(self.rows, self.owned)
+        rows = y[: self.rows * self.owned].reshape(self.rows, self.owned)
         at = 0
         for checkpoint in checkpoints:  # one after the other: no rank holds all cells
             cells = checkpoint["cells"]
             first = max(self.start, at)
             stop = min(self.stop, at + len(cells))
             if first < stop:
-                motion[:, first - self.start : stop - self.start] = cells[first - at : stop - at].T
+                part = rows[:, first - self.start : stop - self.start]
+                part[: 2 * self.dofs] = cells[first - at : stop - at].T
+                if self.damped:
+                    part[2 * self.dofs] = checkpoint["dashpots"][first - at : stop - at]
             at += len(cells)
 
         tables = join(checkpoints, {"work": "number", "losses": "number"})

@@ -59,12 +59,13 @@ def _bytes_of_states(model: Model, engine: str, ranks: int) -> float:
     chain = model.chain
     cell = model.chain.cell
     owned = -(-chain.cells // ranks)
-    per_cell = 2 * cell.dofs + (engine == "ts" and chain.is_damped)
+    per_cell = 2 * cell.dofs + chain.is_damped
     tables = 0 if chain.is_uniform() and not chain.is_damped else 2 * (cell.dofs + len(cell.springs))
     states = 2 * STAGES[model.method] + STATES_BESIDE_STAGES if engine == "ts" else PROPAGATOR_STATES
     differing = sum(array.nbytes for _, array in chain.variation.items()) if chain.variation else 0
     if engine == "propagator" and differing and (series := step_series(model)):
-        numbers = (2 * cell.dofs) ** 2 * (2 * series.reach + 1)
+        # Rows of the step, and with dashpots of the losses in it.
+        numbers = (2 * cell.dofs) ** 2 * (2 * series.reach + 1) * (1 + chain.is_damped)
         differing += 8 * numbers * series.own_rows()[1] // ranks
     return (states * per_cell + 2 * tables) * 8 * owned + differing
 

@@ -129,7 +129,7 @@ class Guard(Observer):
 
 
 class Ledger(Observer):
-    """Keeps the largest residual in J of the energy balance; NaN where the dashpots' energy is its remainder."""
+    """Keeps the largest residual in J of the energy balance."""
 
     name = "ledger"
     saved = ("worst", "most_work", "work", "dissipated", "dissipated_by_damping")
@@ -141,14 +141,13 @@ class Ledger(Observer):
         self.work = float(energies.work[-1])
         self.dissipated = float(energies.dissipated[-1])
         self.dissipated_by_damping = float(energies.dissipated_by_damping[-1])
-        # ``np.maximum`` keeps a NaN, which ``max`` would lose.
-        self.worst = float(np.maximum(self.worst, np.abs(energies.residual).max()))
+        self.worst = max(self.worst, float(np.abs(energies.residual).max()))
         self.most_work = max(self.most_work, float(np.abs(energies.work).max()))
 
     def statistics(self) -> dict[str, Any]:
         """``ledger_error``: largest residual over the largest work; ``work`` and ``dissipated`` in J at the end."""
         error = self.worst / self.most_work if self.most_work else 0.0
-        numbers = {"ledger_error": None if np.isnan(error) else error}
+        numbers = {"ledger_error": error}
         if np.isnan(self.work):
             return numbers
         numbers |= {"work": self.work, "dissipated": self.dissipated}
@@ -161,7 +160,7 @@ class Ledger(Observer):
         error = self.statistics()["ledger_error"]
         rtol = self.setup.model.rtol
         bound = min(max(LEDGER_PER_RTOL * rtol, LEAST_LEDGER), MOST_LEDGER)
-        if error is None or error <= bound:
+        if error <= bound:
             return []
         missing = f"the error of the energy balance is {error:.2g} of the work, above {bound:.2g}"
         return [f"{missing}: the trajectory is no more accurate than that; reduce time.rtol = {rtol:g}"]

@@ -24,7 +24,7 @@ from vipetsc.io.store import GATHER_LIMIT
 # A chunk is at most this many samples, and at most this many bytes of fields on a rank.
 CHUNK_SAMPLES = 256
 CHUNK_BYTES = 64 * 2**20
-ENERGIES = {field.name: f"energy/{field.name}" for field in fields(Energies) if field.name != "balanced"}
+ENERGIES = {field.name: f"energy/{field.name}" for field in fields(Energies)}
 
 
 def recorded_cells(output: OutputTable, cells: int) -> range:

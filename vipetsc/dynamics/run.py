@@ -219,7 +219,7 @@ class Simulation:
         begin = Begin(time.perf_counter(), time.process_time(), compiling.seconds)
         sys.audit("vipetsc.set-up", self.case.name)
         with log.SET_UP, petsc_options(options_of(self.case)):
-            layout = Layout(self.model, output.comm, self.kind.dashpots)
+            layout = Layout(self.model, output.comm, dashpots=True)
             engine = self.kind(self.model, layout, self.stop)
         with released(engine, output.comm):
             meter = EnergyMeter(self.model, layout)

@@ -1,6 +1,5 @@
 """Pictures of one run: where its energy is, its dispersion, ledger, phase portraits; the bands of a cell."""
 
-import json
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -195,27 +194,13 @@ def _draw_residual(axes: Axes, run: xr.Dataset, largest: float) -> None:
     stored = run["energy/kinetic"] + run["energy/spring"] + run["energy/contact"]
     residual = np.abs(work - run["energy/dissipated"] - damped - stored) / largest
 
-    # A run whose dashpots were given what the balance leaves has no error of its own.
-    if _statistics(run).get("ledger_error", 0.0) is None:
-        residual *= np.nan
-        text = "none: the dissipation of dashpots is the remainder of the balance"
-        panels.note(axes, text, (0.5, 0.3), (0, 0), xycoords="axes fraction", ha="center")
-
     axes.semilogy(run["time"].values, np.maximum(residual, 1e-18), color=style.BLACK, lw=0.5)
     axes.axhline(LARGEST_RESIDUAL, color=style.VERMILION, lw=0.7, ls=style.DASHED)
     place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom", "color": style.VERMILION}
     panels.note(axes, "limit 1e-8", (0.99, LARGEST_RESIDUAL), (0, 1.5), **place)
     axes.locator_params(axis="x", nbins=5)
-    top = np.fmax(1e-6, 10 * float(residual.max()))  # the residual may be NaN
+    top = max(1e-6, 10 * float(residual.max()))
     axes.set(xlabel="Time (s)", ylabel="|Residual| / work", ylim=(1e-15, top))
-
-
-def _statistics(run: xr.Dataset) -> dict[str, Any]:
-    """Return the statistics of ``run``, which are JSON in a file and a mapping in a run that was not written."""
-    statistics = run.attrs.get("statistics", {})
-    if isinstance(statistics, str):
-        statistics = json.loads(statistics)
-    return dict(statistics)
 
 
 class Motion(NamedTuple):

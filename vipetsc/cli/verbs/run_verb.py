@@ -155,8 +155,7 @@ def run_table(result: "Result", faster: str = "") -> str:
         energy = f"work {work:.6g} J, dissipated {100 * numbers['dissipated'] / work:.4g} %"
         if damped := numbers.get("dissipated_by_damping", 0.0):
             energy += f" in contacts and {100 * damped / work:.4g} % in dashpots"
-        if numbers["ledger_error"] is not None:
-            energy += f", ledger closes to {numbers['ledger_error']:.2g} of the work"
+        energy += f", ledger closes to {numbers['ledger_error']:.2g} of the work"
 
     rebounds = [*dict.fromkeys(np.ravel(numbers.get("effective_restitution", [])).tolist())]
     restitution = f"{first_few([f'{e:.3f}' for e in rebounds])} (effective)" if rebounds else ""

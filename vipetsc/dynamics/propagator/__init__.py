@@ -74,11 +74,24 @@ lattice each of whose entries of K M^-1 and C M^-1 has the largest magnitude tha
 
 **9. Variations** of an orbit move by P and by one small matrix a step in contact: ``tangent``, ``tangent_kernels``.
 
+**10. What dashpots dissipate** (``dashpots``, ``free_losses``, ``loss_tables``, ``losses``) is the integral of v^T C v
+over the step, computed from the motion and not from the other energies, so that the balance of these is a check. With
+v = V(s) y + sum_l integral of r_l F_l dt, V the rows of 7 and r_l the velocities after an impulse on DoF l, it has
+three parts. That of free motion is y^T S y, S = H integral of V^T C V ds, by Gauss's rule: banded, symmetric, one
+number of each cell. Let a and b >= a remain of the step after two impulses. The force at the later one then adds
+
+    2 F_l(a) [ f_l(a) y + sum_m integral of Psi_lm(a, b) F_m dt ],
+    f_l(a) = H integral_0^a r_l(x)^T C V(x + 1 - a) dx,   Psi_lm(a, b) = H integral_0^a r_l(x)^T C r_m(x + b - a) dx,
+
+the sum over forces up to then. All are smooth in a and b: Legendre coefficients are tabulated, and forces enter by
+their moments with these polynomials, of the substeps before, and within a substep at its nodes.
+
 **Modules**, from the lattice to the engine. ``rows``: powers of the lattice's matrix, row by row. ``series``: how many
 of them count, and how far. ``stencil``: P on a rank's cells. ``clusters``: contact DoFs, their groups and tables.
 ``nodes``: tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep.
 ``advance``: substeps up to a change of modes. ``forces``: changes up to the step's end. ``engine``: steps up to the
-sample. ``tangent`` and ``tangent_kernels``: variations.
+sample. ``dashpots``, ``free_losses``, ``loss_modes``, ``loss_tables``, ``losses``: what dashpots dissipate. ``tangent``
+and ``tangent_kernels``: variations.
 
 References
 ----------

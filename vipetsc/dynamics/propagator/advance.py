@@ -36,6 +36,7 @@ from vipetsc.dynamics.propagator.collocation import (
     evaluate_site_motion,
     update_taylor,
 )
+from vipetsc.dynamics.propagator.losses import PairLosses, accumulate_losses
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN
 from vipetsc.dynamics.propagator.series import ROUNDING, copy, first_onset, shift
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, select_active, write_on_tape
@@ -297,10 +298,12 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> 
 
 
 @inlined
-def _take(cluster: Cluster, trial: Trial, substep: Substep) -> None:
+def _take(cluster: Cluster, losses: PairLosses, trial: Trial, substep: Substep) -> None:
     """Take the substep of ``trial``: add its moments, energies and extremes; the cluster then stands at its end."""
     state = cluster.state[0]
     accumulate_moments(cluster, trial, substep)
+    if losses.moments.shape[1] > 0:
+        accumulate_losses(losses, cluster, trial, substep)
     write_on_tape(cluster, trial, substep)
     for i in trial.closed:
         _update_extremes(cluster, trial, i, cluster.interval * substep.length)
@@ -310,8 +313,8 @@ def _take(cluster: Cluster, trial: Trial, substep: Substep) -> None:
 
 
 @kernel
-def advance_cluster(cluster: Cluster, may_rest: bool) -> tuple[int, int]:
-    """Advance a cluster to the first change of modes or to the step's end.
+def advance_cluster(cluster: Cluster, losses: PairLosses, may_rest: bool) -> tuple[int, int]:
+    """Advance a cluster to the first change of modes or to the step's end; ``losses`` are those of its dashpots.
 
     Returns how it ended, and a site or -1. ``DONE``: at the step's end. ``CHANGED``: the cluster stands on a change of
     modes, and the caller switches the sites whose switching functions say so; the site is one that changes again before
@@ -371,7 +374,7 @@ def advance_cluster(cluster: Cluster, may_rest: bool) -> tuple[int, int]:
             # Judged only now: a force continued beyond its end is no smooth function.
             if not _control_length(cluster, trial, substep.length, landed):
                 continue
-            _take(cluster, trial, substep)
+            _take(cluster, losses, trial, substep)
         if landed:
             return (RESTS if may_rest and site >= 0 else CHANGED), site
     return FAILED, -1

@@ -17,8 +17,8 @@ displacement. With dashpots C is symmetric, too, and so is Q_k M^-1, the series 
 force changes velocities alone at once; what follows is the motion from these velocities, for which the Q_k stand: no
 P_k is needed. The velocity, the derivative of sum_k Q_k s^k H/k!, has the same Q_k with the factor 1/(k-1)!.
 
-**Words.** A *group* is a set of DoFs of the whole lattice that are solved for together, as numbers (``Groups``); a
-*cluster* is such a group on a rank that feels it, with its tables (``DofTables``). They are numbered alike on the rank.
+**Words.** A *group* is a set of DoFs of the lattice that are solved for together, as numbers (``Groups``); a *cluster*
+is such a group on a rank that feels it, with its tables (``DofTables``).
 """
 
 from typing import NamedTuple
@@ -178,7 +178,8 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     ledger = places[[*(-1 - i for i in layout.drives), *layout.sites]]
 
     leftmost_cells = dofs["cell"] - series.reach
-    column = halo.add(leftmost_cells, series.width)
+    margin = series.reach + 1 if layout.damped else 0  # of what moves the dashpots that forces reach
+    column = halo.add(leftmost_cells - margin, series.width + 2 * margin) + margin
     return DofTables(
         column=column,
         owned=_owned_cells(leftmost_cells, series.width, layout),
@@ -187,7 +188,6 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
         factors=series.factors(),
         inverse_masses=1 / masses,
         clearance=dofs["clearance"] * (1 - NEARLY_TOUCHING),
-        # np.add.reduceat cannot sum over no groups.
         sites=np.add.reduceat(numbers >= 0, groups.first[:-1], dtype=np.int64) if len(numbers) else numbers[:0],
         first=groups.first,
         ledger=ledger,

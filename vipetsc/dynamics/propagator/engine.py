@@ -23,7 +23,10 @@ from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
 from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion, group_dofs
+from vipetsc.dynamics.propagator.dashpots import DashpotRows
 from vipetsc.dynamics.propagator.forces import Forces, follow_contacts
+from vipetsc.dynamics.propagator.free_losses import create_loss_stencil
+from vipetsc.dynamics.propagator.losses import FreeLosses, PairLosses, add_free_losses, loss_by_forces
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, exchange
 from vipetsc.dynamics.propagator.substeps import Cluster
@@ -98,13 +101,14 @@ the state is not finite), its time in s."""
 class States(NamedTuple):
     """Two states that steps read and write in turn; a sample interval in s has ``parts`` steps.
 
-    ``components`` (2, component) are ordered as ``Layout`` says; ``owned`` counts the cells, ``ghosts`` the
-    neighbouring ones, the last columns of ``HaloRegions``, and ``ghost_rows`` what the state has of each. ``progress``
-    (1,) is of dtype ``PROGRESS``.
+    ``components`` (2, component) are ordered as ``Layout`` says; ``owned`` counts the cells, each with ``rows``
+    components, ``ghosts`` the neighbouring ones, the last columns of ``HaloRegions``, and ``ghost_rows`` what the state
+    has of each. ``progress`` (1,) is of dtype ``PROGRESS``.
     """
 
     components: np.ndarray
     owned: int
+    rows: int
     ghosts: int
     ghost_rows: int
     parts: int
@@ -112,9 +116,22 @@ class States(NamedTuple):
     progress: np.ndarray
 
 
+class StepTables(NamedTuple):
+    """A linear step: the stencil of P(H); what dashpots dissipate in it, in free motion and by forces.
+
+    The losses by forces are those with the rates of free motion and those by pairs of forces. Without dashpots no loss
+    is computed.
+    """
+
+    stencil: Stencil
+    free_losses: Stencil
+    by_forces: FreeLosses
+    by_pairs: PairLosses
+
+
 @njit(error_model="numpy")
 def take_steps(
-    states: States, stencil: Stencil, halo: Halo, dofs: DofTables, clusters: Cluster, tracks: Tracks, samples: Samples
+    states: States, step: StepTables, halo: Halo, dofs: DofTables, clusters: Cluster, tracks: Tracks, samples: Samples
 ) -> tuple[int, np.ndarray]:
     """Go on to the last step and take the ``samples`` on the way; returns PETSc's error code and the log of ``tracks``.
 
@@ -139,7 +156,7 @@ def take_steps(
         is_sample = 0 <= k < samples.work.shape[0]
         if is_sample or steps == progress.last:
             ghosts = halo.columns[: states.ghost_rows, halo.columns.shape[1] - states.ghosts :]
-            state[rows * owned :] = np.concatenate((clusters.energy[dofs.ledger], ghosts.T.flatten()))
+            state[states.rows * owned :] = np.concatenate((clusters.energy[dofs.ledger], ghosts.T.flatten()))
         if is_sample:
             # Behind the drives' works the ledger has the losses of the owned sites.
             own_sites = dofs.ledger[samples.lattice.drives.rows.size :]
@@ -152,14 +169,17 @@ def take_steps(
             break
 
         # The clusters read the halo, that is the state before the step.
-        apply_propagator(stencil, cells, halo.columns, next_cells)
+        apply_propagator(step.stencil, cells, halo.columns, next_cells)
+        lost = states.components[1 - steps % 2, rows * owned : states.rows * owned]
+        if lost.size > 0:
+            add_free_losses(step.free_losses, cells, halo.columns, state[rows * owned : states.rows * owned], lost)
         for c in range(0 if failed else clusters.state.size):
             may_touch = expand_free_motion(dofs, c, halo.columns, clusters.taylor)
             for i in range(dofs.first[c] + dofs.sites[c], dofs.first[c + 1]):
                 may_touch |= begin < clusters.drives.rows[i].duration
             if not may_touch:
                 continue
-            followed, tracks = follow_contacts(clusters, dofs, c, tracks, begin)
+            followed, tracks = follow_contacts(clusters, step.by_pairs, dofs, c, tracks, begin)
             if not followed:
                 progress.failed = steps
                 progress.cluster = c
@@ -167,6 +187,9 @@ def take_steps(
                 break
             first = dofs.first[c]
             apply_impulses(dofs, first, clusters.moments[first : dofs.first[c + 1]], next_cells)
+            if lost.size > 0 and step.by_forces.leader[c] >= 0:
+                loss = loss_by_forces(step.by_forces, step.by_pairs, dofs, c, halo.columns)
+                lost[step.by_forces.leader[c]] += loss
 
         # A rank alone stays at the step that failed, for its state to be shown; among others it must keep their pace.
         if progress.failed > progress.last or halo.scatter != 0:
@@ -189,8 +212,12 @@ class Propagator(Engine):
 
         # Everything that reads cells of other ranks says which before the halo is bound; the ghosts come last.
         self._regions = HaloRegions(layout)
-        self._forces = on_every_rank(layout.comm, lambda: Forces(model, layout, series, self._regions))
+        dashpots = DashpotRows(series) if layout.damped else None
+        self._forces = on_every_rank(layout.comm, lambda: Forces(model, layout, series, self._regions, dashpots))
         self._stencil = create_stencil(series, layout, self._regions)
+        # Without dashpots any stencil serves: none is applied.
+        loss_stencil = create_loss_stencil(dashpots, layout, self._regions) if dashpots else self._stencil
+        self._tables = StepTables(self._stencil, loss_stencil, *self._forces.losses)
         ghosts = [cell for cell in layout.neighbours() if cell is not None]
         for cell in ghosts:
             self._regions.add(cell, 1)
@@ -201,6 +228,7 @@ class Propagator(Engine):
         self._record = States(
             components=self._components,
             owned=layout.owned,
+            rows=layout.rows,
             ghosts=len(ghosts),
             ghost_rows=layout.ghost_rows,
             parts=round(model.sample_interval / series.interval),
@@ -255,7 +283,7 @@ class Propagator(Engine):
         tracks = forces.tracker.tracks
         with PROPAGATOR:
             error, log = take_steps(
-                self._record, self._stencil, self._halo, forces.dofs, forces.clusters, tracks, samples
+                self._record, self._tables, self._halo, forces.dofs, forces.clusters, tracks, samples
             )
         if error:
             raise RuntimeError(f"PETSc could not exchange cells: error {error}")

@@ -41,6 +41,9 @@ from vipetsc.dynamics.propagator.clusters import (
     group_dofs,
     groups_within_reach,
 )
+from vipetsc.dynamics.propagator.dashpots import DashpotRows
+from vipetsc.dynamics.propagator.loss_tables import create_losses, no_losses
+from vipetsc.dynamics.propagator.losses import PairLosses, begin_losses
 from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
@@ -101,7 +104,9 @@ def _switch(cluster: Cluster, tracks: Tracks, now: float) -> None:
 
 
 @njit(error_model="numpy")
-def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, begin: float) -> tuple[bool, Tracks]:
+def follow_contacts(
+    clusters: Cluster, all_losses: PairLosses, dofs: DofTables, c: int, tracks: Tracks, begin: float
+) -> tuple[bool, Tracks]:
     """Advance cluster ``c`` through the step that begins at ``begin`` in s, from one switching to the next.
 
     Returns whether that was possible, and ``tracks`` with as much room as was needed.
@@ -112,11 +117,12 @@ def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, 
     state.begin = begin
     state.position = 0.0
     cluster.moments[:] = 0.0
+    losses = begin_losses(all_losses, dofs, c)
     # One landing that leads nowhere may be an accident; from the second one in a step on, its site rests. Numba would
     # compile the call twice for a variable that begins as False, once for the constant.
     landings_nowhere = 0
     for _ in range(MOST_CHANGES):
-        outcome, site = advance_cluster(cluster, landings_nowhere > 0)
+        outcome, site = advance_cluster(cluster, losses, landings_nowhere > 0)
         if outcome not in (CHANGED, RESTS):
             return outcome == DONE, tracks
         tracks = with_room(tracks)
@@ -135,18 +141,25 @@ def follow_contacts(clusters: Cluster, dofs: DofTables, c: int, tracks: Tracks, 
 class Forces:
     """Clusters that a rank's cells feel; adds to ``halo`` the cells whose motion they need.
 
-    ``dofs`` are their tables, ``clusters`` the record of all of them, ``tracker`` the modes of their sites and the log.
+    ``dofs`` are their tables, ``clusters`` the record of all of them, ``losses`` those of ``dashpots`` by
+    their forces, none if these are None, ``tracker`` the modes of their sites and the log.
     ``logs`` (cluster,) marks those that this rank logs: every rank that a cluster reaches does the same sums on the
     same numbers, and the one that owns its first cell logs it.
     """
 
-    def __init__(self, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions) -> None:
+    def __init__(
+        self, model: Model, layout: Layout, series: StepSeries, halo: HaloRegions, dashpots: DashpotRows | None = None
+    ) -> None:
         self._comm = layout.comm
         all_dofs = contact_dofs(model)
         all_groups = group_dofs(model, series.reach)
         groups = groups_within_reach(all_groups, all_dofs[all_groups.numbers], series.reach, layout)
         self._numbers = groups.numbers
         self.dofs = create_dof_tables(groups, model, layout, series, halo)
+        if dashpots is None:
+            self.losses = no_losses(len(groups.numbers), len(groups.first) - 1)
+        else:
+            self.losses = create_losses(groups, self.dofs, model, layout, dashpots)
         self.clusters = _create_clusters(groups, self.dofs, model, series)
         self.tracker = ImpactTracker(self.clusters.contacts, groups.numbers.tolist())
 

@@ -66,15 +66,17 @@ class _Neighbourhoods(NamedTuple):
     acts: np.ndarray
 
 
-def local_recursion(chain: Chain, interval: float, cells: np.ndarray, exists: np.ndarray, near: int) -> PowerRecursion:
+def local_recursion(
+    chain: Chain, interval: float, cells: np.ndarray, exists: np.ndarray, near: int, number: type = np.longdouble
+) -> PowerRecursion:
     """The recursion for rows of the masses of ``cells``, each with the coefficients of the cells on either side of it.
 
     ``exists`` (cell, neighbour), the cell itself in the middle, marks those that the lattice has. Neighbours further
     away than ``near`` are taken to be as the reference cell: sec. 8 counts what that leaves out. The step is of
-    ``interval`` in s.
+    ``interval`` in s, and rows are of the type ``number``.
     """
     width = exists.shape[1] // 2
-    masses, grounding, stiffness, damping = _coefficients_near(chain, cells, width, min(near, width))
+    masses, grounding, stiffness, damping = _coefficients_near(chain, cells, width, min(near, width), number)
 
     # No power reaches the outermost neighbours: what np.roll carries across them is zero.
     acts = np.ones_like(exists)
@@ -82,7 +84,7 @@ def local_recursion(chain: Chain, interval: float, cells: np.ndarray, exists: np
         acts = exists & np.roll(exists, -1, axis=-1)
     neighbours = _Neighbourhoods(chain, masses[:, None], exists[:, None, None], acts[:, None])
 
-    h = np.longdouble(interval)
+    h = number(interval)
     by_stiffness = partial(_multiply, neighbours, h**2 * stiffness, None)
     by_damping = None
     if chain.is_damped:
@@ -90,16 +92,16 @@ def local_recursion(chain: Chain, interval: float, cells: np.ndarray, exists: np
     return PowerRecursion(by_stiffness, by_damping)
 
 
-def _coefficients_near(chain: Chain, cells: np.ndarray, width: int, near: int) -> Coefficients:
+def _coefficients_near(chain: Chain, cells: np.ndarray, width: int, near: int, number: type) -> Coefficients:
     """Coefficients (cell, mass or spring, neighbour) of ``width`` neighbours on either side of each of ``cells``.
 
-    They are those of the reference cell beyond the ``near`` ones. In extended precision, since rows are high powers of
-    them and P's entries, good to double precision, are used in every step.
+    They are those of the reference cell beyond the ``near`` ones. They are of the type ``number``, for P in extended
+    precision, since rows are high powers of them and P's entries, good to double precision, are used in every step.
     """
     # Beyond its end a chain without variation has the reference cell.
     reference = Chain(chain.cell, 1).coefficients(-1, 0)
     shape = (len(cells), 2 * width + 1, 1)
-    arrays = [np.tile(array, shape).astype(np.longdouble) for array in reference]
+    arrays: list[np.ndarray] = [np.tile(array, shape).astype(number) for array in reference]
 
     if chain.variation is not None:
         for i, cell in enumerate(cells.tolist()):

@@ -131,7 +131,7 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
         last = min(last, layout.cells - reach)
     inner = np.arange(first, max(first, last))
     is_own = (inner >= layout.start + reach) & (inner < layout.stop - reach)
-    interior = _ranges(series.is_interior(inner) & is_own, first)
+    interior = ranges_of(series.is_interior(inner) & is_own, first)
     # Vectors of cells need so many; shorter ranges are left to the dense rows.
     interior = interior[interior @ [-1, 1] >= LANES]
 
@@ -140,7 +140,7 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
     for start, stop in interior - first:
         is_dense[start:stop] = False
     columns = [np.zeros(0, np.int64)]
-    for start, stop in _ranges(is_dense, first).tolist():
+    for start, stop in ranges_of(is_dense, first).tolist():
         columns.append(int(halo.add(start - reach, stop - start + 2 * reach)) + np.arange(stop - start))
 
     # Cells near an end all read the same columns, from the end on: (first column's cell, first of the cells, last).
@@ -154,7 +154,7 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
 
     borders, table = _dense_rows(series, inner[is_dense], ends)
     cells = np.append(inner[is_dense], [cell for _, cell in ends]).astype(np.int64)
-    sparse = _sparse_rows(series.interior(), layout.dofs, reach)
+    sparse = sparse_rows(series.interior(), layout.dofs, reach)
     return Stencil(
         interior=interior - layout.start,
         blocks=sparse.blocks,
@@ -167,8 +167,8 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
     )
 
 
-class _SparseRows(NamedTuple):
-    """P's rows of an interior cell without zeros, as ``Stencil`` has them."""
+class SparseRows(NamedTuple):
+    """Rows of an interior cell without zeros, as ``Stencil`` has them."""
 
     blocks: np.ndarray
     starts: np.ndarray
@@ -177,8 +177,8 @@ class _SparseRows(NamedTuple):
     values: np.ndarray
 
 
-def _sparse_rows(entries: np.ndarray, dofs: int, reach: int) -> _SparseRows:
-    """P's rows in blocks of four, from its ``entries`` (2 dof, 2 dof, 2 reach + 1) of an interior cell."""
+def sparse_rows(entries: np.ndarray, dofs: int, reach: int) -> SparseRows:
+    """Rows in blocks of four, from ``entries`` (2 dof, 2 dof, cell) of an interior cell, counted from ``-reach`` on."""
     # Two masses a block, each with its displacement and its velocity: these read almost the same cells. Of an odd
     # number of masses the last one is there twice.
     masses = np.minimum(np.arange(dofs + dofs % 2), dofs - 1)
@@ -194,7 +194,7 @@ def _sparse_rows(entries: np.ndarray, dofs: int, reach: int) -> _SparseRows:
         rows.append(row)
         offsets.append(column - reach)
         values.append(entries[block][:, row, column].T.copy())
-    return _SparseRows(
+    return SparseRows(
         blocks=blocks,
         starts=np.array(starts),
         rows=np.concatenate(rows),
@@ -203,7 +203,7 @@ def _sparse_rows(entries: np.ndarray, dofs: int, reach: int) -> _SparseRows:
     )
 
 
-def _ranges(is_in: np.ndarray, first: int) -> np.ndarray:
+def ranges_of(is_in: np.ndarray, first: int) -> np.ndarray:
     """Ranges (range, 2), half open, of the numbers from ``first`` on that are in."""
     return np.flatnonzero(np.diff(np.concatenate([[False], is_in, [False]]))).reshape(-1, 2) + first
 

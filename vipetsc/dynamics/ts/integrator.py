@@ -63,7 +63,6 @@ class Integrator(Engine):
     """
 
     name = "ts"
-    dashpots = True
 
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         self.comm = layout.comm

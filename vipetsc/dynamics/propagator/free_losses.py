@@ -1,0 +1,121 @@
+"""The loss of free motion in a step as a quadratic form of the state, half of it a stencil.
+
+Free motion from the state y loses y^T S y in a step, S = integral of V^T C V, where the rows V(s) take the velocities
+from the state (sec. 10 of the derivation in the package's docstring). S is symmetric, so that each cell multiplies
+itself and those to its right alone, these twice: the stencil takes the state to what its cells are to be multiplied by.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.propagator.dashpots import NO_DASHPOTS, DashpotRows
+from vipetsc.dynamics.propagator.loss_modes import gauss, mode_count
+from vipetsc.dynamics.propagator.stencil import HaloRegions, Stencil, ranges_of, sparse_rows
+from vipetsc.dynamics.vectors import LANES
+
+# Entries below this fraction of a table's largest one are left out.
+SMALL = 1e-12
+
+
+class _Gramian:
+    """Tables of S (2 dof, 2 dof, cell), from a cell to itself and to those on its right, by the kinds around it."""
+
+    def __init__(self, dashpots: DashpotRows) -> None:
+        self._dashpots = dashpots
+        # The products of rates have twice the degree that so many nodes are needed for.
+        count = -(-mode_count(dashpots.series.omega_max_h) // 2)
+        nodes, weights = gauss(count)
+        seconds = weights * dashpots.series.interval
+        self._powers = nodes[:, None] ** np.arange(dashpots.powers) * np.sqrt(seconds)[:, None]
+        self._rates = lru_cache(maxsize=2 * dashpots.width)(self._compute_rates)
+
+    def _compute_rates(self, kind: int) -> np.ndarray:
+        """Rates at the nodes (rate and node, 2 dof, cell) of dashpots of a ``kind``."""
+        rows = np.tensordot(self._powers, self._dashpots.rows(kind), axes=(1, 1))
+        return rows.reshape(-1, *rows.shape[2:])
+
+    def table(self, kinds: np.ndarray) -> np.ndarray:
+        """The table of a cell, from the ``kinds`` of those from ``reach`` + 1 before it to ``reach`` behind it."""
+        width = self._dashpots.width
+        rows = 2 * self._dashpots.chain.cell.dofs
+        out = np.zeros((rows, rows, width))
+        for k, kind in enumerate(kinds.tolist()):
+            if kind == NO_DASHPOTS:
+                continue
+            # The later the dashpot's cell, the earlier the column of the cell in its rows.
+            column = width - 1 - k
+            rates = self._rates(kind)
+            from_cell = rates[:, :, column].T
+            to_right = rates[:, :, column:].reshape(len(rates), -1)
+            out[:, :, : width - column] += (from_cell @ to_right).reshape(rows, rows, -1)
+        # The pairs' other halves. Within a cell, too, masses of a block that is summed together multiply those of later
+        # blocks alone.
+        out[:, :, 1:] *= 2
+        block = np.arange(rows) % (rows // 2) // 2
+        out[:, :, 0] *= 1 + np.sign(block - block[:, None])
+        return self._without_small(out)
+
+    def _without_small(self, entries: np.ndarray) -> np.ndarray:
+        """The ``entries`` with zeros for small ones, a velocity measured as omega u."""
+        series = self._dashpots.series
+        d = self._dashpots.chain.cell.dofs
+        scale = np.ones(2 * d)
+        scale[d:] = (series.omega_max_h or 1.0) / series.interval
+        sizes = np.abs(entries) * scale[:, None, None] * scale[:, None]
+        return np.where(sizes > SMALL * sizes.max(), entries, 0.0)
+
+
+def create_loss_stencil(dashpots: DashpotRows, layout: Layout, halo: HaloRegions) -> Stencil:
+    """Create the stencil on the cells of ``layout``; adds to ``halo`` the cells that it reads."""
+    reach = dashpots.series.reach
+    gramian = _Gramian(dashpots)
+    # One more, so that a rank without cells has a window, too.
+    kinds = dashpots.kinds(np.arange(layout.start - reach - 1, layout.stop + reach + 1))
+    # Which of the cells up to each one are not interior, and which have dashpots: a window's number is a difference.
+    others = np.append(0, np.cumsum((kinds != dashpots.interior) | (kinds == NO_DASHPOTS)))
+    damped = np.append(0, np.cumsum(kinds != NO_DASHPOTS))
+    width = dashpots.width
+    is_interior = (others[width:] == others[:-width])[: layout.owned]
+    is_damped = (damped[width:] > damped[:-width])[: layout.owned]
+
+    cells = np.arange(layout.start, layout.stop)
+    interior = gramian.table(np.full(width, dashpots.interior))
+    columns_read = _columns(interior)
+    is_own = cells + columns_read <= layout.stop
+    ranges = ranges_of(is_interior & is_own, layout.start)
+    ranges = ranges[ranges @ [-1, 1] >= LANES]
+
+    is_dense = is_damped.copy()
+    for start, stop in ranges - layout.start:
+        is_dense[start:stop] = False
+    windows = sliding_window_view(kinds, width)[: layout.owned][is_dense]
+    examples, table = np.unique(windows, axis=0, return_inverse=True)
+    tables = np.array([gramian.table(example) for example in examples]).reshape(-1, *interior.shape)
+    read = max([columns_read, *map(_columns, tables)])
+
+    columns = [np.zeros(0, np.int64)]
+    for start, stop in ranges_of(is_dense, layout.start).tolist():
+        columns.append(int(halo.add(start, stop - start + read - 1)) + np.arange(stop - start))
+    sparse = sparse_rows(interior, layout.dofs, 0)
+    if layout.dofs % 2:
+        # The last mass is there twice, and counts once.
+        sparse.values[sparse.starts[-2] :, 2:] = 0.0
+    return Stencil(
+        interior=ranges - layout.start,
+        blocks=sparse.blocks,
+        starts=sparse.starts,
+        rows=sparse.rows,
+        offsets=sparse.offsets,
+        values=sparse.values,
+        # Columns before rows: the sums of ``apply_propagator`` run over one cell's outputs at a time.
+        borders=np.ascontiguousarray(tables[..., :read].transpose(0, 2, 3, 1)),
+        border_cells=np.column_stack([np.concatenate(columns), cells[is_dense] - layout.start, table.ravel()]),
+    )
+
+
+def _columns(entries: np.ndarray) -> int:
+    """How many cells ``entries`` (2 dof, 2 dof, cell) have before zeros alone follow, one at least."""
+    return int(np.flatnonzero(entries.any(axis=(0, 1))).max(initial=0)) + 1

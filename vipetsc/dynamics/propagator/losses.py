@@ -1,0 +1,217 @@
+"""Compiled losses of dashpots in a step, by the tables of ``loss_tables`` and the stencil of ``free_losses``.
+
+See sec. 10 of the derivation in the package's docstring. The forces of a substep are put into the double integral of
+pairs of forces as they are into the moments, by their values at the nodes.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.compiled import kernel, njit
+from vipetsc.dynamics.propagator.clusters import DofTables
+from vipetsc.dynamics.propagator.nodes import NODES
+from vipetsc.dynamics.propagator.stencil import Stencil
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial
+from vipetsc.dynamics.vectors import LANES, add_lanes, add_product, store, zeros
+
+
+class FreeLosses(NamedTuple):
+    """Losses by forces on a rank's DoFs times the rates of free motion; empty without dashpots.
+
+    ``rows`` (table, 2 mass, cell, mode) give the coefficients of the loss by a unit impulse on a DoF, of which
+    ``table`` (dof,) numbers one, from the cells in the halo's columns from ``column`` (dof,) on. ``leader`` (cluster,)
+    is the rank's cell that counts the losses of a cluster's forces, -1 where another rank does.
+    """
+
+    column: np.ndarray
+    table: np.ndarray
+    rows: np.ndarray
+    leader: np.ndarray
+
+
+class PairLosses(NamedTuple):
+    """Losses of dashpots by pairs of forces of a cluster, or of all clusters of a rank: see ``loss_tables``.
+
+    ``kernels`` (kind, mode, mode) are the coefficients of the loss in J by unit impulses at two times, of which those
+    whose modes sum to less than ``degrees`` (kind,) count. ``kinds`` (dof, dof of the same cluster) numbers that of a
+    later impulse's DoF and of an earlier one's, -1 if they are too far apart. In the present step: ``moments`` (dof,
+    mode) in N s of the forces, ``loss`` (cluster,) in J so far. ``legendre`` (mode, node) and ``before`` (dof, mode,
+    node) are workspace. Without dashpots there are no modes.
+    """
+
+    kinds: np.ndarray
+    kernels: np.ndarray
+    degrees: np.ndarray
+    moments: np.ndarray
+    loss: np.ndarray
+    legendre: np.ndarray
+    before: np.ndarray
+
+
+@njit(error_model="numpy")
+def begin_losses(losses: PairLosses, dofs: DofTables, c: int) -> PairLosses:
+    """The losses of cluster ``c`` of all, without any by forces so far."""
+    first = dofs.first[c]
+    stop = dofs.first[c + 1]
+    selected = PairLosses(
+        kinds=losses.kinds[first:stop],
+        kernels=losses.kernels,
+        degrees=losses.degrees,
+        moments=losses.moments[first:stop],
+        loss=losses.loss[c : c + 1],
+        legendre=losses.legendre,
+        before=losses.before,
+    )
+    selected.moments[:] = 0.0
+    selected.loss[:] = 0.0
+    return selected
+
+
+@njit(error_model="numpy")
+def add_free_losses(
+    stencil: Stencil, state: np.ndarray, columns: np.ndarray, before: np.ndarray, after: np.ndarray
+) -> None:
+    """Put into ``after`` (cell,) what is ``before`` and the loss in J of free motion from ``state`` (2 dof, cell).
+
+    ``columns`` (2 dof, column) are the state's halo. What ``apply_propagator`` would make of the state is multiplied by
+    it as soon as it is known: no array is filled with it.
+    """
+    cells = state.shape[1]
+    x = state.reshape(-1)
+    values = stencil.values
+    to = stencil.blocks * cells
+    places = stencil.rows * cells + stencil.offsets
+    after[:] = before
+    for first, stop in stencil.interior:
+        for a in range(first, stop, LANES):
+            # The last vector overlaps the one before.
+            i = min(a, stop - LANES)
+            loss = zeros()
+            for b in range(to.shape[0]):
+                sum0 = zeros()
+                sum1 = zeros()
+                sum2 = zeros()
+                sum3 = zeros()
+                for t in range(stencil.starts[b], stencil.starts[b + 1]):
+                    sum0 = add_product(sum0, values[t, 0], x, places[t] + i)
+                    sum1 = add_product(sum1, values[t, 1], x, places[t] + i)
+                    sum2 = add_product(sum2, values[t, 2], x, places[t] + i)
+                    sum3 = add_product(sum3, values[t, 3], x, places[t] + i)
+                loss = add_lanes(loss, sum0, x, to[b, 0] + i)
+                loss = add_lanes(loss, sum1, x, to[b, 1] + i)
+                loss = add_lanes(loss, sum2, x, to[b, 2] + i)
+                loss = add_lanes(loss, sum3, x, to[b, 3] + i)
+            store(add_product(loss, 1.0, before, i), after, i)
+
+    masses = state.shape[0] // 2
+    total = np.empty(2 * masses)
+    for column, at, table in stencil.border_cells:
+        rows = stencil.borders[table]
+        total[:] = 0.0
+        for row in range(rows.shape[0]):
+            for k in range(rows.shape[1]):
+                for o in range(total.size):
+                    total[o] += columns[row, column + k] * rows[row, k, o]
+        # In the order of the blocks above.
+        dense = 0.0
+        for mass in range(masses):
+            dense += total[mass] * state[mass, at]
+            dense += total[masses + mass] * state[masses + mass, at]
+        after[at] = dense + before[at]
+
+
+@njit(error_model="numpy")
+def loss_by_forces(free: FreeLosses, pairs: PairLosses, dofs: DofTables, c: int, columns: np.ndarray) -> float:
+    """Loss in J that the step's forces on the DoFs of cluster ``c`` have added, by pairs and with free motion.
+
+    ``columns`` (2 mass, column) hold the lattice's state at the beginning of the step.
+    """
+    loss = pairs.loss[c]
+    _, masses, width, modes = free.rows.shape
+    total = np.empty(modes)
+    for i in range(dofs.first[c], dofs.first[c + 1]):
+        moments = pairs.moments[i]
+        if not moments.any():
+            continue
+
+        total[:] = 0.0
+        for j in range(masses):
+            for k in range(width):
+                x = columns[j, free.column[i] + k]
+                row = free.rows[free.table[i], j, k]
+                for p in range(modes):
+                    total[p] += x * row[p]
+        for p in range(modes):
+            loss += total[p] * moments[p]
+    return loss
+
+
+@kernel
+def _fill_legendre(losses: PairLosses, cluster: Cluster, substep: Substep) -> None:
+    """Put Legendre's polynomials of what remains of the step after each node into the workspace."""
+    legendre = losses.legendre
+    position = cluster.state[0].position
+    for node in range(NODES):
+        legendre[0, node] = 1.0
+        legendre[1, node] = 1.0 - 2.0 * (position + substep.length * cluster.nodes.position[substep.kind, node])
+    for p in range(2, legendre.shape[0]):
+        last = (2 * p - 1) / p
+        last_but_one = (p - 1) / p
+        for node in range(NODES):
+            x = legendre[1, node]
+            legendre[p, node] = last * x * legendre[p - 1, node] - last_but_one * legendre[p - 2, node]
+
+
+@kernel
+def _fill_before(losses: PairLosses, cluster: Cluster, trial: Trial, substep: Substep) -> None:
+    """Put the moments that forces have up to each node, in Legendre's polynomials, into the workspace."""
+    modes = losses.moments.shape[1]
+    # Forces that are over have moments, too.
+    for i in range(losses.moments.shape[0]):
+        for q in range(modes):
+            for node in range(NODES):
+                losses.before[i, q, node] = losses.moments[i, q]
+
+    for i in trial.active:
+        for q in range(modes):
+            for k in range(NODES):
+                amount = cluster.interval * substep.length * trial.force[i, k] * losses.legendre[q, k]
+                for node in range(NODES):
+                    losses.before[i, q, node] += cluster.nodes.powers[substep.kind, 0, k, node] * amount
+
+
+@kernel
+def accumulate_losses(losses: PairLosses, cluster: Cluster, trial: Trial, substep: Substep) -> None:
+    """Add a substep's forces to the losses by pairs of forces and to the moments in Legendre's polynomials."""
+    modes = losses.moments.shape[1]
+    _fill_legendre(losses, cluster, substep)
+    _fill_before(losses, cluster, trial, substep)
+    legendre = losses.legendre
+    total = trial.sums.w
+    part = trial.sums.v
+    for later in trial.active:
+        # The rates that earlier forces have left, in the integrals that a force at each node is to be multiplied by.
+        total[:] = 0.0
+        for source in range(losses.moments.shape[0]):
+            number = losses.kinds[later, source]
+            if number < 0 or not losses.before[source, 0, NODES - 1]:
+                continue
+            for p in range(losses.degrees[number]):
+                part[:] = 0.0
+                for q in range(losses.degrees[number] - p):
+                    for node in range(NODES):
+                        part[node] += losses.kernels[number, p, q] * losses.before[source, q, node]
+                for node in range(NODES):
+                    total[node] += legendre[p, node] * part[node]
+
+        for node in range(NODES):
+            weight = cluster.nodes.weight[substep.kind, node]
+            losses.loss[0] += cluster.interval * substep.length * weight * trial.force[later, node] * total[node]
+
+    # The moments change only now: all forces of the substep were to see those before it.
+    for i in trial.active:
+        for node in range(NODES):
+            amount = cluster.interval * substep.length * cluster.nodes.weight[substep.kind, node] * trial.force[i, node]
+            for p in range(modes):
+                losses.moments[i, p] += amount * legendre[p, node]
