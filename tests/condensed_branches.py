@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from tests.models import CLEARANCE, four_band_contact
-from vipetsc.case.nnm import NnmTable
+from vipetsc.case.nnm_table import NnmTable
 from vipetsc.lattice import Chain, WaveCompliance, four_band
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
@@ -48,5 +48,5 @@ def condensed_breather(
 
 def displacement(problem: ConservativeMotions, point: Point) -> np.ndarray:
     """Displacements of a system's masses at rest, at phase 0."""
-    (u,) = state_of(problem, point).values()
+    (u,) = state_of(problem, point, len(problem.compliance.vectors)).values()
     return u

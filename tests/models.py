@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from vipetsc.lattice import Contact, contact_stiffness, four_band
+from vipetsc.modes.balance.harmonics import Stops
 from vipetsc.modes.system import SmoothSpring, System
 
 # SPEC section 9: the clearance, the radius and Poisson's ratio of the four-band lattice's contacts.
@@ -24,7 +25,7 @@ def four_band_contact(law: str = "hertz", modulus: float = 1e8, exponent: float 
 
 def reduced_model(law: str = "bilinear", modulus: float = 1e8, exponent: float | None = None) -> System:
     """The paper's two masses with one contact between them (SPEC section 9)."""
-    return System.reduced(four_band(), CLEARANCE, four_band_contact(law, modulus, exponent))
+    return System.reduced(four_band(), Stops.both(four_band_contact(law, modulus, exponent), CLEARANCE))
 
 
 def kerschen_system() -> System:

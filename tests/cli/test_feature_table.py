@@ -38,9 +38,9 @@ WITHOUT_INFLUENCE = {
     "nfrc": {"harmonic"},
     "wave": {"harmonic"} | ENDS,
     "reduced": {"law of a plugin"} | ENDS,
-    "chain": {"unequal clearances", "law of a plugin"},
+    "chain": {"unequal clearances", "law of a plugin", "a law for each site", "restitutions of sites"},
     "own": {"law of a plugin"},
-    "condensed": {"unequal clearances"},
+    "condensed": {"unequal clearances", "restitutions of sites"},
 }
 pytestmark = pytest.mark.slow
 

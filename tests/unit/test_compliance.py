@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from vipetsc.lattice import Chain, Spring, UnitCell, bloch, diatomic, four_band
-from vipetsc.lattice.compliance import DenseCompliance, WaveCompliance
+from vipetsc.lattice.compliance import WaveCompliance
+from vipetsc.lattice.dense_compliance import DenseCompliance
 
 pytestmark = pytest.mark.parallel(1)
 

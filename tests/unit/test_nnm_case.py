@@ -105,19 +105,65 @@ def test_a_restitution_is_warned_of():
     [
         ({"contacts": {"law": "power"}}, r"contacts\.exponent: missing"),
         ({"contacts": {"exponent": 3.0}}, r"contacts\.exponent = 3.0: applies only to law"),
-        ({"contacts": {"side": "plus"}}, r"contacts\.side"),
-        ({"contacts": {"clearance_minus": 2e-3}}, r"contacts\.clearance_minus"),
-        ({"contacts": {"each": {"law": ["bilinear"]}}}, r"contacts\.each"),
-        ({"contacts": {"next_cell": True}}, r"contacts\.next_cell"),
+        ({"contacts": {"clearance": 0.0, "side": "plus"}}, "without one there are none"),
+        ({"contacts": {"each": {"law": ["bilinear", "hertz", "hertz"]}}}, "contacts.each"),
+        ({"contacts": {"pair": [2, 2]}}, r"contacts\.pair"),
         ({"lattice": {"damping": {"mass": 1.0}}}, "none does with dashpots"),
         ({"lattice": {"absorbing": {"cells": 2, "strength": 1.0}}}, r"lattice\.absorbing"),
-        ({"disorder": {"seed": 1, "cells": {"masses": {"relative": 0.01}}}}, "disorder"),
+        ({"disorder": {"seed": 1, "cells": {"mass": {"relative": 0.01}}}}, "disorder"),
     ],
 )
 def test_what_branches_do_not_support_is_refused(nnm, table, key):
-    """Dissipation, disorder, and contacts that differ or are not symmetric are refused for every kind of system."""
+    """Dissipation, and cells and contacts that are not sound, are refused for every kind of system."""
     contacts = {"sites": [2], "clearance": 1e-3} | table.get("contacts", {})
     lattice = {"preset": "four-band", "cells": 8} | table.get("lattice", {})
 
     with pytest.raises(CaseError, match=key):
         NnmCase.from_table(table | {"contacts": contacts, "lattice": lattice, "nnm": nnm})
+
+
+@pytest.mark.parametrize(
+    ("contacts", "lattice", "message"),
+    [
+        ({"pair": [0, 3]}, {}, "two masses in contact within a cell"),
+        ({"each": {"law": ["bilinear"]}}, {}, "one contact; omit the lists"),
+        ({"clearance": [1e-3, 2e-3]}, {}, "one contact"),
+        ({}, {"profiles": {"masses[1]": {"first": 5e-3, "last": 6e-3}}}, "one cell, which stands for all others"),
+    ],
+)
+def test_the_reduced_model_is_one_pair_of_masses(contacts, lattice, message):
+    """What only a lattice has is refused for the reduced model; a stop on one side is not."""
+    table = {"contacts": {"side": "plus"} | contacts, "lattice": {"preset": "four-band"} | lattice}
+    with pytest.raises(CaseError, match=message):
+        NnmCase.from_table(table)
+    assert NnmCase.from_table({"contacts": {"side": "plus"}}).gaps() == ((pytest.approx(CLEARANCE), float("inf")),)
+
+
+def test_a_lattice_that_nothing_holds_is_not_pushed():
+    """A stop to ground on one side moves a lattice with free ends away; on both sides it does not."""
+    table = {
+        "lattice": {"preset": "four-band", "cells": 8, "ends": "free"},
+        "contacts": {"sites": [2], "clearance": 1e-3, "pair": [0, 3]},
+        "nnm": {"system": "chain", "modes": [5]},
+    }
+    NnmCase.from_table(table)
+    table["contacts"] |= {"side": "plus"}
+    with pytest.raises(CaseError, match="nothing holds this lattice"):
+        NnmCase.from_table(table)
+
+
+def test_disorder_is_drawn_for_normal_modes():
+    """The case holds what was drawn about the clearances, and is read back as the same case."""
+    table = {
+        "lattice": {"preset": "four-band", "cells": 8},
+        "contacts": {"sites": [2, 5], "clearance": 1e-3},
+        "disorder": {"seed": 3, "clearance": {"relative": 0.05}, "cells": {"masses[1]": {"relative": 0.01}}},
+        "nnm": {"system": "chain", "modes": [5]},
+    }
+    case = NnmCase.from_table(table)
+
+    (first, _), (second, _) = case.gaps()
+    assert first != second
+    assert first == pytest.approx(1e-3, rel=0.2)
+    assert not case.chain().is_uniform()
+    assert NnmCase.from_toml(case.to_toml()) == case

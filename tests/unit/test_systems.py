@@ -9,6 +9,7 @@ from tests.models import CLEARANCE, four_band_contact, reduced_model
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell, diatomic
+from vipetsc.modes.balance.harmonics import Stops
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.shooting import Shooting
@@ -26,7 +27,7 @@ def test_reduced_model_of_the_paper():
 
 def test_reduced_model_of_another_cell():
     """In the diatomic cell the host is on two springs of 90 kN/m to its neighbours, and on a third to the resonator."""
-    system = System.reduced(diatomic(), CLEARANCE, LINEAR_STOP)
+    system = System.reduced(diatomic(), Stops.both(LINEAR_STOP, CLEARANCE))
     assert system.stiffness == pytest.approx(np.array([[2 * 9e4 + 9e4, -9e4], [-9e4, 9e4]]))
 
 
@@ -119,7 +120,7 @@ def test_a_chain_keeps_its_nonlinear_springs(ends, springs, held):
     nonlinear = Spring(1, 0, 5.0, next_cell=True, quadratic=quadratic, cubic=cubic)
     cell = UnitCell((1.0, 2.0), (Spring(0, 1, 7.0), nonlinear), host=0, resonator=1)
 
-    system = System.from_chain(Chain(cell, 3, ends), LINEAR_STOP)
+    system = System.from_chain(Chain(cell, 3, ends), [])
 
     assert len(system.springs) == springs
     u = np.ones(system.dofs)

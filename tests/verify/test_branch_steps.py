@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.models import CLEARANCE, IN_PHASE, OUT_OF_PHASE, reduced_model
-from vipetsc.case.nnm import Guards, NnmTable
+from vipetsc.case.nnm_table import Guards, NnmTable
 from vipetsc.modes.branches.branch_checks import BranchMonitor, is_jump, suspects
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.continuation.guards import half_trace_change

@@ -8,6 +8,7 @@ import pytest
 from tests.condensed_branches import condensed_branch, condensed_breather, condensed_problem, displacement
 from tests.models import CLEARANCE, four_band_contact, kerschen_system, reduced_model
 from vipetsc.lattice import Chain, four_band
+from vipetsc.modes.balance.harmonics import Stops
 from vipetsc.modes.branches.condensed import state_of
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.shooting.dop853 import Dop853Flow
@@ -66,9 +67,9 @@ def assert_orbits_of_shooting(system, problem, points) -> None:
 def test_a_breather_returns_after_a_period_in_its_chain():
     chain = Chain(four_band("calibrated"), 12, "fixed", (5,), (CLEARANCE,))
     problem, point = condensed_breather(12, 6, 1600.0, 2e-9, max_newton=12)
-    state = state_of(problem, point)
+    state = state_of(problem, point, chain.cell.dofs)
     u = np.concatenate([state[cell] for cell in range(12)])
-    system = System.from_chain(chain, four_band_contact("hertz"))
+    system = System.from_chain(chain, [Stops.both(four_band_contact("hertz"), CLEARANCE)])
     assert point.energy == pytest.approx(system.energy(u, 0 * u), rel=1e-8)
 
     end = Dop853Flow(system).arc(np.append(u, 0 * u), point.period, point.period).end

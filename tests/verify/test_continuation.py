@@ -9,7 +9,7 @@ import pytest
 
 from tests.models import IN_PHASE, OUT_OF_PHASE, kerschen_system, reduced_model
 from tests.verify.conftest import follow
-from vipetsc.case.nnm import Guards, NnmTable
+from vipetsc.case.nnm_table import Guards, NnmTable
 from vipetsc.modes.branches.branch_checks import is_jump, suspects
 from vipetsc.modes.continuation import segment as segments
 from vipetsc.modes.continuation.arclength import Continuation

@@ -15,6 +15,7 @@ from tests.breathers import BREATHER_FREQUENCY, breather_chain
 from tests.models import CLEARANCE, four_band_contact
 from vipetsc.lattice import Chain, Contact, four_band
 from vipetsc.lattice.chain import Pair
+from vipetsc.modes.balance.harmonics import Stops
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 from vipetsc.modes.problem import FlowError
 
@@ -26,7 +27,8 @@ UNITS = np.repeat([1e-3, 1.0], DOFS)[:, None]
 
 
 def lattice_flow(sites: tuple[int, ...], contact: Contact, ends: str = "fixed") -> LatticeFlow:
-    return LatticeFlow(breather_chain(ends, sites), contact, MPI.COMM_SELF)
+    stops = [Stops.both(contact, CLEARANCE)] * len(sites)
+    return LatticeFlow(breather_chain(ends, sites), stops, MPI.COMM_SELF)
 
 
 def irregular_motion(sites: tuple[int, ...], w: float = 1.6e-3, speed: float = 1.0) -> np.ndarray:
@@ -119,7 +121,8 @@ def test_the_linearisation_of_contacts_between_cells_and_with_ground_agrees_with
     pairs = (Pair(-1, 2), Pair(0, 3), Pair(3, 0, next_cell=True))
     sites = (4, 4, CELLS - 1)
     chain = Chain(four_band("calibrated"), CELLS, "periodic", sites, (CLEARANCE,) * 3, pairs=pairs)
-    flow = LatticeFlow(chain, Contact("hertz", STIFFNESS["hertz"], restitution), MPI.COMM_SELF)
+    law = Contact("hertz", STIFFNESS["hertz"], restitution)
+    flow = LatticeFlow(chain, [Stops.both(law, CLEARANCE)] * len(sites), MPI.COMM_SELF)
     random = np.random.default_rng(1)
     start = 1e-2 * random.standard_normal((2 * DOFS, CELLS)) * UNITS
     for pair, site in zip(pairs, sites, strict=True):
@@ -181,13 +184,13 @@ def test_a_dissipative_contact_cannot_be_closed_at_the_start():
 
 def test_contacts_that_always_act_are_refused():
     chain = Chain(four_band("calibrated"), CELLS, "fixed", (5,), (0.0,), pairs=(Pair(0, 0, next_cell=True),))
-    flow = LatticeFlow(chain, Contact("hertz", 1e6), MPI.COMM_SELF)
+    flow = LatticeFlow(chain, [Stops.both(Contact("hertz", 1e6), gap) for gap in chain.clearances], MPI.COMM_SELF)
     with pytest.raises(FlowError, match="touch or are precompressed"):
         flow.arc(np.zeros((2 * DOFS, CELLS)), PERIOD)
 
 
 def test_a_lattice_shorter_than_the_reach_of_a_step_is_refused():
     chain = Chain(four_band("calibrated"), 2, "fixed", (1,), (CLEARANCE,))
-    flow = LatticeFlow(chain, four_band_contact(), MPI.COMM_SELF)
+    flow = LatticeFlow(chain, [Stops.both(four_band_contact(), CLEARANCE)], MPI.COMM_SELF)
     with pytest.raises(FlowError, match="2 cells are fewer"):
         flow.arc(np.zeros((2 * DOFS, 2)), PERIOD)

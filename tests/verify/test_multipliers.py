@@ -12,6 +12,7 @@ import pytest
 
 from tests.breathers import BREATHER_FREQUENCY, breather_case, breather_chain
 from tests.models import CLEARANCE, four_band_contact
+from vipetsc.modes.balance.harmonics import Stops
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.lattice import floquet
@@ -23,10 +24,12 @@ from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.shooting.start import linear_start
 from vipetsc.modes.system import System
 
+STOPS = [Stops.both(four_band_contact(), CLEARANCE)]
+
 
 def lattice_shooting() -> LatticeShooting:
     chain = breather_chain()
-    system = System.from_chain(chain, four_band_contact(), dense=False)
+    system = System.from_chain(chain, STOPS, dense=False)
     return LatticeShooting(system, chain, MAPS["quarter"], MPI.COMM_SELF, 1e-12, 10)
 
 
@@ -83,7 +86,7 @@ def test_the_product_is_the_derivative_of_the_residual(breather):
 
 
 def test_a_linear_mode_is_continued_as_by_the_dense_method():
-    dense = Shooting(Dop853Flow(System.from_chain(breather_chain(), four_band_contact())), MAPS["quarter"])
+    dense = Shooting(Dop853Flow(System.from_chain(breather_chain(), STOPS)), MAPS["quarter"])
     point = linear_start(lattice_shooting(), 3, 1e-6)
     expected = linear_start(dense, 3, 1e-6)
     assert point.period == pytest.approx(expected.period, rel=1e-12)

@@ -10,8 +10,9 @@ import pytest
 
 from tests.models import GRAZING_ENERGY, IN_PHASE, OUT_OF_PHASE, four_band_contact, reduced_model
 from tests.verify.conftest import follow
-from vipetsc.case.nnm import Guards, NnmTable
+from vipetsc.case.nnm_table import Guards, NnmTable
 from vipetsc.lattice import Chain, four_band
+from vipetsc.modes.balance.harmonics import Stops
 from vipetsc.modes.branches.branch_checks import BranchMonitor, suspects
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.continuation.special import locate
@@ -167,7 +168,7 @@ def test_both_directions_give_the_same_curve():
 def test_three_cells_through_grazing(law, mode):
     """A lattice with three contacts grazes at the energy at which its linear mode touches the first of them."""
     chain = Chain(four_band(), 3, "fixed", (0, 1, 2), (10**-2.65, 10**-2.7, 10**-2.75))
-    system = System.from_chain(chain, four_band_contact(law))
+    system = System.from_chain(chain, [Stops.both(four_band_contact(law), gap) for gap in chain.clearances])
     graze = system.grazing_energy(mode)
 
     branch = follow(system, mode, graze / 2, energy=[0.0, 1.05 * graze], points=400)

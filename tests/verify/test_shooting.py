@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tests.models import CLEARANCE, OUT_OF_PHASE, four_band_contact, reduced_model
-from vipetsc.case.nnm import NnmTable
+from vipetsc.case.nnm_table import NnmTable
 from vipetsc.lattice import four_band
+from vipetsc.modes.balance.harmonics import Stops
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
@@ -34,7 +35,7 @@ def test_half_map_of_an_asymmetric_system():
 
 def test_an_arc_that_ends_where_a_contact_just_closes_ends():
     """The time left, 1e-8 of the arc, is all rounding: a search that lands on its beginning again has no end."""
-    system = System.reduced(four_band("printed"), CLEARANCE, four_band_contact("hertz"))
+    system = System.reduced(four_band("printed"), Stops.both(four_band_contact("hertz"), CLEARANCE))
     flow = Dop853Flow(system)
     start = np.array([7.732456897616884, 7.742513284851792, 0.0, 0.0])
 

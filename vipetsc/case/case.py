@@ -5,7 +5,6 @@ A case is TOML with the sections of ``vipetsc.case.schema``, in SI units; masses
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
 from functools import cache, cached_property
 from typing import Any, ClassVar
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, read_section
 from vipetsc.case.contacts import check_pairs, check_touching, contact_of, gaps_of_sites, laws_of_sites, values_of_sites
-from vipetsc.case.disorder import SEED, DisorderTable, scatter
+from vipetsc.case.disorder import DisorderTable, with_drawn
 from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_speed
 from vipetsc.case.features import refusals
 from vipetsc.case.html import case_html
@@ -93,22 +92,7 @@ class Case(CaseFile):
         problems = [*_resolved_problems(sections, resolved), *_touching_problems(sections, beginning)]
         if problems or "disorder" not in table:
             return resolved, problems
-        return cls._scattered(resolved, disorder, sections["contacts"])
-
-    @classmethod
-    def _scattered(
-        cls, resolved: dict[str, Any], disorder: DisorderTable, contacts: ContactsTable
-    ) -> tuple[dict[str, Any], list[Problem]]:
-        """The ``resolved`` sections with the drawn values; ``contacts`` are those of the file."""
-        drawn, problems = scatter(resolved, disorder, contacts)
-        if problems or not drawn:
-            return resolved, problems
-
-        # What is drawn may be out of bounds: it is checked as if it stood in the file.
-        tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in resolved.items()}
-        sections, problems = super().read(tables | drawn)
-        # The file has no such value: the message names the seed that drew it.
-        return sections, [replace(p, key=f"{SEED} = {disorder.seed} draws {p.key}") for p in problems]
+        return with_drawn(super().read, resolved, disorder, sections["contacts"])
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:

@@ -161,6 +161,17 @@ def resolved_per_site(contacts: ContactsTable, count: int) -> PerSiteTable | Non
     return contacts.each.model_copy(update=dict.fromkeys(MATERIAL) | {"stiffness": stiffness})
 
 
+def with_stiffness(contacts: ContactsTable, count: int) -> ContactsTable:
+    """``contacts`` with stiffnesses in place of materials, for all sites and in the lists over ``count`` sites."""
+    update: dict[str, Any] = {"each": resolved_per_site(contacts, count)}
+    modulus = contacts.modulus
+    radius = contacts.radius
+    poisson = contacts.poisson
+    if contacts.stiffness is None and modulus is not None and radius is not None and poisson is not None:
+        update |= {"stiffness": float(contact_stiffness(modulus, radius, poisson)), "modulus": None, "poisson": None}
+    return contacts.model_copy(update=update)
+
+
 def contact_of(contacts: ContactsTable) -> Contact:
     """The law of all sites of a resolved case; the stiffness is 0 where none is given."""
     return Contact(

@@ -5,8 +5,8 @@ draw. Each quantity has its own generator (Philox), keyed by the seed and its na
 number of ranks, on the order of the draws or on the other quantities.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -107,6 +107,27 @@ def scatter(
         if lattice.preset and "stiffness" in changed["contacts"]:
             changed["contacts"].setdefault("radius", CONTACTS["radius"])
     return changed, []
+
+
+def with_drawn(
+    read: Callable[[Table], tuple[dict[str, Any], list[Problem]]],
+    resolved: dict[str, Any],
+    disorder: DisorderTable,
+    given: ContactsTable,
+) -> tuple[dict[str, Any], list[Problem]]:
+    """The ``resolved`` sections with the values that ``disorder`` draws, checked as ``read`` reads a case's table.
+
+    ``given`` are the contacts before they were resolved.
+    """
+    drawn, problems = scatter(resolved, disorder, given)
+    if problems or not drawn:
+        return resolved, problems
+
+    # What is drawn may be out of bounds: it is checked as if it stood in the file.
+    tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in resolved.items()}
+    sections, problems = read(tables | drawn)
+    # The file has no such value: the message names the seed that drew it.
+    return sections, [replace(p, key=f"{SEED} = {disorder.seed} draws {p.key}") for p in problems]
 
 
 def _draw(

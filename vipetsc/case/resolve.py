@@ -8,14 +8,14 @@ import numpy as np
 
 from vipetsc.case.absorbing import designed_end
 from vipetsc.case.case_file import Problem, Table, Valid
-from vipetsc.case.contacts import check_per_site, contact_of, laws_of_sites, pairs_of_sites, resolved_per_site
+from vipetsc.case.contacts import check_per_site, contact_of, laws_of_sites, pairs_of_sites, with_stiffness
 from vipetsc.case.drive import DriveTable, build_drives, packet_speed, resolve_drives, waveform_of
 from vipetsc.case.inhomogeneity import cell_variation
 from vipetsc.case.initial import Beginning, InitialTable
 from vipetsc.case.schema import CONTACTS, PRESETS, DampingTable, LatticeTable, TimeTable
 from vipetsc.case.sites import ContactsTable, Span
 from vipetsc.case.waveforms import DEFAULT, is_sine
-from vipetsc.lattice import Chain, UnitCell, contact_stiffness, pass_bands
+from vipetsc.lattice import Chain, UnitCell, pass_bands
 from vipetsc.lattice.cell import cell_problems, connected_groups
 
 # A key of a case file takes the place of these keys of the preset.
@@ -243,7 +243,7 @@ def resolve(sections: Mapping[str, Any], beginning: Beginning | None) -> dict[st
 
     resolved = dict(sections)
     resolved["lattice"] = _resolved_lattice(lattice, cell, reference)
-    resolved["contacts"] = _resolved_contacts(sections["contacts"], lattice)
+    resolved["contacts"] = resolved_contacts(sections["contacts"], lattice)
     resolved["drive"] = drive
     resolved["time"] = _resolved_time(sections["time"], cell, lattice.cells, reference)
     resolved.pop("initial", None)  # a lattice at rest says nothing
@@ -279,7 +279,7 @@ def reference_drive(drive: DriveTable, initial: InitialTable | None) -> DriveTab
 
 def contact_frequency(lattice: LatticeTable, contacts: ContactsTable, speed: float) -> float | None:
     """Frequency in rad/s of which the shortest contact at a ``speed`` in m/s is half a period; None without sites."""
-    resolved = _resolved_contacts(contacts, lattice)
+    resolved = resolved_contacts(contacts, lattice)
     chain = build_chain(lattice, resolved)
     laws = laws_of_sites(resolved, len(chain.sites)) or (contact_of(resolved),) * len(chain.sites)
     impacts = {*zip(laws, chain.reduced_masses(), strict=True)}
@@ -302,22 +302,17 @@ def _resolved_lattice(lattice: LatticeTable, cell: UnitCell, drive: DriveTable) 
     return lattice.model_copy(update=update)
 
 
-def _resolved_contacts(contacts: ContactsTable, lattice: LatticeTable) -> ContactsTable:
+def resolved_contacts(contacts: ContactsTable, lattice: LatticeTable) -> ContactsTable:
     """The contacts with a cell and a clearance for every site, and a stiffness in place of a material."""
     sites = site_cells(lattice, contacts)
+    resolved = with_stiffness(contacts, len(sites))
     update: dict[str, Any] = {"sites": sites, "clearance": clearances(lattice, contacts, len(sites))}
-    update["each"] = resolved_per_site(contacts, len(sites))
     if contacts.damping == "paper":
         update["damping"] = None  # as if left out: the same case
-
-    modulus = contacts.modulus
-    radius = contacts.radius
-    poisson = contacts.poisson
-    if contacts.stiffness is None and modulus is not None and radius is not None and poisson is not None:
-        update |= {"stiffness": float(contact_stiffness(modulus, radius, poisson)), "modulus": None, "poisson": None}
-        if lattice.preset and radius == CONTACTS["radius"]:
-            update["radius"] = None  # the preset says it
-    return contacts.model_copy(update=update)
+    is_of_material = resolved.modulus is None and contacts.modulus is not None
+    if is_of_material and lattice.preset and contacts.radius == CONTACTS["radius"]:
+        update["radius"] = None  # the preset says it
+    return resolved.model_copy(update=update)
 
 
 def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTable) -> TimeTable:

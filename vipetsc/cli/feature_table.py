@@ -74,10 +74,9 @@ class Column:
         if changes is None:
             return None
 
-        read = {*self.kind.keywords(), "plugins"} | ({"disorder"} if self.kind is NnmCase else set())
-        if not changes.keys() <= read:
+        if not changes.keys() <= {*self.kind.keywords(), "plugins"}:
             return None
-        return merged(merged(BASE, self.sections), changes | feature.scaled.get(self.heading, {}))
+        return merged(merged(BASE, self.sections), merged(changes, feature.scaled.get(self.heading, {})))
 
     def answer(self, feature: Feature) -> str:
         """``YES``, ``UNREAD``, or the sentence that refuses ``feature``."""
@@ -184,6 +183,11 @@ def _initial(**changes: Any) -> Table:
     return {"initial": changes}
 
 
+FEW_SPRINGS: Table = {
+    "lattice": {"cells": 4},
+    "contacts": {"sites": [2, 3]},
+    "nnm": {"points": 1, "harmonics": 21, "truncation": 1e-3},
+}
 CUBIC_CELL = {"springs": [HOST_SPRING, RESONATOR_SPRING | {"cubic": 1e9}]}
 MEASURED = {"time": [0.0, 1e-3, 2e-3, 3e-3, 4e-3], "value": [0.0, 1.0, -1.0, 0.5, 0.0]}
 RUBBER = {"plugins": {"modules": [str(files("vipetsc") / "examples" / "own_law.py")]}} | _contacts(
@@ -197,7 +201,7 @@ FEATURES: tuple[Feature, ...] = (
         _lattice(cell=CUBIC_CELL),
         {"nnm": {"own": {"smooth": [{"start": 0, "end": 1, "cubic": 0.5}]}}},
         # Each of these springs has unknown harmonics.
-        scaled={"nfrc": {"nfrc": {"points": 2, "harmonics": 3}}},
+        scaled={"nfrc": {"nfrc": {"points": 2, "harmonics": 3}}, "condensed": FEW_SPRINGS},
     ),
     Feature("profiles of cells", _lattice(profiles={"masses[1]": {"first": 4e-3, "last": 4.1e-3}})),
     Feature("disorder of cells", {"disorder": {"cells": {"masses[1]": {"relative": 0.01}}}}),
@@ -205,7 +209,13 @@ FEATURES: tuple[Feature, ...] = (
     Feature("absorbing ends", _lattice(absorbing={"cells": 9, "strength": 1.0})),
     Feature("free ends", _lattice(ends="free")),
     Feature("ring", _lattice(ends="periodic")),
-    Feature("one-sided stops", _contacts(side="plus"), _contacts(side="plus")),
+    Feature(
+        "one-sided stops",
+        _contacts(side="plus"),
+        _contacts(side="plus"),
+        # Above the bands the mean of its force moves such a site away from its stop.
+        scaled={"condensed": {"nnm": {"start_frequency": [1500.0]}}},
+    ),
     Feature("two clearances", _contacts(clearance_minus=2e-4), _contacts(clearance_minus=2e-4)),
     Feature("unequal clearances", _contacts(clearance=[1e-4, 2e-4]), _own_contacts((1, 0.1), (0, 0.2))),
     Feature("touching stops", _contacts(clearance=0.0, side="plus", restitution=1.0)),

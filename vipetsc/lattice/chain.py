@@ -69,6 +69,15 @@ class Chain:
         dashpots = [array for name, array in self._varied.items() if name in ("grounding", "damping")]
         return self.cell.is_damped or any(array.any() for array in dashpots)
 
+    def without_dashpots(self) -> "Chain":
+        """The lattice with all dashpots left out; itself if it has none."""
+        if not self.is_damped:
+            return self
+        springs = tuple(replace(spring, damping=0.0) for spring in self.cell.springs)
+        remaining = {name: array for name, array in self._varied.items() if name not in ("grounding", "damping")}
+        cell = replace(self.cell, springs=springs, grounding=())
+        return replace(self, cell=cell, variation=Variation(**remaining) if remaining else None)
+
     @property
     def contact_pairs(self) -> tuple[Pair, ...]:
         """The pair of each site: those of ``pairs``, or the cell's."""

@@ -1,6 +1,6 @@
 """A conservative system of masses, springs and contact pairs, with any number of degrees of freedom."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, Self
@@ -10,21 +10,29 @@ from scipy.linalg import eigh
 from scipy.sparse import issparse
 
 from vipetsc.case.nnm import NnmCase
-from vipetsc.case.resolve import build_chain, clearances
-from vipetsc.lattice import Chain, Contact, Spring, UnitCell
+from vipetsc.lattice import Chain, Contact, Spring, UnitCell, nonlinear_places
+from vipetsc.modes.balance.harmonics import Stops
 
 
 @dataclass(frozen=True)
 class ContactPair:
-    """Contact between two masses (0-based), on both sides of a ``clearance`` in m.
+    """Contact between two masses (0-based), with stops on both sides of a ``clearance`` in m.
 
-    ``host`` may be None for a contact with the ground; w = u_resonator - u_host.
+    ``host`` may be None for a contact with the ground; w = u_resonator - u_host. The stop on the side of negative w is
+    at ``clearance_minus`` if that is not None. A clearance of inf is that of a side without a stop.
     """
 
     host: int | None
     resonator: int
     clearance: float
     law: Contact
+    clearance_minus: float | None = None
+
+    @property
+    def stops(self) -> Stops:
+        """The law and the clearances on both sides."""
+        minus = self.clearance if self.clearance_minus is None else self.clearance_minus
+        return Stops(self.law, self.clearance, minus)
 
 
 class SmoothSpring(NamedTuple):
@@ -66,8 +74,8 @@ class System:
             raise ValueError(f"the stiffness must be a symmetric matrix of shape ({n}, {n})")
 
         for pair in self.contacts:
-            if pair.clearance <= 0:
-                raise ValueError(f"clearance {pair.clearance!r} must be positive (m)")
+            if pair.stops.clearance <= 0:
+                raise ValueError(f"clearance {pair.stops.clearance!r} must be positive (m)")
             if pair.law.restitution != 1:
                 raise ValueError(
                     f"restitution {pair.law.restitution!r} dissipates; nonlinear normal modes need restitution = 1"
@@ -97,30 +105,36 @@ class System:
     @classmethod
     def from_case(cls, case: NnmCase) -> Self:
         """The system of a case: masses and springs, the reduced model of the lattice's cell, or the lattice."""
-        law = case.contact()
+        stops = elastic_stops(case)
         table = case.nnm.custom
         if case.nnm.system == "chain":
-            return cls.from_chain(build_chain(case.lattice, case.contacts), law)
+            return cls.from_chain(case.chain(), stops)
         if table is None:
-            return cls.reduced(case.lattice.unit_cell(), clearances(case.lattice, case.contacts, 1)[0], law)
+            return cls.reduced(case.lattice.unit_cell(), *stops)
 
         mass = [None, *range(len(table.masses))]  # the table counts them from 1, and 0 is the ground
         smooth = table.smooth
+        pairs = zip(table.contacts, stops, strict=True)
         return cls.assemble(
             masses=table.masses,
             springs=[(mass[s.start], s.end - 1, s.stiffness) for s in table.springs],
-            contacts=[ContactPair(mass[p.host], p.resonator - 1, p.clearance, law) for p in table.contacts],
+            contacts=[contact_pair(mass[p.host], p.resonator - 1, of_pair) for p, of_pair in pairs],
             smooth=[SmoothSpring.between(mass[s.start], s.end - 1, s.quadratic, s.cubic) for s in smooth],
         )
 
     @classmethod
-    def from_chain(cls, chain: Chain, law: Contact, dense: bool = True) -> Self:
-        """The finite lattice ``chain`` with its contact sites, as one system; else with a sparse stiffness."""
-        cell = chain.cell
-        pairs = (
-            ContactPair(site * cell.dofs + cell.host, site * cell.dofs + cell.resonator, clearance, law)
-            for site, clearance in zip(chain.sites, chain.clearances, strict=True)
-        )
+    def from_chain(cls, chain: Chain, stops: Sequence[Stops], dense: bool = True) -> Self:
+        """The finite lattice ``chain`` with the ``stops`` of its sites, as one system; else with a sparse stiffness.
+
+        Dashpots of the lattice are left out.
+        """
+        dofs = chain.cell.dofs
+        pairs = []
+        places = zip(chain.sites, chain.resonator_cells, chain.contact_pairs, stops, strict=True)
+        for site, resonator_cell, pair, of_site in places:
+            host = site * dofs + pair.host if pair.host >= 0 else None
+            pairs.append(contact_pair(host, resonator_cell * dofs + pair.resonator, of_site))
+
         # Shooting with matrices needs a dense one; of the 40,000 masses of a whole lattice it would take 13 GB.
         stiffness = chain.stiffness_matrix()
         return cls(
@@ -131,7 +145,7 @@ class System:
         )
 
     @classmethod
-    def reduced(cls, cell: UnitCell, clearance: float, law: Contact) -> Self:
+    def reduced(cls, cell: UnitCell, stops: Stops) -> Self:
         """The paper's 2-DoF model of a cell's contact pair (Sec. IV); masses are (host, resonator).
 
         Each of the host's springs to other masses is divided between its two masses: held at its middle it has twice
@@ -146,7 +160,7 @@ class System:
                 ground[mass] += 2 * stiffness / 2
         springs = [(None, 0, ground[cell.host]), (0, 1, between), (None, 1, ground[cell.resonator])]
         masses = (cell.masses[cell.host], cell.masses[cell.resonator])
-        return cls.assemble(masses, springs, (ContactPair(0, 1, clearance, law),))
+        return cls.assemble(masses, springs, (contact_pair(0, 1, stops),))
 
     @property
     def dofs(self) -> int:
@@ -165,13 +179,19 @@ class System:
 
     @cached_property
     def clearances(self) -> np.ndarray:
-        """Clearances (contacts,) in m."""
-        return np.array([p.clearance for p in self.contacts])
+        """Clearances (contacts, 2) in m on the sides + and -; inf where there is no stop."""
+        return np.array([(p.stops.plus, p.stops.minus) for p in self.contacts]).reshape(-1, 2)
+
+    def clearances_at(self, w: np.ndarray) -> np.ndarray:
+        """Clearances (..., contacts) in m on the sides of the relative displacements ``w`` (..., contacts)."""
+        plus, minus = self.clearances.T
+        return np.where(w < 0, minus, plus)
 
     @property
     def odd(self) -> bool:
         """Whether all forces change sign with the displacement."""
-        return all(s.law.is_odd for s in self.springs)
+        plus, minus = self.clearances.T
+        return np.array_equal(plus, minus) and all(s.law.is_odd for s in self.springs)
 
     def linear_modes(self) -> tuple[np.ndarray, np.ndarray]:
         """Frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) without contact."""
@@ -192,13 +212,14 @@ class System:
 
     def gaps(self, u: np.ndarray) -> np.ndarray:
         """|w| - clearance in m of every contact at displacements ``u`` (..., n); shape (..., contacts)."""
-        return np.abs(u @ self.contact_rows.T) - self.clearances
+        w = u @ self.contact_rows.T
+        return np.abs(w) - self.clearances_at(w)
 
     def forces(self, u: np.ndarray) -> np.ndarray:
         """Restoring forces (n,) in N at displacements ``u`` (n,) in m."""
         force = self.stiffness @ u
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
-            force = force + row * pair.law.force(row @ u, pair.clearance)
+            force = force + row * pair.stops.force(row @ u)
         for row, spring in zip(self.spring_rows, self.springs, strict=True):
             force = force + row * spring.law.nonlinear_force(row @ u)
         return force
@@ -207,7 +228,7 @@ class System:
         """Kinetic and potential energy in J at displacements ``u`` and velocities ``v`` (n,)."""
         total = 0.5 * (self.masses * v) @ v + 0.5 * u @ self.stiffness @ u
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
-            total += pair.law.potential(row @ u, pair.clearance)
+            total += pair.stops.energy(row @ u)
         for row, spring in zip(self.spring_rows, self.springs, strict=True):
             total += spring.law.nonlinear_energy(row @ u)
         return float(total)
@@ -216,18 +237,32 @@ class System:
         """Energy in J at which linear mode ``mode`` (0-based) first touches a contact; inf if it never does."""
         omega, shapes = self.linear_modes()
         reach = np.abs(self.contact_rows @ shapes[:, mode])
-        amplitude = (self.clearances[reach > 0] / reach[reach > 0]).min(initial=np.inf)
+        nearest = self.clearances.min(axis=1)
+        amplitude = (nearest[reach > 0] / reach[reach > 0]).min(initial=np.inf)
         if not np.isfinite(amplitude):  # times omega = 0 of a rigid-body motion it would be no number
             return np.inf
         return float(0.5 * omega[mode] ** 2 * amplitude**2)
 
     def closed_frequencies(self) -> np.ndarray:
-        """Frequencies (n,) in rad/s with every contact closed and no clearance: the bilinear law's limit."""
+        """Frequencies (n,) in rad/s with every contact closed and no clearance: the bilinear law's limit.
+
+        It is that of contacts with stops on both sides.
+        """
         # With w >> D only the linear part of a bilinear contact counts: a spring of its stiffness.
         stiffness = self.stiffness.copy()
         for row, pair in zip(self.contact_rows, self.contacts, strict=True):
             stiffness += pair.law.stiffness * np.outer(row, row)
         return np.sqrt(eigh(stiffness, np.diag(self.masses), eigvals_only=True))
+
+
+def elastic_stops(case: NnmCase) -> list[Stops]:
+    """The stops of each contact of a case, and its law without dissipation."""
+    return [Stops(law, plus, minus) for law, (plus, minus) in zip(case.elastic_laws(), case.gaps(), strict=True)]
+
+
+def contact_pair(host: int | None, resonator: int, stops: Stops) -> ContactPair:
+    """The contact of two masses (from 0; ``host`` None is the ground) with these ``stops``."""
+    return ContactPair(host, resonator, stops.plus, stops.law, stops.minus)
 
 
 def elongation_rows(ends: list[tuple[int | None, int]], dofs: int) -> np.ndarray:
@@ -250,19 +285,9 @@ def _is_symmetric(matrix: np.ndarray) -> bool:
 
 def _nonlinear_springs(chain: Chain) -> Iterator[SmoothSpring]:
     """The springs of a lattice that have more than a linear part, those to its walls among them."""
-    d = chain.cell.dofs
-    for spring in chain.cell.springs:
-        if spring.is_linear:
-            continue
-        for cell in range(chain.cells - spring.next_cell):
-            yield SmoothSpring(cell * d + spring.start, (cell + spring.next_cell) * d + spring.end, spring)
-        # A spring within a cell is complete; one to the next cell still lacks its place at the lattice's ends.
-        if not spring.next_cell:
-            continue
-        last = (chain.cells - 1) * d + spring.start
-        if chain.ends == "periodic":
-            yield SmoothSpring(last, spring.end, spring)
-        elif chain.ends == "fixed":
-            yield SmoothSpring(None, spring.end, spring)
+    for place in nonlinear_places(chain):
+        if place.end >= 0:
+            yield SmoothSpring(place.start if place.start >= 0 else None, place.end, place.law)
+        else:
             # From the last mass to the wall the elongation is -u: an even part of the force changes its sign.
-            yield SmoothSpring(None, last, replace(spring, quadratic=-spring.quadratic))
+            yield SmoothSpring(None, place.start, replace(place.law, quadratic=-place.law.quadratic))

@@ -83,11 +83,11 @@ def follow_branches(
 
 def nnm_rows(case: NnmCase, ranks: int) -> Rows:
     """System, modes, range of energy and contact law of the branches."""
-    contact = case.contact()
     low, high = case.nnm.energy
+    laws = dict.fromkeys(f"{law.law}, {law.stiffness:.6g} N/m^{law.onset_exponent:g}" for law in case.laws())
     return [
         ("nnm", f"{case.nnm.system} system, modes {first_few(case.nnm.modes)}, {low:g} to {high:g} J"),
-        ("nnm contact", f"{contact.law}, {contact.stiffness:.6g} N/m^{contact.onset_exponent:g}"),
+        ("nnm contact", first_few(list(laws)) if laws else "none"),
     ]
 
 

@@ -2,16 +2,17 @@
 
 The motions are at rest at phase 0 (cosines alone), and symmetric where all forces are odd (odd harmonics alone). The
 number of harmonics is chosen at every point for the next one by the estimate of what is left out. A branch begins at
-a linear mode, or at a frequency in a gap: there a describing function, z = a cos(Om t) at one place, gives a from
-1 + G(Om) F_1(a)/a = 0, and the other harmonics are brought in with a growing weight.
+a linear mode, or at a frequency in a gap: there a describing function, z = b + a cos(Om t) at one place, gives a from
+1 + G(Om) F_1/a = 0 and the mean from b + G(0) F_0 = 0, and the other harmonics are brought in with a growing weight.
 """
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
 
-from vipetsc.case.nnm import NnmTable
+from vipetsc.case.nnm_table import NnmTable
 from vipetsc.modes.balance.harmonic_balance import Compliance, HarmonicBalance
 from vipetsc.modes.balance.harmonics import Episode, SiteForces
 from vipetsc.modes.newton import DenseNewton
@@ -27,8 +28,9 @@ MORE = 0.5
 AIM = 0.2
 # Step along the tangent by whose two ends the energy's slope is taken.
 SLOPE_STEP = 1e-5
-# Largest size of a describing function, in clearances.
+# Largest size of a describing function, in clearances, and the mean over the amplitude that is none.
 LARGEST = 1e3
+LEAST_MEAN = 1e-14
 # As the harmonics above the first are brought in: first step of their weight, how far the motion may change in one,
 # and the smallest.
 FIRST_WEIGHT = 0.1
@@ -244,17 +246,23 @@ class ConservativeMotions:
 
         Raises ContinuationError where there is none with one harmonic, or none is reached by bringing in the others.
         """
-        g = self.compliance.at(np.array([omega]))[0]
+        # A harmonic motion of forces that are odd has no mean, and the static compliance need not be there.
+        static, dynamic = self.compliance.at(np.array([omega if self.forces.odd else 0.0, omega]))
         z = np.zeros(len(signs))
-        for place in np.nonzero(signs)[0]:
-            z[place] = signs[place] * describing_amplitude(self.forces, place, g[place, place], omega)
+        mean = np.zeros(len(signs))
+        for place in np.nonzero(signs)[0].tolist():
+            g = PlaceCompliance(float(static[place, place]), float(dynamic[place, place]))
+            mean[place], amplitude = describing_motion(self.forces, place, g, omega)
+            z[place] = signs[place] * amplitude
+            # The force there moves the places that are not in contact, too.
+            z += np.where(signs == 0, dynamic[:, place] / g.dynamic * z[place], 0.0)
 
-        x = self.one_harmonic(z)
+        x = self.one_harmonic(z, mean)
         size = float(np.abs(z).max())
         row = np.append(0 * x, 1.0)
         weight = 0.0
         step = FIRST_WEIGHT
-        # The other harmonics change the motion smoothly with their weight; at once Newton's method would be lost.
+        # Harmonics above the first change the motion smoothly with their weight; at once Newton's method would be lost.
         while weight < 1:
             tried = min(weight + step, 1.0)
             frame = HarmonicFrame(self, self.balance(FEWEST).weighted(tried), x, omega, size)
@@ -273,10 +281,12 @@ class ConservativeMotions:
                 )
         return self.refined(self._guess(x, omega), keep_frequency=True)
 
-    def one_harmonic(self, z: np.ndarray) -> np.ndarray:
-        """Unknowns with the fewest harmonics of a motion z cos(theta), ``z`` (places,) in m."""
+    def one_harmonic(self, z: np.ndarray, mean: np.ndarray | float = 0.0) -> np.ndarray:
+        """Unknowns with the fewest harmonics of a motion ``mean`` + z cos(theta), ``z`` (places,) and mean in m."""
         balance = self.balance(FEWEST)
-        return balance.pack(z[:, None] * (np.arange(balance.order + 1) == 1))
+        harmonics = z[:, None] * (np.arange(balance.order + 1) == 1)
+        harmonics[:, 0] = mean
+        return balance.pack(harmonics)
 
     def _guess(self, x: np.ndarray, omega: float) -> Point:
         """A point to be corrected, of unknowns with the fewest harmonics."""
@@ -284,9 +294,24 @@ class ConservativeMotions:
         return frame.measures(Attempt(False, "", [], frame.xi))
 
 
-def describing_amplitude(forces: SiteForces, place: int, g: float, omega: float) -> float:
-    """Amplitude in m of z = a cos(Om t) at a ``place`` with the compliance ``g`` in m/N and one of the ``forces``.
+class PlaceCompliance(NamedTuple):
+    """Compliance in m/N of one place: ``static``, which the mean of a force meets, and ``dynamic``, at a frequency."""
 
+    static: float
+    dynamic: float
+
+
+class DescribedMotion(NamedTuple):
+    """A motion ``mean`` + ``amplitude`` cos(theta) of one place, in m."""
+
+    mean: float
+    amplitude: float
+
+
+def describing_motion(forces: SiteForces, place: int, g: PlaceCompliance, omega: float) -> DescribedMotion:
+    """The motion z = b + a cos(Om t) at a ``place`` with one of the ``forces``, of which two harmonics balance.
+
+    b + G(0) F_0 = 0 gives the mean b of every amplitude a, which increases with the force; a + G(Om) F_1 = 0 gives a.
     Raises ContinuationError where there is none.
     """
     spring = place - len(forces.contacts)
@@ -297,14 +322,29 @@ def describing_amplitude(forces: SiteForces, place: int, g: float, omega: float)
         )
     z = np.zeros((forces.pairs, 2), complex)
 
-    def balance(amplitude: float) -> float:
-        z[place, 1] = amplitude
-        return amplitude + g * float(forces.series(z, omega).forces[place, 1].real)
+    def force(mean: float, amplitude: float) -> np.ndarray:
+        z[place] = mean, amplitude
+        return forces.series(z, omega).forces[place].real
 
-    size = forces.amplitude_scale(place, g)
+    def mean_of(amplitude: float) -> float:
+        def static_balance(mean: float) -> float:
+            return mean + g.static * float(force(mean, amplitude)[0])
+
+        # Odd forces have no mean. Of forces that harden it lies between 0 and that of the force at 0; of others the
+        # balance of all harmonics will find it.
+        without = static_balance(0.0)
+        if forces.odd or abs(without) <= LEAST_MEAN * amplitude or static_balance(-without) * without >= 0:
+            return 0.0
+        return float(brentq(static_balance, -without, 0.0))
+
+    def balance(amplitude: float) -> float:
+        return amplitude + g.dynamic * float(force(mean_of(amplitude), amplitude)[1])
+
+    size = forces.amplitude_scale(place, g.dynamic)
     if balance(size) * balance(LARGEST * size) >= 0:
         raise ContinuationError(
-            f"no breather starts at {omega:g} rad/s: the compliance of its site is {g:.4g} m/N there, and a force "
-            f"that hardens needs a negative one of moderate size; change nnm.start_frequency"
+            f"no breather starts at {omega:g} rad/s: the compliance of its site is {g.dynamic:.4g} m/N there, and a "
+            f"force that hardens needs a negative one of moderate size; change nnm.start_frequency"
         )
-    return float(brentq(balance, size, LARGEST * size, rtol=1e-12))
+    amplitude = float(brentq(balance, size, LARGEST * size, rtol=1e-12))
+    return DescribedMotion(mean=mean_of(amplitude), amplitude=amplitude)

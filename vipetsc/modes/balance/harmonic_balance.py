@@ -26,6 +26,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from vipetsc.lattice import DenseCompliance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 
 # Radius, over the frequency, of a circle on which Cauchy's formula gives the derivative of a real compliance, and the
@@ -38,6 +39,8 @@ STEP = 1e-6
 LEAST_RATE = 1e-3
 # Relative detuning of a frequency at which the compliance has a pole.
 DETUNING = 1e-15
+# Size of the compliance times the stiffness of the shift from which several pairs are taken to be close to a pole.
+NEAR_POLE = 1e3
 
 
 class Compliance(Protocol):
@@ -72,7 +75,7 @@ class HarmonicBalance:
 
     ``order`` is K, the highest. Odd orders alone are enough for symmetric motions of ``forces.odd``; ``cosines`` alone
     for conservative motions that are at rest at phase 0. x holds, pair by pair, Re Z_k and then Im Z_k for the orders
-    k, in m. ``weight`` multiplies the compliances of all orders but the first: at 0 a motion has one harmonic.
+    k, in m. ``weight`` multiplies the compliances of orders above the first: at 0 a motion has a mean and one harmonic.
 
     Residual, derivative and energy are those of the compliance shifted by stiffnesses that ``shift`` chooses at a
     frequency: all of them are asked with one choice along a step.
@@ -133,7 +136,7 @@ class HarmonicBalance:
         circle = RADIUS * NODES if np.isrealobj(values) else STEP * np.array([1.0, -1.0])
         near = self.compliance.at((rates + sizes * circle[:, None]).ravel())
         values = np.concatenate([values[None], near.reshape(len(circle), *values.shape)])
-        values[:, self.orders != 1] *= self.weight
+        values[:, self.orders > 1] *= self.weight
         return Compliances(values, sizes * len(circle), circle)
 
     def shift(self, omega: float) -> np.ndarray:
@@ -150,10 +153,28 @@ class HarmonicBalance:
         values, scale, circle = self.compliances(omega)
         factor = np.linalg.inv(np.eye(self.forces.pairs) + shift * values)
         shifted = factor @ values
+        self._correct_near_modes(omega, shift, values[0], shifted[0], factor[0])
         slopes = np.einsum("n,nkij->kij", 1 / circle, shifted[1:]) / scale[:, None, None]
         if len(circle) == len(NODES):  # the other half of the circle is its conjugate
             return Shifted(shifted[0].real, slopes.real, factor[0].real)
         return Shifted(shifted[0], slopes, factor[0])
+
+    def _correct_near_modes(
+        self, omega: float, shift: np.ndarray, values: np.ndarray, shifted: np.ndarray, factor: np.ndarray
+    ) -> None:
+        """Compute ``shifted`` and ``factor`` anew, of orders at which the compliance ``values`` are close to a pole.
+
+        All three are (orders, pairs, pairs). Near the pole of a mode the compliance of several pairs is that of the
+        mode alone, to rounding, and the inverse has lost the rest; of one pair nothing is lost.
+        """
+        if self.forces.pairs < 2 or not isinstance(self.compliance, DenseCompliance):
+            return
+        sizes = np.abs(shift[:, 0, 0]) * np.abs(values).max(axis=(1, 2))
+        (near,) = np.nonzero(sizes > NEAR_POLE)
+        stiffness = shift[near, 0, 0]
+        if near.size and self.weight == 1.0:
+            shifted[near] = self.compliance.with_springs(self.orders[near] * omega, stiffness)
+            factor[near] = np.eye(self.forces.pairs) - stiffness[:, None, None] * shifted[near]
 
     def shifted_force(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
         """F - s Z (orders, pairs, 1) complex in N."""

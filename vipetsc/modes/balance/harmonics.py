@@ -229,6 +229,15 @@ class Stops(NamedTuple):
         """The smaller clearance in m."""
         return min(self.plus, self.minus)
 
+    def force(self, w: float) -> float:
+        """Elastic force in N at the relative displacement ``w`` in m, without what a static load balances."""
+        elastic = self.law.elastic_force(w - self.plus) - self.law.elastic_force(-w - self.minus)
+        return float(elastic)
+
+    def energy(self, w: float) -> float:
+        """Elastic energy in J at the relative displacement ``w`` in m."""
+        return float(self.law.elastic_energy(w - self.plus) + self.law.elastic_energy(-w - self.minus))
+
     @property
     def load(self) -> float:
         """Force in N, on the side + positive, that a static load balances."""

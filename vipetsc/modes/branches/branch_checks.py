@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from vipetsc.case.nnm import Guards, NnmTable
+from vipetsc.case.nnm_table import Guards, NnmTable
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.continuation.guards import half_trace_change

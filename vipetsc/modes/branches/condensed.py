@@ -9,14 +9,14 @@ import numpy as np
 
 from vipetsc.case import NnmCase
 from vipetsc.case.names import distinct
-from vipetsc.case.nnm import NnmTable
-from vipetsc.case.resolve import build_chain
+from vipetsc.case.nfrc import needs_modes
+from vipetsc.case.nnm_table import NnmTable
 from vipetsc.io.branch_kinds import CONDENSED
 from vipetsc.io.netcdf import Variables
 from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, pass_bands
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
-from vipetsc.modes.balance.harmonics import SiteForces, Stops
+from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.hill import Hill
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, start_energy
@@ -26,7 +26,7 @@ from vipetsc.modes.lattice.floquet import with_multipliers
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import PeriodicProblem
-from vipetsc.modes.system import System
+from vipetsc.modes.system import System, elastic_stops
 
 # A field is left out below this fraction of its largest value.
 NEGLIGIBLE = 1e-16
@@ -36,30 +36,39 @@ LAST_REACH = 2048
 
 
 class Condensed(NamedTuple):
-    """A case condensed onto contacts and springs: its motions, and their lattice or else their system."""
+    """A case condensed onto contacts and springs: its motions, and the system whose linear modes begin branches.
+
+    ``dofs`` are the masses of a cell, all masses in a system of one's own.
+    """
 
     motions: ConservativeMotions
     chain: Chain | None
     system: System | None
+    dofs: int
 
     @classmethod
     def from_case(cls, case: NnmCase) -> "Condensed":
         """The lattice of a case between its sites, or its system between its contacts and springs."""
         options = case.nnm
-        if options.system == "condensed":
-            chain = build_chain(case.lattice, case.contacts)
-            forces = SiteForces([Stops.both(case.contact(), clearance) for clearance in chain.clearances])
-            compliance = SeriesCompliance(WaveCompliance(chain))
-            return cls(ConservativeMotions(compliance, forces, options), chain, None)
-        system = System.from_case(case)
-        return cls(condensed_system(system, options), None, system)
+        if options.system != "condensed":
+            system = System.from_case(case)
+            dofs = case.lattice.unit_cell().dofs if options.system == "chain" else system.dofs
+            return cls(condensed_system(system, options), None, system, dofs)
+
+        chain = case.chain()
+        stops = elastic_stops(case)
+        if needs_modes(chain):
+            # Bloch waves are those of equal cells with contacts of the cell's pair: other lattices have all modes.
+            motions = condensed_system(System.from_chain(chain, stops), options)
+        else:
+            motions = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), SiteForces(stops), options)
+        return cls(motions, chain, None, chain.cell.dofs)
 
 
 def condensed_system(system: System, options: NnmTable) -> ConservativeMotions:
     """The motions of a ``system`` condensed onto its contacts and springs."""
     rows = np.vstack([system.contact_rows, system.spring_rows])
-    contacts = [Stops.both(pair.law, pair.clearance) for pair in system.contacts]
-    forces = SiteForces(contacts, [spring.law for spring in system.springs])
+    forces = SiteForces([pair.stops for pair in system.contacts], [spring.law for spring in system.springs])
     return ConservativeMotions(DenseCompliance(system.masses, system.stiffness, rows), forces, options)
 
 
@@ -72,7 +81,7 @@ class CondensedMethod(NnmMethod):
 
     def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
         super().__init__(case, comm)
-        self.motions, self.chain, self.system = Condensed.from_case(case)
+        self.motions, self.chain, self.system, self.dofs = Condensed.from_case(case)
 
     def new_branch(self, name: str) -> Branch[Point]:
         """A branch without points."""
@@ -127,34 +136,33 @@ class CondensedMethod(NnmMethod):
 
     def _with_multipliers(self, point: Point, chain: Chain) -> Point:
         """The point with its largest Floquet multipliers, from the lattice's state at phase 0."""
-        cells = state_of(self.motions, point)
+        cells = state_of(self.motions, point, self.dofs)
         still = np.zeros(chain.cell.dofs)
         u = np.array([cells.get(cell, still) for cell in range(chain.cells)]).ravel()
-        law = self.case.contact()
-        system = System.from_chain(chain, law, dense=False)
-        flow = LatticeFlow(chain, law, self.comm)
+        stops = elastic_stops(self.case)
+        system = System.from_chain(chain, stops, dense=False)
+        flow = LatticeFlow(chain, stops, self.comm)
         return with_multipliers(flow, system, self.motions.forces.odd, point, u, self.options.multipliers)
 
     def finish(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> None:
         """Add the states at phase 0 of the first and the last point, and of those asked for."""
         points = [branch.points[0], *self.asked(problem, branch), branch.regular()[-1]]
-        branch.extra = states(self.motions, points)
+        branch.extra = states(self.motions, points, self.dofs)
 
 
-def states(motions: ConservativeMotions, points: list[Point]) -> Variables:
+def states(motions: ConservativeMotions, points: list[Point], dofs: int) -> Variables:
     """Displacements at phase 0, where all is at rest, of the cells in which they are not negligible."""
-    fields = [state_of(motions, point) for point in points]
+    fields = [state_of(motions, point, dofs) for point in points]
     cells = sorted(set().union(*fields))
     u = np.array([[field.get(cell, 0 * next(iter(field.values()))) for cell in cells] for field in fields])
     return stored_states(points, cells, u)
 
 
-def state_of(motions: ConservativeMotions, point: Point) -> dict[int, np.ndarray]:
+def state_of(motions: ConservativeMotions, point: Point, dofs: int) -> dict[int, np.ndarray]:
     """Displacement (dofs,) in m at phase 0 of every cell (from 0) in which it is not negligible."""
     omega = 2 * np.pi / point.period
-    # A system has no cells: its masses stand in the file as one.
     if isinstance(motions.compliance, DenseCompliance):
-        return {0: _system_state(motions, motions.compliance, point)}
+        return dict(enumerate(_system_state(motions, motions.compliance, point).reshape(-1, dofs)))
     assert isinstance(motions.compliance, SeriesCompliance)
     balance = motions.balance(point.order)
     forces = balance.series(point.x, omega).forces.real

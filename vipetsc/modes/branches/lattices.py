@@ -6,18 +6,16 @@ import numpy as np
 
 from vipetsc.case import NnmCase
 from vipetsc.case.names import distinct
-from vipetsc.case.resolve import build_chain
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.orbits import NnmMethod, start_energy
+from vipetsc.modes.branches.orbits import NnmMethod, map_of, start_energy
 from vipetsc.modes.branches.stored_states import stored_states
 from vipetsc.modes.lattice.floquet import with_multipliers
 from vipetsc.modes.lattice.krylov import LatticeShooting
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError, FlowError, PeriodicProblem, StartError
-from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.start import linear_start
-from vipetsc.modes.system import System
+from vipetsc.modes.system import System, elastic_stops
 
 
 class LatticeMethod(NnmMethod):
@@ -31,9 +29,9 @@ class LatticeMethod(NnmMethod):
     def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
         super().__init__(case, comm)
         options = case.nnm
-        chain = build_chain(case.lattice, case.contacts)
-        self.system = System.from_chain(chain, case.contact(), dense=False)
-        shooting_map = MAPS["quarter" if options.map == "auto" else options.map]
+        chain = case.chain()
+        self.system = System.from_chain(chain, elastic_stops(case), dense=False)
+        shooting_map = map_of(options, self.system)
         self.lattice = LatticeShooting(self.system, chain, shooting_map, comm, options.tolerance, options.max_newton)
 
     def new_branch(self, name: str) -> Branch[Point]:

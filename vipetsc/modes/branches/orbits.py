@@ -8,7 +8,7 @@ from functools import partial
 from mpi4py import MPI
 
 from vipetsc.case import NnmCase
-from vipetsc.case.nnm import NnmTable
+from vipetsc.case.nnm_table import NnmTable
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import BranchMonitor, compare, jumps, sampled
@@ -21,7 +21,7 @@ from vipetsc.modes.point import Point
 from vipetsc.modes.problem import PeriodicProblem
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.flow import Flow
-from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.maps import MAPS, ShootingMap
 from vipetsc.modes.shooting.reference import FiniteDifferences, Newmark, Tsrk
 from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.shooting.start import linear_start
@@ -77,6 +77,14 @@ def guarded_steps(problem: PeriodicProblem[Point], control: NnmTable, done: int)
     return GuardedSteps(problem, control.model_copy(update={"points": max(control.points - done, 0)}))
 
 
+def map_of(options: NnmTable, system: System) -> ShootingMap:
+    """The part of the period that is shot."""
+    if options.map != "auto":
+        return MAPS[options.map]
+    # The quarter map assumes u(t + T/2) = -u(t), which holds for forces that change sign with the displacement.
+    return MAPS["quarter" if system.odd else "half"]
+
+
 def start_energy(options: NnmTable, system: System, mode: int) -> float:
     """Energy in J of the first point of the branch of ``mode`` (from 0): well below the first touch."""
     if options.start_energy != "auto":
@@ -101,11 +109,7 @@ class ShootingMethod(NnmMethod):
         flow = FLOWS[options.flow](self.system)
         if options.jacobian == "differences":
             flow = FiniteDifferences(flow)
-        # The quarter map assumes u(t + T/2) = -u(t), which holds for forces that change sign with the displacement.
-        name = options.map
-        if name == "auto":
-            name = "quarter" if self.system.odd else "half"
-        self.shooting = Shooting(flow, MAPS[name], options.tolerance, options.max_newton)
+        self.shooting = Shooting(flow, map_of(options, self.system), options.tolerance, options.max_newton)
 
     def new_branch(self, name: str) -> Branch[Point]:
         """A branch without points."""

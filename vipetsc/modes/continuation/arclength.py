@@ -24,7 +24,7 @@ from typing import Any, Generic, NamedTuple, Protocol
 
 import numpy as np
 
-from vipetsc.case.nnm import NnmTable
+from vipetsc.case.nnm_table import NnmTable
 from vipetsc.modes.continuation.guards import GUARDED, strain
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError, PeriodicProblem, S

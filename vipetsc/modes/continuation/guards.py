@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.case.nnm import NnmTable
+from vipetsc.case.nnm_table import NnmTable
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import PeriodicProblem
 

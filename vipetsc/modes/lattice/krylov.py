@@ -18,8 +18,8 @@ from scipy.sparse import diags
 from scipy.sparse.linalg import splu
 
 from vipetsc.lattice import Chain
-from vipetsc.modes.balance.conservative import describing_amplitude
-from vipetsc.modes.balance.harmonics import SiteForces, Stops
+from vipetsc.modes.balance.conservative import PlaceCompliance, describing_motion
+from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.newton import BorderedNewton, Equations
 from vipetsc.modes.point import Point
@@ -33,6 +33,8 @@ from vipetsc.modes.system import System
 RTOL = 1e-10
 RESTART = 200
 MOST_PRODUCTS = 600
+# Squared frequency, over that of a breather, at which displacements count as static.
+STATIC = 1e-6
 REMEDY = "choose another nnm.start_frequency, between the pass bands"
 
 
@@ -137,7 +139,7 @@ class LatticeFrame(ShootingFrame[LatticeArc]):
         start = problem.flow.scatter(problem.start(step[:-1])[None])
         moved = problem.flow.gather(arc.move(start))[0]
         rate = problem.map.fraction * problem.end_rate(arc)
-        return (moved[problem.zero] + rate * step[-1]) / self.chart.size
+        return (moved[problem.zero] + rate * step[-1]) / self.unit
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
         """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value."""
@@ -158,7 +160,7 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
         self, system: System, chain: Chain, shooting_map: ShootingMap, comm: MPI.Comm, tolerance: float, max_newton: int
     ) -> None:
         super().__init__(system, shooting_map, tolerance)
-        self.flow = LatticeFlow(chain, system.contacts[0].law, comm)
+        self.flow = LatticeFlow(chain, [pair.stops for pair in system.contacts], comm)
         layout = self.flow.layout
         # The last part ends with the period, the one unknown that belongs to no cell.
         cuts = [*(layout.ranges[:, 0] * layout.dofs).tolist(), system.dofs + 1]
@@ -203,11 +205,13 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
         system = self.system
         row = system.contact_rows[0]
         pair = system.contacts[0]
-        field = splu((system.stiffness - omega**2 * diags(system.masses)).tocsc()).solve(row)  # of 1 N, in m
-        compliance = row @ field
-        amplitude = describing_amplitude(SiteForces([Stops.both(pair.law, pair.clearance)]), 0, compliance, omega)
+        # Displacements by a force of 1 N, in m. Of a lattice that nothing holds a little inertia replaces the walls.
+        moved = splu((system.stiffness - omega**2 * diags(system.masses)).tocsc()).solve(row)
+        pressed = splu((system.stiffness + STATIC * omega**2 * diags(system.masses)).tocsc()).solve(row)
+        g = PlaceCompliance(static=float(row @ pressed), dynamic=float(row @ moved))
+        mean, amplitude = describing_motion(SiteForces([pair.stops]), 0, g, omega)
 
-        x = field * (amplitude / compliance)
+        x = moved * (amplitude / g.dynamic) + pressed * (mean / g.static)
         frame = self.frame_at("relative", x, 2 * np.pi / omega, np.empty(0))
         keep_period = np.append(np.zeros(system.dofs), 1.0)
         attempt = frame.solve(frame.xi, keep_period, 1.0)

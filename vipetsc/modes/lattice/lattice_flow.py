@@ -10,6 +10,7 @@ States are blocks (2 dof, owned cell), displacements in m before velocities in m
 ``dynamics.layout``; ``scatter`` and ``gather`` go from and to the order of ``modes.system``, cell by cell.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mpi4py import MPI
@@ -22,7 +23,8 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.engine import LARGEST_OMEGA_H
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.tangent import TangentPropagator
-from vipetsc.lattice import Chain, Contact, Drive, ToneBurst
+from vipetsc.lattice import Chain, Drive, ToneBurst
+from vipetsc.modes.balance.harmonics import Stops
 from vipetsc.modes.problem import FlowError
 
 # Errors allowed in a contact's substep, relative to its speed.
@@ -51,12 +53,14 @@ class LatticeArc:
 
 
 class LatticeFlow:
-    """The flow of ``chain``, whose contacts follow the law ``contact``, without drive, on the ranks of ``comm``."""
+    """The flow of ``chain``, whose sites have the elastic ``stops``, without drive, on the ranks of ``comm``."""
 
-    def __init__(self, chain: Chain, contact: Contact, comm: MPI.Comm) -> None:
+    def __init__(self, chain: Chain, stops: Sequence[Stops], comm: MPI.Comm) -> None:
         self.chain = chain
-        self.contact = contact
         self.comm = comm
+        self._laws = tuple(of_site.law for of_site in stops)
+        gaps = tuple((of_site.plus, of_site.minus) for of_site in stops)
+        self._gaps = () if all(plus == minus for plus, minus in gaps) else gaps
         self.layout = Layout(self._model(1.0, 1), comm)
         self._omega = StepSeries(chain, 1.0, RTOL).omega_max_h
 
@@ -65,7 +69,7 @@ class LatticeFlow:
         still = ToneBurst(0.0, 1e-3 / duration, 1)
         return Model(
             chain=self.chain,
-            contact=self.contact,
+            contact=self._laws[0],
             drives=(Drive(still, 0, 0),),
             end=duration,
             sample_interval=duration / samples,
@@ -74,6 +78,8 @@ class LatticeFlow:
             atol=(0.0, 0.0),
             scale=1.0,
             speed=1.0,
+            laws=self._laws if len(set(self._laws)) > 1 else (),
+            gaps=self._gaps,
         )
 
     def arc(self, start: np.ndarray, duration: float) -> LatticeArc:

@@ -17,7 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from vipetsc.case.nnm import NnmTable
+from vipetsc.case.nnm_table import NnmTable
 from vipetsc.lattice import DenseCompliance, ModalCompliance
 from vipetsc.modes.balance.conservative import FEWEST, ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces

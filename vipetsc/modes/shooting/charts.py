@@ -70,7 +70,7 @@ class Relative(DenseChart):
         self.weights = np.eye(len(x)) / self.size
         if rest:
             for row, pair in zip(system.contact_rows, system.contacts, strict=True):
-                scale = min(max(abs(row @ x), pair.clearance), self.size)
+                scale = min(max(abs(row @ x), pair.stops.clearance), self.size)
                 self.weights[pair.resonator] = row / scale
         self.inverse = np.linalg.inv(self.weights)
         self._derivative = block_diag(self.inverse, period)
@@ -122,17 +122,22 @@ class Grazing(DenseChart):
     """Relative, with y in place of the displacement of the contact nearest to its clearance: (|w| - D)/D = y |y|.
 
     An orbit that starts on its largest |w| depends on w - D through a square root (bilinear contact), so that
-    this unknown makes the branch smooth through grazing.
+    this unknown makes the branch smooth through grazing. Where the nearest contact has no stop on the side of w, the
+    gap is that to the other stop.
     """
 
     def __init__(self, system: System, x: np.ndarray, period: float) -> None:
         self.size = float(np.abs(x).max())
         self.period = period
-        nearest = int(np.abs(np.abs(system.contact_rows @ x) / system.clearances - 1).argmin())
+        w = system.contact_rows @ x
+        nearest = int(np.abs(np.abs(w) / system.clearances_at(w) - 1).argmin())
         self.row = system.contact_rows[nearest]
-        self.clearance = system.clearances[nearest]
         self.index = system.contacts[nearest].resonator
         self.sign = float(np.sign(self.row @ x))
+        self.clearance = float(system.clearances_at(w)[nearest])
+        if self.clearance == np.inf:
+            self.sign = -self.sign
+            self.clearance = system.contacts[nearest].stops.clearance
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
         """The unknowns of initial values and period."""
@@ -166,5 +171,6 @@ CHARTS: dict[str, type[Relative | Logarithmic | Grazing]] = {
 
 def near_grazing(system: System, x: np.ndarray) -> bool:
     """Whether a contact of an orbit that starts at rest at ``x`` (n,) is near its clearance there."""
-    distance = np.abs(system.gaps(x) / system.clearances)
+    w = system.contact_rows @ x
+    distance = np.abs(np.abs(w) / system.clearances_at(w) - 1)
     return bool(distance.min(initial=np.inf) < NEAR_GRAZING)

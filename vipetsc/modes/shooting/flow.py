@@ -16,7 +16,7 @@ from vipetsc.dynamics.spring_law import nonlinear_force, nonlinear_slope, spring
 from vipetsc.modes.shooting.landing import EXTREMUM, NONE, Change, first_rise, hermite
 from vipetsc.modes.system import System
 
-CONTACT = np.dtype([("clearance", np.float64), ("elastic", ELASTIC)])
+CONTACT = np.dtype([("plus", np.float64), ("minus", np.float64), ("elastic", ELASTIC)])
 Shape = tuple[int, int, int]  # see restore
 # A step below this fraction of the interval means that the flow is stuck.
 SMALLEST_STEP = 1e-15
@@ -88,7 +88,8 @@ def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.nd
     for c in range(side.size):
         if side[c] != 0:
             contact = system.contacts[c]
-            x = side[c] * elongation(system.rows, c, y, 0, 0, n) - contact.clearance
+            clearance = contact.plus if side[c] > 0 else contact.minus
+            x = side[c] * elongation(system.rows, c, y, 0, 0, n) - clearance
             # past the exit, which is landed on anyway, the law is odd
             force, slope = elastic_force_and_slope(contact.elastic, x)
             _add(system.rows, c, (side[c] * force, slope), y, pull, shape)
@@ -131,7 +132,8 @@ def close(system: CompiledSystem, y: np.ndarray, side: np.ndarray) -> None:
     """The sides on which the contacts are closed at the displacements in column 0 of ``y``, 0 for open ones."""
     for c in range(side.size):
         w = elongation(system.rows, c, y, 0, 0, system.inverse_mass.size)
-        side[c] = np.sign(w) if abs(w) > system.contacts[c].clearance else 0
+        clearance = system.contacts[c].minus if w < 0.0 else system.contacts[c].plus
+        side[c] = np.sign(w) if abs(w) > clearance else 0
 
 
 @njit
@@ -150,9 +152,9 @@ def first_change(step: FlowStep, h: float) -> Change:
     first = 1.0
     change = Change(-1, 0, 0.0, 0.0, False, 0.0, h, h, 0)
     for c in range(step.side.size):
-        clearance = step.system.contacts[c].clearance
         for s in (-1, 1):
-            if step.side[c] != 0 and step.side[c] != s:
+            clearance = step.system.contacts[c].plus if s > 0 else step.system.contacts[c].minus
+            if clearance == np.inf or (step.side[c] != 0 and step.side[c] != s):
                 continue
             # An open contact's gap s w - D rises at an onset, a closed one's D - s w at its separation.
             sign = float(s)
@@ -201,7 +203,7 @@ class Flow(ABC):
     def __init__(self, system: System) -> None:
         self.system = system
         contacts = np.zeros(len(system.contacts), CONTACT)
-        contacts["clearance"] = system.clearances
+        contacts["plus"], contacts["minus"] = system.clearances.T
         contacts["elastic"] = elastic_records([pair.law for pair in system.contacts])
         self.compiled = CompiledSystem(
             inverse_mass=1 / np.asarray(system.masses, float),

@@ -91,7 +91,8 @@ def _equations(
     """
     system = problem.system
     n = system.dofs
-    row = touch.side * system.contact_rows[touch.contact] / system.clearances[touch.contact]
+    plus, minus = system.clearances[touch.contact]
+    row = touch.side * system.contact_rows[touch.contact] / (plus if touch.side > 0 else minus)
     x, period = chart.decode(xi)
     arc = problem.arc(x, period)
     inner = chart.derivative(xi)
@@ -105,10 +106,11 @@ def _equations(
     u, v = u + remaining * (v + remaining / 2 * pull), v + remaining * pull
 
     matrix = np.zeros((n + 2, n + 2))
-    matrix[:n, :-1] = problem.jacobian(arc) @ inner / chart.size
+    end_unit = chart.size * problem.map.end_unit(chart.period)
+    matrix[:n, :-1] = problem.jacobian(arc) @ inner / end_unit
     matrix[n] = np.append(row @ du, row @ v)
     matrix[n + 1] = np.append(row @ dv, row @ pull)
-    values = np.array([*problem.residual(arc) / chart.size, row @ u - 1, row @ v])
+    values = np.array([*problem.residual(arc) / end_unit, row @ u - 1, row @ v])
 
     resonator = system.contacts[touch.contact].resonator
     if touch.time == 0 and isinstance(chart, Grazing) and chart.index == resonator:

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 
 @dataclass(frozen=True)
 class ShootingMap:
@@ -20,6 +22,17 @@ class ShootingMap:
     def quarter(self) -> bool:
         """Whether it goes from one section to the other; the orbit is then odd about its end."""
         return self.start != self.end
+
+    def end_unit(self, period: float) -> float:
+        """Unit of what vanishes at the end over that of the initial values, for an orbit of that ``period`` in s.
+
+        From rest to rest, velocities over displacements, it is the frequency in rad/s, rounded to a power of two, by
+        which numbers are multiplied without rounding.
+        """
+        if self.quarter:
+            return 1.0
+        frequency = float(2.0 ** np.round(np.log2(2 * np.pi / period)))
+        return frequency if self.start == "rest" else 1 / frequency
 
 
 # The whole period is here to be compared with, by the case key ``nnm.map``: its condition is 1e6 times worse.

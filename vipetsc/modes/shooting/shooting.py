@@ -52,7 +52,8 @@ class ShootingFrame(Generic[A]):
     """The shooting equations in the unknowns of a ``chart`` at one orbit.
 
     The argument ``tangent`` (n + 1,) is d(x, period) along the branch, or empty where there is none yet. The attribute
-    is its unit image in the chart's unknowns, and is there only with a tangent.
+    is its unit image in the chart's unknowns, and is there only with a tangent. ``unit`` is that of the residual: the
+    chart's, times the frequency where velocities should vanish at the end of an arc that starts with displacements.
     """
 
     tangent: np.ndarray
@@ -62,6 +63,7 @@ class ShootingFrame(Generic[A]):
     ) -> None:
         self.problem = problem
         self.chart = chart
+        self.unit = chart.size * problem.map.end_unit(period)
         self.xi = chart.encode(x, period)
         if tangent.size:
             self.tangent = unit(chart.to_unknowns(self.xi, tangent))
@@ -81,8 +83,8 @@ class ShootingFrame(Generic[A]):
         return self.problem.arc(*self.chart.decode(xi))
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """The residual (n,) at the arc's end, which vanishes for an orbit, over the chart's unit."""
-        return self.problem.residual(self.arc(xi)) / self.chart.size
+        """The residual (n,) at the arc's end, which vanishes for an orbit, over its unit."""
+        return self.problem.residual(self.arc(xi)) / self.unit
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
         """Newton's method from ``guess`` for the orbit at an ``arclength`` along the tangent."""
@@ -103,6 +105,7 @@ class ShootingFrame(Generic[A]):
         x, period = chart.decode(attempt.xi)
         arc = problem.arc(x, period)
         traces, largest = problem.stability(arc)
+        size = float(np.abs(x).max()) * problem.map.end_unit(period)
 
         tangent = np.empty(0)
         energy_tangent = slope = np.nan
@@ -116,7 +119,7 @@ class ShootingFrame(Generic[A]):
             x=x,
             period=period,
             energy=problem.energy(x),
-            residual=float(np.abs(problem.residual(arc)).max()) / float(np.abs(x).max()),
+            residual=float(np.abs(problem.residual(arc)).max()) / size,
             half_traces=traces,
             multiplier=largest,
             episodes=arc.episodes,
@@ -266,7 +269,7 @@ class DenseFrame(ShootingFrame[Arc]):
 
     def jacobian_of(self, arc: Arc, xi: np.ndarray) -> np.ndarray:
         """Derivative (n, n + 1) of the residual at the unknowns ``xi`` of an ``arc``."""
-        return self.problem.jacobian(arc) @ self.chart.derivative(xi) / self.chart.size
+        return self.problem.jacobian(arc) @ self.chart.derivative(xi) / self.unit
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
         """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value."""

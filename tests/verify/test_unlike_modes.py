@@ -1,0 +1,186 @@
+"""Normal modes of contacts that differ, on their two sides and from site to site, and of cells that differ."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.breathers import breather_chain
+from tests.condensed_branches import condensed_branch
+from tests.models import CLEARANCE, four_band_contact
+from tests.unlike_lattices import independent_lattice, unlike_case
+from vipetsc.case.nnm_table import NnmTable
+from vipetsc.lattice import Contact, WaveCompliance
+from vipetsc.lattice.moments import SeriesCompliance
+from vipetsc.modes.balance.conservative import ConservativeMotions
+from vipetsc.modes.balance.harmonics import SiteForces, Stops
+from vipetsc.modes.branches.condensed import condensed_system, state_of
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.lattice.krylov import LatticeShooting
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.orbit import sample_orbit
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.system import ContactPair, System
+
+MASS = 2.0
+SPRING = 3.0
+STOP = 40.0
+# In the lowest gap: higher up a stop on one side begins no breather, since the mean of its force moves the site away.
+OMEGA = 640.0
+SIDES = [(0.1, np.inf), (np.inf, 0.1), (0.1, 0.13)]
+
+
+def mass_between_stops(plus: float, minus: float) -> System:
+    """A mass on a spring, with linear stops of the ground."""
+    pair = ContactPair(None, 0, plus, Contact("bilinear", STOP), minus)
+    return System.assemble([MASS], [(None, 0, SPRING)], [pair])
+
+
+def time_on_one_side(energy: float, clearance: float) -> float:
+    """Time in s from the middle to rest on the side of a stop at ``clearance``, piece by piece in closed form."""
+    slow = np.sqrt(SPRING / MASS)
+    fast = np.sqrt((SPRING + STOP) / MASS)
+    amplitude = np.sqrt(2 * energy / SPRING)
+    if amplitude <= clearance:
+        return np.pi / 2 / slow
+    middle = STOP * clearance / (SPRING + STOP)
+    at_stop = energy - SPRING * clearance**2 / 2
+    reach = np.sqrt((clearance - middle) ** 2 + 2 * at_stop / (SPRING + STOP))
+    return float(np.arcsin(clearance / amplitude) / slow + np.arccos((clearance - middle) / reach) / fast)
+
+
+@pytest.mark.parametrize(("plus", "minus"), SIDES)
+def test_a_mass_with_stops_that_differ_has_its_period_in_closed_form(plus, minus):
+    """Shooting over half a period gives the exact period of a stop on one side, and of stops at two distances."""
+    system = mass_between_stops(plus, minus)
+    problem = Shooting(Dop853Flow(system), MAPS["half"])
+    start = linear_start(problem, 0, 0.4 * SPRING * 0.1**2)
+    points = [start, *Continuation(problem, start, NnmTable(points=60, largest_step=0.3, first_step=0.1))]
+
+    assert points[-1].episodes == (1 if np.inf in (plus, minus) else 2)
+    for point in points:
+        half = time_on_one_side(point.energy, plus) + time_on_one_side(point.energy, minus)
+        assert point.period == pytest.approx(2 * half, rel=1e-11)
+
+
+def test_harmonic_balance_of_a_stop_on_one_side_has_even_harmonics():
+    """Mean and even harmonics included, the condensed motion has the exact period of a stop on one side."""
+    system = mass_between_stops(0.1, np.inf)
+    _, points = condensed_branch(system, 0, 0.49 * SPRING * 0.1**2, truncation=1e-6, points=14, largest_step=0.2)
+
+    assert points[-1].episodes == 1
+    for point in points:
+        half = time_on_one_side(point.energy, 0.1) + time_on_one_side(point.energy, np.inf)
+        assert point.period == pytest.approx(2 * half, rel=1e-5)
+    # Away from the stop: the mean has the opposite sign.
+    assert points[-1].x[0] < -1e-3 * 0.1
+
+
+def test_the_other_side_has_the_mirrored_orbits():
+    """Stops that change sides, and clearances that are exchanged, mirror every orbit of a lattice."""
+    case = unlike_case(points=60, largest_step=0.3, start_energy=2e-4)
+    system = System.from_case(case)
+    contacts = []
+    for pair in system.contacts:
+        contacts.append(replace(pair, clearance=pair.stops.minus, clearance_minus=pair.stops.plus))
+    mirrored = Shooting(Dop853Flow(replace(system, contacts=tuple(contacts))), MAPS["half"])
+    problem = Shooting(Dop853Flow(system), MAPS["half"])
+
+    start = linear_start(problem, 3, 2e-4)
+    points = list(Continuation(problem, start, case.nnm))
+    assert points[-1].episodes >= 3
+    for point in points[::10]:
+        frame = mirrored.frame_at("relative", -point.x, point.period)
+        assert np.abs(frame.residual(frame.xi)).max() < 1e-12
+        arc = mirrored.arc(-point.x, point.period)
+        assert arc.episodes == point.episodes
+        assert np.array_equal(arc.events[:, 2], -problem.arc(point.x, point.period).events[:, 2])
+
+
+@pytest.fixture(scope="module")
+def unlike_branch(tmp_path_factory):
+    """The branch of a mode of a lattice whose cells and sites differ, followed as the verb does."""
+    case = unlike_case(points=60, largest_step=0.3, start_energy=2e-4)
+    (branch,) = follow_all(case, tmp_path_factory.mktemp("unlike"), MPI.COMM_SELF)
+    return Shooting(Dop853Flow(System.from_case(case)), MAPS["half"]), branch
+
+
+def test_orbits_of_a_lattice_that_differs_everywhere_return_by_scipy(unlike_branch):
+    """Integrated by SciPy from equations of its own, an orbit comes back after its period."""
+    problem, branch = unlike_branch
+    lattice = independent_lattice()
+    for number in (40, 60):
+        point = branch.regular()[number]
+        u, v = sample_orbit(problem, point, samples=40)
+        # The comparison begins where all contacts are open.
+        begin = int(np.flatnonzero(np.all(problem.system.gaps(u) < 0, axis=1))[0])
+        motion, impacts = lattice.motion(np.array([point.period]), u[begin], v[begin], 0.0)
+
+        assert impacts >= 3
+        assert np.abs(motion[0, -1] - u[begin]).max() < 1e-8 * np.abs(u).max()
+        assert np.abs(motion[1, -1] - v[begin]).max() < 1e-8 * np.abs(v).max()
+
+
+@pytest.mark.slow
+def test_motions_condensed_onto_unlike_sites_are_those_of_shooting(unlike_branch):
+    """Harmonic balance at three different sites meets the orbits that shooting corrects from its states."""
+    shooting, _ = unlike_branch
+    system = shooting.system
+    case = unlike_case(method="condensed", points=12, truncation=1e-6, largest_step=0.2)
+    problem = condensed_system(system, case.nnm)
+    omega, shapes = system.linear_modes()
+    z = system.contact_rows @ shapes[:, 3] * np.sqrt(2 * 2.1e-4) / omega[3]
+    start = problem.from_mode(z, float(omega[3]))
+    point = list(Continuation(problem, start, case.nnm))[-1]
+    assert point.episodes
+
+    u = np.concatenate(list(state_of(problem, point, 2).values()))
+    assert system.energy(u, 0 * u) == pytest.approx(point.energy, rel=1e-6)
+    frame = shooting.frame_at("relative", u, point.period)
+    row = np.append(u / np.linalg.norm(u), 0.0)
+    attempt = frame.solve(frame.xi, row, row @ frame.xi)
+    assert attempt.converged
+    x, period = frame.chart.decode(attempt.xi)
+    assert np.abs(x - u).max() < 1e-4 * np.abs(u).max()
+    assert period == pytest.approx(point.period, rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def one_sided():
+    """The breather of a site with a stop on one side, and its chain, by shooting without matrices."""
+    chain = breather_chain()
+    stops = [Stops(four_band_contact("hertz"), CLEARANCE, np.inf)]
+    system = System.from_chain(chain, stops, dense=False)
+    problem = LatticeShooting(system, chain, MAPS["half"], MPI.COMM_SELF, 1e-12, 12)
+    return chain, stops, problem.breather(OMEGA)
+
+
+def test_a_breather_on_one_side_closes_by_the_dense_flow(one_sided):
+    """Two flows that share no code agree on the orbit of a lattice with a stop on one side."""
+    chain, stops, point = one_sided
+    dense = Dop853Flow(System.from_chain(chain, stops))
+    end = dense.arc(np.append(point.x, 0 * point.x), point.period, point.period).end
+    assert np.abs(end[: len(point.x)] - point.x).max() < 1e-8 * np.abs(point.x).max()
+    assert point.episodes == 1
+
+
+def test_bloch_waves_and_all_modes_give_the_same_breather_on_one_side(one_sided):
+    """The compliance of equal cells by waves is that of a lattice by its modes: one motion, that of shooting."""
+    chain, stops, shot = one_sided
+    control = NnmTable(truncation=1e-6, tolerance=1e-11)
+    by_waves = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), SiteForces(stops), control)
+    by_modes = condensed_system(System.from_chain(chain, stops), control)
+
+    first, second = (problem.from_gap(OMEGA, np.array([1.0])) for problem in (by_waves, by_modes))
+
+    assert first.x == pytest.approx(second.x, abs=1e-10 * np.abs(first.x).max())
+    assert first.energy == pytest.approx(shot.energy, rel=1e-5)
+    u = np.concatenate(list(state_of(by_modes, second, chain.cell.dofs).values()))
+    assert min(np.abs(u - shot.x).max(), np.abs(u + shot.x).max()) < 1e-4 * np.abs(u).max()

@@ -1,0 +1,192 @@
+"""Problems between the keys of a case of normal modes."""
+
+from collections.abc import Iterator
+
+from vipetsc.case.case_file import Problem, Valid
+from vipetsc.case.contacts import Gaps, check_pairs, lists_of, pairs_of_sites
+from vipetsc.case.inhomogeneity import check_inhomogeneity
+from vipetsc.case.nfrc import MOST_UNKNOWNS, needs_modes
+from vipetsc.case.nnm_table import MOST_MASSES, MOST_OF_LATTICE, NnmTable
+from vipetsc.case.resolve import check_stiffness, site_cells
+from vipetsc.case.schema import LatticeTable
+from vipetsc.case.sites import ContactsTable
+from vipetsc.lattice import Chain, UnitCell, nonlinear_places, pass_bands
+from vipetsc.lattice.modal_compliance import MOST_DOFS
+
+ONE_CONTACT = "the reduced model has one contact"
+
+
+def check_options(nnm: NnmTable) -> Iterator[Problem]:
+    """Problems with a user-defined system, and with the bounds of a branch and its steps."""
+    if (nnm.system == "own") != (nnm.custom is not None):
+        yield Problem("nnm.system", nnm.system, 'a system of one\'s own needs "own" and [nnm.own]')
+    for key, (low, high) in (("energy", nnm.energy), ("frequency", nnm.frequency)):
+        if not low < high:
+            yield Problem(f"nnm.{key}", [low, high], "must be [low, high]")
+    if nnm.direction != "up" and not nnm.energy[0] > 0:
+        yield Problem("nnm.energy", nnm.energy, "the direction down needs a lowest energy above 0 (J)")
+
+    yield from check_method(nnm)
+    is_chain = nnm.system == "chain"
+    if not is_chain and (nnm.shooting == "krylov" or (nnm.multipliers and nnm.system != "condensed")):
+        remedy = '"krylov" is for "chain", multipliers for that and "condensed"'
+        yield Problem("nnm.system", nnm.system, remedy)
+    if not nnm.smallest_step < nnm.largest_step:
+        yield Problem("nnm.smallest_step", nnm.smallest_step, "must be below nnm.largest_step")
+    if nnm.system != "own" or nnm.custom is None:
+        return
+
+    masses = len(nnm.custom.masses)
+    pairs = [(f"springs[{i}]", s.start, s.end) for i, s in enumerate(nnm.custom.springs, 1)]
+    pairs += [(f"smooth[{i}]", s.start, s.end) for i, s in enumerate(nnm.custom.smooth, 1)]
+    pairs += [(f"contacts[{i}]", p.host, p.resonator) for i, p in enumerate(nnm.custom.contacts, 1)]
+    for key, start, end in pairs:
+        if start == end or max(start, end) > masses:
+            yield Problem(f"nnm.own.{key}", [start, end], f"is not a pair of the {masses} masses (0 is the ground)")
+
+
+def check_size(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> list[Problem]:
+    """Problems with a chain of such cells, of which the way that orbits are solved for allows so many masses."""
+    most = MOST_MASSES
+    what = "with dense matrices"
+    dofs = lattice.cells * cell.dofs
+    if nnm.is_krylov(dofs, cell.is_linear):
+        most = MOST_OF_LATTICE
+        what = "on all ranks"
+
+    if dofs <= most:
+        return []
+    remedy = f"makes {dofs} masses; orbits are solved for {what}, at most {most}"
+    return [Problem("lattice.cells", lattice.cells, remedy)]
+
+
+def check_reduced(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell) -> Iterator[Problem]:
+    """Problems with what the reduced model, two masses of one ``cell`` and the contact between them, cannot have."""
+    if isinstance(contacts.clearance, list) and len(contacts.clearance) != 1:
+        yield Problem("contacts.clearance", contacts.clearance, ONE_CONTACT)
+    if contacts.clearance is None and lattice.preset is None:
+        yield Problem("contacts.clearance", None, "missing; give the clearance in m")
+    given = lists_of(contacts)
+    for key in ("pair", "next_cell"):
+        if getattr(contacts, key) is not None or key in given:
+            remedy = "the reduced model is that of the two masses in contact within a cell, cell.contact; omit the key"
+            yield Problem(f"contacts.{key}", getattr(contacts, key), remedy)
+            return
+
+    if given:
+        yield Problem("contacts.each", None, f"{ONE_CONTACT}; omit the lists over sites")
+    for key in ("profiles", "scatter"):
+        if getattr(lattice, key):
+            remedy = "the reduced model is that of one cell, which stands for all others; omit cells that differ"
+            yield Problem(f"lattice.{key}", None, remedy)
+    if not cell.is_linear:
+        remedy = "the reduced model holds springs at their middle, with half of their stiffness; a quadratic or cubic"
+        yield Problem("lattice.cell.springs", None, f"{remedy} part has no such half; omit quadratic and cubic")
+
+
+def check_gaps(contacts: ContactsTable, gaps: Gaps, valid: Valid) -> Iterator[Problem]:
+    """Problems with contacts that touch or are pressed at rest; ``gaps`` are the clearances in m on both sides."""
+    if not valid("contacts.clearance"):
+        return
+    smallest = min((min(gap) for gap in gaps), default=1.0)
+    if smallest < 0:
+        remedy = "not yet: linear modes do not include contacts that are pressed at rest; omit it"
+        yield Problem("contacts.precompression", contacts.precompression, remedy)
+    elif smallest == 0 and contacts.clearance_minus == 0:
+        remedy = "branches begin with linear motions within the clearance, and without one there are none"
+        yield Problem("contacts.clearance_minus", 0.0, f"{remedy}; give a clearance above 0")
+
+
+def check_lattice(
+    lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps, valid: Valid
+) -> Iterator[Problem]:
+    """Problems with the cells and sites of a whole lattice of such cells, with the clearances ``gaps`` in m."""
+    yield from check_inhomogeneity(lattice, [])
+    sites = site_cells(lattice, contacts)
+    if not valid("contacts"):
+        return
+    yield from check_pairs(lattice, contacts, cell, sites)
+    if not sites and cell.is_linear:
+        yield Problem("contacts.sites", [], f"give cells from 1 to {lattice.cells}")
+
+    # Nothing but the stops acts on such a lattice from outside: their mean force moves it away.
+    pairs = pairs_of_sites(contacts.model_copy(update={"sites": sites}), cell, len(sites))
+    to_ground = [number for number, pair in enumerate(pairs) if pair.host < 0]
+    if lattice.ends != "fixed" and any(gaps[number][0] != gaps[number][1] for number in to_ground):
+        remedy = "nothing holds this lattice, and a stop to ground that differs on its two sides pushes it away"
+        yield Problem("contacts.pair", contacts.pair, f'{remedy}; use ends = "fixed", or equal stops on both sides')
+
+
+def check_method(nnm: NnmTable) -> Iterator[Problem]:
+    """Keys that belong to the other method than the one by which motions are found."""
+    foreign: tuple[str, ...]
+    if nnm.system == "condensed" or nnm.method == "condensed":
+        method = "shot"
+        foreign = ("compare", "switch")
+    elif nnm.system == "chain":
+        # A start frequency begins a branch of localised motions of a chain: it is not foreign here.
+        method = "condensed"
+        foreign = ("start_sites",)
+    else:
+        method = "condensed"
+        foreign = ("start_frequency", "start_sites")
+    for key in foreign:
+        given = getattr(nnm, key)
+        if given:
+            yield Problem(f"nnm.{key}", given, f"applies to motions that are {method}")
+
+
+def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid: Valid) -> Iterator[Problem]:
+    """Problems with the start of motions of the lattice ``chain`` without dashpots, and with its size."""
+    yield from check_stiffness(contacts, bool(chain.sites), valid)
+    if not nnm.start_frequency:
+        yield Problem("nnm.start_frequency", [], "give frequencies in rad/s, between the pass bands or above them")
+
+    count = len(chain.sites) + len(nonlinear_places(chain))
+    outside = [number for number in nnm.start_sites if not 1 <= abs(number) <= count]
+    if outside:
+        yield Problem("nnm.start_sites", outside, f"give site numbers from 1 to {count}, with a sign")
+
+    cell = chain.cell
+    masses = cell.dofs * chain.cells
+    if needs_modes(chain) and masses > MOST_DOFS:
+        remedy = f"{masses} masses: all modes of a lattice with unlike cells or other contact pairs are needed"
+        yield Problem("lattice.cells", chain.cells, f"{remedy}, of at most {MOST_DOFS} masses")
+    unknowns = count * (nnm.harmonics + 1)  # fewer for motions of odd harmonics alone
+    if not cell.is_linear and unknowns > MOST_UNKNOWNS:
+        remedy = f"{count} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
+        yield Problem("nnm.harmonics", nnm.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
+    if nnm.multipliers and not cell.is_linear:
+        remedy = "move variations by exact linear steps, which springs that are not linear do not have; omit it"
+        yield Problem("nnm.multipliers", nnm.multipliers, remedy)
+    elif nnm.multipliers and masses > MOST_OF_LATTICE:
+        remedy = f"need the motion of all {masses} masses, and are found up to {MOST_OF_LATTICE}"
+        yield Problem(
+            "nnm.multipliers", nnm.multipliers, f"{remedy}; multiplier_max needs only the motion of the sites"
+        )
+    # A motion whose frequency is in a band sends waves away: it is not localised, and nothing is periodic.
+    bands = pass_bands(cell)
+    inside = [omega for omega in nnm.start_frequency if any(band.low <= omega <= band.high for band in bands)]
+    if inside:
+        edges = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)
+        yield Problem("nnm.start_frequency", inside, f"lies in a pass band ({edges} rad/s); motions there radiate")
+
+
+def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iterator[Problem]:
+    """Keys of [nnm] that do not fit the shooting method of a lattice of such cells."""
+    dofs = lattice.cells * cell.dofs
+    krylov = nnm.is_krylov(dofs, cell.is_linear)
+    if not cell.is_linear and (krylov or nnm.multipliers or nnm.start_frequency):
+        key = next(key for key in ("multipliers", "start_frequency", "shooting") if getattr(nnm, key))
+        remedy = "moves variations by exact linear steps, which springs that are not linear do not have; omit it, or"
+        yield Problem(f"nnm.{key}", getattr(nnm, key), f'{remedy} system = "condensed"')
+        return
+    if krylov:
+        for key in ("compare", "switch", "orbits_at", "flow", "jacobian"):
+            if getattr(nnm, key) != NnmTable.model_fields[key].default:
+                yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs dense matrices: nnm.shooting = "dense"')
+    if nnm.shooting == "dense" and (nnm.multipliers or nnm.start_frequency):
+        key = "multipliers" if nnm.multipliers else "start_frequency"
+        yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs nnm.shooting = "krylov"; "dense" has all half-traces')
+    if krylov and dofs > MOST_MASSES and not nnm.start_frequency:
+        yield Problem("nnm.modes", nnm.modes, f"are known up to {MOST_MASSES} masses: give nnm.start_frequency")

@@ -1,0 +1,55 @@
+"""Compliance of a small system between its contact pairs, from all its linear modes."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import eigh
+
+RIGID = 1e-12  # squared frequencies below this fraction of the largest are those of rigid motions
+UNMOVED = 1e-10  # a rigid motion whose relative displacements are below this fraction of the largest moves no pair
+
+
+class DenseCompliance:
+    """Compliance of a small system, from all its linear modes.
+
+    ``masses`` (dofs,) in kg and ``stiffness`` (dofs, dofs) in N/m; ``rows`` (pairs, dofs) pick the relative
+    displacements z = rows u. ``squared`` (mode,) are the squared frequencies in (rad/s)^2, ``vectors`` (dofs, mode) the
+    mass-normalised modes, ``parts`` (pairs, mode) their relative displacements.
+    """
+
+    def __init__(self, masses: np.ndarray, stiffness: np.ndarray, rows: np.ndarray) -> None:
+        root = 1 / np.sqrt(masses)
+        squared, vectors = eigh(stiffness * np.outer(root, root))
+        rigid = np.abs(squared) < RIGID * np.abs(squared).max()
+
+        self.squared = np.where(rigid, 0, squared)
+        self.vectors = vectors * root[:, None]
+        self.parts = rows * root @ vectors
+
+        # Forces of pairs do not move a rigid motion without relative displacement. Rounding would make them do so, and
+        # at omega = 0 without bound.
+        relative = np.abs(self.parts).max(axis=0, initial=0.0)
+        self.parts[:, rigid & (relative < UNMOVED * np.abs(self.parts).max(initial=0.0))] = 0
+
+    def at(self, omegas: ArrayLike) -> np.ndarray:
+        """Relative displacements (omega, pair, pair) in m/N at frequencies ``omegas`` in rad/s, real or complex."""
+        return np.einsum("in,wn,jn->wij", self.parts, self._gain(np.atleast_1d(omegas)), self.parts)
+
+    def with_springs(self, omegas: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+        """The compliance with a spring of ``stiffness`` (omega,) in N/m added at each pair, also on a linear mode."""
+        # Where the compliance itself has a pole, as many digits of it are lost as it is large.
+        gap = self.squared - np.asarray(omegas)[:, None] ** 2
+        dynamic = np.eye(len(self.squared)) * gap[:, None]
+        dynamic = dynamic + np.asarray(stiffness)[:, None, None] * (self.parts.T @ self.parts)
+        loads = np.broadcast_to(self.parts.T, (len(gap), *self.parts.T.shape))
+        return np.asarray(self.parts @ np.linalg.solve(dynamic, loads))
+
+    def field(self, omega: complex, forces: np.ndarray) -> np.ndarray:
+        """Displacement (dofs,) in m that ``forces`` (pairs,) in N, which pull pairs together, make."""
+        gain = self._gain(np.array([omega]))[0]
+        return np.asarray(-self.vectors @ (gain * (forces @ self.parts)))
+
+    def _gain(self, omega: np.ndarray) -> np.ndarray:
+        """The factor 1/(Om_n^2 - omega^2) (omega, mode); 0 of a mode at rest that no pair moves."""
+        gap = self.squared - omega[:, None] ** 2
+        moved = np.any(self.parts != 0, axis=0)
+        return np.divide(1, gap, out=np.zeros_like(gap), where=moved | (gap != 0))
