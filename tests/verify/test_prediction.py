@@ -240,3 +240,24 @@ def test_what_cannot_be_predicted_is_refused_before_any_run(sections, key):
 
     assert key in str(error.value)
     assert error.value.problems
+
+
+@pytest.mark.slow
+def test_the_wave_of_a_moved_wall_is_predicted_as_simulated(tmp_path):
+    """A wall moved by U acts as a force k U on the mass beside it; amplitudes are in m."""
+    moved = prediction_case(
+        contacts={"restitution": 0.7}, drive={"end": "left"}, predict={"amplitudes": [5e-4, 2e-3], "points": 16}
+    )
+    model = moved.model()
+    [spring] = model.drives
+    forced = prediction_case(contacts={"restitution": 0.7}, drive={"cell": 1, "mass": spring.mass + 1})
+    np.testing.assert_allclose(Network(model).linear, spring.stiffness * Network(forced.model()).linear, rtol=1e-12)
+
+    data = predict(moved, tmp_path)
+
+    assert data["amplitude"].attrs["units"] == "m"
+    # The first contact is exact: one amplitude lies below, one above.
+    assert (data["simulated/contact_episodes"].values > 0).tolist() == [False, True]
+    assert 5e-4 < data.attrs["onset_amplitude"] < 2e-3
+    assert data.attrs["rms_upper"] < 0.15
+    assert data.attrs["worst_dissipated"] < 0.05

@@ -14,7 +14,9 @@ MOST = 10_000  # amplitudes
 
 
 class PredictTable(Section):
-    """``amplitudes`` in N; by default ``count``, log-spaced from that of the first contact to ``span`` times it.
+    """``amplitudes`` in N, of a moved wall in m.
+
+    By default they are ``count``, log-spaced from that of the first contact to ``span`` times it.
 
     ``points``: number of runs with a single site. ``simulate``: also simulate the same amplitudes, for comparison.
     """
@@ -33,10 +35,9 @@ class PredictCase(LawCase):
 
     verb = section = "predict"
     refuses: ClassVar[Mapping[str, str]] = {
-        **LawCase.refuses,
+        **{feature: reason for feature, reason in LawCase.refuses.items() if feature != "moved wall"},
         "absorbing ends": "not yet: the wave between sites is followed in equal cells up to the ends",
         "rings": "waves around a ring meet its sites again and again, and a prediction follows them once",
-        "moved wall": "not yet: the wave that a force on a mass sends is predicted",
     }
 
     def warnings(self) -> list[str]:

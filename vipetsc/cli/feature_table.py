@@ -237,7 +237,7 @@ FEATURES: tuple[Feature, ...] = (
     Feature(
         "moved wall",
         {"drive": {"end": "left", "cell": None, "amplitude": 1e-4}},
-        scaled={"nfrc": {"nfrc": {"range": [1e-6, 2e-5]}}},
+        scaled={"nfrc": {"nfrc": {"range": [1e-6, 2e-5]}}, "predict": {"predict": {"amplitudes": [1e-4]}}},
     ),
     Feature("several drives", {"drive": {"more": [{"amplitude": 0.5, "frequency": 900.0, "cycles": 3, "cell": 6}]}}),
     Feature("mode at t = 0", _initial(kind="mode", number=3, amplitude=1e-5)),

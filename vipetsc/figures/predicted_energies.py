@@ -49,7 +49,7 @@ def prediction(data: xr.Dataset) -> Figure:
         axes.axvline(onset, color=style.GREY, lw=0.7, ls=style.DOTTED)
     _show_amplitudes(transferred, np.append(data["amplitude"].values, onset))
     for axes in grid[1]:
-        axes.set_xlabel("Amplitude (N); dotted: first contact")
+        axes.set_xlabel(f"Amplitude ({data['amplitude'].attrs['units']}); dotted: first contact")
 
     # A prediction without simulated runs to compare with has no error.
     rms = data.attrs.get(f"rms_{name}")

@@ -82,17 +82,22 @@ class Network:
         self.decay = DECAY / length
         self.during = self.time <= model.end  # the second half is padding for what the transform would fold back
 
-        # The burst's envelope under 1 N: sin is -i exp(i Om t), under a Hann window.
+        # The burst's envelope of a drive of 1 N, or of 1 m of a wall: sin is -i exp(i Om t), under a Hann window.
         force = drive.window_amplitude / abs(drive.amplitude) * (1 - np.cos(self.om * self.time / drive.cycles))
         pulse = self._forward(np.where(self.time < drive.duration, -1j * force, 0))
         response, g = self._responses(self.om)
-        self.linear = self._backward(response[:, :, -1].T * pulse)
+        sites = len(chain.sites)
+        self.linear = np.zeros((sites, len(self.time)), complex)
+        # A wall acts through springs, on several masses if they are tied to it.
+        for number, acting in enumerate(model.drives, sites):
+            gain = acting.stiffness or 1.0
+            self.linear += self._backward(response[:, :, number].T * (gain * pulse))
 
         inside = self._propagates(self.om)
         radiated = 1j * g.imag  # the part of g that leaves as waves
         eye = np.eye(len(chain.sites))
         # Over what the site that sends, the last axis, radiates.
-        others = (response[:, :, :-1] - g.T[:, :, None] * eye) / radiated.T[:, None]
+        others = (response[:, :, :sites] - g.T[:, :, None] * eye) / radiated.T[:, None]
         self.between = np.where(inside, others.T, 0)
         self.radiated = _of_sites(radiated[:, most])
         self.power = self._powers(self.om)
@@ -104,15 +109,15 @@ class Network:
             self.power3 = self._powers(3 * self.om)
             self.g3 = g
             self.centre = _of_sites(g[:, most])
-            self.response3 = response[:, :, :-1].T
+            self.response3 = response[:, :, :sites].T
             # Over the g of the site that receives a wave, or of the one that sends it: the same for equal pairs.
-            received = response[:, :, :-1] / g.T[:, :, None]
-            sent = response[:, :, :-1] / g.T[:, None]
+            received = response[:, :, :sites] / g.T[:, :, None]
+            sent = response[:, :, :sites] / g.T[:, None]
             self.received3 = np.where(inside, received.T - eye[:, :, None], 0)
             self.between3 = np.where(inside, sent.T - eye[:, :, None], 0)
 
     def compose(self, amplitude: float, sites: SiteResponses) -> Composed:
-        """The energies at the end under ``amplitude`` (N), from the response of each of the ``sites`` alone."""
+        """The energies at the end under ``amplitude`` (N, of a wall m), from the response of each site alone."""
         linear = np.where(self.during, abs(amplitude) * self.linear, 0)
         size = float(np.abs(linear).max())
         c = linear.copy()
@@ -143,13 +148,13 @@ class Network:
         return self._energies(Arriving(c, c3, on), sites, change)
 
     def _responses(self, middle: float) -> tuple[np.ndarray, np.ndarray]:
-        """Response of w at the sites to forces at the sites and the drive (frequency, site, site and 1); of one alone.
+        """Response of w at the sites to forces at the sites and of the drives (frequency, site, force); of one alone.
 
         The second (site, frequency) is that of a site in an infinite lattice to a pair of forces at itself.
         """
         omega = middle + self.offset - 1j * self.decay
-        drive = (self.model.drive_cell, self.model.drive_mass)
-        response = WaveCompliance(self.model.chain, points=(drive,)).response(omega)
+        driven = tuple((drive.cell, drive.mass) for drive in self.model.drives)
+        response = WaveCompliance(self.model.chain, points=driven).response(omega)
         pairs = self.model.chain.contact_pairs
         alone = {pair: self_response(self.cell, omega, pair) for pair in {*pairs}}
         return response, np.array([alone[pair] for pair in pairs])

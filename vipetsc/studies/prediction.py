@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case
+from vipetsc.case.amplitude import amplitude_unit
 from vipetsc.case.kinds import NO_SITES
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.folder import PREDICTION, claimed, provenance
@@ -37,7 +38,7 @@ NEAR_ONSET = (5e-4, 2e-3, 7e-3, 0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.8, 1.2)
 HIGH = 2.8
 BEYOND = 1.01  # the one site's runs reach this many times the largest z of any amplitude
 LAYOUT = {
-    "amplitude": ("amplitude", "N", "amplitude of the drive"),
+    "amplitude": ("amplitude", "N", "amplitude of the drive; in m of a moved wall"),
     "band": ("band", "1", "pass band, from 1"),
     "site": ("site", "1", "contact site"),
     "sites/cell": ("site", "1", "cell (1-based) of a site"),
@@ -277,7 +278,9 @@ def composed(case: PredictCase, records: Records) -> xr.Dataset:
         simulated = _simulated(records.members, driven)
         values |= {f"simulated/{name}": value for name, value in simulated.items()}
         about |= errors(values)
-    return xr.Dataset(tabulated(LAYOUT, values), attrs=about)
+    data = xr.Dataset(tabulated(LAYOUT, values), attrs=about)
+    data["amplitude"].attrs["units"] = amplitude_unit(case)
+    return data
 
 
 def _predicted(

@@ -69,7 +69,8 @@ class Ring:
         case = self.case.varied(
             without=("output",),
             lattice={"cells": setting.cells, "ends": "periodic"},
-            drive={"cell": 1, "amplitude": amplitude},
+            # Where the case moves a wall, a force sends a wave of the same form.
+            drive={"cell": 1, "amplitude": amplitude, "end": None},
             contacts=contacts,
             time={"end": setting.end},
             output=output,

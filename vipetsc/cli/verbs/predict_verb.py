@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from vipetsc.case.amplitude import amplitude_unit
 from vipetsc.case.predict import PredictCase
 from vipetsc.cli.arguments import CASE, OF_STUDIES
 from vipetsc.cli.case_rows import lattice_rows
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SUMMARY = {
-    "onset_amplitude": "first contact (N)",
     "rms_upper": "rms error of the upper bands (decades)",
     "rms_other": "rms error of all bands except the driven one (decades)",
     "worst_dissipated": "largest error of the dissipated fraction",
@@ -38,7 +38,7 @@ def predict_rows(case: PredictCase, ranks: int) -> Rows:
     if options.amplitudes:
         low = min(options.amplitudes)
         high = max(options.amplitudes)
-        amplitudes = f"{len(options.amplitudes)} amplitudes, {low:g} to {high:g} N"
+        amplitudes = f"{len(options.amplitudes)} amplitudes, {low:g} to {high:g} {amplitude_unit(case)}"
     else:
         amplitudes = f"{options.count} amplitudes, from the first contact to {options.span:g} times its amplitude"
 
@@ -63,7 +63,8 @@ def prediction_table(data: xr.Dataset) -> str:
     kinds = [kind for kind in ("predicted", "simulated") if f"{kind}/other" in data]
     columns = [(kind, quantity) for quantity in ("upper", "other", "dissipated") for kind in kinds]
 
-    lines = ["   amplitude (N)  " + "  ".join(f"{kind} {quantity}" for kind, quantity in columns)]
+    unit = data["amplitude"].attrs["units"]
+    lines = [f"   amplitude ({unit})  " + "  ".join(f"{kind} {quantity}" for kind, quantity in columns)]
     for row, amplitude in enumerate(data["amplitude"].values):
         values = []
         for kind, quantity in columns:
@@ -71,6 +72,7 @@ def prediction_table(data: xr.Dataset) -> str:
             values.append(f"{float(data[f'{kind}/{quantity}'][row]):{width}.4f}")
         lines.append(f"{amplitude:16.5g}  " + "  ".join(values))
 
+    lines.append(f"first contact ({unit}): {data.attrs['onset_amplitude']:.4g}")
     lines += [f"{text}: {data.attrs[key]:.4g}" for key, text in SUMMARY.items() if key in data.attrs]
     return "\n".join(lines)
 
