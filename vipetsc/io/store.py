@@ -310,7 +310,7 @@ class RunMemory:
     def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
         """Create the dataset; all ranks must call it."""
         if self.comm.rank == 0:
-            self.dataset = chunks.small_dataset(self, attributes)
+            small = chunks.small_dataset(self, attributes)
             log = sort_over_ranks(MPI.COMM_SELF, chunks.read_log(self), ("onset", "site"))
             large = {**chunks.joined(self, self.recording.of_sites), **chunks.log_columns(log.rows)}
             recorded = self._fields[:, : self._rows].swapaxes(2, 3)
@@ -318,10 +318,12 @@ class RunMemory:
             if self.end is not None:
                 displacement, velocity = np.split(self.end[self.recording.given["cell"] - 1], 2, axis=1)
                 large |= {"end/displacement": displacement, "end/velocity": velocity}
+            variables = {}
             for name, values in large.items():
-                description = chunks.described(name, self.dataset)
-                self.dataset[name] = (description.dims, values, description.attributes)
-            self.dataset = with_point_names(self.dataset)
+                description = chunks.described(name, small)
+                variables[name] = (description.dims, values, description.attributes)
+            # Together, since xarray aligns all variables whenever some are added.
+            self.dataset = with_point_names(small.assign(variables))
         self._chunks = []
 
 

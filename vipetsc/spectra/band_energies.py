@@ -85,17 +85,16 @@ def part_energies(
     steps.append(_fewest_steps(parts[-1], last, stride))
 
     energies = [np.zeros(count + 1) for count in steps]
-    together = max(COLUMNS // dofs, 1)
+    weights = np.asarray(masses) / (8 * last**2)
     for block in blocks(cells, 8 * dofs * nt, memory):
         held = np.asarray(velocity[:, block])
-        for first in range(0, held.shape[1], together):
-            columns = np.moveaxis(held[:, first : first + together], 1, 2)  # as runs in memory hold them
-            weights = np.repeat(np.asarray(masses) / (8 * last**2), columns.shape[2])
-            spectrum = _cosines(columns.reshape(nt, -1))
+        # Mass by mass: the cells of one lie together where runs in memory hold them.
+        for mass, first in itertools.product(range(dofs), range(0, held.shape[1], COLUMNS)):
+            spectrum = _cosines(held[:, first : first + COLUMNS, mass])
             spectrum[[0, -1]] *= 0.5
             for energy, part in zip(energies, parts, strict=True):
                 filtered = _folded(spectrum[part.low : part.high + 1], part.low, len(energy) - 1)
-                energy += np.einsum("tc,tc,c->t", filtered, filtered, weights)
+                energy += weights[mass] * np.einsum("tc,tc->t", filtered, filtered)
 
     return np.array([_at_samples(energy, part, last) for energy, part in zip(energies, parts, strict=True)])
 
@@ -125,13 +124,12 @@ def part_maps(
 def _cosines(columns: np.ndarray) -> np.ndarray:
     """``fft.dct(columns, 1, axis=0)``, two columns a transform: faster where the length has large factors."""
     nt, count = columns.shape
-    half = -(-count // 2)
-    pairs = np.zeros((2 * nt - 2, half), dtype=complex)
-    pairs[:nt].real = columns[:, :half]
-    pairs[:nt, : count - half].imag = columns[:, half:]
-    pairs[nt:] = pairs[nt - 2 : 0 : -1]
-    pairs = fft.fft(pairs, axis=0, overwrite_x=True)[:nt]  # of real even columns, so real
-    return np.concatenate([pairs.real, pairs.imag[:, : count - half]], axis=1)
+    mirrored = np.zeros((2 * nt - 2, count + count % 2))
+    mirrored[:nt, :count] = columns
+    mirrored[nt:] = mirrored[nt - 2 : 0 : -1]
+    # Neighbouring columns as real and imaginary parts: the transforms of both are real, since both are even.
+    pairs = fft.fft(mirrored.view(complex), axis=0, overwrite_x=True)[:nt]
+    return pairs.view(float)[:, :count]
 
 
 class _Cosines(NamedTuple):
