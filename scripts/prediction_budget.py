@@ -1,0 +1,181 @@
+"""Budget of the error of a prediction: one approximation after another is replaced by the simulation of the lattice.
+
+    python scripts/prediction_budget.py FOLDER
+
+FOLDER has a prediction of sites of one kind, with simulations. For each of its amplitudes there are the energy of the
+upper bands and the dissipated energy over the work, and the differences from them, in decades and absolute:
+
+``scatter``: standard deviation of nine runs with amplitudes up to 1 % apart. ``predicted``: the prediction. ``waves``:
+composed of the response of one site, but of the driven waves that arrive at the sites in the simulation. ``times``: in
+the same manner, but with sites in contact while they are in the simulation.
+
+The forces of the contacts are f = G^-1 (w - w0) at each frequency, with the compliance G of the lattice between the
+sites and the linear wave w0; what arrives at a site is w - g f. Third harmonics are composed throughout.
+"""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+import xarray as xr
+
+from vipetsc.case import Case
+from vipetsc.case.kinds import NO_SITES
+from vipetsc.case.predict import PredictCase
+from vipetsc.io.records import Record, read_records
+from vipetsc.lattice import WaveCompliance
+from vipetsc.parallel import StopRequest
+from vipetsc.spectra import ModalParts
+from vipetsc.studies.composition import Arriving, Network
+from vipetsc.studies.pair_motion import PairMotion
+from vipetsc.studies.prediction import SITE, read_prediction
+from vipetsc.studies.recorded_runs import run_in_memory
+from vipetsc.studies.response import FIRST_LINE, TOP, Burst, SiteResponse, SiteResponses, in_contact, unit_phase
+
+SCATTER = np.linspace(-0.01, 0.01, 9)  # relative amplitudes of the runs that show the scatter
+ROUNDS = 30  # iterations of the third harmonics
+
+
+class Fractions(NamedTuple):
+    """Fractions of the work: of the bands above the driven one, and dissipated."""
+
+    upper: float
+    lost: float
+
+
+class Simulation(NamedTuple):
+    """Driven waves (site, time) in m that arrive at the sites over a network's time, and where these are in contact."""
+
+    waves: np.ndarray
+    on: np.ndarray
+
+
+class Budget:
+    """What one prediction in a ``folder`` is composed of, and simulations of its lattice."""
+
+    def __init__(self, folder: Path) -> None:
+        self.data = read_prediction(folder)
+        self.case = PredictCase.from_table(tomllib.loads(self.data.attrs["case"]))
+        model = self.case.model()
+        chain = model.chain
+        rows: list[Record] = [record for record, _ in read_records(folder / "prediction-runs.jsonl", sys.exit)]
+        answers = [record for record in rows if record["kind"] == SITE]
+        [kind] = self.case.kinds.kinds
+        drive = model.drive.frequency
+        response = SiteResponse.of(answers, chain.cell, drive, answers[0]["largest"], kind.pair)
+        self.sites = SiteResponses((response,), np.zeros(len(chain.sites), int))
+        self.network = Network(model)
+
+        self.linear = self._motion(self._run(1.0, NO_SITES))
+        self.burst = Burst(chain.cell, drive, self.linear.time, self.linear.displacement[:, 0], kind.pair)
+        self.compliance = WaveCompliance(chain).at(self.burst.omega - 1j * self.burst.decay)
+
+    def _run(self, amplitude: float, contacts: dict[str, object] | None = None) -> xr.Dataset:
+        """A run under ``amplitude`` of which the cells of the sites are kept."""
+        sites = self.case.model().chain.sites
+        output = {"window": [min(sites) + 1, max(sites) + 2]}
+        case: Case = self.case.varied(without=("output",), drive={"amplitude": amplitude}, output=output)
+        if contacts:
+            case = case.varied(contacts=contacts)
+        return run_in_memory(case, MPI.COMM_SELF, StopRequest())[0]
+
+    def _motion(self, run: xr.Dataset) -> PairMotion:
+        chain = self.case.model().chain
+        return PairMotion.between(run, [site - min(chain.sites) for site in chain.sites], chain.contact_pairs)
+
+    def simulation(self, amplitude: float) -> Simulation:
+        """The waves that arrive in a run under ``amplitude``, and the times of contact."""
+        run = self._run(amplitude)
+        burst = self.burst
+        carried = burst.omega < TOP * burst.bands[-1].high
+        w = np.array([burst.spectrum(column) for column in self._motion(run).displacement.T])
+        free = amplitude * np.array([burst.spectrum(column) for column in self.linear.displacement.T])
+        force = np.zeros_like(w)
+        force[:, carried] = np.linalg.solve(self.compliance[carried], (w - free).T[carried, :, None])[:, :, 0].T
+        arriving = [burst.envelope(row, burst.drive, FIRST_LINE * burst.drive) for row in w - burst.g * force]
+
+        network = self.network
+        waves = [_at(network.time, burst.time, row) for row in arriving]
+        on = np.zeros((len(waves), len(network.time)), bool)
+        # Contact goes on over the drive's period, in which a site touches on both sides.
+        period = 2 * np.pi / burst.drive
+        impacts = (run[f"impacts/{name}"].values for name in ("site", "onset", "separation"))
+        for site, onset, separation in zip(*impacts, strict=True):
+            # A contact at the end of the run has no separation.
+            until = separation if np.isfinite(separation) else burst.time[-1]
+            on[site - 1] |= (network.time >= onset - period / 2) & (network.time <= until + period / 2)
+        return Simulation(np.array(waves) * network.during, on & network.during)
+
+    def composed(self, waves: np.ndarray, on: np.ndarray | None = None) -> tuple[float, float]:
+        """Energies in J of upper bands and dissipated, of ``waves`` that arrive; in contact by the rule, or ``on``."""
+        network = self.network
+        third = np.zeros_like(waves)
+        for _ in range(ROUNDS):
+            z = (np.abs(waves) + np.abs(third)) / network.clearance[:, None]
+            release = self.sites.over_bursts(z.max(axis=1)).release
+            touching = in_contact(z, release) & network.during if on is None else on
+            force = self.sites.at(z).third * np.abs(waves) * unit_phase(waves) ** 3 * touching
+            sent = network._sent(network.received3, force) * network.centre
+            third = third + 0.5 * (network._solve(network.between3, -1.0 * touching, sent, third) - third)
+
+        energies = network._energies(Arriving(waves, third, touching), self.sites, 0.0)
+        return float(energies.into[int(self.data.attrs["drive_band"]) :].sum()), energies.dissipated
+
+    def scatter(self, amplitude: float) -> Fractions:
+        """Standard deviations of runs near ``amplitude``: of log10 of the upper bands, and of the dissipated part."""
+        modes = ModalParts.of(self.case.model().chain).modes
+        above = modes.frequency > self.burst.bands[int(self.data.attrs["drive_band"])].low * (1 - 1e-9)
+        rows = []
+        for change in SCATTER:
+            output = {"stride": self.case.model().samples - 1}
+            case = self.case.varied(without=("output",), drive={"amplitude": amplitude * (1 + change)}, output=output)
+            run, result = run_in_memory(case, MPI.COMM_SELF, StopRequest())
+            energy = np.abs(modes.amplitudes(run["displacement"].values[-1:], run["velocity"].values[-1:])[0]) ** 2 / 2
+            work = result.statistics["work"]
+            rows.append((np.log10(energy[above].sum() / work), result.statistics["dissipated"] / work))
+        return Fractions(*np.std(rows, axis=0, ddof=1))
+
+
+def _at(times: np.ndarray, given: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Complex ``values`` over ``given`` times at other ``times``; 0 beyond."""
+    return np.asarray(
+        np.interp(times, given, values.real, right=0.0) + 1j * np.interp(times, given, values.imag, right=0.0)
+    )
+
+
+def main() -> None:
+    """Print the budget of the prediction in the folder of the command line."""
+    budget = Budget(Path(sys.argv[1]))
+    data = budget.data
+    work = {
+        record["at"]: record["work"]
+        for record, _ in read_records(Path(sys.argv[1]) / "prediction-runs.jsonl", sys.exit)
+        if record["kind"] == "member"
+    }
+    print("amplitude  simulated      scatter        predicted       waves           times")
+    for row, amplitude in enumerate(data["amplitude"].values.tolist()):
+        simulated = Fractions(*(float(data[f"simulated/{name}"][row]) for name in ("upper", "dissipated")))
+        predicted = Fractions(*(float(data[f"predicted/{name}"][row]) for name in ("upper", "dissipated")))
+        run = budget.simulation(amplitude)
+        columns = [predicted]
+        for on in (None, run.on):
+            upper, lost = budget.composed(run.waves, on)
+            columns.append(Fractions(upper / work[amplitude], lost / work[amplitude]))
+
+        scatter = budget.scatter(amplitude)
+        cells = [f"{np.log10(c.upper / simulated.upper):+.3f} {c.lost - simulated.lost:+.3f}" for c in columns]
+        print(
+            f"{amplitude:9.5g}  {simulated.upper:.4f} {simulated.lost:.4f}  {scatter.upper:.3f} {scatter.lost:.4f}   ",
+            "   ".join(cells),
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
