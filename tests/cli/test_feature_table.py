@@ -40,7 +40,7 @@ WITHOUT_INFLUENCE = {
     "reduced": {"law of a plugin"} | ENDS,
     "chain": {"unequal clearances", "law of a plugin", "a law for each site", "restitutions of sites"},
     "own": {"law of a plugin"},
-    "condensed": {"unequal clearances", "restitutions of sites"},
+    "condensed": {"unequal clearances"},
 }
 pytestmark = pytest.mark.slow
 

@@ -90,13 +90,12 @@ def test_a_cell_of_ones_own_needs_clearances_and_a_stiffness():
         NnmCase.from_table({"lattice": lattice, "contacts": {"clearance": 0.1}})
 
 
-def test_a_restitution_is_warned_of():
-    """Normal modes are conservative: a restitution below 1 is ignored with a warning, one of 1 without."""
-    lossy = NnmCase.from_table({"contacts": {"restitution": 0.7}})
-    assert lossy.warnings() == [
-        "contacts.restitution = 0.7 is treated as 1: normal modes are computed without dissipation"
-    ]
-    assert NnmCase.from_table({"contacts": {"restitution": 1.0}}).warnings() == []
+def test_a_restitution_is_warned_of_where_losses_are_not_computed():
+    """Losses are computed by shooting with matrices: for a long chain a restitution below 1 is treated as 1."""
+    table = {"contacts": {"restitution": 0.7, "sites": 1}, "nnm": {"system": "chain", "start_frequency": [1600.0]}}
+    (warning,) = NnmCase.from_table(table).warnings()
+    assert warning.startswith("contacts.restitution = 0.7 is treated as 1")
+    assert NnmCase.from_table({"contacts": {"restitution": 0.7}}).warnings() == []
 
 
 @pytest.mark.parametrize("nnm", [{}, {"system": "chain"}, {"system": "condensed", "start_frequency": [1600.0]}])
@@ -108,7 +107,6 @@ def test_a_restitution_is_warned_of():
         ({"contacts": {"clearance": 0.0, "side": "plus"}}, "without one there are none"),
         ({"contacts": {"each": {"law": ["bilinear", "hertz", "hertz"]}}}, "contacts.each"),
         ({"contacts": {"pair": [2, 2]}}, r"contacts\.pair"),
-        ({"lattice": {"damping": {"mass": 1.0}}}, "none does with dashpots"),
         ({"lattice": {"absorbing": {"cells": 2, "strength": 1.0}}}, r"lattice\.absorbing"),
         ({"disorder": {"seed": 1, "cells": {"mass": {"relative": 0.01}}}}, "disorder"),
     ],
@@ -128,6 +126,7 @@ def test_what_branches_do_not_support_is_refused(nnm, table, key):
         ({"pair": [0, 3]}, {}, "two masses in contact within a cell"),
         ({"each": {"law": ["bilinear"]}}, {}, "one contact; omit the lists"),
         ({"clearance": [1e-3, 2e-3]}, {}, "one contact"),
+        ({}, {"damping": {"mass": 1.0}}, "where a dashpot has none"),
         ({}, {"profiles": {"masses[1]": {"first": 5e-3, "last": 6e-3}}}, "one cell, which stands for all others"),
     ],
 )
@@ -167,3 +166,19 @@ def test_disorder_is_drawn_for_normal_modes():
     assert first == pytest.approx(1e-3, rel=0.2)
     assert not case.chain().is_uniform()
     assert NnmCase.from_toml(case.to_toml()) == case
+
+
+@pytest.mark.parametrize(
+    ("nnm", "message"),
+    [
+        ({"forced": [3]}, "no mass; there are 2"),
+        ({"forced": [1, 1]}, r"\[mass\], or in a lattice"),
+        ({"system": "chain", "forced": [9, 1]}, "4 in each of 8 cells"),
+        ({"system": "condensed", "start_frequency": [1600.0], "forced": [2]}, r"\[cell, mass\]"),
+    ],
+)
+def test_a_forced_mass_that_is_not_there_is_refused(nnm, message):
+    """The mass is one of the system's, and in a lattice one of a cell."""
+    table = {"lattice": {"preset": "four-band", "cells": 8}, "contacts": {"sites": [2], "clearance": 1e-3}}
+    with pytest.raises(CaseError, match=message):
+        NnmCase.from_table(table | {"nnm": nnm})

@@ -17,6 +17,7 @@ from vipetsc.case.features import refusals
 from vipetsc.case.nnm_checks import (
     ONE_CONTACT,
     check_condensed,
+    check_forced,
     check_gaps,
     check_lattice,
     check_options,
@@ -57,7 +58,6 @@ class NnmCase(CaseFile):
     verb = section = "nnm"
     kept_by_resume: ClassVar[str] = "the system, map and flow with which its branches were started"
     refuses: ClassVar[Mapping[str, str]] = {
-        "damping": "a normal mode is a free motion that repeats itself, and none does with dashpots",
         "absorbing ends": "absorbing ends are dashpots, with which no free motion repeats itself",
         "touching stops": "branches begin with linear motions within the clearance, and without one there are none",
     }
@@ -106,10 +106,11 @@ class NnmCase(CaseFile):
     def warnings(self) -> list[str]:
         """Sentences about keys of the case that normal modes ignore."""
         restitution = self.contacts.restitution
-        if restitution == 1:
+        if restitution == 1 or not self.krylov:
             return []
         return [
-            f"contacts.restitution = {restitution:g} is treated as 1: normal modes are computed without dissipation"
+            f"contacts.restitution = {restitution:g} is treated as 1: losses are computed with nnm.shooting = "
+            '"dense" or nnm.system = "condensed"'
         ]
 
     @classmethod
@@ -135,6 +136,7 @@ class NnmCase(CaseFile):
             if not problems:
                 problems += _check_stops(contacts, clearances(lattice, contacts, 1), valid)
             problems += check_stiffness(contacts, True, valid)
+            problems += check_forced(nnm, None, 2)
             return problems + _check_modes(nnm, 2, 0, problems)
 
         problems += check_sites(lattice, contacts)
@@ -150,9 +152,10 @@ class NnmCase(CaseFile):
         if problems:
             return problems
 
+        problems += check_forced(nnm, lattice.cells, cell.dofs)
         if nnm.system == "condensed":
             chain = build_chain(lattice, contacts).without_dashpots()
-            return list(check_condensed(nnm, contacts, chain, valid))
+            return [*problems, *check_condensed(nnm, contacts, chain, valid)]
         problems += check_shooting(nnm, lattice, cell)
         problems += check_size(nnm, lattice, cell)
         problems += check_stiffness(contacts, bool(sites), valid)
@@ -185,6 +188,13 @@ class NnmCase(CaseFile):
     def damped_chain(self) -> Chain:
         """The lattice with its sites and dashpots."""
         return build_chain(self.lattice, self.contacts)
+
+    def forced_mass(self) -> int | None:
+        """The mass (from 0, through all cells) that the key ``nnm.forced`` names; None without it."""
+        if self.nnm.forced is None:
+            return None
+        *cell, mass = self.nnm.forced
+        return (cell[0] - 1) * self.lattice.unit_cell().dofs + mass - 1 if cell else mass - 1
 
     def gaps(self) -> Gaps:
         """Clearances in m of each contact on the sides + and -; inf where there is no stop."""
@@ -221,6 +231,7 @@ def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], val
     yield from _check_stops(contacts, [pair.clearance for pair in custom.contacts], valid)
 
     masses = len(custom.masses)
+    yield from check_forced(nnm, None, masses)
     rigid = 0
     if not wrong:
         group = connected_groups(masses + 1, tuple((s.start, s.end) for s in custom.springs))

@@ -45,6 +45,18 @@ def check_options(nnm: NnmTable) -> Iterator[Problem]:
             yield Problem(f"nnm.own.{key}", [start, end], f"is not a pair of the {masses} masses (0 is the ground)")
 
 
+def check_forced(nnm: NnmTable, cells: int | None, masses: int) -> Iterator[Problem]:
+    """Problems with the forced mass of a lattice of ``cells``, each of so many ``masses``; None: of a small system."""
+    if nnm.forced is None:
+        return
+    *cell, mass = nnm.forced
+    if len(cell) != (cells is not None):
+        yield Problem("nnm.forced", nnm.forced, "give the mass that is forced, [mass], or in a lattice [cell, mass]")
+    elif mass > masses or (cells is not None and cell[0] > cells):
+        of_cells = f" in each of {cells} cells" if cells else ""
+        yield Problem("nnm.forced", nnm.forced, f"is no mass; there are {masses}{of_cells}")
+
+
 def check_size(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> list[Problem]:
     """Problems with a chain of such cells, of which the way that orbits are solved for allows so many masses."""
     most = MOST_MASSES
@@ -75,6 +87,9 @@ def check_reduced(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell
 
     if given:
         yield Problem("contacts.each", None, f"{ONE_CONTACT}; omit the lists over sites")
+    if cell.is_damped:
+        remedy = "the reduced model holds springs at their middle, where a dashpot has none; its contact may dissipate"
+        yield Problem("lattice", "damped", f"{remedy}; omit [lattice.damping] and the dashpots of the cell")
     for key in ("profiles", "scatter"):
         if getattr(lattice, key):
             remedy = "the reduced model is that of one cell, which stands for all others; omit cells that differ"
@@ -181,6 +196,9 @@ def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iter
         remedy = "moves variations by exact linear steps, which springs that are not linear do not have; omit it, or"
         yield Problem(f"nnm.{key}", getattr(nnm, key), f'{remedy} system = "condensed"')
         return
+    if krylov and cell.is_damped:
+        remedy = 'not yet: losses along orbits are computed with nnm.shooting = "dense", or system = "condensed"'
+        yield Problem("lattice", "damped", remedy)
     if krylov:
         for key in ("compare", "switch", "orbits_at", "flow", "jacobian"):
             if getattr(nnm, key) != NnmTable.model_fields[key].default:

@@ -82,7 +82,9 @@ class NnmTable(Section):
     are stored in addition to those of the regions; ``compare`` corrects every fourth point with other flows; ``switch``
     follows the branches that cross at these kinds of special points, ``switch_points`` points each. ``shooting``
     "krylov" does without dense matrices, for a chain on all ranks together ("auto" beyond 100 masses): there and in a
-    condensed lattice so many of the largest ``multipliers`` (true: 8) are found.
+    condensed lattice so many of the largest ``multipliers`` (true: 8) are found. Where dashpots or contacts dissipate,
+    points have the loss along the motion without loss, and the force on the mass ``forced`` that makes up for it:
+    [cell, mass] of a lattice, else [mass].
     """
 
     system: Literal["reduced", "chain", "own", "condensed"] = "reduced"
@@ -92,6 +94,7 @@ class NnmTable(Section):
     harmonics: int = Field(1023, ge=15)
     truncation: Positive = 1e-7
     custom: SystemTable | None = Field(None, alias="own")
+    forced: list[Annotated[int, Field(ge=1)]] | None = Field(None, min_length=1, max_length=2)
     modes: Annotated[list[Annotated[int, Field(ge=1)]], AfterValidator(once)] = Field([1, 2], min_length=1)
     shooting: Literal["auto", "dense", "krylov"] = "auto"
     multipliers: bool | Annotated[int, Field(ge=1)] = False

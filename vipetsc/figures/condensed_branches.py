@@ -12,6 +12,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from vipetsc.case.nnm import NnmCase
 from vipetsc.figures import style
 from vipetsc.figures.branch_curves import draw_branch
+from vipetsc.figures.branch_losses import draw_losses
 from vipetsc.figures.frequency_energy import MARKS
 from vipetsc.figures.panels import annotate_empty, label_panels
 from vipetsc.io.netcdf import open_netcdf
@@ -31,8 +32,9 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
             names = np.array(file["kind"].attrs["flag_meanings"].split())
             branches.append(file.load().assign(kind=("point", names[file["kind"].values])))
     figure = style.new_figure(style.PAGE, 2.5 * len(branches))
-    grid = figure.subplots(len(branches), 3, squeeze=False)
-    for (frequency, elongation, motions), branch in zip(grid, branches, strict=True):
+    has_losses = any("damping_ratio" in branch for branch in branches)
+    grid = figure.subplots(len(branches), 4 if has_losses else 3, squeeze=False)
+    for (frequency, elongation, *losses, motions), branch in zip(grid, branches, strict=True):
         case = NnmCase.from_toml(branch.attrs["case"])
         # A user-defined system has neither cells nor pass bands.
         is_lattice = case.nnm.system == "condensed"
@@ -43,12 +45,14 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
         frequency.set_title(branch.attrs["name"])
 
         _draw_elongation(elongation, branch)
-        for axes in (frequency, elongation):
+        for axes in losses:
+            draw_losses(axes, branch)
+        for axes in (frequency, elongation, *losses):
             _set_energy_axis(axes, branch)
         if "states/number" not in branch:
             # They are stored when a branch ends: this one was interrupted.
             annotate_empty(motions, "no motions stored")
-        elif is_lattice:
+        elif is_lattice or branch.sizes["states/cell"] > 1:
             _draw_over_cells(motions, branch)
         else:
             _draw_over_masses(motions, branch)

@@ -28,6 +28,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullF
 
 from vipetsc.figures import style
 from vipetsc.figures.branch_curves import draw_branch, lowest, smooth
+from vipetsc.figures.branch_losses import draw_losses
 from vipetsc.figures.panels import REGIONS, ROMAN, annotate_empty, note, shade_regions
 from vipetsc.io.netcdf import open_netcdf
 
@@ -60,7 +61,10 @@ CURVE_POINTS = 4000  # of the curve that the inset is kept off
 
 
 def backbone(paths: Sequence[Path]) -> Figure:
-    """Draw frequency, slope, differences of flows and phase portraits of the branches in ``paths``, a column each.
+    """Draw frequency, slope, differences of flows, damping and phase portraits of the branches in ``paths``.
+
+    Each branch has a column, and panels are there if one of the branches has their quantities.
+
 
     Raises OSError or ValueError for a file that holds no branch.
     """
@@ -72,6 +76,9 @@ def backbone(paths: Sequence[Path]) -> Figure:
     heights = [FREQUENCY_HEIGHT, OTHER_HEIGHT]
     if has_flows:
         draw_panels.append(flow_differences)
+        heights.append(OTHER_HEIGHT)
+    if any("damping_ratio" in branch for branch in branches):
+        draw_panels.append(draw_losses)
         heights.append(OTHER_HEIGHT)
     page_heights = [sum(heights)]
     if has_orbits:

@@ -24,6 +24,14 @@ QUANTITIES: dict[str, tuple[str, type, str, str]] = {
 }
 
 
+# Quantities of motions along which something dissipates: name in the files, unit, description.
+OF_LOSSES: dict[str, tuple[str, str]] = {
+    "loss": ("J", "energy lost in a period along the motion without loss"),
+    "damping_ratio": ("1", "loss over 4 pi times the energy"),
+    "force": ("N", "force at the forced mass, a quarter of a period ahead, that makes up for the loss"),
+}
+
+
 # Points compare by identity: the arrays in them have no single truth value that a generated == could return.
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Point(Solution):
@@ -33,7 +41,7 @@ class Point(Solution):
     balance in m; ``tangent`` is d(x, period). Only orbits shot with dense matrices have ``half_traces`` (n - 1,);
     ``multipliers`` (number, 2) are the largest ones of a lattice's orbit and their residuals. Harmonic balance gives
     the ``order`` of the highest harmonic, the estimated ``truncation``, and ``elongations`` (places,) in m at phase 0.
-    ``QUANTITIES`` describes the other fields.
+    ``QUANTITIES`` describes the other fields, ``OF_LOSSES`` those that are NaN unless something dissipates.
     """
 
     x: np.ndarray
@@ -57,6 +65,13 @@ class Point(Solution):
     order: int = 0
     truncation: float = np.nan
     elongations: np.ndarray = field(default_factory=lambda: np.empty(0))
+    loss: float = np.nan
+    force: float = np.nan
+
+    @property
+    def damping_ratio(self) -> float:
+        """Loss over 4 pi times the energy: of a linear mode its damping ratio."""
+        return self.loss / (4 * np.pi * self.energy)
 
     @property
     def frequency(self) -> float:

@@ -1,5 +1,7 @@
 """Branches of conservative motions by harmonic balance, and the states of the lattice that belong to them."""
 
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -19,6 +21,7 @@ from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.hill import Hill
 from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.losses import Dissipation, dissipation_of, force_for
 from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, start_energy
 from vipetsc.modes.branches.stored_states import stored_states
 from vipetsc.modes.continuation.arclength import StepRule
@@ -82,6 +85,7 @@ class CondensedMethod(NnmMethod):
     def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
         super().__init__(case, comm)
         self.motions, self.chain, self.system, self.dofs = Condensed.from_case(case)
+        self.dissipation = dissipation_of(case)
 
     def new_branch(self, name: str) -> Branch[Point]:
         """A branch without points."""
@@ -130,6 +134,8 @@ class CondensedMethod(NnmMethod):
         hill = Hill(motions.compliance, omega, point.order, motions.forces.odd, finite=True)
         fastest = hill.fastest(motions.balance(point.order).series(point.x, omega))
         largest = np.nan if fastest is None else float(np.exp(2 * np.pi * fastest.real))
+        if self.dissipation.acts:
+            point = with_condensed_loss(motions, self.dissipation, point, self.dofs)
         if self.options.multipliers and self.chain is not None:
             point = self._with_multipliers(point, self.chain)
         return replace(point, multiplier=largest)
@@ -160,22 +166,63 @@ def states(motions: ConservativeMotions, points: list[Point], dofs: int) -> Vari
 
 def state_of(motions: ConservativeMotions, point: Point, dofs: int) -> dict[int, np.ndarray]:
     """Displacement (dofs,) in m at phase 0 of every cell (from 0) in which it is not negligible."""
-    omega = 2 * np.pi / point.period
     if isinstance(motions.compliance, DenseCompliance):
-        return dict(enumerate(_system_state(motions, motions.compliance, point).reshape(-1, dofs)))
-    assert isinstance(motions.compliance, SeriesCompliance)
-    balance = motions.balance(point.order)
-    forces = balance.series(point.x, omega).forces.real
+        u = np.sum(_system_harmonics(motions, motions.compliance, point), axis=0)
+        return dict(enumerate(u.reshape(-1, dofs)))
     total: dict[int, np.ndarray] = {}
-    for k in balance.orders:
-        for cell, u in _field(motions.compliance.compliance, k * omega, forces[:, k]).items():
+    for field in _fields(motions, point):
+        for cell, u in field.items():
             total[cell] = total.get(cell, 0.0) + u
     largest = max(np.abs(u).max() for u in total.values())
     return {cell: u for cell, u in total.items() if np.abs(u).max() > NEGLIGIBLE * largest}
 
 
-def _system_state(motions: ConservativeMotions, compliance: DenseCompliance, point: Point) -> np.ndarray:
-    """Displacement (dofs,) in m at phase 0 of a system, by its linear modes with the added springs."""
+def _fields(motions: ConservativeMotions, point: Point) -> Iterator[dict[int, np.ndarray]]:
+    """Displacements of the cells near the sites, for each harmonic of a motion in turn."""
+    assert isinstance(motions.compliance, SeriesCompliance)
+    omega = 2 * np.pi / point.period
+    balance = motions.balance(point.order)
+    forces = balance.series(point.x, omega).forces.real
+    for k in balance.orders:
+        yield _field(motions.compliance.compliance, k * omega, forces[:, k])
+
+
+def with_condensed_loss(motions: ConservativeMotions, dissipation: Dissipation, point: Point, dofs: int) -> Point:
+    """The ``point`` with its loss in J a period, and the force in N at the forced mass that makes up for it."""
+    omega = 2 * np.pi / point.period
+    balance = motions.balance(point.order)
+    contacts = zip(motions.forces.contacts, dissipation.laws, strict=True)
+    lossy = SiteForces([stops._replace(law=law) for stops, law in contacts])
+    loss = np.nan
+    # A dissipative contact that never separates has no approach velocity, by which its damping divides.
+    with suppress(ArithmeticError):
+        loss = float(lossy.series(balance.unpack(point.x)[: lossy.pairs], omega).loss.sum())
+
+    count = max(dissipation.damping.shape[0], (dissipation.forced or 0) + 1)
+    first = 0.0
+    for k, u in zip(balance.orders.tolist(), _all_masses(motions, point, dofs, count), strict=True):
+        if dissipation.damping.nnz:
+            loss += np.pi * k**2 * omega * float(u @ (dissipation.damping @ u))
+        if k == 1 and dissipation.forced is not None:
+            first = float(u[dissipation.forced])
+    return replace(point, loss=loss, force=np.nan if dissipation.forced is None else force_for(loss, first))
+
+
+def _all_masses(motions: ConservativeMotions, point: Point, dofs: int, count: int) -> Iterator[np.ndarray]:
+    """Displacement (masses,) in m of the first ``count`` masses at least, for each harmonic of a motion in turn."""
+    if isinstance(motions.compliance, DenseCompliance):
+        yield from _system_harmonics(motions, motions.compliance, point)
+        return
+    for field in _fields(motions, point):
+        u = np.zeros(count)
+        for cell, of_cell in field.items():
+            here = u[cell * dofs : (cell + 1) * dofs]
+            here[:] = of_cell[: len(here)]
+        yield u
+
+
+def _system_harmonics(motions: ConservativeMotions, compliance: DenseCompliance, point: Point) -> np.ndarray:
+    """Harmonics (order, dofs) in m of a system's displacements, by its linear modes with the added springs."""
     omega = 2 * np.pi / point.period
     balance = motions.balance(point.order)
     shift = balance.shift(omega)
@@ -184,7 +231,7 @@ def _system_state(motions: ConservativeMotions, compliance: DenseCompliance, poi
     gaps = compliance.squared - (balance.orders * omega)[:, None] ** 2
     dynamic = np.eye(len(gaps[0])) * gaps[:, None] + shift * (parts.T @ parts)
     modal = np.linalg.solve(dynamic, parts.T @ force.real)
-    return np.asarray(-np.sum(compliance.vectors @ modal, axis=0)[:, 0])
+    return np.asarray(-(compliance.vectors @ modal)[..., 0])
 
 
 def _field(compliance: WaveCompliance, omega: float, forces: np.ndarray) -> dict[int, np.ndarray]:

@@ -7,7 +7,7 @@ import xarray as xr
 
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.layout import Table, orbit_attributes, orbit_variables, quantities
+from vipetsc.modes.branches.layout import Table, loss_columns, orbit_attributes, orbit_variables, quantities
 from vipetsc.modes.branches.regions import regions
 from vipetsc.modes.point import Point
 
@@ -58,11 +58,13 @@ class CondensedLayout:
     def table(self, branch: Branch[Point]) -> Table:
         """The table of a branch for CSV: w1 ... are the elongations in m at phase 0."""
         names = ["energy", "frequency", "period", *(f"w{i + 1}" for i in range(branch.dofs))]
-        names += ["harmonics", "truncation", "multiplier_max", "slope", "contacts", "region", "kind"]
+        losses = loss_columns(branch)
+        names += ["harmonics", "truncation", "multiplier_max", "slope", *losses, "contacts", "region", "kind"]
         rows = []
         for p, region in zip(branch.points, regions(branch), strict=True):
             numbers = [p.energy, p.frequency, p.period, *p.elongations.tolist()]
-            numbers += [p.order, p.truncation, p.multiplier, p.slope, p.episodes]
+            numbers += [p.order, p.truncation, p.multiplier, p.slope]
+            numbers += [*(getattr(p, name) for name in losses), p.episodes]
             rows.append([*map(repr, numbers), str(region), p.kind])
         return Table(names, rows)
 

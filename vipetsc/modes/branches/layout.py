@@ -9,7 +9,7 @@ from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.kinds import stored_kinds
 from vipetsc.modes.branches.regions import quantity, regions, slope_laws, tongues
-from vipetsc.modes.point import QUANTITIES, Point
+from vipetsc.modes.point import OF_LOSSES, QUANTITIES, Point
 from vipetsc.modes.problem import S
 
 REGION = "region of the backbone: 1 linear, 2 grazing, 3 vibro-impact, 4 smooth limit; 0 unknown"
@@ -62,7 +62,18 @@ def orbit_variables(branch: Branch[Point]) -> Variables:
     data = {"region": variable("point", regions(branch).astype(np.int64), "1", REGION)}
     for name, (stored, _, units, text) in QUANTITIES.items():
         data[stored] = variable("point", quantity(branch, name), units, text)
-    return data | _multipliers(branch.points)
+    return data | _losses(branch) | _multipliers(branch.points)
+
+
+def loss_columns(branch: Branch[Point]) -> list[str]:
+    """Names of the ``OF_LOSSES`` that points of a branch have."""
+    return [name for name in OF_LOSSES if np.isfinite(branch.column(name).astype(float)).any()]
+
+
+def _losses(branch: Branch[Point]) -> Variables:
+    """Variables of what dissipation takes; none if nothing dissipates."""
+    names = loss_columns(branch)
+    return {name: variable("point", branch.column(name).astype(float), *OF_LOSSES[name]) for name in names}
 
 
 def orbit_attributes(branch: Branch[Point]) -> dict[str, Any]:
@@ -75,6 +86,8 @@ def quantities(data: xr.Dataset) -> list[dict[str, Any]]:
     columns = {name: data[stored].values.tolist() for name, (stored, *_) in QUANTITIES.items()}
     del columns["frequency"]  # a property of ``Point``, which follows from the period
     columns["kind"] = stored_kinds(data)
+    for name in OF_LOSSES.keys() & data.data_vars.keys() - {"damping_ratio"}:  # a property of ``Point``
+        columns[name] = data[name].values.tolist()
     if "multiplier" in data:
         columns["multipliers"] = _stored_multipliers(data)
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]

@@ -7,7 +7,7 @@ import xarray as xr
 
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.layout import Table, orbit_attributes, orbit_variables, quantities
+from vipetsc.modes.branches.layout import Table, loss_columns, orbit_attributes, orbit_variables, quantities
 from vipetsc.modes.branches.regions import regions
 from vipetsc.modes.point import Point
 
@@ -46,10 +46,12 @@ class OrbitLayout:
         """The table of a branch for CSV, with numbers in full precision."""
         traces = ["half_trace"] if branch.dofs == 2 else [f"half_trace_{i + 1}" for i in range(_pairs(branch))]
         names = ["energy", "frequency", "period", *(f"x{i + 1}" for i in range(branch.dofs)), *traces]
-        names += ["multiplier_max", "slope", "contacts", "region", "kind"]
+        losses = loss_columns(branch)
+        names += ["multiplier_max", "slope", *losses, "contacts", "region", "kind"]
         rows = []
         for p, region in zip(branch.points, regions(branch), strict=True):
             numbers = [p.energy, p.frequency, p.period, *p.x.tolist(), *p.half_traces.tolist(), p.multiplier, p.slope]
+            numbers += [getattr(p, name) for name in losses]
             rows.append([*map(repr, numbers), str(p.episodes), str(region), p.kind])
         return Table(names, rows)
 

@@ -12,6 +12,7 @@ from vipetsc.case.nnm_table import NnmTable
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import BranchMonitor, compare, jumps, sampled
+from vipetsc.modes.branches.losses import dissipation_of, with_loss
 from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor
 from vipetsc.modes.branches.regions import regions
 from vipetsc.modes.continuation.arclength import GuardedSteps, StepRule
@@ -103,6 +104,7 @@ class ShootingMethod(NnmMethod):
         super().__init__(case, comm)
         options = case.nnm
         self.system = System.from_case(case)
+        self.dissipation = dissipation_of(case)
         self.grazing = options.locate_grazing
         self.crossing_options = options.model_copy(update={"points": options.switch_points, "chart": "relative"})
 
@@ -126,6 +128,10 @@ class ShootingMethod(NnmMethod):
     def start(self, problem: PeriodicProblem[Point], job: int) -> Point:
         """The orbit of a linear mode at a small energy."""
         return linear_start(self.shooting, job, start_energy(self.options, self.system, job))
+
+    def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:
+        """The point with its loss, if anything dissipates."""
+        return with_loss(self.shooting, self.dissipation, point) if self.dissipation.acts else point
 
     def monitor(self, problem: PeriodicProblem[Point]) -> Monitor[Point]:
         """The check of every new point: whether the branch retraces itself, stands still or is another one."""

@@ -1,0 +1,134 @@
+"""Losses along normal modes: the damping of linear modes, free decay by SciPy, and forced states in quadrature."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.rigs import TWO_MASSES
+from tests.unlike_lattices import TABLE, independent_lattice
+from vipetsc.case import NnmCase
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.modes.branches.condensed import CondensedMethod
+from vipetsc.modes.branches.files import read_branch
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.orbits import ShootingMethod
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.response.free_motions import resonance
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.shooting.orbit import sample_orbit
+
+OF_MASS = 0.2
+OF_STIFFNESS = 1e-7
+RESTITUTION = 0.998
+
+
+def lossy_case(**nnm: Any) -> NnmCase:
+    """The lattice that differs everywhere, with Rayleigh damping and contacts that dissipate a little."""
+    each = TABLE["contacts"]["each"] | {"restitution": [RESTITUTION] * 3}
+    changes = {
+        "lattice": TABLE["lattice"] | {"damping": {"mass": OF_MASS, "stiffness": OF_STIFFNESS}},
+        "contacts": TABLE["contacts"] | {"each": each},
+        "nnm": TABLE["nnm"] | {"forced": [2, 1]} | nnm,
+    }
+    return NnmCase.from_table(TABLE | changes)
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory):
+    """A branch with losses as the verb follows it, and the folder of its file."""
+    folder = tmp_path_factory.mktemp("lossy")
+    (branch,) = follow_all(lossy_case(points=60, largest_step=0.3, start_energy=2e-4), folder, MPI.COMM_SELF)
+    return branch, folder
+
+
+def test_a_linear_mode_has_its_damping_ratio(shot):
+    """Before the first contact the loss over 4 pi times the energy is the damping ratio of Rayleigh damping."""
+    branch, _ = shot
+    first = branch.points[0]
+    omega = 2 * np.pi * first.frequency
+    assert first.episodes == 0
+    assert first.damping_ratio == pytest.approx((OF_MASS / omega + OF_STIFFNESS * omega) / 2, rel=1e-11)
+    # In contact the mode is another one, and contacts take their part.
+    assert branch.regular()[-1].damping_ratio > 1.1 * first.damping_ratio
+
+
+def test_losses_are_in_the_files_of_a_branch(shot):
+    """The file and the table have loss, damping ratio and force, and give the points back."""
+    branch, folder = shot
+    stored = read_branch(folder / "branch-mode-4.h5")
+    assert [(p.loss, p.force) for p in stored.points] == [(p.loss, p.force) for p in branch.points]
+    assert "slope,loss,damping_ratio,force,contacts" in (folder / "branch-mode-4.csv").read_text(encoding="utf-8")
+
+
+def test_free_decay_takes_the_loss(shot):
+    """Integrated by SciPy with its dashpots and restitutions, an orbit loses the energy that the branch says."""
+    branch, _ = shot
+    shooting = ShootingMethod(lossy_case(), MPI.COMM_SELF).shooting
+    lattice = independent_lattice()
+    damped = replace(
+        lattice,
+        damping=OF_MASS * np.diag(lattice.masses) + OF_STIFFNESS * lattice.stiffness,
+        stops=tuple(replace(stop, restitution=RESTITUTION) for stop in lattice.stops),
+    )
+    point = branch.regular()[-1]
+    u, v = sample_orbit(shooting, point, samples=40)
+    begin = int(np.flatnonzero(np.all(shooting.system.gaps(u) < 0, axis=1))[0])
+
+    motion, impacts = damped.motion(np.array([point.period]), u[begin], v[begin], 0.0)
+
+    lost = point.energy - shooting.system.energy(motion[0, -1], motion[1, -1])
+    assert impacts >= 3
+    # First order in the loss, which is a small part of the energy.
+    assert point.loss < 1e-2 * point.energy
+    assert lost == pytest.approx(point.loss, rel=1e-2)
+
+
+@pytest.mark.slow
+def test_condensed_motions_lose_what_orbits_lose(shot):
+    """Harmonics of all masses and of the contact forces give the loss and the force of the orbit of that energy."""
+    branch, _ = shot
+    method = CondensedMethod(
+        lossy_case(method="condensed", points=12, truncation=1e-6, largest_step=0.2, start_energy=2.1e-4), MPI.COMM_SELF
+    )
+    point = list(Continuation(method.motions, method.start(method.motions, 3), method.options))[-1]
+    point = method.assess(method.motions, point)
+    assert point.episodes
+
+    regular = [p for p in branch.regular() if p.episodes]
+    energies = np.array([p.energy for p in regular])
+    near = regular[int(np.abs(energies - point.energy).argmin())]
+    # The nearest orbit has another energy: ratios change more slowly than the losses themselves.
+    assert point.damping_ratio == pytest.approx(near.damping_ratio, rel=5e-3)
+    assert point.force / point.loss * np.sqrt(point.energy) == pytest.approx(
+        near.force / near.loss * np.sqrt(near.energy), rel=1e-2
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damping", [0.02, 0.005])
+def test_the_force_holds_a_steady_state_in_quadrature(damping):
+    """A forced state a quarter of a period behind its force, near the free motion, needs the force of the branch."""
+    lattice = TWO_MASSES["lattice"] | {"damping": {"mass": damping}}
+    nnm = {"system": "chain", "method": "condensed", "modes": [1], "forced": [2, 1], "truncation": 1e-5}
+    nnm |= {"points": 14, "largest_step": 0.2, "first_step": 0.05, "tolerance": 1e-11, "harmonics": 63}
+    case = NnmCase.from_table(
+        {"name": "rig", "lattice": lattice, "contacts": TWO_MASSES["contacts"], "nnm": nnm | {"start_energy": 0.9}}
+    )
+    method = CondensedMethod(case, MPI.COMM_SELF)
+    motion = list(Continuation(method.motions, method.start(method.motions, 0), method.options))[-1]
+    motion = method.assess(method.motions, motion)
+    assert motion.episodes
+
+    drive = {"waveform": "harmonic", "amplitude": 0.1, "frequency": 2 * np.pi / motion.period, "cell": 2, "mass": 1}
+    nfrc = {"source": "force", "over": "amplitude", "range": [1e-3, 1.0], "harmonics": 63}
+    forced = NfrcCase.from_table(TWO_MASSES | {"lattice": lattice, "drive": drive, "nfrc": nfrc})
+    states = SteadyStates(forced, 1.0, 2 * np.pi / motion.period)
+    xi = resonance(states, method.motions.balance(motion.order).unpack(motion.x))
+
+    assert xi[-1] * states.parameter.scale == pytest.approx(motion.force, rel=damping)
