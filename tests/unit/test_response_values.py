@@ -70,3 +70,5 @@ def test_where_a_curve_folds_its_largest_state_counts():
     assert widest_gap([folded], 1.0, 0, 5) == pytest.approx(2.0)  # 0 to 1, then 3 to 5
     isolated = part([3.5, 4.0, 3.5], [2.0, 2.0, 2.0])
     assert widest_gap([folded, isolated], 1.0, 0, 5) == pytest.approx(1.0)
+    within = part([2.5, 2.6], [2.0, 2.0])
+    assert widest_gap([folded, within], 1.0, 0, 5) == pytest.approx(2.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 from mpi4py import MPI
@@ -20,6 +21,7 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.parallel import StopRequest
 from vipetsc.spectra.responses import CurvePart, largest_response
+from vipetsc.studies import response_objective
 from vipetsc.studies.optimum_search import run_search
 from vipetsc.studies.response_objective import measured_responses
 
@@ -162,9 +164,19 @@ def test_a_curve_that_ends_early_is_a_design_that_fails(tmp_path):
     summary = run_search(OptimiseCase.from_table(table), tmp_path, MPI.COMM_SELF)
     found = datasets(tmp_path / "optimum.h5")
     assert np.isnan(found["value"]).all()
-    assert b"points reached: increase nfrc.points" in found["reason"][0]
+    assert found["reason"][0].startswith(b"curve r1-1: 4 points reached: increase nfrc.points")
     assert "2 designs, 2 runs, 2 frequency responses; 2 designs failed" in summary
     assert np.isfinite(found["curve/dissipated"]).all()
+
+
+def test_a_curve_that_turns_back_has_no_states_on_a_part_of_its_range(monkeypatch):
+    """It ends at the beginning of the range: a peak beyond would not be seen, so the design fails."""
+    case = absorber(0.05, 0.01, largest_step=0.3)
+    [curve] = follow_all(case, None, MPI.COMM_SELF)
+    there_and_back = replace(curve, points=[*curve.points, *curve.points[::-1]], ending="reached the end")
+    monkeypatch.setattr(response_objective, "follow_all", lambda *arguments, **options: [there_and_back])
+    with pytest.raises(RuntimeError, match=r"r1-1: turned back and reached the end, without states up to 1\.2"):
+        measured(case)
 
 
 @pytest.mark.parametrize(

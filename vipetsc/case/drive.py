@@ -31,6 +31,11 @@ class DriveTable(OneDrive):
         others = [(f"drive.more[{i}]", drive) for i, drive in enumerate(self.more or [], 1)]
         return [("drive", self), *others]
 
+    @property
+    def ratios(self) -> list[tuple[OneDrive, float]]:
+        """Drives, each with the ratio of its amplitude to that of the first one, which is not zero."""
+        return [(drive, drive.amplitude / self.amplitude) for _, drive in self.every]
+
 
 AnyDrive = TypeVar("AnyDrive", bound=OneDrive)
 
@@ -214,20 +219,23 @@ def resolve_drive(drive: AnyDrive, cell: UnitCell, cells: int, frequency: float 
 
 
 def build_drives(drives: DriveTable, chain: Chain) -> tuple[Drive, ...]:
-    """The drives of a resolved section; the motion of a wall acts on each mass that a spring ties to it."""
-    built: list[Drive] = []
-    for _, drive in drives.every:
-        waveform = waveform_of(drive)
-        if drive.end is None:
-            built.append(Drive(waveform, drive.cell - 1, drive.mass - 1))
-            continue
+    """The drives of a resolved section."""
+    return tuple(built for _, drive in drives.every for built in build_drive(drive, chain))
 
-        last = chain.cells - 1
-        for mass, number in _end_masses(chain.cell, drive.end):
-            if drive.end == "left":
-                # The spring to the left wall belongs to the cell before the first one, which does not vary.
-                built.append(Drive(waveform, 0, mass, float(chain.cell.springs[number].stiffness)))
-            else:
-                stiffness = chain.coefficients(last, last + 1).stiffness[0, number]
-                built.append(Drive(waveform, last, mass, float(stiffness)))
-    return tuple(built)
+
+def build_drive(drive: OneDrive, chain: Chain) -> list[Drive]:
+    """A resolved drive; the motion of a wall acts on each mass that a spring ties to it."""
+    waveform = waveform_of(drive)
+    if drive.end is None:
+        return [Drive(waveform, drive.cell - 1, drive.mass - 1)]
+
+    built: list[Drive] = []
+    last = chain.cells - 1
+    for mass, number in _end_masses(chain.cell, drive.end):
+        if drive.end == "left":
+            # The spring to the left wall belongs to the cell before the first one, which does not vary.
+            built.append(Drive(waveform, 0, mass, float(chain.cell.springs[number].stiffness)))
+        else:
+            stiffness = chain.coefficients(last, last + 1).stiffness[0, number]
+            built.append(Drive(waveform, last, mass, float(stiffness)))
+    return built

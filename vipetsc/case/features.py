@@ -78,8 +78,9 @@ def _other_drives(kind: type[CaseFile], drive: DriveTable) -> Iterator[Problem]:
         yield from _refusal(kind, "many drives", "drive.more")
     if drive.end:
         yield from _refusal(kind, "moved wall", "drive.end", drive.end)
-    if drive.kind not in kind.waveforms:
-        yield from _refusal(kind, "other waveforms", "drive.waveform", drive.kind)
+    for path, one in drive.every:
+        if one.kind not in kind.waveforms:
+            yield from _refusal(kind, "other waveforms", f"{path}.waveform", one.kind)
 
 
 def _other_lattices(kind: type[CaseFile], lattice: LatticeTable) -> Iterator[Problem]:

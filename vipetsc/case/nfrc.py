@@ -12,6 +12,7 @@ import tomli_w
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, Problem, Table, Valid, read_section
 from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites
+from vipetsc.case.drive import DriveTable
 from vipetsc.case.family import FamilyMember, family_of
 from vipetsc.case.names import distinct
 from vipetsc.case.nfrc_table import NfrcTable
@@ -54,7 +55,6 @@ class NfrcCase(Case):
     kept_by_resume: ClassVar[str] = "the case with which its curves were started, except nfrc.points"
     refuses: ClassVar[Mapping[str, str]] = {
         "initial motion": "a curve has all steady states, whatever the motion at t = 0",
-        "many drives": "not yet: steady states are computed for one force or one moved wall",
         "other waveforms": "a steady state repeats itself under a sine, that of a harmonic drive or of a burst",
     }
     waveforms = ("burst", "harmonic")
@@ -74,7 +74,7 @@ class NfrcCase(Case):
         contacts = sections["contacts"]
         chain = build_chain(sections["lattice"], contacts)
         cell = chain.cell
-        problems = list(_check_lattice(nfrc, contacts, chain))
+        problems = [*_check_drives(nfrc, sections["drive"]), *_check_lattice(nfrc, contacts, chain)]
         if problems:
             return sections, problems
 
@@ -261,6 +261,16 @@ class NfrcCase(Case):
 def needs_modes(chain: Chain) -> bool:
     """Whether the response of ``chain`` follows from its modes: Bloch waves are those of equal cells without loss."""
     return chain.is_damped or not chain.is_uniform() or bool(chain.pairs) or not chain.cell.is_linear
+
+
+def _check_drives(nfrc: NfrcTable, drives: DriveTable) -> Iterator[Problem]:
+    """Problems with further drives, which are resolved: beside a wave, or with frequencies of their own."""
+    for path, drive in drives.every[1:]:
+        if nfrc.source == "wave":
+            yield Problem(path, None, 'a wave that is incident acts alone; omit it, or nfrc.source = "force"')
+        elif drive.frequency != drives.frequency:
+            remedy = "a steady state repeats itself with one period, and so must all drives; give that of the first one"
+            yield Problem(f"{path}.frequency", drive.frequency, f"{remedy}, {drives.frequency:.15g} rad/s")
 
 
 def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> Iterator[Problem]:

@@ -188,6 +188,7 @@ FEW_SPRINGS: Table = {
     "contacts": {"sites": [2, 3]},
     "nnm": {"points": 1, "harmonics": 21, "truncation": 1e-3},
 }
+SECOND_DRIVE = {"amplitude": 0.5, "frequency": 900.0, "cycles": 3, "cell": 6}
 CUBIC_CELL = {"springs": [HOST_SPRING, RESONATOR_SPRING | {"cubic": 1e9}]}
 MEASURED = {"time": [0.0, 1e-3, 2e-3, 3e-3, 4e-3], "value": [0.0, 1.0, -1.0, 0.5, 0.0]}
 RUBBER = {"plugins": {"modules": [str(files("vipetsc") / "examples" / "own_law.py")]}} | _contacts(
@@ -239,7 +240,12 @@ FEATURES: tuple[Feature, ...] = (
         {"drive": {"end": "left", "cell": None, "amplitude": 1e-4}},
         scaled={"nfrc": {"nfrc": {"range": [1e-6, 2e-5]}}, "predict": {"predict": {"amplitudes": [1e-4]}}},
     ),
-    Feature("several drives", {"drive": {"more": [{"amplitude": 0.5, "frequency": 900.0, "cycles": 3, "cell": 6}]}}),
+    Feature(
+        "several drives",
+        {"drive": {"more": [SECOND_DRIVE]}},
+        # All have the period of the steady state; against the first force, so that the range begins without contact.
+        scaled={"nfrc": {"drive": {"more": [SECOND_DRIVE | {"frequency": 1000.0, "amplitude": -0.5}]}}},
+    ),
     Feature("mode at t = 0", _initial(kind="mode", number=3, amplitude=1e-5)),
     Feature("packet at t = 0", _initial(kind="packet", band=1, wavenumber=1.0, cell=12, width=2.0, amplitude=1e-5)),
     Feature("struck masses", _initial(kind="velocity", cell=5, velocity=0.1)),

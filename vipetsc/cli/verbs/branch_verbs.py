@@ -102,6 +102,8 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
         if case.drive.end:
             excitation = f"the motion of the {case.drive.end} wall"
         amplitude_unit = "m" if case.drive.end else "N"
+        if case.drive.more:
+            excitation += f", and {len(case.drive.more)} more in the ratios of the amplitudes"
 
     fixed = "amplitude"
     fixed_unit = amplitude_unit

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vipetsc.case.drive import build_drive
 from vipetsc.case.nfrc import NfrcCase, needs_modes
 from vipetsc.case.resolve import build_chain
 from vipetsc.lattice import ModalCompliance, OpenCompliance, WaveCompliance, nonlinear_places
@@ -20,15 +21,19 @@ class DrivenPoints(NamedTuple):
 def driven_points(case: NfrcCase) -> DrivenPoints:
     """The driven masses of a ``case``; none under an incident wave.
 
-    A wall acts on each mass that a spring ties to it, with that spring's stiffness times its motion.
+    A wall acts on each mass that a spring ties to it, with that spring's stiffness times its motion. The amplitude is
+    that of the first drive; all others keep their ratios to it.
     """
     if case.nfrc.source == "wave":
         return DrivenPoints((), np.empty(0))
-    drives = case.model().drives
-    return DrivenPoints(
-        places=tuple((drive.cell, drive.mass) for drive in drives),
-        weights=np.array([drive.stiffness or 1.0 for drive in drives]),
-    )
+
+    places: list[tuple[int, int]] = []
+    weights: list[float] = []
+    for drive, ratio in case.drive.ratios:
+        for built in build_drive(drive, case.model().chain):
+            places.append((built.cell, built.mass))
+            weights.append(ratio * (built.stiffness or 1.0))
+    return DrivenPoints(tuple(places), np.array(weights))
 
 
 def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:

@@ -58,7 +58,7 @@ class ResponseOutputs:
         self.walls: list[WallSprings] = []
         if self.wants_forces and not (case.nfrc.infinite or case.nfrc.open_ends) and chain.ends == "fixed":
             self.walls = [wall_springs(chain, wall) for wall in WALLS]
-        self._moved = case.drive.end
+        self._moved = [(drive.end, ratio) for drive, ratio in case.drive.ratios if drive.end]
         self._masses = [(point.cell - 1, point.mass - 1) for point in output.points or []]
         self.cells = sorted({cell for cell, _ in self._masses} | {wall.cell for wall in self.walls})
 
@@ -132,8 +132,9 @@ class ResponseOutputs:
                 # A spring that pulls at the left wall is stretched by u > 0, one at the right wall by u < 0.
                 if (place.start if name == "left" else place.end) < 0:
                     force += beyond if name == "left" else -beyond
-            if name == self._moved:
-                force[1] -= wall.stiffness.sum() * motion.amplitude
+            for moved, ratio in self._moved:
+                if name == moved:
+                    force[1] -= wall.stiffness.sum() * ratio * motion.amplitude
             forces.append(force)
         harmonics = np.array(forces)
         return {

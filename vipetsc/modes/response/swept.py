@@ -8,6 +8,7 @@ state is found.
 
 from collections.abc import Iterator
 from contextlib import suppress
+from typing import Any
 
 from mpi4py import MPI
 
@@ -89,18 +90,22 @@ def _sweep(states: SteadyStates, count: int, direction: int) -> Case:
     between = states.options.isola_periods * 2 * np.pi / middle
     duration = count * between
 
-    drive = case.drive.model_dump(include={"cell", "mass", "end"}, exclude_none=True)
-    if "end" in drive:
+    drives: list[dict[str, Any]] = []
+    for one, ratio in case.drive.ratios:
         # The wall that moves says which mass is driven.
-        drive = {"end": drive["end"]}
-    drive |= {
-        "waveform": "chirp",
-        "amplitude": states.parameter.fixed,
-        "frequency": middle,
-        "bandwidth": direction * (high - low),
-        "duration": duration,
-        "ramp": RAMP * between,
-    }
+        place = {"end": one.end} if one.end else {"cell": one.cell, "mass": one.mass}
+        chirp = {
+            "waveform": "chirp",
+            "amplitude": ratio * states.parameter.fixed,
+            "frequency": middle,
+            "bandwidth": direction * (high - low),
+            "duration": duration,
+            "ramp": RAMP * between,
+        }
+        drives.append(place | chirp)
+    drive, *more = drives
+    if more:
+        drive["more"] = more
     interval = case.time.sample_interval
     assert interval != "auto"  # that of a resolved case
     time = {"end": duration, "sample_interval": min(interval, 2 * np.pi / (high * PER_PERIOD))}

@@ -1,0 +1,131 @@
+"""Frequency responses to several drives of one frequency: linear superposition, time integration, what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.conftest import with_sections
+from tests.rigs import OUTPUT, TWO_MASSES, after_a_period
+from tests.steady_states import motion_at
+from vipetsc.case import CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.modes.response.condensation import driven_points
+from vipetsc.modes.response.state import Response
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import first_state
+from vipetsc.modes.response.swept import _sweep
+
+FORCE = {"waveform": "harmonic", "amplitude": 0.3, "frequency": 1.0, "cell": 1}
+BEYOND = {"waveform": "harmonic", "amplitude": -0.6, "frequency": 1.0, "cell": 2}
+LEFT = {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "end": "left"}
+RIGHT = LEFT | {"end": "right", "amplitude": 0.25}
+
+
+def rig(*drives: dict[str, Any], **nfrc: Any) -> NfrcCase:
+    """The rig of two masses with these drives, at the amplitude of the first one."""
+    first, *more = drives
+    table = with_sections(TWO_MASSES, {"nfrc": {"fixed": [abs(first["amplitude"])]} | nfrc})
+    return NfrcCase.from_table(table | {"drive": first | ({"more": more} if more else {}), "output": OUTPUT})
+
+
+def states_of(case: NfrcCase) -> SteadyStates:
+    """The steady states of the first curve of a case."""
+    _, restitution, fixed = case.curves()[0]
+    return SteadyStates(case, restitution, fixed)
+
+
+def phasors(outputs: dict[str, np.ndarray]) -> np.ndarray:
+    """First harmonics of the displacements of both masses, and of the forces on both walls."""
+    displacement = outputs["location_harmonics"][:, 1] + 1j * outputs["location_harmonics_imaginary"][:, 1]
+    return np.append(displacement, outputs["first_wall_force"] * np.exp(-1j * np.radians(outputs["wall_force_lag"])))
+
+
+def linear_phasors(*drives: dict[str, Any]) -> np.ndarray:
+    """The phasors at 1.3 rad/s of a state that touches no stop."""
+    case = rig(*drives, range=[1.3, 2.0])
+    states = states_of(NfrcCase.from_table(case.model_dump(by_alias=True, exclude_none=True) | FAR))
+    return phasors(states.measured(first_state(states).xi).outputs)
+
+
+FAR = {"contacts": TWO_MASSES["contacts"] | {"clearance": 1e3}}
+
+
+@pytest.mark.parametrize(
+    "drives",
+    [(FORCE, BEYOND), (LEFT, RIGHT), (LEFT, FORCE), (BEYOND, LEFT, RIGHT)],
+    ids=["forces", "walls", "mixed", "3"],
+)
+def test_without_contact_drives_are_superposed(drives):
+    """Displacements and forces on the walls are sums of those of each drive alone, at its own amplitude."""
+    together = linear_phasors(*drives)
+    alone = sum(np.sign(drive["amplitude"]) * linear_phasors(drive) for drive in drives)
+    np.testing.assert_allclose(together * np.sign(drives[0]["amplitude"]), alone, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_two_forces_on_one_mass_are_one():
+    """Halves of a force act as the whole, also with contact, in every unknown of the state."""
+    half = FORCE | {"amplitude": 0.5}
+    whole = first_state(states_of(rig(FORCE | {"amplitude": 1.0}, range=[1.4, 2.0], harmonics=15)))
+    halves = first_state(states_of(rig(half, half, range=[1.4, 2.0], harmonics=15)))
+    assert abs(whole.xi[:-1]).max() > 1.05  # over the clearance
+    np.testing.assert_allclose(halves.xi, whole.xi, atol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drives", [(FORCE, BEYOND), (LEFT, FORCE)], ids=["forces", "wall and force"])
+def test_states_with_contact_repeat_themselves_in_time(drives):
+    """SciPy's motion from a steady state is back after a period; the loads have the ratios of the case."""
+    larger = [drive | {"amplitude": 4 * drive["amplitude"]} for drive in drives]
+    states = states_of(rig(*larger, range=[1.45, 2.0]))
+    ratio = drives[1]["amplitude"] / drives[0]["amplitude"]
+    weights = [1.0, ratio] if drives[0] is FORCE else [1.5, ratio]
+    assert driven_points(states.case).weights.tolist() == pytest.approx(weights)
+
+    point: Response = first_state(states)
+    assert states.measured(point.xi).episodes > 0
+    state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(2))])
+    assert np.abs(after_a_period(states, point, state) - state).max() < 2e-4 * np.abs(state).max()
+
+
+def test_sweeps_in_time_that_look_for_isolated_curves_have_all_drives():
+    """Each is a chirp at its own place, in the ratio of the amplitudes."""
+    run = _sweep(states_of(rig(LEFT, BEYOND)), 4, 1)
+    assert run.drive.end == "left"
+    assert run.drive.amplitude == 0.1
+    [other] = run.drive.more
+    assert (other.cell, other.amplitude, other.waveform) == (2, pytest.approx(-0.6), "chirp")
+    assert (other.frequency, other.bandwidth, other.duration) == (
+        run.drive.frequency,
+        run.drive.bandwidth,
+        run.drive.duration,
+    )
+
+
+@pytest.mark.parametrize(
+    ("drives", "nfrc", "key", "sentence"),
+    [
+        ((FORCE, BEYOND | {"frequency": 2.0}), {}, "drive.more[1].frequency", "repeats itself with one period"),
+        (
+            (FORCE, {"waveform": "impulse", "amplitude": 1.0, "duration": 0.5, "cell": 2}),
+            {},
+            "drive.more[1].waveform",
+            "under a sine",
+        ),
+    ],
+)
+def test_drives_without_a_common_period_are_refused(drives, nfrc, key, sentence):
+    with pytest.raises(CaseError) as caught:
+        rig(*drives, **nfrc)
+    (problem,) = caught.value.problems
+    assert problem.key == key
+    assert sentence in problem.remedy
+
+
+def test_an_incident_wave_acts_alone():
+    more = [{"amplitude": 1.0, "frequency": 1500.0, "cell": 5}]
+    with pytest.raises(CaseError, match="a wave that is incident acts alone"):
+        NfrcCase.from_table({"nfrc": {"range": [0.9, 1.1]}, "drive": {"more": more}})
