@@ -72,7 +72,7 @@ def test_kinetic_energies_are_of_the_masses_there_are(runs):
     """Kinetic energies over cells and wavenumbers sum to the ledger's, which the masses of all cells alike miss."""
     run, _ = runs["propagator"]
     ledger = run["energy/kinetic"].values
-    record = VelocityRecord(run, AnalysisTable())
+    record = VelocityRecord(run, Case.of(run), AnalysisTable())
 
     energy = spectra.kinetic_energy(record.weighted, record.masses)
     expected = (0.5 * run["lattice/masses"].values * run["velocity"].values ** 2).sum(axis=2)

@@ -17,6 +17,7 @@ from scipy import fft
 
 import vipetsc
 from vipetsc import spectra
+from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import tabulated
 from vipetsc.lattice import pass_bands
@@ -25,7 +26,7 @@ from vipetsc.spectra.measures import MEASURES, PART, RunRecord, row_of, take
 from vipetsc.studies.band_measures import BANDS, band_energies
 from vipetsc.studies.modal_measures import MODAL, modal_energies
 from vipetsc.studies.run_record import record_of
-from vipetsc.studies.velocity_record import VelocityRecord, options_of
+from vipetsc.studies.velocity_record import VelocityRecord
 
 FORMAT_VERSION = 3
 HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
@@ -97,7 +98,8 @@ def analyse(
     ``left_out``; those that the stored samples and cells do not resolve are also named in the list ``warnings``.
     """
     sys.audit("vipetsc.analyse")
-    options = options or options_of(run.attrs["case"])
+    case = Case.of(run)
+    options = options or case.analysis or AnalysisTable.model_validate({})
     about = {
         "format_version": FORMAT_VERSION,
         "vipetsc_version": vipetsc.__version__,
@@ -105,7 +107,7 @@ def analyse(
         "status": run.attrs.get("status", ""),
         "analysis": describe_options(options),
     }
-    seen = record_of(run, options)
+    seen = record_of(run, case, options)
     taken = take(seen, measures)
     layout, numbers, attributes = _numbers(seen, taken)
     if "velocity" not in run:
@@ -113,7 +115,7 @@ def analyse(
         about |= {"left_out": left_out, "warnings": json.dumps(seen.warnings)}
         return _dataset(LAYOUT | layout, numbers, about, attributes)
 
-    record = VelocityRecord(run, options)
+    record = VelocityRecord(run, case, options)
     values = _measure(run, record, set(measures) - record.unresolved(), arrival) | numbers
     record.warnings += seen.warnings
     about["left_out"] = "; ".join(record.left_out + record.warnings)

@@ -11,9 +11,8 @@ from vipetsc.spectra.histories import History, SteadyDrive
 from vipetsc.spectra.measures import PERIODS, QUANTITIES, TOLERANCE, RunRecord
 
 
-def record_of(run: xr.Dataset, options: AnalysisTable) -> RunRecord:
-    """The record of a ``run``, open or in memory, measured with ``options``."""
-    case = Case.of(run)
+def record_of(run: xr.Dataset, case: Case, options: AnalysisTable) -> RunRecord:
+    """The record of a ``run`` of ``case``, open or in memory, measured with ``options``."""
     output = case.output
     cell = case.lattice.unit_cell()
     # Masses without springs have no bands.

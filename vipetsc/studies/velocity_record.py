@@ -27,7 +27,7 @@ def options_of(case: str, folder: Path | None = None, overrides: Iterable[str] =
 
 
 class VelocityRecord:
-    """Velocity, axes and masses of a run for its measures, which add attributes and what is left out.
+    """Velocity, axes and masses of a run of ``case`` for its measures, which add attributes and what is left out.
 
     ``masses`` (dof) of the reference cell in kg, ``velocity`` (t, cell, dof) in m/s and ``weighted`` the same times
     sqrt(m/m_reference) of each mass, so that its energies by the reference cell's masses are those of the masses there
@@ -36,10 +36,10 @@ class VelocityRecord:
     ``memory`` in bytes. ``attributes`` are those of variables, of groups under "".
     """
 
-    def __init__(self, run: xr.Dataset, options: AnalysisTable) -> None:
+    def __init__(self, run: xr.Dataset, case: Case, options: AnalysisTable) -> None:
         self.options = options
         self.memory = options.memory * 2**30
-        self.model = Case.of(run).model()
+        self.model = case.model()
         self.masses = np.asarray(self.model.chain.cell.masses)
         self.velocity: Any = self.field(run["velocity"])
         self.weighted = self.velocity
