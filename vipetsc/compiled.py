@@ -19,6 +19,7 @@ from typing import Any, TypeVar, overload
 import numba
 from numba.core import event
 
+from vipetsc.kernel import Kernel
 from vipetsc.process import compiling, launched_rank, say
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -34,10 +35,13 @@ def njit(function: Function, /) -> Function: ...
 @overload
 def njit(*signature: str, **options: Any) -> Callable[[Function], Function]: ...
 def njit(*signature: Any, **options: Any) -> Any:
-    """``numba.njit`` with a cache; without a signature, it compiles at the first call."""
+    """``numba.njit`` with a cache; without a signature, a ``Kernel`` that is compiled at the first call."""
     if signature and callable(signature[0]):
-        return _decorator(numba.njit)(signature[0])
-    return _decorator(numba.njit, *signature, **options)
+        return njit()(signature[0])
+    compile_entry = _decorator(numba.njit, *signature, **options)
+    if signature:
+        return compile_entry
+    return lambda function: Kernel(function, compile_entry, options)
 
 
 def cfunc(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -72,11 +76,13 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
         PARENTS.add(folder.parent)
         config.CACHE_DIR = str(folder)
         # Callbacks and kernels with a signature are compiled here, others at their first call.
-        compiling.start()
+        if signature:
+            compiling.start()
         try:
             return compiler(*signature, cache=_can_keep(folder.parent), **options)(function)
         finally:
-            compiling.stop()
+            if signature:
+                compiling.stop()
             config.CACHE_DIR = chosen
 
     return decorate
@@ -100,10 +106,10 @@ class CompilerListener(event.Listener):
 
 @cache
 def _announce() -> None:
-    """Report once, on one rank, why the first run of a version takes a minute longer than the next."""
+    """Report once, on one rank, why the first run of a version takes half a minute longer than the next."""
     # Where kernels cannot be kept, a warning has said that they are compiled at every start.
     if not launched_rank() and all(_can_keep(parent) for parent in PARENTS):
-        say("vipetsc: compiling kernels (once, about a minute)")
+        say("vipetsc: compiling kernels (once, about half a minute)")
 
 
 event.register("numba:compile", CompilerListener())
@@ -135,7 +141,7 @@ def _can_keep(parent: Path) -> bool:
         parent.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=parent).close()
     except OSError as error:
-        # Once, on one rank: every command compiles for up to a minute then.
+        # Once, on one rank: every command compiles for up to half a minute then.
         if not launched_rank():
             reason = error.strerror or error
             logger.warning(

@@ -10,10 +10,11 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numba
 import pytest
 
 import vipetsc
-from vipetsc import compiled, process
+from vipetsc import compiled, kernel, process
 from vipetsc.dynamics.ts.right_hand_side import compile_callback
 
 ROOT = Path(vipetsc.__file__).parent
@@ -45,7 +46,7 @@ import json, os, sys, numba
 environment, folder = dict(os.environ), numba.config.CACHE_DIR
 from vipetsc.outer import callback, scaled, twice
 values = [twice(3.0), callback.ctypes(3.0)]
-hits = [sum(scaled.stats.cache_hits.values()), sum(twice.stats.cache_hits.values()), callback.cache_hits]
+hits = [sum(scaled.stats.cache_hits.values()), sum(twice.entry.stats.cache_hits.values()), callback.cache_hits]
 print(json.dumps([values, hits, environment == dict(os.environ) and folder == numba.config.CACHE_DIR]))
 """
 
@@ -67,6 +68,7 @@ def package(tmp_path):
     (folder / "outer.py").write_text(OUTER)
     (folder / "plain.py").write_text("import numpy\n")
     shutil.copy(compiled.__file__, folder)
+    shutil.copy(kernel.__file__, folder)
     shutil.copy(process.__file__, folder)
 
     def ask() -> list:
@@ -101,6 +103,20 @@ def test_kernels_are_found_again_until_their_sources_change(package):
 
     # Four versions of inner.py, and five of outer.py.
     assert len(list(folder.glob("__pycache__/kernels-*"))) == 4 + 5
+
+
+def test_a_kernel_is_translated_only_where_python_calls_it():
+    double = kernel.Kernel(lambda x: 2.0 * x, numba.njit, {})
+    quadruple = kernel.Kernel(lambda x: double(double(x)), numba.njit, {})
+    assert quadruple(3.0) == 12.0
+
+    # As part of its caller it has no machine code, and none was compiled for Python.
+    (found,) = double.overloads.values()
+    assert not found.library.codegen._engine.is_symbol_defined(found.fndesc.llvm_func_name)
+    assert "entry" not in vars(double)
+
+    # Python calls the same function, by names of its arguments too.
+    assert double(x=3.0) == 6.0
 
 
 def test_kernels_may_be_kept_in_a_chosen_folder(package, tmp_path):
@@ -187,7 +203,7 @@ def test_that_kernels_are_compiled_is_said_once(package, tmp_path):
         return done.stderr.splitlines()
 
     assert say(OMPI_COMM_WORLD_RANK="1", NUMBA_CACHE_DIR=str(tmp_path / "other")) == []
-    assert say(OMPI_COMM_WORLD_RANK="0") == ["vipetsc: compiling kernels (once, about a minute)"]
+    assert say(OMPI_COMM_WORLD_RANK="0") == ["vipetsc: compiling kernels (once, about half a minute)"]
     assert say() == []
 
 
