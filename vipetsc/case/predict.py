@@ -37,13 +37,21 @@ class PredictCase(LawCase):
     refuses: ClassVar[Mapping[str, str]] = {
         **{feature: reason for feature, reason in LawCase.refuses.items() if feature != "moved wall"},
         "absorbing ends": "not yet: the wave between sites is followed in equal cells up to the ends",
-        "rings": "waves around a ring meet its sites again and again, and a prediction follows them once",
     }
 
     def warnings(self) -> list[str]:
         """Warnings about the waves of the prediction; its runs do not store fields."""
         model = self.model()
-        return [*wave_warnings(model), *length_warnings(model), *end_warnings(model, self.output)]
+        warnings = [*wave_warnings(model), *length_warnings(model), *end_warnings(model, self.output)]
+        nearest = min(abs(site - model.drive_cell) for site in model.chain.sites)
+        # Once around and on to the site, until the end of the burst has passed it.
+        passed = (model.chain.cells + nearest) / model.speed + model.drive.duration
+        if model.chain.ends == "periodic" and passed < model.end:
+            warnings.append(
+                f"the wave ({model.speed:.4g} cells/s) has passed a site for the second time at {passed:.4g} s, before"
+                f" time.end = {model.end:.4g} s: sites that meet it several times are predicted less accurately"
+            )
+        return warnings
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
