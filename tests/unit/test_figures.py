@@ -357,7 +357,7 @@ def test_a_note_leaves_the_picture_above_it_as_it_is(tmp_path):
             figure.get_layout_engine().set(rect=(0, 0.15, 1, 0.85))
             figure.legend([line], ["a curve"], loc="lower center")
             figure.set_label(label)
-            pixels.append(imread(save(figure, tmp_path / f"{number}.png")))
+            pixels.append(imread(save(figure, tmp_path / f"{number}.png"))[..., :3])
     plain, noted = pixels
     assert len(noted) > len(plain)
     np.testing.assert_array_equal(noted[: len(plain)], plain)
