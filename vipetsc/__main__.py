@@ -1,12 +1,13 @@
 """Entry point: ``python -m vipetsc VERB``, on one process or under ``mpirun -n N``; PETSc options follow ``--``."""
 
+import gc
 import logging
 import os
 import sys
 from importlib.util import find_spec
 
 from vipetsc.cli.streams import check_standard_streams
-from vipetsc.process import end_on_request, quick_start_alone
+from vipetsc.process import collect_seldom, end_on_request, quick_start_alone
 
 BUILT_FOR_MPI = "mpi4py", "petsc4py", "h5py"  # which no wheel brings
 
@@ -15,6 +16,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one verb on all ranks; returns the exit code: 0 done, 2 bad input, 75 stopped on request, 1 failed."""
     # Before modules are loaded, which takes a second or more.
     end_on_request()
+    collect_seldom()
     check_standard_streams()
 
     # One thread per rank: further threads would compete with the other ranks for the cores.
@@ -66,6 +68,8 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options:
         database.delValue(name)
 
+    # What is loaded stays, and need not be searched for garbage.
+    gc.freeze()
     return run_verb(arguments[:end], options)
 
 

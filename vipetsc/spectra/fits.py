@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import curve_fit
 from scipy.special import stdtrit
 
 LEVEL = 0.95  # of confidence
@@ -90,7 +90,7 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
     else:
         tolerances = {"ftol": 1e-14, "xtol": 1e-14, "gtol": 1e-14, "maxfev": 2000}
         try:
-            (c, b), covariance = curve_fit(_exponential, u, w, p0=(c, b), jac=_gradient, **tolerances)
+            (c, b), covariance = scipy.optimize.curve_fit(_exponential, u, w, p0=(c, b), jac=_gradient, **tolerances)
             r2 = r2_adjusted(w, _exponential(u, c, b))
             variance = covariance[1, 1]
         except RuntimeError:  # no convergence: the squares keep falling as the exponent runs away
