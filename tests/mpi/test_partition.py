@@ -167,14 +167,22 @@ def test_a_step_that_fails_on_one_rank_ends_the_run_on_all(engine, stiffness, ob
 
 
 @pytest.mark.parallel([2, 3])
-@pytest.mark.parametrize(("engine", "looks"), [("ts", (500, 150)), ("propagator", (6, 1))])
+@pytest.mark.parametrize(
+    ("engine", "looks", "damping"), [("ts", (500, 150), None), ("propagator", (6, 1), {"mass": 10.0})]
+)
 @pytest.mark.parametrize("writer", [*on_two("gather"), in_parallel])
-def test_a_stopped_run_goes_on_to_the_same_bits_on_any_number_of_ranks(folder, monkeypatch, engine, looks, writer):
-    """A run goes on one rank, then on all, then on all but one; contacts last over both checkpoints."""
+def test_a_stopped_run_goes_on_to_the_same_bits_on_any_number_of_ranks(
+    folder, monkeypatch, engine, looks, damping, writer
+):
+    """A run goes on one rank, then on all, then on all but one; contacts last over both checkpoints.
+
+    That by exact steps has dashpots, too, whose losses are kept cell by cell.
+    """
     comm = MPI.COMM_WORLD
     # Blocks of 25 samples: the propagator can stop between them.
     monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 24 * 25)
     sections = {
+        "lattice": {"damping": damping},
         "contacts": {"sites": [12, 8, 1, 13, 24], "restitution": 0.7},
         "output": {"writer": writer, "window": [3, 20], "every": 2},
     }

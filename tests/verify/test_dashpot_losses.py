@@ -111,7 +111,7 @@ def test_the_loss_of_a_driven_lattice_with_stops_is_that_of_scipy(sample_interva
 
 
 LATTICES = {
-    "fixed": {"lattice": {"damping": DAMPING}},
+    "fixed": {"lattice": {"cells": 80, "damping": DAMPING}},
     "free": {"lattice": {"ends": "free", "damping": DAMPING}},
     "short ring": {"lattice": {"ends": "periodic", "cells": 9, "damping": DAMPING}, "contacts": {"sites": [3, 6]}},
     "strong": {"lattice": {"damping": {"mass": 100.0, "stiffness": 1e-4}}, "contacts": {"clearance": 5e-5}},
@@ -146,7 +146,8 @@ def test_the_energy_balance_closes_by_terms_computed_apart(name, sample_interval
 
 
 def test_a_cell_with_an_odd_number_of_masses_counts_each_once():
-    changes = ["lattice.cells=40", "lattice.damping={mass=10.0, stiffness=1e-5}", "contacts.sites=[6, 12]"]
+    """In so many cells that most are summed as vectors of them, masses two by two."""
+    changes = ["lattice.cells=80", "lattice.damping={mass=10.0, stiffness=1e-5}", "contacts.sites=[6, 12]"]
     changes += ["contacts.clearance=1e-4", "time.engine='propagator'", "time.end=0.05"]
     _, result = simulated(Case.load(EXAMPLES / "three-mass.toml", changes))
     assert result.statistics["engine"] == "propagator"

@@ -252,11 +252,14 @@ def test_auto_takes_it_where_it_suits():
     assert "engine_note" not in result.statistics
 
 
-@pytest.mark.parametrize(("looks", "contacts"), [(0, {}), (2, {}), (4, {}), (3, PRESSED)])
-def test_a_stopped_run_goes_on_to_the_same_bits(folder, monkeypatch, looks, contacts):
+@pytest.mark.parametrize(
+    ("looks", "contacts", "damping"), [(0, {}, {}), (2, {}, {}), (4, {}, {"mass": 10.0}), (3, PRESSED, {})]
+)
+def test_a_stopped_run_goes_on_to_the_same_bits(folder, monkeypatch, looks, contacts, damping):
     # Blocks of 49 samples of 24 cells: the run of 251 samples can stop between six of them.
     monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 24 * 49)
-    case = small_case(time={"engine": "propagator"}, contacts={"sites": [1, 6, 12, 13]} | contacts)
+    sites = {"sites": [1, 6, 12, 13]}
+    case = small_case(time={"engine": "propagator"}, contacts=sites | contacts, lattice={"damping": damping or None})
     straight = simulate(case, folder / "straight")
 
     assert simulate(case, folder / "stopped", stop=StopAt(looks)).resumable
