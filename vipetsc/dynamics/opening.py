@@ -58,7 +58,7 @@ class Opening(NamedTuple):
                     scaled[name] = values.copy()
                     scaled[name]["energy"] *= self.factor**2
                 elif values.dtype.kind == "f":
-                    # What observers keep: energies, and an indentation, which is zero.
+                    # What dashpots dissipated, and what observers keep: energies, and an indentation, which is zero.
                     scaled[name] = values * self.factor**2
                 else:
                     scaled[name] = values
