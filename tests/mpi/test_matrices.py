@@ -160,6 +160,37 @@ def test_where_energy_is_counts_with_the_masses_of_each_cell(folder):
     assert (data["left"] + data["right"]).values == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.parallel([1, 2])
+def test_contacts_that_are_pressed_at_rest_are_springs_of_small_motions(folder):
+    """Of the slope 3/2 k d^(1/2) of Hertz's force: in a cell, to the ground, around a ring; an open one has none."""
+    pressed = 1e-4
+    contacts = {
+        "sites": [3, 7, 12, 9],
+        "clearance": [2e-4, 2e-4, 2e-4, 5e-4],
+        "precompression": 3e-4,
+        "side": "plus",
+        "restitution": 1.0,
+        "each": {"pair": [[1, 2], [0, 3], [1, 1], [1, 2]], "next_cell": [False, False, True, False]},
+    }
+    case = small_case(lattice={"cells": 12, "ends": "periodic"}, contacts=contacts)
+    data = find_modes(case, 48, 900.0, folder, COMM)
+    if COMM.rank:
+        return
+
+    stiffness = case.model().chain.stiffness_matrix().toarray()
+    spring = 1.5 * case.contacts.stiffness * np.sqrt(pressed)
+    # Masses of the pairs, four to a cell; None is the ground.
+    for host, resonator in ((8, 9), (None, 26), (44, 0)):
+        ends = np.zeros(48)
+        ends[resonator] = 1.0
+        if host is not None:
+            ends[host] = -1.0
+        stiffness += spring * np.outer(ends, ends)
+    squares = eigvalsh(stiffness, np.diag(case.model().chain.masses()))
+    assert data["frequency"].values ** 2 == pytest.approx(squares, rel=1e-8, abs=1e-8 * squares.max())
+    assert squares.max() > 1.1 * mode_frequency(Chain(four_band("calibrated"), 12, "periodic"), 48) ** 2
+
+
 @pytest.mark.parallel([1])
 def test_modes_that_cannot_be_found_are_refused(monkeypatch, folder):
     case = small_case()
@@ -168,9 +199,9 @@ def test_modes_that_cannot_be_found_are_refused(monkeypatch, folder):
         with pytest.raises(CaseError, match=key):
             find_modes(case, count, near, folder, COMM)
 
-    pressed = small_case(contacts={"side": "plus", "precompression": 3e-4, "restitution": 1.0})
-    with pytest.raises(CaseError, match="touch or are pressed at rest"):
-        find_modes(pressed, 2, 1.0, folder, COMM)
+    touching = small_case(contacts={"side": "plus", "clearance": 0.0, "restitution": 1.0})
+    with pytest.raises(CaseError, match="no motion about it is linear"):
+        find_modes(touching, 2, 1.0, folder, COMM)
 
     monkeypatch.setattr(eigen, "RESTARTS", 1)
     long = LatticeMatrices(Chain(four_band("calibrated"), 2000), COMM)

@@ -6,6 +6,10 @@ the springs' stiffnesses added up on the diagonal, the columns of other ranks la
 spring by spring: they agree to rounding, and to the last bit where products and sums are exact.
 """
 
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -19,22 +23,34 @@ from vipetsc.lattice import Chain
 from vipetsc.parallel import on_every_rank
 
 
+class Joint(NamedTuple):
+    """A spring of ``stiffness`` in N/m between two rows of a lattice, cell by cell; ``host`` is -1 for the ground."""
+
+    host: int
+    resonator: int
+    stiffness: float
+
+
 class LatticeMatrices:
     """``stiffness`` in N/m and ``mass`` in kg of ``chain`` without contacts, on the ranks of ``comm``.
+
+    ``joints`` are springs besides those of the cells, as contacts that are pressed at rest are for small motions.
 
     This rank has the cells ``start`` to ``stop``; ``rows`` counts all rows, no squared frequency in (rad/s)^2 is above
     ``largest`` (Gershgorin). Raises CaseError on all ranks where PETSc's indices do not count the
     rows or a rank's entries.
     """
 
-    def __init__(self, chain: Chain, comm: MPI.Comm) -> None:
+    def __init__(self, chain: Chain, comm: MPI.Comm, joints: Sequence[Joint] = ()) -> None:
         self.chain = chain
         self.comm = comm
         self.rows = chain.cells * chain.cell.dofs
         self.start, self.stop = cell_cuts(chain.cells, comm.size)[comm.rank : comm.rank + 2]
         # Before any assembly: a count beyond the index type would wrap around unseen.
         self._check_indices()
-        self.stiffness = self._matrix(on_every_rank(comm, lambda: chain.stiffness_rows(self.start, self.stop)))
+        stiffness = on_every_rank(comm, lambda: chain.stiffness_rows(self.start, self.stop))
+        joined = self._joined_rows(joints)
+        self.stiffness = self._matrix((stiffness + joined).tocsr() if joints else stiffness)
 
         coefficients = chain.coefficients(self.start - 1, self.stop)
         masses = coefficients.masses[1:]
@@ -47,7 +63,24 @@ class LatticeMatrices:
         for coupling in chain.cell.couplings():
             springs = coefficients.stiffness[1 + min(coupling.offset, 0) :][:owned, coupling.spring]
             reaches[:, coupling.mass] += 2 * springs
+        reaches += 2 * joined.diagonal(first_row).reshape(masses.shape)
         self.largest = comm.allreduce(float(np.max(reaches / masses, initial=0.0)), MPI.MAX)
+
+    def _joined_rows(self, joints: Sequence[Joint]) -> csr_matrix:
+        """The rows of this rank of the stiffness of ``joints``."""
+        first = self.start * self.chain.cell.dofs
+        last = self.stop * self.chain.cell.dofs
+        rows: list[int] = []
+        columns: list[int] = []
+        values: list[float] = []
+        for joint in joints:
+            ends = [end for end in (joint.host, joint.resonator) if end >= 0]
+            for row, column in itertools.product(ends, ends):
+                if first <= row < last:
+                    rows.append(row - first)
+                    columns.append(column)
+                    values.append(joint.stiffness if row == column else -joint.stiffness)
+        return csr_matrix((values, (rows, columns)), shape=(last - first, self.rows))
 
     def _check_indices(self) -> None:
         """Raise CaseError on all ranks where PETSc's indices count neither all rows nor a rank's entries."""

@@ -9,10 +9,10 @@ from mpi4py import MPI
 import numpy as np
 import xarray as xr
 
-from vipetsc.case import Case, CaseError
+from vipetsc.case import Case, CaseError, Model
 from vipetsc.case.case_file import Problem
 from vipetsc.dynamics.eigen import modes_near
-from vipetsc.dynamics.matrices import LatticeMatrices
+from vipetsc.dynamics.matrices import Joint, LatticeMatrices
 from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import tabulated, write_netcdf
 from vipetsc.io.store import GATHER_LIMIT
@@ -49,7 +49,7 @@ def find_modes(case: Case, count: int, near: float, folder: Path, comm: MPI.Comm
     """
     chain = case.model().chain
     check_modes(case, count, near)
-    matrices = LatticeMatrices(chain, comm)
+    matrices = LatticeMatrices(chain, comm, pressed_contacts(case.model()))
     modes = modes_near(matrices, count, near)
     # Freed here, on all ranks together: garbage collection would come on each rank at its own time.
     matrices.destroy()
@@ -86,13 +86,28 @@ def check_modes(case: Case, count: int, near: float) -> None:
     masses = chain.cells * chain.cell.dofs
     if not 1 <= count <= masses:
         raise CaseError([Problem("--modes", count, f"the lattice has {masses} modes")])
-    if gaps and np.min(gaps) <= 0:
-        remedy = "not yet: linear modes do not include contacts that touch or are pressed at rest"
-        raise CaseError([Problem("contacts.clearance", None, remedy)])
+    if gaps and np.any(np.min(gaps, axis=1) == 0):
+        remedy = "a contact that touches at rest resists on one side only: no motion about it is linear, however small"
+        raise CaseError([Problem("contacts.clearance", 0.0, remedy)])
     if not 0 <= near < 1e50:
         raise CaseError([Problem("--near", near, "give a frequency in rad/s that is not negative")])
     if 8 * count * masses > GATHER_LIMIT:
         raise CaseError([Problem("--modes", count, "one rank cannot gather all shapes; request fewer modes")])
+
+
+def pressed_contacts(model: Model) -> list[Joint]:
+    """The contacts of a ``model`` that are pressed at rest: for small motions springs of the slope of their force."""
+    chain = model.chain
+    dofs = chain.cell.dofs
+    laws = model.laws or (model.contact,) * len(chain.sites)
+    joints: list[Joint] = []
+    rows = zip(chain.sites, chain.resonator_cells, chain.contact_pairs, laws, model.gaps, strict=False)
+    for site, cell, pair, law, stops in rows:
+        pressed = -min(stops)
+        if pressed > 0:
+            host = site * dofs + pair.host if pair.host >= 0 else -1
+            joints.append(Joint(host, cell * dofs + pair.resonator, float(law.elastic_slope(pressed))))
+    return joints
 
 
 def classify(chain: Chain, frequency: np.ndarray, shape: np.ndarray) -> dict[str, Any]:
