@@ -54,6 +54,16 @@ def test_forces_are_the_energy_gradient():
     assert not system.odd
 
 
+def test_gaps_are_those_to_the_stop_on_the_side_of_the_motion():
+    """A contact with two clearances is beyond the nearer stop on one side, and within the other on the other side."""
+    pairs = (ContactPair(None, 0, 0.1, LINEAR_STOP, 0.13), ContactPair(None, 0, 0.1, LINEAR_STOP, np.inf))
+    system = System.assemble([1.0], [(None, 0, 1.0)], pairs)
+
+    assert system.gaps(np.array([[0.12], [-0.12]])) == pytest.approx(np.array([[0.02, 0.02], [-0.01, -np.inf]]))
+    assert not system.odd
+    assert system.grazing_energy(0) == pytest.approx(0.5 * 0.1**2)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -14,9 +14,10 @@ from tests.rigs import TWO_MASSES
 from tests.unlike_lattices import TABLE, independent_lattice
 from vipetsc.case import NnmCase
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.modes.branches.condensed import CondensedMethod
+from vipetsc.modes.branches.condensed import CondensedMethod, state_of
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.losses import with_loss
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.response.free_motions import resonance
@@ -108,6 +109,29 @@ def test_condensed_motions_lose_what_orbits_lose(shot):
     assert point.force / point.loss * np.sqrt(point.energy) == pytest.approx(
         near.force / near.loss * np.sqrt(near.energy), rel=1e-2
     )
+
+
+def test_harmonics_of_all_orders_count_in_the_loss():
+    """Far in contact, dashpots between the masses take from the harmonics what they take along the shot orbit."""
+    lattice = TWO_MASSES["lattice"] | {"damping": {"stiffness": 0.01}}
+    nnm = {"system": "chain", "method": "condensed", "modes": [1], "forced": [2, 1], "truncation": 1e-5}
+    nnm |= {"points": 60, "largest_step": 0.3, "first_step": 0.1, "tolerance": 1e-11, "start_energy": 0.9}
+    nnm |= {"energy": [0.0, 5.0]}
+    table = {"name": "rig", "lattice": lattice, "contacts": TWO_MASSES["contacts"]}
+    case = NnmCase.from_table(table | {"nnm": nnm})
+    method = CondensedMethod(case, MPI.COMM_SELF)
+    motion = list(Continuation(method.motions, method.start(method.motions, 0), method.options))[-1]
+    motion = method.assess(method.motions, motion)
+
+    shooting = ShootingMethod(NnmCase.from_table(table | {"nnm": nnm | {"method": "shooting"}}), MPI.COMM_SELF).shooting
+    u = np.concatenate(list(state_of(method.motions, motion, 1).values()))
+    frame = shooting.frame_at("relative", u, motion.period)
+    row = np.append(u / np.linalg.norm(u), 0.0)
+    orbit = frame.measures(frame.solve(frame.xi, row, row @ frame.xi))
+    orbit = with_loss(shooting, method.dissipation, orbit)
+
+    assert motion.loss == pytest.approx(orbit.loss, rel=1e-4)
+    assert motion.force == pytest.approx(orbit.force, rel=1e-4)
 
 
 @pytest.mark.slow
