@@ -24,7 +24,8 @@ def prediction(level: float = 0.2) -> Figure:
         data |= {f"{kind}/{name}": ("amplitude", energies[:, 0]) for name in ("upper", "dissipated")}
     data |= {"predicted/z": (("amplitude", "site"), np.outer(X, [1.0, 1.1, 1.2]))}
     about = {"drive_band": 2, "onset_amplitude": 1.0}
-    return predicted_energies.prediction(xr.Dataset(data, {"amplitude": X, "band": [*BANDS]}, about))
+    coords = {"amplitude": ("amplitude", X, {"units": "N"}), "band": [*BANDS]}
+    return predicted_energies.prediction(xr.Dataset(data, coords, about))
 
 
 def law() -> Figure:

@@ -112,14 +112,6 @@ def test_what_sites_cannot_be_is_refused_with_its_key(contacts, key):
     assert [problem.key for problem in error.value.problems] == [key]
 
 
-def test_modes_of_a_lattice_refuse_sites_that_differ():
-    table = {"lattice": {"preset": "four-band", "cells": 40}, "contacts": {"sites": [20], "clearance": 1e-3}}
-    for key, value in (("side", "plus"), ("clearance_minus", 2e-3), ("each", {"restitution": [0.5]})):
-        with pytest.raises(CaseError) as error:
-            NnmCase.from_table(table | {"contacts": table["contacts"] | {key: value}})
-        assert [problem.key for problem in error.value.problems] == [f"contacts.{key}"]
-
-
 def test_disorder_scatters_each_of_a_list():
     table = {"sites": [4, 9], "clearance": 3e-5, "each": {"restitution": [0.5, 0.7]}}
     case = small_case(contacts=table, disorder={"seed": 3, "restitution": {"relative": 0.05}})

@@ -1,7 +1,9 @@
 """Compiled losses of dashpots in a step, by the tables of ``loss_tables`` and the stencil of ``free_losses``.
 
-See sec. 10 of the derivation in the package's docstring. The forces of a substep are put into the double integral of
-pairs of forces as they are into the moments, by their values at the nodes.
+The loss in a step is a sum of three parts (sec. 10 of the derivation in the package's docstring): that of free motion,
+a quadratic form of the state at the beginning; that of the forces' motion times free motion; and that of pairs of
+forces, a double integral over their two times. In the last two the forces enter through moments, integrals of the force
+times Legendre's polynomials of what remains of the step: each substep adds to them by the force's values at its nodes.
 """
 
 from typing import NamedTuple
@@ -33,11 +35,12 @@ class FreeLosses(NamedTuple):
 class PairLosses(NamedTuple):
     """Losses of dashpots by pairs of forces of a cluster, or of all clusters of a rank: see ``loss_tables``.
 
-    ``kernels`` (kind, mode, mode) are the coefficients of the loss in J by unit impulses at two times, of which those
-    whose modes sum to less than ``degrees`` (kind,) count. ``kinds`` (dof, dof of the same cluster) numbers that of a
-    later impulse's DoF and of an earlier one's, -1 if they are too far apart. In the present step: ``moments`` (dof,
-    mode) in N s of the forces, ``loss`` (cluster,) in J so far. ``legendre`` (mode, node) and ``before`` (dof, mode,
-    node) are workspace. Without dashpots there are no modes.
+    ``kernels`` (kind, mode of the later impulse, mode of the earlier one) are the coefficients of the loss in J by two
+    unit impulses, both orders of a pair together; those whose modes sum to less than ``degrees`` (kind,) count.
+    ``kinds`` (dof of the later impulse, dof of the earlier one) numbers the table of the pair, -1 if the two are too
+    far apart. In the present step: ``moments`` (dof, mode) in N s of the forces, ``loss`` (cluster,) in J so far.
+    ``legendre`` (mode, node) and ``before`` (dof, mode, node) are workspace. Without dashpots there are no modes, and
+    nothing here is called.
     """
 
     kinds: np.ndarray
@@ -51,7 +54,7 @@ class PairLosses(NamedTuple):
 
 @njit(error_model="numpy")
 def begin_losses(losses: PairLosses, dofs: DofTables, c: int) -> PairLosses:
-    """The losses of cluster ``c`` of all, without any by forces so far."""
+    """The part of ``losses`` that belongs to cluster ``c``, with moments and loss set to zero for a new step."""
     first = dofs.first[c]
     stop = dofs.first[c + 1]
     selected = PairLosses(
@@ -74,8 +77,9 @@ def add_free_losses(
 ) -> None:
     """Put into ``after`` (cell,) what is ``before`` and the loss in J of free motion from ``state`` (2 dof, cell).
 
-    ``columns`` (2 dof, column) are the state's halo. What ``apply_propagator`` would make of the state is multiplied by
-    it as soon as it is known: no array is filled with it.
+    ``columns`` (2 dof, column) are the state's halo. The loss is y . (S y) of the state y, with the stencil of half of
+    a symmetric matrix, so that each pair counts once. Each product of S y is multiplied by its y at once, and S y is
+    not stored. ``before`` and ``after`` are different arrays.
     """
     cells = state.shape[1]
     x = state.reshape(-1)
@@ -85,7 +89,7 @@ def add_free_losses(
     after[:] = before
     for first, stop in stencil.interior:
         for a in range(first, stop, LANES):
-            # The last vector overlaps the one before.
+            # The last vector overlaps the one before; an interior has at least so many cells.
             i = min(a, stop - LANES)
             loss = zeros()
             for b in range(to.shape[0]):
@@ -113,7 +117,7 @@ def add_free_losses(
             for k in range(rows.shape[1]):
                 for o in range(total.size):
                     total[o] += columns[row, column + k] * rows[row, k, o]
-        # In the order of the blocks above.
+        # Displacement and velocity mass by mass, as in the stencil's blocks: sums are rounded alike.
         dense = 0.0
         for mass in range(masses):
             dense += total[mass] * state[mass, at]
@@ -167,7 +171,7 @@ def _fill_legendre(losses: PairLosses, cluster: Cluster, substep: Substep) -> No
 def _fill_before(losses: PairLosses, cluster: Cluster, trial: Trial, substep: Substep) -> None:
     """Put the moments that forces have up to each node, in Legendre's polynomials, into the workspace."""
     modes = losses.moments.shape[1]
-    # Forces that are over have moments, too.
+    # All DoFs, as forces that have ended within the step have moments too.
     for i in range(losses.moments.shape[0]):
         for q in range(modes):
             for node in range(NODES):
@@ -191,10 +195,12 @@ def accumulate_losses(losses: PairLosses, cluster: Cluster, trial: Trial, subste
     total = trial.sums.w
     part = trial.sums.v
     for later in trial.active:
-        # The rates that earlier forces have left, in the integrals that a force at each node is to be multiplied by.
+        # What a unit impulse on this DoF at each node loses with all impulses before it, its own among them. The
+        # trial's sums are free for it: the substep is accepted, and the next one begins them anew.
         total[:] = 0.0
         for source in range(losses.moments.shape[0]):
             number = losses.kinds[later, source]
+            # Mode 0 is the impulse, which is exactly zero of a DoF on which nothing has acted in the step.
             if number < 0 or not losses.before[source, 0, NODES - 1]:
                 continue
             for p in range(losses.degrees[number]):

@@ -1,11 +1,13 @@
 """Rows of the powers of which free motion consists: what a mass's Taylor coefficients take from the cells around it.
 
-A row vector c (-A)^m, A = H^2 M^-1 K, says what the m-th power in the series of c u takes from every displacement
-(sec. 1 of the derivation in the package's docstring); with dashpots c P_k and c Q_k do so for displacements and
-velocities (sec. 7). Rows are multiplied by one power after another from the right, each time for many cells at once,
-and each time they grow by a cell on either side. Where cells differ (sec. 8) every row takes the masses, springs and
-dashpots that lie around its own cell. ``Bounds`` has what no cell exceeds: the largest frequency, from Gershgorin's
-circles, decides how many powers count, the largest entries how far the rows reach.
+Let c be the row vector that picks a mass from all displacements u, and H the step in s. The term of order 2m of the
+series of c u in t/H is c (-A)^m u/(2m)! with A = H^2 M^-1 K (sec. 1 of the derivation in the package's docstring): a
+row c (-A)^m says what this term takes from every displacement. With dashpots the rows c P_k and c Q_k say what the term
+of order k takes from displacements and from velocities times H (sec. 7). Rows are multiplied by one power after another
+from the right, each time for many cells at once, and each time they grow by a cell on either side. Where cells differ
+(sec. 8) every row takes the masses, springs and dashpots that lie around its own cell. ``Bounds`` has what no cell
+exceeds: the largest frequency, from Gershgorin's circles, decides how many powers count, the largest entries how far
+the rows reach.
 """
 
 from collections.abc import Callable
@@ -71,8 +73,9 @@ def local_recursion(
 ) -> PowerRecursion:
     """The recursion for rows of the masses of ``cells``, each with the coefficients of the cells on either side of it.
 
-    ``exists`` (cell, neighbour), the cell itself in the middle, marks those that the lattice has. Neighbours further
-    away than ``near`` are taken to be as the reference cell: sec. 8 counts what that leaves out. The step is of
+    ``exists`` (cell, neighbour), the cell itself in the middle, marks those that the lattice has; there must be more
+    neighbours on either side than powers. Neighbours further away than ``near`` are taken to be as the reference cell,
+    the one that the case describes before any cell is varied: sec. 8 bounds what that leaves out. The step is of
     ``interval`` in s, and rows are of the type ``number``.
     """
     width = exists.shape[1] // 2
@@ -95,10 +98,11 @@ def local_recursion(
 def _coefficients_near(chain: Chain, cells: np.ndarray, width: int, near: int, number: type) -> Coefficients:
     """Coefficients (cell, mass or spring, neighbour) of ``width`` neighbours on either side of each of ``cells``.
 
-    They are those of the reference cell beyond the ``near`` ones. They are of the type ``number``, for P in extended
-    precision, since rows are high powers of them and P's entries, good to double precision, are used in every step.
+    They are those of the reference cell beyond the ``near`` ones. Grounding is that of dashpots to the ground. They are
+    of the type ``number``: extended precision for the propagator P(H), whose entries are sums of high powers of them,
+    must be good to double precision, and are used in every step.
     """
-    # Beyond its end a chain without variation has the reference cell.
+    # A chain without variation has the reference cell wherever it is asked, also beyond its ends.
     reference = Chain(chain.cell, 1).coefficients(-1, 0)
     shape = (len(cells), 2 * width + 1, 1)
     arrays: list[np.ndarray] = [np.tile(array, shape).astype(number) for array in reference]
@@ -115,8 +119,8 @@ def _multiply(
 ) -> np.ndarray:
     """The ``rows`` (cell, row, dof, neighbour) times - M^-1 V, V the matrix of ``springs`` (cell, spring, neighbour).
 
-    ``ground`` (cell, 1, dof, neighbour) is added to V's diagonal. V is symmetric, so that a row times V is what springs
-    pull on masses displaced by the row.
+    ``ground`` (cell, 1, dof, neighbour) is added to V's diagonal. V is symmetric: -x V is the force of the springs on
+    masses that are displaced by the row x.
     """
     x = rows / neighbours.masses
     out = np.zeros_like(rows) if ground is None else -ground * x
@@ -139,8 +143,10 @@ class Bounds(NamedTuple):
     """What no cell of a lattice exceeds.
 
     ``frequency`` of a mode in rad/s and its ``damping``, a rate in 1/s, are by Gershgorin's circles of M^-1/2 K M^-1/2
-    and of M^-1/2 C M^-1/2. ``by_stiffness`` and ``by_damping`` (3, dof, dof) are the magnitudes of the entries of
-    K M^-1 and C M^-1, where the other mass is in the cell before, in the same one, in the next one.
+    and of M^-1/2 C M^-1/2. ``by_stiffness`` and ``by_damping`` (3, dof, dof) are the largest magnitudes in any cell of
+    the entries of K M^-1 and C M^-1, where the other mass is in the cell before, in the same one, in the next one.
+    These are the transposes of M^-1 K and M^-1 C, by which rows are multiplied as columns. Springs and dashpots must
+    not be negative.
     """
 
     frequency: float
@@ -164,7 +170,7 @@ class Bounds(NamedTuple):
 
 
 def _multiply_magnitudes(entries: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """The ``rows`` (..., dof, cell) times a matrix with ``entries`` (3, dof, dof) as in ``Bounds`` in every cell."""
+    """A matrix with ``entries`` (3, dof, dof) as in ``Bounds`` in every cell, times ``rows`` (..., dof, cell)."""
     total = np.zeros_like(rows)
     for offset in (-1, 0, 1):
         total = total + entries[1 + offset] @ np.roll(rows, -offset, axis=-1)
@@ -173,6 +179,7 @@ def _multiply_magnitudes(entries: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 def bounds_of(chain: Chain) -> Bounds:
     """The bounds of all cells of ``chain``."""
+    # Without variation one cell has the bounds of all; at a free or fixed end a mass has no more springs than inside.
     if chain.variation is None:
         chain = Chain(chain.cell, 1)
     stiffness = []

@@ -1,9 +1,11 @@
 """An orbit of a lattice that nothing drives, and the motion of variations along it.
 
 ``TangentPropagator`` runs the orbit as the engine does, but from a state of one's own, and keeps on a tape the substeps
-in which contacts were closed. From them it makes, once, one small matrix for each step and cluster in contact (sec. 9
-of the derivation in the package's docstring, written out in ``tangent_kernels``); after that any number of variations
-of the initial state are moved at the cost of linear steps. That is what shooting for periodic orbits of a whole lattice
+in which contacts were closed. From them it computes, once for the orbit, one small matrix for each step and cluster in
+contact. The matrix maps the variations of the free motion of the cluster's DoFs and of w'_minus of its sites, the
+approach velocity at which each present contact began, to what the forces add to them (sec. 9 of the derivation in the
+package's docstring, written out in ``tangent_kernels``). After that any number of variations of the initial state are
+moved at the cost of linear steps. That is what shooting for periodic orbits of a whole lattice
 asks for: products of the monodromy matrix with vectors, never the matrix.
 """
 
@@ -46,7 +48,10 @@ class _Moving(NamedTuple):
 
 
 def no_samples(model: Model, layout: Layout, number: int) -> Samples:
-    """Room for no sample from the ``number`` on: an engine that fills it goes to the sample before."""
+    """Samples of which none is stored, after which the next is that of the ``number``.
+
+    An engine that fills them advances to the sample before that one.
+    """
     return Samples(
         number=number,
         sums=np.zeros((0, 5, 2), np.int64),
@@ -70,14 +75,15 @@ class TangentPropagator(Propagator):
     """The engine for a lattice that nothing drives, from a state of one's own, with the motion of variations of it.
 
     ``cells`` are arrays (2 dof, owned cell), displacements before velocities. A contact that dissipates must be open
-    at the beginning: its w'_minus is not part of the state.
+    at the beginning: the approach velocity w'_minus with which it began is not part of the state. An engine is for one
+    orbit: ``place``, then ``run``, then ``move`` any number of times.
     """
 
     def __init__(self, model: Model, layout: Layout) -> None:
         super().__init__(model, layout)
         self._model = model
         clusters = self._forces.clusters
-        # Drives that are over: a cluster is looked at only where a site may touch.
+        # Clusters with a drive that acts are solved in every step; without one only those whose sites may touch.
         clusters.drives.rows["duration"] = 0.0
         self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), MOST_ROWS))
         self._linear: _Linearisation | None = None
@@ -92,7 +98,10 @@ class TangentPropagator(Propagator):
         return super().refusal(model)
 
     def place(self, cells: np.ndarray, speed: float) -> None:
-        """Begin at ``cells``; ``speed`` in m/s is that of relative motion, for the accuracy of closed contacts.
+        """Begin at ``cells``; ``speed`` in m/s is a typical one of relative motion.
+
+        Errors of substeps in contact are relative to the approach velocity, which a contact that is closed already does
+        not have: it gets ``speed``.
 
         Raises StalledError, on all ranks, for a closed contact that dissipates.
         """
@@ -112,12 +121,15 @@ class TangentPropagator(Propagator):
 
         sites["mode"] = np.where(closed, np.sign(w) * CLOSED, 0)
         sites["approach"] = np.where(closed, np.sign(w) * speed, 1.0)
-        # As if the contact were old: its force is smooth.
+        # No contact has just begun or ended, where forces are not smooth and the first substeps are short.
         clusters.history["onset"] = -np.inf
         clusters.history["duration"] = 1.0
 
     def run(self, samples: int) -> np.ndarray:
-        """Go on to the sample of that number from the start; the cells there. Raises StalledError on all ranks."""
+        """Advance to the sample of that number, counted from the start; returns the cells there.
+
+        Raises StalledError on all ranks, also where the orbit needs more substeps in contact than the tape has rows.
+        """
         layout = self._layout
         result = self.fill(no_samples(self._model, layout, samples + 1))
         needed = layout.comm.allreduce(int(self._forces.clusters.tape.used.max(initial=0)), max)
@@ -127,7 +139,10 @@ class TangentPropagator(Propagator):
         return cells.reshape(2 * layout.dofs, layout.owned).copy()
 
     def contacts(self) -> tuple[np.ndarray, int]:
-        """Times (interval, 2) in s in which a site that this rank logs was closed, and the number of its contacts."""
+        """Begin and end (substep, 2) in s of the substeps in which a site was closed, and the number of contacts.
+
+        They are those of the sites that this rank logs; one contact takes several substeps, which follow each other.
+        """
         tape = self._forces.clusters.tape
         spans = [np.zeros((0, 2))]
         episodes = 0
@@ -135,18 +150,18 @@ class TangentPropagator(Propagator):
             rows = tape.rows[c, : tape.used[c]]
             begin = rows["begin"] + rows["position"] * self.series.interval
             spans.append(np.column_stack([begin, begin + rows["length"] * self.series.interval]))
-            # A contact that is closed from the start has no onset on the tape.
+            # The first substep after an onset is marked; a contact that is closed from the start has none on the tape.
             episodes += int(np.sum((rows["onset"] > 0) | (begin == 0.0)))
         return np.concatenate(spans), episodes
 
     def _linearise(self) -> _Linearisation:
-        """Make the matrices of the orbit from the tape."""
+        """Compute the matrices of the orbit from the tape."""
         clusters = self._forces.clusters
         dofs = self._forces.dofs
         tape = clusters.tape
         places = np.full((self.steps, len(clusters.state)), -1)
         matrices: list[np.ndarray] = []
-        # Coefficients of every DoF, and w'_minus of every site, of the largest cluster.
+        # Coefficients of every DoF of the largest cluster, and w'_minus of every site: each has a DoF of its own.
         largest = int(np.diff(dofs.first).max(initial=0)) * (clusters.taylor.shape[1] + 1)
 
         energy = clusters.energy.copy()
@@ -159,7 +174,7 @@ class TangentPropagator(Propagator):
                 places[step, c] = len(matrices)
                 matrices.append(np.zeros((largest, largest)))
                 linearise(clusters, dofs, c, rows[a:b], motion[a:b], matrices[-1])
-        # Energies of variations were added to those of the orbit.
+        # The kernels that carry variations through a substep are those of the motion itself, and change its energies.
         clusters.energy[:] = energy
         return _Linearisation(places, np.array(matrices).reshape(len(matrices), largest, largest))
 

@@ -1,13 +1,14 @@
 """Steady states near the free motions of a lattice without loss: its nonlinear normal modes and breathers.
 
-Where a small force makes up for a small loss, a steady state is nearly a free motion of the conservative lattice at
-the same frequency, a quarter of a period behind the force at resonance. An isolated curve lies along the frequencies
-of such motions between two points at which the force no longer makes up for the loss. Cf. R. J. Kuether et al.,
-J. Sound Vib. 351 (2015) 299, and T. L. Hill et al., Proc. R. Soc. A 471 (2015) 20140809.
+Where a small force makes up for a small loss, a steady state is nearly a free motion of the conservative lattice at the
+same frequency; at resonance the motion is a quarter of a period behind the force. An isolated curve of the frequency
+response follows these motions over the frequency, between two points at which the force no longer makes up for the
+loss. Cf. R. J. Kuether et al., J. Sound Vib. 351 (2015) 299, and T. L. Hill et al., Proc. R. Soc. A 471 (2015)
+20140809.
 
-Free motions are followed from each linear mode near the range. At each place, Newton's method finds the force that
-keeps such a motion going a quarter of a period ahead of it, with the loss that the lattice has. From there states over
-the amplitude are followed to that of the curve.
+Free motions are followed from each linear mode near the range. At each place Newton's method finds the amplitude of the
+force that keeps such a motion going against the loss that the lattice has, if the force is a quarter of a period ahead.
+From that state the amplitude of the force is varied until it is that of the curve which is being searched for.
 """
 
 from collections.abc import Iterator
@@ -31,18 +32,23 @@ from vipetsc.modes.response.steady import SteadyStates
 # Linear modes whose frequencies lie within this factor of the range are followed, with so many motions each at most.
 NEAR = 2.0
 MOST_MOTIONS = 300
-# Size of the first motion, in clearances: within them, and small for springs that are not linear.
+# Largest relative displacement of the first motion, over the clearance: it touches no stop, and springs that are not
+# linear are nearly so. Arclength of the first step, in the units of the continuation.
 FIRST_SIZE = 0.1
 FIRST_STEP = 0.02
-# Slack of the bounds of frequency, within which a mode without contact stays in spite of rounding.
+# Slack of the bounds of frequency: a motion without contact keeps its frequency, but for rounding.
 SLACK = 1e-3
-# Accuracy of a motion that only begins Newton's method: what harmonics leave out, and residual.
+# Accuracy of motions from which Newton's method begins: what the harmonics leave out, over the motion, and the
+# residual.
 TRUNCATION = 1e-4
 TOLERANCE = 1e-9
 
 
 def states_near_free_motions(states: SteadyStates, places: np.ndarray) -> list[list[np.ndarray]]:
-    """Unknowns of the steady states that free motions lead to at each of ``places`` (count,), scaled frequencies."""
+    """Unknowns of the steady states that free motions lead to at each of ``places``.
+
+    ``states`` are those over the frequency; ``places`` (count,) are frequencies over ``states.parameter.scale``.
+    """
     motions = _conservative(states)
     of_places: list[list[np.ndarray]] = [[] for _ in places]
     for points in _branches(motions, states):
@@ -66,7 +72,10 @@ def resonance(line: SteadyStates, harmonics: np.ndarray) -> np.ndarray:
     count = min(len(orders), harmonics.shape[1])
     free[:, :count] = harmonics[:, :count]
 
-    # The free motion has no phase of its own: that to the force is kept, and the amplitude of the force is unknown.
+    # A free motion may begin at any time. As it is computed, at rest at phase 0, it is in phase with the force; an
+    # order k is put k quarter turns behind. Newton's method may not move it in time (``row`` is the motion's derivative
+    # by time), and finds the amplitude of the force instead, whose first guess, the one that touches a stop, hardly
+    # counts.
     behind = free * np.exp(-0.5j * np.pi * orders)
     row = np.append(unit(line.balance.pack(-1j * orders * behind)), 0.0)
     guess = np.append(line.balance.pack(behind) / line.clearance, 1.0)

@@ -1,12 +1,15 @@
 """Steady states whose parameter is a key of the case: a clearance, a restitution, a mass, a spring, a dashpot.
 
 At each value v of the key the lattice is another one, with equations R(x, v) = 0 of its own (``steady``); amplitude and
-frequency stay the same. Newton's method takes dR/dx from these equations, and dR/dv from central differences of R at
-fixed x, with steps of ``SLOPE`` half ranges. The error of that column is of second order in the step: the convergence
-remains quadratic down to 1e-10 of the first residual, which is below what a step begins with over the tolerance.
+frequency stay the same. Newton's method takes dR/dx from these equations, and dR/dv from differences of R at fixed x,
+with steps of ``SLOPE`` half ranges: central ones, whose error is of second order in the step, and at the two ends of
+the range, beyond which nothing is evaluated, one-sided ones, whose error is of first order. An error of this one column
+makes the convergence linear with a factor of that size, 1e-10 or 1e-5, so that a Newton step more at an end is all that
+is noticed.
 
 A step may pass the end of the range, beyond which the key may have no valid value (a restitution above 1). The
-equations are continued there by their tangent in v; such a state is replaced by that at the end of the range.
+equations are continued there by their tangent in v, and the rule of the steps replaces such a state by the one at the
+end of the range (``steps.TurningSteps.end``).
 """
 
 from collections.abc import Callable, Iterator
@@ -30,9 +33,10 @@ KEPT_VALUES = 9
 
 
 class StatesOverKey(SteadyEquations):
-    """Steady states over a key, whose equations at a value ``build`` gives, over the amplitude from that of the curve.
+    """Steady states over the key of the path ``over``, at one frequency and the ``amplitude`` of the curve.
 
-    ``over`` is the key's path, ``amplitude`` that of the curve; ``options`` have the range of the key.
+    ``build`` gives the equations of the lattice whose key has a value. Their own parameter is the amplitude, from that
+    of the curve on, and their frequency is fixed. ``options`` have the range of the key.
     """
 
     def __init__(self, build: Callable[[float], SteadyStates], over: str, amplitude: float, options: NfrcTable) -> None:
@@ -78,7 +82,11 @@ class StatesOverKey(SteadyEquations):
         return residual
 
     def jacobian(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """The derivative (n, n + 1) of the ``residual``."""
+        """The derivative (n, n + 1) of the ``residual``.
+
+        Beyond the range that of the tangent's own slope is left out, which is small as what is beyond. Residual and
+        unknowns are over the same clearance, so that the derivative by the motion does not depend on it.
+        """
         states, inner = self._at(xi)
         return np.column_stack([states.jacobian(inner, shift)[:, :-1], self._slope(xi, shift)])
 
@@ -125,7 +133,7 @@ class StatesOverKey(SteadyEquations):
         return states.stability(inner)
 
     def determinant(self, xi: np.ndarray, exponent: complex) -> float:
-        """Hill's determinant of a state at lambda/Om = ``exponent``, where it is real."""
+        """Hill's determinant of a state at an ``exponent`` lambda/Om at which the determinant is real."""
         states, inner = self._at(xi)
         return states.determinant(inner, exponent)
 
