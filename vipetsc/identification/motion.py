@@ -54,7 +54,9 @@ class MotionCoefficients(NamedTuple):
         pattern = np.unique(np.concatenate([*places, diagonal]))
         values = []
         for matrix, place in zip((stiffness, damping), places, strict=True):
-            values.append(np.bincount(np.searchsorted(pattern, place), matrix.data, len(pattern)))
+            sums = np.bincount(np.searchsorted(pattern, place), matrix.data, len(pattern))
+            # Sums of no entries, as of a lattice without dashpots, are integers.
+            values.append(sums.astype(float))
         return cls(
             masses=masses,
             first=np.searchsorted(pattern, np.arange(n + 1) * n),
@@ -176,8 +178,10 @@ def respond(
         state.state[:, 0] = begin.state
         state.state[:, 1:] = begin.slopes
         begin_contacts(lattice, state, tracker)
+    # Kernels are compiled once for each layout of their arguments.
+    instants = np.ascontiguousarray(times)
     outcome, tracks, motion, reached = integrate(
-        lattice, state, tracker.tracks, fastest(coefficients), instant, times, watched
+        lattice, state, tracker.tracks, fastest(coefficients), instant, instants, watched
     )
     if outcome != DONE:
         raise MotionError("the steps of the integration became too small")
