@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.conftest import DIFFERING, run_of, small_case
-from vipetsc.case import Case, CaseError, NnmCase
+from vipetsc.case import Case, CaseError
 from vipetsc.contact.law import CLOSED, contact_force, create_contacts
 from vipetsc.lattice import Contact
 

@@ -28,7 +28,10 @@ OMEGA = "Frequency ω (krad/s)"
 
 
 def band_of(row: Mapping[Any, Any], name: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the lowest and highest quantile (point) over the samples of the measure ``name``; None without samples."""
+    """Return the lowest and highest stored quantile (point) over the disorder samples of the measure ``name``.
+
+    None where there are no such samples.
+    """
     path = f"statistics/{name}/quantiles"
     if path not in row:
         return None
@@ -43,7 +46,11 @@ def annotate_empty(axes: Axes, reason: str) -> None:
 
 
 def label_panels(panels: Iterable[Axes]) -> None:
-    """Begin the titles of ``panels`` with (a), (b), ..., or with (a.i), (a.ii), ... those of a grid (row, column)."""
+    """Begin the titles of ``panels`` with (a), (b), ...; panels beyond the 26th have no letter.
+
+    In a grid (row, column) of several rows and columns the letter is that of the column and a numeral that of the row,
+    (b.iii). Titles stand at the left, where the style puts them.
+    """
     if isinstance(panels, np.ndarray) and panels.ndim == 2 and min(panels.shape) > 1:
         tags = {axes: f"{ascii_lowercase[column]}.{ROMAN[row]}" for (row, column), axes in np.ndenumerate(panels)}
     else:
@@ -60,7 +67,10 @@ def block_means(values: np.ndarray) -> np.ndarray:
 
 
 def log_norm(*fields: ArrayLike, decades: float = DECADES) -> LogNorm:
-    """Return logarithmic colours over ``decades`` below the largest value of the ``fields``; below 1 if they vanish."""
+    """Return logarithmic colours over ``decades`` below the largest value of the ``fields``.
+
+    Fields without a largest value, since all of them vanish or one is not finite, have colours up to 1.
+    """
     top = max(float(np.max(np.asarray(field))) for field in fields)
     if not (np.isfinite(top) and top > 0):
         top = 1.0
@@ -101,7 +111,10 @@ def space_time_map(axes: Axes, field: xr.DataArray, norm: Normalize, run: xr.Dat
 
 
 def content_map(axes: Axes, content: xr.DataArray, norm: Normalize) -> AxesImage:
-    """Draw a map of ``content`` (t, wavenumber), time to the right, wavenumbers in pi rad/cell."""
+    """Draw a map of ``content`` (t, wavenumber in rad/cell), time to the right, wavenumbers from 0 to pi upwards.
+
+    The content of real motions is the same at negative wavenumbers.
+    """
     kappa = content["wavenumber"].values / np.pi
     image = draw_map(axes, content["time"].values, kappa, content.values.T, norm, "viridis")
     axes.set(ylim=(0, kappa[-1]), xlabel="Time (s)", ylabel=KAPPA)
@@ -119,7 +132,7 @@ def recorded_sites(run: xr.Dataset, cells: np.ndarray | None = None) -> np.ndarr
 def mark_sites(
     axes: Axes, run: xr.Dataset, colour: str = "white", along: str = "y", cells: np.ndarray | None = None
 ) -> None:
-    """Draw dotted lines at the ``recorded_sites`` if these are few, and triangles at the edge.
+    """Draw triangles at the edge at the ``recorded_sites``, and dotted lines as well if these are few.
 
     ``along`` is the axis of the cells, "x" or "y".
     """
@@ -143,7 +156,8 @@ def indentations(run: xr.Dataset, model: Model) -> np.ndarray:
     stops = model.gaps or [(gap, gap) for gap in chain.clearances]
     depth = []
     for cell, pair, (plus, minus) in zip(chain.sites, chain.contact_pairs, stops, strict=True):
-        # The resonator may be in the next cell, that of a ring's last cell in its first.
+        # Cells from 0. The resonator may be in the next cell, that of a ring's last cell in its first; a case has no
+        # contact to the next cell in the last one of a lattice with ends.
         w = u[:, (cell + pair.next_cell) % chain.cells, pair.resonator]
         if pair.host >= 0:  # a contact with the ground has no host
             w = w - u[:, cell, pair.host]
@@ -195,7 +209,10 @@ def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> None:
 
 
 def mark_degrees(axes: Axes) -> None:
-    """Put ticks of a vertical axis in degrees at parts of a right angle, few of a revolution as well as of a degree."""
+    """Put few ticks on a vertical axis in degrees: multiples of 1, 1.5, 3, 4.5 or 9 times a power of ten.
+
+    Over a revolution these are multiples of 45 or 90 degrees, and over small ranges plain numbers.
+    """
     axes.yaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 3, 4.5, 9, 10]))
 
 
@@ -205,10 +222,11 @@ def note(axes: Axes, text: str, at: Sequence[float], shift: tuple[float, float],
 
 
 def shade_regions(axes: Axes, energy: np.ndarray, region: np.ndarray, left: float, at_top: bool) -> None:
-    """Shade the regions I-IV of a branch on the axis of energy, with their names at the top or the bottom of the panel.
+    """Shade the regions I-IV of a branch (``modes.branches.regions``) on the axis of energy, and name them.
 
     ``energy`` (J) and ``region`` (1-4) are those of the branch's points. Each region is shaded from where the one below
-    it ends, the first from ``left``, to the largest energy of its points.
+    it ends, the first from ``left`` above 0, to the largest energy of its points; a region without points above the one
+    below is left out. Names are at the top or the bottom of the panel.
     """
     height = 0.985 if at_top else 0.015
     look = {"ha": "center", "va": "top" if at_top else "bottom", "color": style.GREY}
