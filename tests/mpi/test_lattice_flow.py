@@ -13,6 +13,7 @@ from tests.conftest import on_two
 from tests.models import CLEARANCE, four_band_contact
 from vipetsc.lattice import Chain
 from vipetsc.lattice.cell import four_band
+from vipetsc.modes.balance.harmonics import Stops
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 
 COMM = MPI.COMM_WORLD
@@ -37,7 +38,7 @@ def test_variations_have_the_same_bits(restitution):
 
     def after_a_period(comm):
         """State, variations and number of closed contacts after a period."""
-        flow = LatticeFlow(chain, contact, comm)
+        flow = LatticeFlow(chain, [Stops.both(contact, clearance) for clearance in chain.clearances], comm)
         arc = flow.arc(flow.scatter(state.ravel()), 2 * np.pi / 1600)
         assert arc.episodes >= len(sites)
         end = flow.gather(arc.end)
