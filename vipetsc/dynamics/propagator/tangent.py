@@ -2,11 +2,12 @@
 
 ``TangentPropagator`` runs the orbit as the engine does, but from a state of one's own, and keeps on a tape the substeps
 in which contacts were closed. From them it computes, once for the orbit, one small matrix for each step and cluster in
-contact. The matrix maps the variations of the free motion of the cluster's DoFs and of w'_minus of its sites, the
-approach velocity at which each present contact began, to what the forces add to them (sec. 9 of the derivation in the
-package's docstring, written out in ``tangent_kernels``). After that any number of variations of the initial state are
-moved at the cost of linear steps. That is what shooting for periodic orbits of a whole lattice
-asks for: products of the monodromy matrix with vectors, never the matrix.
+contact. The matrix maps variations of the series of the free motion of the cluster's DoFs, and of w'_minus of its sites
+(the approach velocity at which the present contact began), at the beginning of a step to those of the moments of the
+forces, and of w'_minus, at its end (sec. 9 of the derivation in the package's docstring, written out in
+``tangent_kernels``). After that any number of variations of the initial state are moved at the cost of linear steps.
+That is what shooting for periodic orbits of a whole lattice asks for: products of the monodromy matrix with vectors,
+never the matrix.
 """
 
 import copy
