@@ -5,8 +5,10 @@ engines differ by a common factor, so that their ratio remains. The contacts are
 return to the sites, there are up to several times as many.
 """
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -23,11 +25,19 @@ RESOLVED = 0.37
 EPISODE_STEPS = 60.0
 # Steps that end on samples, over those that are needed.
 SAMPLED_STEPS = 1.3
+# Exchanges of ghosts in a step of 8vr, one for each stage and one for the contact search, and seconds that ranks on one
+# machine take for one: by it two ranks are a little slower than one at 1200 masses, as was measured.
+EXCHANGES = 14
+EXCHANGE = 6.5e-6
 # Of the propagator, in s: what it begins with, a linear step, a cell in it, an episode.
 BEGIN = 0.06
 LINEAR_STEP = 2e-5
 CELL = 6.5e-8
 EPISODE = 3.5e-4
+# One exchange of ghosts in a linear step, in s: two ranks are as fast as one at 300 cells.
+LINEAR_EXCHANGE = 1e-5
+# More ranks are worth their cores where they take less than this fraction of the time of one.
+WORTHWHILE = 0.95
 # Of cells with rows of their own, in s: a number of these in a step, what it takes to make one.
 OWN_NUMBER = 4e-10
 MAKE_NUMBER = 7e-7
@@ -45,14 +55,33 @@ class Seconds(NamedTuple):
         return self.linear + self.contacts
 
 
+class OwnRows(NamedTuple):
+    """Cells that have separate rows in the propagator, the ``tables`` of these rows, and the numbers in a table."""
+
+    cells: int
+    tables: int
+    numbers: int
+
+    @classmethod
+    def of(cls, series: StepSeries) -> Self:
+        """What the cells that differ in the lattice of ``series`` need."""
+        cells, tables = series.own_rows()
+        return cls(cells, tables, (2 * series.chain.cell.dofs) ** 2 * (2 * series.reach + 1))
+
+    def describe(self, ranks: int) -> str:
+        """Note on how many cells differ and on the memory of their tables, which the ranks divide among them."""
+        megabytes = 8e-6 * self.tables * self.numbers / ranks
+        return f"{self.cells} cells have separate rows, {self.tables} tables of {megabytes:.3g} MB per rank"
+
+
 @dataclass(frozen=True)
 class Cost:
     """The ``engine`` that simulates a run, and a note on it; contact ``episodes``; CPU times in s.
 
     The ``note`` says why it is not the requested engine, or how many cells have separate rows.
 
-    ``seconds`` of this engine on each of the ranks, of which ``contacts`` for the episodes; ``propagator``: those of
-    the engine that takes linear steps, None where it does not suit.
+    ``seconds`` of this engine on each of the ``ranks``, of which ``contacts`` for the episodes; ``alone``: those on one
+    rank; ``propagator``: those of the engine that takes linear steps, None where it does not suit.
     """
 
     engine: str
@@ -60,15 +89,27 @@ class Cost:
     episodes: float
     seconds: float
     contacts: float
+    alone: float
     propagator: float | None
+    ranks: int
 
     @property
     def faster(self) -> str:
+        """Sentences on what would simulate the case faster: the propagator, or one rank; empty if nothing would."""
+        return "; ".join(filter(None, (self._faster_engine(), self._fewer_ranks())))
+
+    def _faster_engine(self) -> str:
         """Sentence on how much faster the propagator is where ``ts`` is to simulate what it could; else empty."""
         if self.engine != "ts" or self.propagator is None or self.seconds < 1.5 * self.propagator:
             return ""
         ratio = self.seconds / self.propagator
         return f'time.engine = "propagator" would be about {ratio:.0f} times faster'
+
+    def _fewer_ranks(self) -> str:
+        """Sentence that one rank is as fast as several, where their messages cost what they save; else empty."""
+        if self.ranks == 1 or self.seconds < WORTHWHILE * self.alone:
+            return ""
+        return f"one rank would be as fast: in so short a lattice messages cost what {self.ranks} ranks save"
 
 
 def estimate(case: Case, ranks: int = 1) -> Cost:
@@ -76,43 +117,49 @@ def estimate(case: Case, ranks: int = 1) -> Cost:
     model = case.model()
     kind, note = select_engine(case, model)
     episodes = expected_episodes(model)
-    by_ts = _runge_kutta_seconds(model, episodes, ranks)
+
+    by_ts = functools.partial(_runge_kutta_seconds, model, episodes)
     exact = None
     if not case.petsc and Propagator.refusal(model) is None and (series := step_series(model)):
-        exact, own_rows = _propagator_seconds(model, series, episodes, ranks)
-        if own_rows and kind is Propagator:
-            note = own_rows
+        own_rows = OwnRows.of(series)
+        exact = functools.partial(_propagator_seconds, model, series, own_rows, episodes)
+        if own_rows.cells and kind is Propagator:
+            note = own_rows.describe(ranks)
 
-    seconds = by_ts if kind.name == "ts" or exact is None else exact
+    cost_on: Callable[[int], Seconds] = by_ts
+    if kind is Propagator and exact is not None:
+        cost_on = exact
+    seconds = cost_on(ranks)
     return Cost(
         engine=kind.name,
         note=note if case.time.engine != "ts" else None,
         episodes=episodes,
         seconds=seconds.total,
         contacts=seconds.contacts,
-        propagator=exact.total if exact else None,
+        alone=cost_on(1).total,
+        propagator=exact(ranks).total if exact else None,
+        ranks=ranks,
     )
 
 
 def _runge_kutta_seconds(model: Model, episodes: float, ranks: int) -> Seconds:
     """CPU time of ``ts`` for ``model`` with so many contact episodes."""
     step = STEP + MASS * model.chain.cells * model.chain.cell.dofs / ranks
+    if ranks > 1:
+        step += EXCHANGES * EXCHANGE
     steps_per_sample = max(np.ceil(model.sample_interval * pass_bands(model.chain.cell)[-1].high / RESOLVED), 1)
     return Seconds(SAMPLED_STEPS * model.samples * steps_per_sample * step, EPISODE_STEPS * episodes * step)
 
 
-def _propagator_seconds(model: Model, series: StepSeries, episodes: float, ranks: int) -> tuple[Seconds, str | None]:
-    """CPU time of the propagator, and a note on cells with rows of their own, if there are any."""
+def _propagator_seconds(model: Model, series: StepSeries, own_rows: OwnRows, episodes: float, ranks: int) -> Seconds:
+    """CPU time of the propagator for ``model`` with so many contact episodes."""
     steps = model.samples * round(model.sample_interval / series.interval)
-    differing, tables = series.own_rows()
-    numbers = (2 * model.chain.cell.dofs) ** 2 * (2 * series.reach + 1) / ranks
-    step = LINEAR_STEP + CELL * model.chain.cells / ranks + OWN_NUMBER * differing * numbers
-    begin = BEGIN + MAKE_NUMBER * tables * numbers
-    seconds = Seconds(begin + steps * step, EPISODE * episodes)
-    if not differing:
-        return seconds, None
-    size = f"{tables} tables of {8e-6 * tables * numbers:.3g} MB per rank"
-    return seconds, f"{differing} cells have separate rows, {size}"
+    numbers = own_rows.numbers / ranks
+    step = LINEAR_STEP + CELL * model.chain.cells / ranks + OWN_NUMBER * own_rows.cells * numbers
+    if ranks > 1:
+        step += LINEAR_EXCHANGE
+    begin = BEGIN + MAKE_NUMBER * own_rows.tables * numbers
+    return Seconds(begin + steps * step, EPISODE * episodes)
 
 
 def expected_episodes(model: Model) -> float:
