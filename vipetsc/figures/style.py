@@ -91,6 +91,8 @@ def with_prefix(value: float, unit: str) -> str:
 def new_figure(width: float, height: float, heading: str = "") -> Figure:
     """An empty figure of ``width`` x ``height`` inches under a ``heading``, which needs no display and no pyplot."""
     figure = Figure(figsize=(width, height))
+    # The canvas that measures text for the layout prints it too, and remembers what it has measured.
+    FigureCanvasAgg(figure)
     if heading:
         figure.suptitle("\n".join(wrap(heading, int(HEADING_LETTERS * width))))
     return figure
@@ -133,7 +135,7 @@ def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
             FigureCanvasPdf(figure).print_pdf(partial_path)
         elif path.suffix == ".png" and not lines:
             figure.set_dpi(SCREEN)
-            canvas = FigureCanvasAgg(figure)
+            canvas = figure.canvas
             canvas.draw()
             # A page is opaque: without the channel for transparency it takes half the time, and less room.
             pixels = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
