@@ -1,10 +1,10 @@
 """Work and precision of vipetsc's engines and of their peers, interleaved, in CPU time at equal error.
 
 The lattice is the four-band one of 300 cells with its five sites, A = 30 N, conservative; all solvers return the
-velocities every 2e-4 s, on one core. Then members of a sweep, the paper's budget (from where ``paper`` left it),
-scaling over cells and ranks with a model of many ranks, set-up and files of large lattices. Writes ``latest.json``
-and pictures. The full bench takes about a quarter of an hour, ``--quick`` three minutes; ``--large`` adds the whole
-program on a million cells (minutes).
+velocities every 2e-4 s, on one core. Then whole programs beside an earlier version, members of a sweep, the paper's
+budget (from where ``paper`` left it), scaling over cells and ranks with a model of many ranks, set-up and files of
+large lattices. Writes ``latest.json`` and pictures. The full bench takes about half an hour, ``--quick`` five minutes;
+``--large`` adds the whole program on a million cells (minutes).
 """
 
 from __future__ import annotations
@@ -27,10 +27,12 @@ petsc4py.init(["bench", "-no_signal_handler"])
 
 from mpi4py import MPI
 
+from bench_chapter import CHAPTER, write_chapter
 from bench_members import member_seconds, paper_budget
 from bench_ours import own_solvers, right_hand_side_us
 from bench_peers import parameters, peers
 from bench_precision import lattice_case, work_precision
+from bench_programs import BASELINE, PROGRAMS, programs
 from bench_report import draw, markdown
 from bench_scaling import builds, large, scaling, whole_runs
 
@@ -38,7 +40,7 @@ from vipetsc.case import Case
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import provenance
 
-PARTS = ("precision", "whole", "members", "scaling", "builds")
+PARTS = ("precision", "whole", "programs", "members", "scaling", "builds")
 NEEDED = {
     "odeint": "g++ and libboost-dev",
     "ARKODE": "g++ and libsundials-dev",
@@ -71,7 +73,9 @@ def options_from(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change the compared case")
     parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="where results go")
     parser.add_argument("--paper", type=Path, default=Path("runs/paper"), help="folder that `paper` left")
-    parser.add_argument("--table", action="store_true", help="print the README's tables from the last results, no more")
+    parser.add_argument("--baseline", default=BASELINE, metavar="COMMIT", help="the version beside which programs run")
+    parser.add_argument("--table", action="store_true", help="print the tables of the last results, no more")
+    parser.add_argument("--write", action="store_true", help="write tables and picture of the results into the manual")
 
     options = parser.parse_args(arguments)
     if options.rounds is not None and options.rounds < 1:
@@ -107,6 +111,8 @@ def measure(case: Case, options: argparse.Namespace) -> dict:
         if "whole" in parts:
             found["whole"] = whole_runs(Path(folder), options.rounds)
             found["right_hand_side_us"] = right_hand_side_us(case)
+        if "programs" in parts:
+            found["programs"] = measured_programs(options)
         if "members" in parts:
             found["members"] = member_seconds(Path(folder), min(options.rounds, 3))
             found["paper"] = paper_budget(options.paper)
@@ -120,6 +126,16 @@ def measure(case: Case, options: argparse.Namespace) -> dict:
     found["minutes"] = (time.perf_counter() - begin) / 60
     found["provenance"] = provenance(MPI.COMM_WORLD)
     return found
+
+
+def measured_programs(options: argparse.Namespace) -> list[dict]:
+    """The rows of whole programs; none, with a message, where the earlier version is not in the repository."""
+    names = [name for name, program in PROGRAMS.items() if not (options.quick and program.compiles)]
+    try:
+        return programs(options.out.absolute(), options.rounds, options.baseline, names)
+    except RuntimeError as error:
+        print(f"bench: goes on without programs: {error}", file=sys.stderr)
+        return []
 
 
 def print_rows(found: dict) -> None:
@@ -138,6 +154,12 @@ def print_rows(found: dict) -> None:
     print(f"measured in {found['minutes']:.1f} min\n")
 
 
+def write_manual(found: dict, folder: Path) -> None:
+    """Write tables and picture of ``found`` into the manual's chapter, and say for which tables it has no place."""
+    for titles in write_chapter(markdown(found), draw(found, folder)):
+        print(f"bench: {CHAPTER.name} has no table with the titles {titles!r}", file=sys.stderr)
+
+
 def main(arguments: list[str]) -> int:
     """Measure, store, draw and print; returns the exit code."""
     options = options_from(arguments)
@@ -146,7 +168,10 @@ def main(arguments: list[str]) -> int:
         if not latest.exists():
             print(f"bench: {latest} does not exist; run scripts/bench first", file=sys.stderr)
             return 2
-        print(markdown(json.loads(latest.read_text(encoding="utf-8"))), end="")
+        found = json.loads(latest.read_text(encoding="utf-8"))
+        print(markdown(found), end="")
+        if options.write:
+            write_manual(found, options.out)
         return 0
 
     # Refused before anything is measured, if the peers cannot solve it.
@@ -164,6 +189,8 @@ def main(arguments: list[str]) -> int:
     print(markdown(found))
     for path in draw(found, options.out):
         print(path)
+    if options.write:
+        write_manual(found, options.out)
     return 0
 
 

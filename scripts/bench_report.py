@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import platform
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from bench_model import model_tables
 from bench_precision import ERRORS, at_equal_error
+from bench_programs import programs_table
 from bench_targets import table as target_table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -41,17 +44,44 @@ def curve(found: dict[str, Any], solver: str) -> list[tuple[float, float]]:
 
 
 def markdown(found: dict[str, Any]) -> str:
-    """The README's summary of what was measured: CPU time at equal error, whole runs, scaling."""
+    """The tables of the manual's chapter: CPU time at equal error, whole programs, scaling, goals."""
     parts = {
+        "provenance": _origin_table,
         "rows": _precision_table,
-        "whole": _whole_sentence,
-        "paper": _paper_sentence,
+        "reference": _reference_table,
+        "whole": _whole_table,
+        "programs": lambda measured: programs_table(measured["programs"]),
+        "members": _members_table,
+        "paper": _paper_table,
         "scaling": _scaling_table,
         "builds": _builds_table,
     }
     sections = [part(found) for key, part in parts.items() if found.get(key)]
     sections += [model_tables(found.get("scaling", [])), target_table(found)]
     return "\n\n".join(filter(None, sections)) + "\n"
+
+
+def _origin_table(found: dict[str, Any]) -> str:
+    """When, of what and on what the bench was measured."""
+    origin = found["provenance"]
+    rows = {
+        "date": origin["date"][:10],
+        "version": origin["revision"],
+        "processor": f"{processor()}, {os.cpu_count()} cores",
+        "rounds": f"{found['rounds']} ({found['mode']})",
+        "libraries": f"PETSc {origin['petsc_version']}, {origin['mpi_version']}, numpy {origin['numpy_version']}",
+    }
+    return "\n".join(["| measured | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
+
+
+def processor() -> str:
+    """The name of the processor as Linux gives it; elsewhere that of the architecture."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
 
 
 def _precision_table(found: dict[str, Any]) -> str:
@@ -73,9 +103,14 @@ def _precision_table(found: dict[str, Any]) -> str:
             ratio = found["ratios"].get(f"{name} / {engine} at {wanted:g}")
             cells.append(_seconds_and_ratio(seconds, ratio))
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
-    apart = ", ".join(f"{name} {value:.1e}" for name, value in reference["separation"].items())
-    lines += ["", f"Reference: {reference['solver']}, to {reference['end']:g} s; distances from it: {apart}."]
+
+def _reference_table(found: dict[str, Any]) -> str:
+    """How far other solvers at the edge of double precision lie from the reference."""
+    reference = found["reference"]
+    lines = [f"| reference: {reference['solver']}, to {reference['end']:g} s | distance from it |", "|---|---|"]
+    lines += [f"| {name} | {value:.1e} |" for name, value in reference["separation"].items()]
     return "\n".join(lines)
 
 
@@ -86,20 +121,30 @@ def _seconds_and_ratio(seconds: float | None, ratio: float | None) -> str:
     return f"{seconds:.3g} ({ratio:.3g})" if ratio else f"{seconds:.3g}"
 
 
-def _whole_sentence(found: dict[str, Any]) -> str:
-    """CPU time of whole runs, and of a right-hand side."""
-    runs = ", ".join(f"{engine} {seconds:.2f} s" for engine, seconds in found["whole"].items())
-    return (
-        f"Built-in case, from start to `run.h5`: {runs} of CPU. One right-hand side at"
-        f" {found['degrees_of_freedom']} degrees of freedom: {found['right_hand_side_us']:.2g} us through PETSc."
-    )
+def _whole_table(found: dict[str, Any]) -> str:
+    """CPU time of the built-in case without the start of the program, and of a right-hand side."""
+    lines = ["| inside the program | CPU time |", "|---|---|"]
+    for engine, seconds in found["whole"].items():
+        lines.append(f"| built-in case up to `run.h5`, {engine} | {seconds:.2f} s |")
+    size = found["degrees_of_freedom"]
+    lines.append(f"| right-hand side of {size} masses through PETSc | {found['right_hand_side_us']:.2g} us |")
+    return "\n".join(lines)
 
 
-def _paper_sentence(found: dict[str, Any]) -> str:
-    """CPU time of the paper, by stage."""
+def _members_table(found: dict[str, Any]) -> str:
+    """CPU time of one more member of a sweep."""
+    lines = ["| one more member of a sweep | CPU s |", "|---|---|"]
+    lines += [f"| {kind} | {seconds:.3g} |" for kind, seconds in found["members"].items()]
+    return "\n".join(lines)
+
+
+def _paper_table(found: dict[str, Any]) -> str:
+    """CPU time of the paper over all ranks, by stage, the longest first."""
     budget = found["paper"]
-    stages = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in sorted(budget.items(), key=lambda s: -s[1]))
-    return f"The paper: {sum(budget.values()):.0f} s of CPU over all ranks. By stage: {stages}."
+    lines = ["| stage of the paper | CPU s of all ranks |", "|---|---|", f"| all | {sum(budget.values()):.0f} |"]
+    for stage, seconds in sorted(budget.items(), key=lambda item: -item[1]):
+        lines.append(f"| {stage} | {seconds:.0f} |")
+    return "\n".join(lines)
 
 
 def _builds_table(found: dict[str, Any]) -> str:
@@ -122,7 +167,7 @@ def _scaling_table(found: dict[str, Any]) -> str:
     """Wall time and memory over cells and ranks."""
     lines = [
         "| engine | cells | ranks | ms per 2e-4 s | two ranks gain (bare memory gains) | peak GiB a rank"
-        " | share of bandwidth limit |",
+        " | fraction of bandwidth limit |",
         "|---|---|---|---|---|---|---|",
     ]
 
@@ -133,7 +178,7 @@ def _scaling_table(found: dict[str, Any]) -> str:
         gain = f"{row['speedup']:.2f} ({row['memory_speedup']:.2f})" if "speedup" in row else ""
         lines.append(
             f"| {row['engine']} | {row['cells']:,} | {row['ranks']} | {row['wall_ms']:.3g} | {gain}"
-            f" | {row['peak_gib_a_rank']:.2f} | {100 * row['share_of_bandwidth_limit']:.2g} % |"
+            f" | {row['peak_gib_a_rank']:.2f} | {100 * row['fraction_of_bandwidth_limit']:.2g} % |"
         )
     return "\n".join(lines)
 
@@ -209,5 +254,5 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
 def _limit(axes: Axes, rows: list[dict]) -> None:
     """The time in which one rank's memory reads and writes the state once."""
     first = [r for r in rows if r["ranks"] == 1 and r["engine"] == rows[0]["engine"]]
-    limit = [r["wall_ms"] * r["share_of_bandwidth_limit"] for r in first]
+    limit = [r["wall_ms"] * r["fraction_of_bandwidth_limit"] for r in first]
     axes.loglog([r["cells"] for r in first], limit, ":", color=style.GREY, label="memory alone, 1 rank")

@@ -111,7 +111,7 @@ def flight(engine: str, cells: int, intervals: int) -> dict:
         "peak_gib_a_rank": memory,
         "triad_gb_per_second": gigabytes,
         # No method can do with less than reading and writing the state once an interval.
-        "share_of_bandwidth_limit": 2 * state / (1e9 * gigabytes) / wall,
+        "fraction_of_bandwidth_limit": 2 * state / (1e9 * gigabytes) / wall,
     } | traffic
 
 

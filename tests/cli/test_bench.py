@@ -83,7 +83,7 @@ def test_what_two_ranks_do_is_timed_beside_memory_messages_and_files(monkeypatch
 
     assert row["ranks"] == 2
     assert row["wall_ms"] > 0
-    assert 0 < row["share_of_bandwidth_limit"] < 1
+    assert 0 < row["fraction_of_bandwidth_limit"] < 1
     assert 0.01 < row["peak_gib_a_rank"] < 4
     # Each stage of a step sends the ghosts of a cell, 4 displacements and 4 velocities or half of them.
     assert row["messages"] >= 13
@@ -125,7 +125,7 @@ def test_a_model_of_many_ranks_and_the_targets_read_the_same_rows(monkeypatch):
     short_alone, short_paired, long_alone, long_paired = rows
     short_paired.update(speedup=2.0, memory_speedup=2.0)
     long_paired.update(speedup=1.4, memory_speedup=2.0)
-    long_alone.update(share_of_bandwidth_limit=0.4)
+    long_alone.update(fraction_of_bandwidth_limit=0.4)
     rows.append({"engine": "ts", "cells": 300, "ranks": 0, "failure": "no memory"})
 
     model = ScalingModel(rows, "propagator")
@@ -137,7 +137,7 @@ def test_a_model_of_many_ranks_and_the_targets_read_the_same_rows(monkeypatch):
     assert "| ts |" not in model_tables(rows)
 
     # No target concerns the bandwidth of so few cells.
-    short_alone.update(share_of_bandwidth_limit=0.1)
+    short_alone.update(fraction_of_bandwidth_limit=0.1)
     found = {
         "scaling": rows,
         "ratios": {"odeint dopri5 / vipetsc propagator at 1e-08": 21.0},
@@ -148,6 +148,59 @@ def test_a_model_of_many_ranks_and_the_targets_read_the_same_rows(monkeypatch):
     # 1 s where a member may take 0.25 s.
     assert list(met.values()) == [True, True, False, True, False]
     assert table(found).count("| yes |") == 3
+
+
+def test_programs_run_beside_an_earlier_version(tmp_path, monkeypatch):
+    """A call of two versions gives positive times and their ratio; a call that fails, and no such commit, are named."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    import bench_programs
+
+    calls = {"help": bench_programs.Program("--help"), "none": bench_programs.Program("validate {folder}/none.toml")}
+    monkeypatch.setattr(bench_programs, "PROGRAMS", calls)
+    helped, failed = bench_programs.programs(tmp_path, rounds=1, commit="HEAD", names=calls)
+
+    assert min(helped["wall_now"], helped["cpu_now"], helped["cpu_before"]) > 0.02
+    assert helped["wall_ratio"] == pytest.approx(helped["wall_now"] / helped["wall_before"])
+    assert "none.toml" in failed["failure"]
+    # What was unpacked is the package of that commit, not this one.
+    assert (tmp_path / "baseline" / "HEAD" / "vipetsc" / "__init__.py").exists()
+
+    table = bench_programs.programs_table([helped, failed])
+    assert "| help | 1 | " in table
+    assert "| none | 1 | failed |" in table
+    with pytest.raises(RuntimeError, match="not a valid object name"):
+        bench_programs.programs(tmp_path, rounds=1, commit="nocommit", names=calls)
+
+
+def test_the_goal_of_a_program_is_compared_with_its_ratio(monkeypatch):
+    """A goal of wall time is compared with that ratio, one of CPU time with the other, and none of a failed call."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    from bench_targets import targets
+
+    ratios = {"baseline": "b03848f", "wall_ratio": 0.4, "cpu_ratio": 0.6}
+    rows = [ratios | {"program": name} for name in ("validate", "sweep of six", "help")]
+    rows.append({"program": "plot", "failure": "no memory"})
+
+    met = {target.name.split(",")[0]: target.met for target in targets({"programs": rows})}
+    assert met == {"validate": True, "sweep of six": False}
+
+
+def test_the_chapter_takes_the_tables_that_were_measured(monkeypatch):
+    """A table with the titles of a measured one is replaced, all else remains; a table without a place is named."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    from bench_chapter import CHAPTER, with_tables
+
+    chapter = (
+        "# Speed\n\n| engine | cells | ms |\n|---|---|---|\n| ts | 3 | 1 |\n\nText.\n\n| engine | model |\n|---|---|\n"
+    )
+    measured = "| engine | cells | s |\n|---|---|---|\n| ts | 3 | 7 |\n\n| goal | met |\n|---|---|\n"
+    written, left = with_tables(chapter, measured)
+    assert written == chapter.replace("| ms |", "| s |").replace("| 1 |", "| 7 |")
+    assert left == ["goal|met"]
+
+    # A table that is measured twice changes nothing else in the real chapter either.
+    text = CHAPTER.read_text(encoding="utf-8")
+    assert with_tables(text, text) == (text, [])
 
 
 def test_equal_error_is_interpolated_in_logarithms_and_never_beyond_the_points(monkeypatch):

@@ -1,0 +1,59 @@
+"""The chapter ``measurements`` of the manual takes its tables and its picture from a bench."""
+
+from __future__ import annotations
+
+import shutil
+from itertools import groupby
+from pathlib import Path
+
+from vipetsc.io.atomic import atomic_write, write_text
+
+MANUAL = Path(__file__).parents[1] / "vipetsc" / "manual"
+CHAPTER = MANUAL / "measurements.md"
+PICTURES = {"work-precision.png": MANUAL / "pictures" / "bench.png"}
+
+
+def with_tables(chapter: str, measured: str) -> tuple[str, list[str]]:
+    """``chapter`` with its tables replaced by those in ``measured`` that have the same first two titles of columns.
+
+    The second value has the titles of the tables in ``measured`` for which the chapter has no place. Tables of the
+    chapter that were not measured, and all other text, remain.
+    """
+    found = {_titles(table): table for is_table, table in _blocks(measured) if is_table}
+    blocks = []
+    placed = set()
+    for is_table, block in _blocks(chapter):
+        titles = _titles(block) if is_table else ""
+        if titles in found:
+            placed.add(titles)
+            block = found[titles]
+        blocks.append(block)
+
+    left = [titles for titles in found if titles not in placed]
+    return "\n".join(blocks) + "\n", left
+
+
+def _blocks(text: str) -> list[tuple[bool, str]]:
+    """The text in blocks of whole lines, each with whether it is a table."""
+    groups = groupby(text.splitlines(), key=lambda line: line.startswith("|"))
+    return [(is_table, "\n".join(lines)) for is_table, lines in groups]
+
+
+def _titles(table: str) -> str:
+    """The titles of a table's first two columns, by which it is recognised."""
+    cells = table.splitlines()[0].split("|")
+    return "|".join(cell.strip() for cell in cells[1:3])
+
+
+def write_chapter(measured: str, pictures: list[Path]) -> list[str]:
+    """Put the tables in ``measured``, and those of ``pictures`` that the manual shows, into the manual.
+
+    Returns the titles of tables for which the chapter has no place.
+    """
+    text, left = with_tables(CHAPTER.read_text(encoding="utf-8"), measured)
+    write_text(CHAPTER, text)
+    for picture in pictures:
+        if picture.name in PICTURES:
+            with atomic_write(PICTURES[picture.name]) as aside:
+                shutil.copyfile(picture, aside)
+    return left

@@ -1,0 +1,193 @@
+"""Whole programs as a user calls them, beside an earlier version: time from the prompt to the last picture.
+
+Calls of the two versions alternate, each in a process of its own, so that both meet the same machine. The earlier
+version comes out of the repository's history; the package needs no build.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+BASELINE = "b03848f"
+PATIENCE = 600  # seconds that one call may take
+
+# Six amplitudes, of which the lower ones touch nothing and the upper ones have many contacts.
+SWEEP = """
+name = "six"
+[sweep]
+measures = ["transfer", "entropy"]
+[sweep.drive]
+amplitude = [2.0, 6.0, 12.0, 18.0, 24.0, 30.0]
+"""
+
+
+@dataclass(frozen=True)
+class Program:
+    """A call of ``python -m vipetsc``: its ``words``, the ``ranks``, and whether kernels are compiled in it.
+
+    ``{folder}`` in a word is the folder of the version that is measured; ``--force`` lets a round replace another's
+    results. ``target`` is what the ratio of times may be at most, None where there is no goal; it is one of CPU time
+    where ``by_cpu``, else of wall time.
+    """
+
+    words: str
+    ranks: int = 1
+    compiles: bool = False
+    target: float | None = None
+    by_cpu: bool = False
+
+
+PROGRAMS = {
+    "help": Program("--help"),
+    "validate": Program("validate", target=0.7 / 1.6),
+    "run without pictures, propagator": Program(
+        "run --set time.engine=propagator --set output.figures=false --force --out {folder}/plain"
+    ),
+    # The folder that it draws is that of the row before.
+    "plot": Program("plot {folder}/plain", target=2.2 / 4.9),
+    "run with pictures, propagator": Program(
+        "run --set time.engine=propagator --force --out {folder}/propagator", target=3.0 / 8.4
+    ),
+    "run with pictures, ts": Program("run --set time.engine=ts --force --out {folder}/ts", ranks=2, target=4.5 / 9.3),
+    "sweep of six": Program("sweep {folder}/six.toml --force --out {folder}/six", target=2.2 / 4.3, by_cpu=True),
+    "first run, with compilation, propagator": Program(
+        "run --set time.engine=propagator --set output.figures=false --force --out {folder}/first",
+        compiles=True,
+        target=25 / 58,
+        by_cpu=True,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Version:
+    """A version of the package in ``source``, and the ``folder`` of its results."""
+
+    source: Path
+    folder: Path
+
+    def seconds(self, program: Program) -> tuple[float, float]:
+        """Wall and CPU time in s of one call of ``program``; raises RuntimeError if the call fails."""
+        # This process has its own MPI: the processes that it starts must not inherit that.
+        environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX", "OMPI_UNIVERSE"))}
+        environment["PYTHONPATH"] = str(self.source)
+        if program.compiles:
+            kernels = self.folder / "kernels"
+            shutil.rmtree(kernels, ignore_errors=True)
+            environment["NUMBA_CACHE_DIR"] = str(kernels)
+
+        words = program.words.format(folder=self.folder).split()
+        command = [sys.executable, "-m", "vipetsc", *words]
+        if program.ranks > 1:
+            command = ["mpirun", "-n", str(program.ranks), *command]
+
+        before = _cpu_seconds_of_children()
+        begin = time.perf_counter()
+        ended = subprocess.run(
+            command, cwd=self.folder, env=environment, capture_output=True, text=True, check=False, timeout=PATIENCE
+        )
+        wall = time.perf_counter() - begin
+        if ended.returncode:
+            raise RuntimeError(f"{' '.join(words)} failed: {ended.stderr.strip()[-500:]}")
+        return wall, _cpu_seconds_of_children() - before
+
+
+def _cpu_seconds_of_children() -> float:
+    """CPU seconds of all processes that this one has started and that have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+def unpack(commit: str, folder: Path) -> Path:
+    """The package as it was at ``commit``, in a folder below ``folder``; raises RuntimeError without that commit."""
+    source = folder / commit
+    if (source / "vipetsc").is_dir():
+        return source
+
+    archive = subprocess.run(["git", "-C", str(ROOT), "archive", commit, "vipetsc"], capture_output=True, check=False)
+    if archive.returncode:
+        raise RuntimeError(archive.stderr.decode().strip())
+    # Unpacked aside: a bench that is ended meanwhile leaves no half of a package.
+    aside = folder / f"{commit}.part"
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
+    subprocess.run(["tar", "-x", "-C", str(aside)], input=archive.stdout, check=True)
+    aside.rename(source)
+    return source
+
+
+def programs(folder: Path, rounds: int, commit: str, names: Iterable[str]) -> list[dict]:
+    """One row for each of ``names``: medians over the rounds of both versions' wall and CPU times, and of their ratios.
+
+    A round before the first fills caches and is not counted. A program that compiles runs once. Raises RuntimeError
+    where the repository has no such commit.
+    """
+    source = unpack(commit, folder / "baseline")
+    versions = {"before": Version(source, folder / "before"), "now": Version(ROOT, folder / "now")}
+    for version in versions.values():
+        version.folder.mkdir(parents=True, exist_ok=True)
+        (version.folder / "six.toml").write_text(SWEEP, encoding="utf-8")
+
+    rows = []
+    for name in names:
+        program = PROGRAMS[name]
+        first = 0 if program.compiles else 1
+        turns = 1 if program.compiles else rounds
+        measured: dict[str, list[tuple[float, float]]] = {label: [] for label in versions}
+        try:
+            for turn in range(first + turns):
+                for label, version in versions.items():
+                    seconds = version.seconds(program)
+                    if turn >= first:
+                        measured[label].append(seconds)
+        except (RuntimeError, subprocess.TimeoutExpired) as failure:
+            rows.append({"program": name, "ranks": program.ranks, "failure": str(failure)})
+            continue
+        rows.append({"program": name, "ranks": program.ranks, "baseline": commit} | _summary(measured))
+    return rows
+
+
+def _summary(measured: dict[str, list[tuple[float, float]]]) -> dict:
+    """Medians over the rounds of wall and CPU seconds, of their ratios, and the range of the ratios."""
+    before = np.array(measured["before"])
+    now = np.array(measured["now"])
+    ratios = now / before
+    found = {}
+    for column, kind in enumerate(("wall", "cpu")):
+        found[f"{kind}_before"] = statistics.median(before[:, column])
+        found[f"{kind}_now"] = statistics.median(now[:, column])
+        found[f"{kind}_ratio"] = statistics.median(ratios[:, column])
+        found[f"{kind}_range"] = [float(ratios[:, column].min()), float(ratios[:, column].max())]
+    return found
+
+
+def programs_table(rows: list[dict]) -> str:
+    """The rows in Markdown."""
+    commit = next((row["baseline"] for row in rows if "baseline" in row), BASELINE)
+    lines = [
+        f"| program | ranks | wall s at {commit} | now | ratio (range) | CPU s at {commit} | now | ratio (range) |",
+        "|---" * 8 + "|",
+    ]
+    for row in rows:
+        if "failure" in row:
+            lines.append(f"| {row['program']} | {row['ranks']} | failed | | | | | |")
+            continue
+        cells = [row["program"], str(row["ranks"])]
+        for kind in ("wall", "cpu"):
+            low, high = row[f"{kind}_range"]
+            cells += [f"{row[f'{kind}_before']:.2f}", f"{row[f'{kind}_now']:.2f}"]
+            cells.append(f"{row[f'{kind}_ratio']:.2f} ({low:.2f} to {high:.2f})")
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
