@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -33,15 +34,29 @@ class Stop:
         return row
 
 
+class CurvedSpring(NamedTuple):
+    """The part q z^2 + c z^3 of a spring's force at its elongation z = ``row`` @ u: ``quadratic`` q, ``cubic`` c."""
+
+    row: np.ndarray
+    quadratic: float
+    cubic: float
+
+    def force(self, u: np.ndarray) -> np.ndarray:
+        """Forces (n,) in N on the masses at displacements ``u`` (n,) in m."""
+        z = self.row @ u
+        return -(self.quadratic * z**2 + self.cubic * z**3) * self.row
+
+
 @dataclass(frozen=True)
 class ScipyLattice:
-    """M u'' + C u' + K u = force(t) + contacts, with ``masses`` (n,), ``damping`` and ``stiffness`` (n, n)."""
+    """M u'' + C u' + K u = force(t) + contacts + curved springs; ``masses`` (n,), ``damping``, ``stiffness`` (n, n)."""
 
     masses: np.ndarray
     stiffness: np.ndarray
     damping: np.ndarray
     stops: tuple[Stop, ...]
     force: Callable[[float], np.ndarray]
+    curved: tuple[CurvedSpring, ...] = ()
 
     def motion(self, times: np.ndarray, u: np.ndarray, v: np.ndarray, start: float) -> tuple[np.ndarray, int]:
         """u, u', u'' as (quantity, time, mass) at ``times``, from the state at ``start`` on; the number of impacts."""
@@ -52,6 +67,8 @@ class ScipyLattice:
 
         def rates(t: float, y: np.ndarray) -> np.ndarray:
             total = self.force(t) - self.stiffness @ y[:n] - self.damping @ y[n:]
+            for spring in self.curved:
+                total = total + spring.force(y[:n])
             for k, speed in closed.items():
                 stop = self.stops[k]
                 depth = max(stop.side * (rows[k] @ y[:n]) - stop.gap, 0.0)

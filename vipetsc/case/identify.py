@@ -15,6 +15,7 @@ from vipetsc.case.features import refusals, refuse_disorder
 from vipetsc.case.measured import MeasuredError, RecordTable, read_measured, sensor_problems
 from vipetsc.case.sought import (
     OF_CELL,
+    OF_EITHER_SIGN,
     OF_SITES,
     SoughtParameter,
     UnknownTable,
@@ -61,7 +62,6 @@ class IdentifyCase(StudyCase):
 
     verb = section = "identify"
     refuses: ClassVar[Mapping[str, str]] = {
-        "nonlinear springs": "not yet: derivatives of the motion are those of linear springs between contacts",
         "touching stops": "a stop that touches at rest has no onset, at which the derivatives of a contact begin",
         "disorder": "a lattice that was measured has one value of each quantity, which is sought, and no scatter",
     }
@@ -209,6 +209,8 @@ def _bounds_problems(unknown: UnknownTable, at: str) -> Iterator[Problem]:
     """Problems of bounds beyond what the quantity may be."""
     low, high = unknown.bounds
     quantity = unknown.quantity
+    if quantity in OF_EITHER_SIGN and unknown.scale != "logarithmic":
+        return
     if quantity == "restitution" and not 0 <= low < high <= 1:
         yield Problem(f"{at}.bounds", unknown.bounds, "a restitution is between 0 and 1")
     elif quantity == "exponent" and not 1 <= low < high <= 10:

@@ -14,15 +14,23 @@ from vipetsc.case.disorder import with_cell
 from vipetsc.lattice import UnitCell
 
 OF_SITES = ("clearance", "clearance_minus", "stiffness", "exponent", "restitution")
-OF_CELL = ("mass", "spring", "dashpot", "grounding")
-LINEAR = (*OF_CELL, "amplitude")
+OF_SPRINGS = {"spring": "stiffness", "dashpot": "damping", "quadratic": "quadratic", "cubic": "cubic"}
+"""Unknowns that each spring has, and their names in ``vipetsc.lattice.Spring``."""
+OF_CELL = ("mass", "grounding", *OF_SPRINGS)
+WITHOUT_CONTACT = (*OF_CELL, "amplitude")
 """Unknowns on which a motion without contact depends."""
+OF_EITHER_SIGN = ("quadratic", "cubic")
+"""Unknowns that may be negative."""
+ON_LINEAR_SCALE = ("restitution", "exponent", *OF_EITHER_SIGN)
+"""Unknowns whose coordinate is not the logarithm unless they say so."""
 UNITS = {
     "clearance": "m",
     "clearance_minus": "m",
     "stiffness": "N/m^n",
     "mass": "kg",
     "spring": "N/m",
+    "quadratic": "N/m^2",
+    "cubic": "N/m^3",
     "dashpot": "N s/m",
     "grounding": "N s/m",
     "amplitude": "N",
@@ -34,7 +42,8 @@ class UnknownTable(Section):
 
     ``of``: "all" sites, masses or springs have one value, "each" has one of its own, or groups of their numbers have.
     ``scale``: derivatives and steps are those of the logarithm or of the value. ``dashpot`` is parallel to a spring,
-    ``grounding`` a dashpot between a mass and the ground; ``amplitude`` is that of the first drive.
+    ``grounding`` a dashpot between a mass and the ground; ``quadratic`` and ``cubic`` are a spring's; ``amplitude`` is
+    that of the first drive.
     """
 
     quantity: Literal[
@@ -45,6 +54,8 @@ class UnknownTable(Section):
         "restitution",
         "mass",
         "spring",
+        "quadratic",
+        "cubic",
         "dashpot",
         "grounding",
         "amplitude",
@@ -71,9 +82,9 @@ class SoughtParameter(NamedTuple):
     is_logarithmic: bool
 
     @property
-    def is_linear(self) -> bool:
+    def acts_without_contact(self) -> bool:
         """Whether the motion depends on it without contact."""
-        return self.quantity in LINEAR
+        return self.quantity in WITHOUT_CONTACT
 
     def to_coordinate(self, value: float) -> float:
         """The fit's coordinate of a ``value``."""
@@ -96,10 +107,8 @@ def values_of(case: Case, quantity: str) -> list[float]:
     cell = case.lattice.undamped_cell()
     if quantity == "mass":
         return list(cell.masses)
-    if quantity == "spring":
-        return [spring.stiffness for spring in cell.springs]
-    if quantity == "dashpot":
-        return [spring.damping for spring in cell.springs]
+    if quantity in OF_SPRINGS:
+        return [getattr(spring, OF_SPRINGS[quantity]) for spring in cell.springs]
     if quantity == "grounding":
         return list(cell.grounding) or [0.0] * len(cell.masses)
     if quantity == "amplitude":
@@ -119,15 +128,15 @@ def differs_by_side(base: Case) -> bool:
 
 
 def _with_values(cell: UnitCell, quantity: str, numbers: list[float]) -> UnitCell:
-    """The ``cell`` with other masses, springs or dashpots."""
+    """The ``cell`` with other numbers of its masses or its springs."""
     if quantity == "mass":
         return replace(cell, masses=tuple(numbers))
     if quantity == "grounding":
         return replace(cell, grounding=tuple(numbers))
     springs = []
     for spring, number in zip(cell.springs, numbers, strict=True):
-        is_spring = quantity == "spring"
-        springs.append(replace(spring, stiffness=number) if is_spring else replace(spring, damping=number))
+        change: Table = {OF_SPRINGS[quantity]: number}
+        springs.append(replace(spring, **change))
     return replace(cell, springs=tuple(springs))
 
 
@@ -146,7 +155,7 @@ def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float) ->
     name: str = unknown.quantity
     if unknown.of != "all":
         name += f" {'+'.join(str(member + 1) for member in members)}"
-    scale = unknown.scale or ("linear" if unknown.quantity in ("restitution", "exponent") else "logarithmic")
+    scale = unknown.scale or ("linear" if unknown.quantity in ON_LINEAR_SCALE else "logarithmic")
     # The case may lie outside the bounds; the search does not.
     start = min(max(start, low), high)
     unit = UNITS.get(unknown.quantity, "1")

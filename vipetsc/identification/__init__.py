@@ -1,12 +1,14 @@
 r"""Parameters of a lattice with contacts from measured motion.
 
 **1. Motion and derivatives** (``motion``, ``motion_rates``, ``motion_steps``). With F_c, the force of a site, w = c u,
+and N_d, what a spring of the elongation z = d u has beyond its linear part,
 
-    M u'' + C u' + K u + sum_c c^T F_c(w, w', w'_minus) = f(t),    (u, u')(t_0) = x_0,
+    M u'' + C u' + K u + sum_d d^T N_d(z) + sum_c c^T F_c(w, w', w'_minus) = f(t),    (u, u')(t_0) = x_0,
 
 the derivative s = du/dp with respect to a parameter p solves the variational equation
 
-    M s'' + C s' + K s + sum_c c^T [F_w c s + F_v c s' + F_q dq + F_p] = f_p - M_p u'' - C_p u' - K_p u,
+    M s'' + C s' + K s + sum_d d^T [N_z d s + N_p] + sum_c c^T [F_w c s + F_v c s' + F_q dq + F_p]
+        = f_p - M_p u'' - C_p u' - K_p u,
 
 q = w'_minus. Contact forces are continuous and steps end on every change of a mode, so that the saltation of the state
 is the identity (Leine and Nijmeijer 2004, ch. 7). At an onset sigma w = D the instant moves by -(c s - sigma D_p)/w',

@@ -162,7 +162,7 @@ class GrowingWindows:
         active = []
         for number, parameter in enumerate(plan.parameters):
             is_own = parameter.quantity == "offset" and silent[parameter.members[0]]
-            if parameter.is_linear or is_own:
+            if parameter.acts_without_contact or is_own:
                 active.append(number)
         for number, state in self.misfit.states.items():
             active += state.indices if silent[number] else ()

@@ -9,9 +9,11 @@ from vipetsc.case import Model
 from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.site_dofs import site_records
+from vipetsc.dynamics.spring_law import spring_laws
 from vipetsc.identification.motion_begin import MotionBegin, begin_contacts
-from vipetsc.identification.motion_rates import Lattice, MotionState, Slopes
+from vipetsc.identification.motion_rates import CurvedSprings, Lattice, MotionState, Slopes
 from vipetsc.identification.motion_steps import DONE, integrate
+from vipetsc.lattice import Chain, places_of
 from vipetsc.modes.shooting.dop853 import STAGES
 
 # Errors are relative to a motion, and to derivatives, of at least this fraction of the linear wave: derivatives begin
@@ -93,6 +95,7 @@ def slopes_between(
         gaps=np.zeros((count, number, 2)),
         laws=np.zeros((count, number, 3)),
         drives=np.zeros((count, len(middle.gains))),
+        curves=np.zeros((count, len(model.chain.cell.springs), 2)),
         linear=np.zeros(count, bool),
     )
     for p, (low, high, width) in enumerate(zip(lower, upper, widths, strict=True)):
@@ -104,6 +107,9 @@ def slopes_between(
             slopes.masses[p] = (after.masses - before.masses) / width
             slopes.stiffness[p] = (after.stiffness - before.stiffness) / width
             slopes.damping[p] = (after.damping - before.damping) / width
+            laws = [spring_laws(at.chain.cell.springs) for at in (low, high)]
+            for k, name in enumerate(("quadratic", "cubic")):
+                slopes.curves[p, :, k] = (laws[1][name] - laws[0][name]) / width
             slopes.linear[p] = True
         gains = gains_of(high) - gains_of(low)
         slopes.drives[p] = gains / width / np.where(middle.gains != 0, middle.gains, 1.0)
@@ -162,6 +168,7 @@ def respond(
         columns=coefficients.columns,
         stiffness=coefficients.stiffness,
         damping=coefficients.damping,
+        curved=_curved_springs(chain, slopes),
         contacts=sites,
         ends=ends,
         drives=drives,
@@ -188,6 +195,19 @@ def respond(
     tracker.tracks = tracks
     episodes = tracker.take_episodes(np.zeros(len(sites)), unfinished=True)
     return RecordedMotion(motion, np.sort(episodes, order=("onset", "site")), reached)
+
+
+def _curved_springs(chain: Chain, slopes: Slopes) -> CurvedSprings:
+    """The springs of ``chain`` that have a quadratic or cubic part, or in which one is sought that is zero now."""
+    springs = chain.cell.springs
+    has_slope = slopes.curves.any(axis=(0, 2))
+    numbers = [number for number, spring in enumerate(springs) if has_slope[number] or not spring.is_linear]
+    places = places_of(chain, numbers)
+    return CurvedSprings(
+        ends=np.array([(place.start, place.end) for place in places], np.int64).reshape(-1, 2),
+        numbers=np.array([place.number for place in places], np.int64),
+        laws=spring_laws(springs),
+    )
 
 
 def create_motion(rows: int, columns: int, sites: int, scale: float) -> MotionState:

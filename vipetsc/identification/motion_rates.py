@@ -10,6 +10,7 @@ import numpy as np
 from vipetsc.compiled import kernel
 from vipetsc.contact.law import CLIPPED, FREE, elastic_force_and_slope, gap_of
 from vipetsc.dynamics.drives import Drives, drive_force
+from vipetsc.dynamics.spring_law import nonlinear_force, nonlinear_slope
 
 # Fraction of a period over which the rate of a drive's force is differenced.
 SHORT = 1e-6
@@ -20,8 +21,8 @@ class Slopes(NamedTuple):
 
     ``masses`` (parameter, n), ``stiffness`` and ``damping`` (parameter, entry); ``gaps`` (parameter, site, 2) on the
     sides + and -; ``laws`` (parameter, site, 3) of the contact stiffness, the exponent and the damping c; ``drives``
-    (parameter, drive), relative to the drive's amplitude. ``linear`` (parameter,): whether a mass, a spring or a
-    dashpot depends on it.
+    (parameter, drive), relative to the drive's amplitude; ``curves`` (parameter, spring of the cell, 2) of the
+    springs' quadratic and cubic parts. ``linear`` (parameter,): whether a mass, a spring or a dashpot depends on it.
     """
 
     masses: np.ndarray
@@ -30,7 +31,20 @@ class Slopes(NamedTuple):
     gaps: np.ndarray
     laws: np.ndarray
     drives: np.ndarray
+    curves: np.ndarray
     linear: np.ndarray
+
+
+class CurvedSprings(NamedTuple):
+    """Springs with a quadratic or cubic part, beyond their linear part, which is in K.
+
+    ``ends`` (place, 2): masses, -1 for a wall; ``numbers`` (place,) of the springs in the cell, which have the ``laws``
+    (spring of the cell,) of dtype ``SPRING_LAW``.
+    """
+
+    ends: np.ndarray
+    numbers: np.ndarray
+    laws: np.ndarray
 
 
 class Lattice(NamedTuple):
@@ -45,6 +59,7 @@ class Lattice(NamedTuple):
     columns: np.ndarray
     stiffness: np.ndarray
     damping: np.ndarray
+    curved: CurvedSprings
     contacts: np.ndarray
     ends: np.ndarray
     drives: Drives
@@ -75,8 +90,13 @@ class MotionState(NamedTuple):
 
 @kernel
 def difference(y: np.ndarray, ends: np.ndarray, i: int, first: int, j: int) -> float:
-    """Resonator's less host's entry of column ``j`` of ``y``, from row ``first`` on, of site ``i``."""
-    value = y[first + ends[i, 1], j]
+    """Entry of column ``j`` of ``y``, from row ``first`` on, at the second end of the pair ``i`` less at the first one.
+
+    Of a site these are resonator and host. An end of -1, ground or wall, has an entry of zero.
+    """
+    value = 0.0
+    if ends[i, 1] >= 0:
+        value = y[first + ends[i, 1], j]
     if ends[i, 0] >= 0:
         value -= y[first + ends[i, 0], j]
     return value
@@ -138,6 +158,28 @@ def _add_springs(lattice: Lattice, y: np.ndarray, out: np.ndarray) -> None:
 
 
 @kernel
+def _add_curved_springs(lattice: Lattice, y: np.ndarray, out: np.ndarray) -> None:
+    """Add what springs have beyond their linear parts, and its derivatives, to ``out``, in the rows of velocities."""
+    n = lattice.inverse_mass.size
+    ends = lattice.curved.ends
+    for k in range(lattice.curved.numbers.size):
+        number = lattice.curved.numbers[k]
+        law = lattice.curved.laws[number]
+        z = difference(y, ends, k, 0, 0)
+        slope = nonlinear_slope(law, z)
+        for j in range(y.shape[1]):
+            if j == 0:
+                force = nonlinear_force(law, z)
+            else:
+                curves = lattice.slopes.curves[j - 1, number]
+                force = slope * difference(y, ends, k, 0, j) + (curves[0] + curves[1] * z) * z * z
+            if ends[k, 0] >= 0:
+                out[n + ends[k, 0], j] += force
+            if ends[k, 1] >= 0:
+                out[n + ends[k, 1], j] -= force
+
+
+@kernel
 def rates_of(lattice: Lattice, t: float, y: np.ndarray, approach: np.ndarray, out: np.ndarray) -> None:
     """Time derivatives ``out`` of the motion and its derivatives in ``y`` (2n, column) at time t in s."""
     n = lattice.inverse_mass.size
@@ -147,6 +189,7 @@ def rates_of(lattice: Lattice, t: float, y: np.ndarray, approach: np.ndarray, ou
             out[i, j] = y[n + i, j]
             out[n + i, j] = 0.0
     _add_springs(lattice, y, out)
+    _add_curved_springs(lattice, y, out)
 
     for d in range(lattice.drives.rows.size):
         force = drive_force(lattice.drives, d, t)
@@ -189,6 +232,14 @@ def jerk(lattice: Lattice, motion: MotionState, t: float, i: int) -> float:
     for e in range(lattice.first[i], lattice.first[i + 1]):
         c = lattice.columns[e]
         total -= lattice.stiffness[e] * rates[c, 0] + lattice.damping[e] * rates[n + c, 0]
+
+    for k in range(lattice.curved.numbers.size):
+        ends = lattice.curved.ends
+        if ends[k, 0] == i or ends[k, 1] == i:
+            law = lattice.curved.laws[lattice.curved.numbers[k]]
+            slope = nonlinear_slope(law, difference(motion.state, ends, k, 0, 0))
+            change = slope * difference(rates, ends, k, 0, 0)
+            total += change if ends[k, 0] == i else -change
 
     # A drive has no formula of its rate: its force is differenced.
     for d in range(lattice.drives.rows.size):

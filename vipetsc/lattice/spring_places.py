@@ -1,5 +1,6 @@
 """Where the springs of a finite lattice that are not linear lie."""
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 from vipetsc.lattice.cell import Spring
@@ -22,6 +23,11 @@ class SpringPlace(NamedTuple):
 
 def nonlinear_places(chain: Chain) -> list[SpringPlace]:
     """The springs of a finite ``chain`` whose force has a quadratic or cubic part, from the left."""
+    return places_of(chain, [number for number, law in enumerate(chain.cell.springs) if not law.is_linear])
+
+
+def places_of(chain: Chain, numbers: Collection[int]) -> list[SpringPlace]:
+    """The springs of a finite ``chain`` that have these ``numbers`` (from 0) in the cell, from the left."""
     d = chain.cell.dofs
     is_ring = chain.ends == "periodic"
     places = []
@@ -31,7 +37,7 @@ def nonlinear_places(chain: Chain) -> list[SpringPlace]:
             starts_inside = cell >= 0
             ends_inside = is_ring or cell + law.next_cell < chain.cells
             is_cut = chain.ends != "fixed" and not (starts_inside and ends_inside)
-            if law.is_linear or is_cut or not (starts_inside or law.next_cell):
+            if number not in numbers or is_cut or not (starts_inside or law.next_cell):
                 continue
             after = (cell + law.next_cell) % chain.cells
             places.append(

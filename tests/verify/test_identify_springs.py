@@ -1,0 +1,186 @@
+"""Identification in lattices of quadratic and cubic springs: derivatives and parameters against SciPy alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.independent_lattice import CurvedSpring, ScipyLattice, Stop, chain_matrices
+from vipetsc.case.identify import IdentifyCase
+from vipetsc.identification.misfit import Misfit
+from vipetsc.io.netcdf import open_netcdf
+from vipetsc.studies.identification import read_records, run_identification
+
+COUNT = 3
+STRIKE = 0.8  # m/s of the second mass
+TRUTH = {"mass": 0.25, "spring": 4e4, "quadratic": 2e6, "cubic": 2e9, "clearance": 4e-4, "stiffness": 2e6}
+TIMES = np.arange(0.0, 0.06, 1 / 2000)
+STRUCK = np.array([0.0, 0.0, 0.0, 0.0, STRIKE, 0.0])
+KINDS = ["displacement", "velocity", "acceleration"]
+
+
+def motion_of(truth: dict[str, float], times: np.ndarray = TIMES, state: np.ndarray = STRUCK) -> np.ndarray:
+    """u, u', u'' as (quantity, time, mass) of a chain between walls, whose last mass has a stop.
+
+    It begins in the ``state`` (2n,) of displacements in m and velocities in m/s at ``times[0]``.
+    """
+    shape, _ = chain_matrices(COUNT, 1.0, 0.0)
+    # The springs in the walls are curved, too.
+    rows = np.eye(COUNT + 1, COUNT) - np.eye(COUNT + 1, COUNT, k=-1)
+    lattice = ScipyLattice(
+        masses=np.full(COUNT, truth["mass"]),
+        stiffness=truth["spring"] * shape,
+        damping=3.0 * shape,
+        stops=(Stop(COUNT - 1, -1, truth["clearance"], truth["stiffness"], exponent=1.0, restitution=0.8),),
+        force=lambda t: np.zeros(COUNT),
+        curved=tuple(CurvedSpring(row, truth["quadratic"], truth["cubic"]) for row in rows),
+    )
+    motion, impacts = lattice.motion(times, *np.split(state, 2), start=float(times[0]))
+    assert impacts > 2
+    return motion
+
+
+def table_of(path, unknowns: list[dict[str, Any]], **changes: Any) -> dict[str, Any]:
+    """The identification of ``unknowns`` from the record in ``path``: u, v and a of the masses 1, 2 and 3."""
+    sensors = [{"quantity": kind, "column": kind, "cell": cell} for cell, kind in enumerate(KINDS, 1)]
+    truth = TRUTH | changes
+    spring = {"start": 1, "end": 1, "stiffness": truth["spring"], "damping": 3.0, "next_cell": True}
+    spring |= {key: truth[key] for key in ("quadratic", "cubic") if truth[key]}
+    return {
+        "name": "curved",
+        "lattice": {"cells": COUNT, "cell": {"masses": [truth["mass"]], "springs": [spring], "contact": [1, 1]}},
+        "contacts": {
+            "law": "bilinear",
+            "stiffness": truth["stiffness"],
+            "restitution": 0.8,
+            "sites": [COUNT],
+            "pair": [0, 1],
+            "side": "plus",
+            "clearance": truth["clearance"],
+        },
+        "drive": {"amplitude": 0.0},
+        "initial": {"kind": "velocity", "cell": 2, "velocity": STRIKE},
+        "identify": {
+            "records": [{"file": str(path), "time": "t", "sensors": sensors}],
+            "unknowns": unknowns,
+            "profile": 0,
+        },
+    }
+
+
+def measured(motion: np.ndarray) -> np.ndarray:
+    """What the sensors of ``table_of`` measure, (time, sensor)."""
+    return np.stack([motion[k, :, k] for k in range(COUNT)], axis=1)
+
+
+def written(path, values: np.ndarray, times: np.ndarray = TIMES):
+    """Write a record of the sensors' ``values`` (time, sensor) to ``path``."""
+    rows = np.column_stack([times, values])
+    np.savetxt(path, rows, delimiter=",", header=",".join(["t", *KINDS]), comments="", fmt="%.17g")
+    return path
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory):
+    """The file of the record without noise."""
+    return written(tmp_path_factory.mktemp("record") / "exact.csv", measured(motion_of(TRUTH)))
+
+
+@pytest.mark.slow
+def test_derivatives_are_differences_of_scipy(record):
+    """Through three impacts: by both parts of curved springs, their stiffness, the mass, the stop and the offset."""
+    quantities = ["quadratic", "cubic", "spring", "mass", "clearance"]
+    unknowns = [{"quantity": q, "bounds": [0.5 * TRUTH[q], 2 * TRUTH[q]]} for q in quantities]
+    table = table_of(record, unknowns)
+    table["identify"]["records"][0]["offset"] = [-1e-3, 1e-3]
+    plan = IdentifyCase.from_table(table)
+    misfit = Misfit(plan, read_records(plan))
+    z = np.array([p.to_coordinate(p.start) for p in plan.parameters])
+    values, slopes = misfit.predicted(z, 0, 1.0, range(len(z)))
+    exact = measured(motion_of(TRUTH))
+    assert np.abs(values - exact).max(axis=0) == pytest.approx(0.0, abs=1e-8 * np.abs(exact).max())
+
+    h = 1e-4
+    for column, quantity in enumerate(quantities):
+        parameter = plan.parameters[column]
+        ends = [
+            measured(motion_of(TRUTH | {quantity: parameter.from_coordinate(z[column] + step)})) for step in (-h, h)
+        ]
+        expected = (ends[1] - ends[0]) / (2 * h)
+        error = np.abs(slopes[:, :, column] - expected).max(axis=0)
+        assert (error < 2e-5 * np.abs(expected).max(axis=0)).all(), (quantity, error)
+
+    # A later offset takes every sample at an earlier time; the motion begins with the first one.
+    short = 1e-6
+    ends = [measured(motion_of(TRUTH, np.append(0.0, TIMES[1:] + step)))[1:] for step in (short, -short)]
+    expected = (ends[1] - ends[0]) / (2 * short) * plan.parameters[-1].slope(z[-1])
+    error = np.abs(slopes[1:, :, -1] - expected).max(axis=0)
+    assert (error < 1e-3 * np.abs(expected).max(axis=0)).all(), error
+
+
+@pytest.mark.slow
+def test_derivatives_by_an_unknown_state_are_differences_of_scipy(record):
+    """The stiffness of curved springs at the motion moves a displacement and a velocity of the state that begins it."""
+    unknowns = [{"quantity": "cubic", "bounds": [1e9, 4e9]}]
+    table = table_of(record, unknowns)
+    table["identify"]["records"][0] |= {"initial": "estimate", "begin": 1e-3}
+    plan = IdentifyCase.from_table(table)
+    records = read_records(plan)
+    misfit = Misfit(plan, records)
+    begin = motion_of(TRUTH)[:2, 2].ravel()
+    matrix = misfit.states[0].matrix
+    z = np.append(plan.parameters[0].to_coordinate(TRUTH["cubic"]), np.linalg.solve(matrix, begin))
+    every = [0, 1, 2 * COUNT]
+    _, slopes = misfit.predicted(z, 0, 1.0, every)
+
+    h = 1e-4
+    for column, number in enumerate(every[1:], 1):
+        ends = [measured(motion_of(TRUTH, TIMES[2:], begin + step * matrix[:, number - 1])) for step in (-h, h)]
+        expected = (ends[1] - ends[0]) / (2 * h)
+        error = np.abs(slopes[:, :, column] - expected).max(axis=0)
+        assert (error < 2e-5 * np.abs(expected).max(axis=0)).all(), (number, error)
+
+
+UNKNOWNS = [
+    {"quantity": "quadratic", "bounds": [-1e7, 1e7]},
+    {"quantity": "cubic", "bounds": [-1e10, 1e10]},
+    {"quantity": "spring", "bounds": [1e4, 1e5]},
+    {"quantity": "clearance", "bounds": [1e-4, 2e-3]},
+]
+SOUGHT = [TRUTH[unknown["quantity"]] for unknown in UNKNOWNS]
+# The case has linear springs: the fit begins with curves of zero.
+CASE = {"quadratic": 0.0, "cubic": 0.0, "spring": 4.2e4, "clearance": 4.6e-4}
+
+
+def found_in(table, folder):
+    """The results of an identification."""
+    run_identification(IdentifyCase.from_table(table), folder)
+    with open_netcdf(folder / "identified.h5", "identification") as file:
+        return file.load()
+
+
+@pytest.mark.slow
+def test_curved_springs_come_back_from_linear_ones(record, tmp_path):
+    """Without noise all parameters come back, and the case that comes out has them."""
+    found = found_in(table_of(record, UNKNOWNS, **CASE), tmp_path)
+    assert found["value"].values == pytest.approx(SOUGHT, rel=1e-7)
+    case = IdentifyCase.of(found).case_of(found["value"].values)
+    assert case.lattice.unit_cell().springs[0].cubic == pytest.approx(TRUTH["cubic"], rel=1e-7)
+
+
+@pytest.mark.slow
+def test_intervals_of_curved_springs_hold_the_truth(record, tmp_path):
+    """With 1 % noise the truth lies within three standard errors, which are below a tenth of the values."""
+    exact = measured(motion_of(TRUTH))
+    noise = 0.01 * np.sqrt(np.mean(exact**2, axis=0))
+    noisy = exact + noise * np.random.default_rng(4).standard_normal(exact.shape)
+    table = table_of(written(tmp_path / "noisy.csv", noisy), UNKNOWNS, **CASE)
+    for sensor, size in zip(table["identify"]["records"][0]["sensors"], noise.tolist(), strict=True):
+        sensor["noise"] = size
+    found = found_in(table, tmp_path / "out")
+    deviations = (found["value"].values - SOUGHT) / found["standard_error"].values
+    assert np.abs(deviations).max() < 3, deviations
+    assert (found["standard_error"].values < 0.1 * np.abs(SOUGHT)).all()
+    assert (found["interval_low"].values < found["value"].values).all()
