@@ -13,9 +13,10 @@ from bench_peers import Solution, Solver
 from vipetsc.case import Case
 from vipetsc.case.schema import TimeTable
 from vipetsc.dynamics.energies import EnergyMeter
+from vipetsc.dynamics.engine_choice import choose_engine
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.observers import Guard, Ledger, Setup
-from vipetsc.dynamics.run import Begin, Run, select_engine
+from vipetsc.dynamics.run import ENGINES, Begin, Run
 from vipetsc.io.store import RunMemory
 
 
@@ -33,13 +34,13 @@ class Flight:
     def __init__(self, case: Case, comm: MPI.Comm) -> None:
         self.case = case
         self.model = case.model()
-        kind, refused = select_engine(case, self.model)
-        if refused:
-            raise RuntimeError(refused)
+        engine = choose_engine(case, self.model)
+        if engine.refused:
+            raise RuntimeError(engine.refused)
         self.output = RunMemory(comm)
         self.output.begin(case.to_toml())
         self.layout = Layout(self.model, comm)
-        self.engine = kind(self.model, self.layout)
+        self.engine = ENGINES[engine.name](self.model, self.layout)
         meter = EnergyMeter(self.model, self.layout)
         setup = Setup(case, self.model, self.layout, meter, self.engine, self.output)
         self._run = Run(setup, (Guard, Ledger))

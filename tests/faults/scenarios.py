@@ -251,14 +251,14 @@ def shrink() -> None:
     # Workers alone call this: what is replaced stays so in the process.
     import vipetsc.paper.plan as plan
     from tests.cli.tiny_paper import tiny_plan
-    from vipetsc.dynamics import recorder
+    from vipetsc.dynamics import recorded_sizes
     from vipetsc.figures import measure_pages, registry
 
     for name in registry.FIGURES.keys() - {*DRAWN}:
         del registry.FIGURES[name]
     measures_of = measure_pages.measures_of
     measure_pages.measures_of = lambda ensemble: measures_of(ensemble)[:1]
-    recorder.CHUNK_SAMPLES = SAMPLES_A_CHUNK
+    recorded_sizes.CHUNK_SAMPLES = SAMPLES_A_CHUNK
 
     small = tiny_plan()
     steps = []

@@ -13,7 +13,7 @@ import pytest
 
 from tests.conftest import assert_same_bits, datasets, in_parallel, needs_parallel_hdf5, small_case
 from vipetsc.case import CaseError
-from vipetsc.dynamics import recorder, simulate
+from vipetsc.dynamics import recorded_sizes, simulate
 from vipetsc.io import chunks
 from vipetsc.io.store import RunFolder, RunMemory
 from vipetsc.parallel import StoppedError, StopRequest, on_every_rank, sort_over_ranks
@@ -63,7 +63,7 @@ def test_a_run_in_memory_is_gathered_on_rank_0(folder):
 @pytest.mark.parallel([2, 3])
 def test_ranks_that_write_together_write_what_one_gathers(folder, monkeypatch):
     """The files agree for several sites a rank in no order, several chunks, fields of a window, open episodes."""
-    monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 20)
+    monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 20)
     sites = {"sites": [13, 5, 6, 18, 12, 2], "clearance": [2e-4, 1e-4, 3e-5, 1e-4, 5e-5, 2e-4]}
     for writer in ("gather", "parallel"):
         output = {"writer": writer, "window": [2, 20], "every": 2, "stride": 3}
@@ -199,5 +199,5 @@ def test_without_hdf5_for_mpi_all_ranks_refuse_to_write_together(folder, monkeyp
     assert not (folder / "run").exists()
 
     # A run of any size gathers where the case leaves the choice.
-    monkeypatch.setattr(recorder, "GATHER_LIMIT", 1000)
+    monkeypatch.setattr(recorded_sizes, "GATHER_LIMIT", 1000)
     assert simulate(small_case(time={"end": 0.01}), folder / "run").complete

@@ -12,15 +12,11 @@ import pytest
 from tests.exact_lattices import exponential, unlike_lattice
 from vipetsc.case import Model
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.clusters import (
-    apply_impulses,
-    create_dof_tables,
-    create_responses,
-    expand_free_motion,
-    group_dofs,
-)
-from vipetsc.dynamics.propagator.series import StepSeries, evaluate
+from vipetsc.dynamics.propagator.clusters import apply_impulses, create_dof_tables, create_responses, expand_free_motion
+from vipetsc.dynamics.propagator.groups import group_dofs
+from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions, apply_propagator, create_stencil, exchange
+from vipetsc.dynamics.propagator.taylor import evaluate
 from vipetsc.lattice.chain import Pair
 
 pytestmark = pytest.mark.slow

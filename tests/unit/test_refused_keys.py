@@ -10,7 +10,7 @@ from tests.conftest import small_case
 from vipetsc.case import Case, CaseError
 from vipetsc.case.contacts import describe_stops
 from vipetsc.cli.verbs.run_verb import run_rows
-from vipetsc.dynamics.propagator.engine import Propagator
+from vipetsc.dynamics.propagator.step_choice import refusal
 
 
 def unsprung_table(**sections: dict[str, Any]) -> dict[str, Any]:
@@ -121,4 +121,4 @@ def test_the_propagator_names_what_no_step_of_its_own_suits(cells, frequency, re
         "drive": {"frequency": frequency, "cycles": 2},
         "time": {"end": 0.01, "sample_interval": 2e-4},
     })  # fmt: skip
-    assert reason in str(Propagator.refusal(case.model()))
+    assert reason in str(refusal(case.model()))

@@ -5,7 +5,7 @@ import pytest
 
 from tests.conftest import small_case
 from vipetsc.contact.law import create_contacts
-from vipetsc.dynamics.propagator.series import copy, evaluate, first_onset, shift
+from vipetsc.dynamics.propagator.taylor import copy, evaluate, first_onset, shift
 
 # What first_onset returns without an onset.
 NONE = 2.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets, small_case
-from vipetsc.dynamics import recorder, simulate
+from vipetsc.dynamics import recorded_sizes, simulate
 from vipetsc.dynamics.energies import Energies
 from vipetsc.dynamics.observers import Guard, Ledger, Observer, RunawayError
 from vipetsc.dynamics.samples import Block
@@ -199,7 +199,7 @@ def test_a_run_killed_at_its_end_keeps_its_statistics(folder, monkeypatch):
     case = small_case(time={"end": 0.0254})
     assert case.model().samples % 128 == 0
 
-    monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 128)
+    monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 128)
     straight = simulate(case, folder / "straight")
 
     monkeypatch.setattr("vipetsc.io.store.RunFolder.finish", lambda *_: None)

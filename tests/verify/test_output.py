@@ -9,7 +9,7 @@ import pytest
 
 from tests.conftest import assert_same_bits, datasets, run_of, small_case
 from vipetsc.contact.tracker import EPISODE
-from vipetsc.dynamics import recorder, simulate
+from vipetsc.dynamics import recorded_sizes, simulate
 from vipetsc.dynamics.recorder import Recorder
 from vipetsc.io import chunks
 from vipetsc.io.atomic import load_arrays, save_arrays
@@ -27,7 +27,7 @@ def test_the_length_of_a_chunk_does_not_show(folder, monkeypatch, sections):
     simulate(case, folder / "long")
 
     # A divisor neither of the number of samples nor of the strides.
-    monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 7)
+    monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 7)
     simulate(case, folder / "short")
 
     assert_same_bits(datasets(folder / "long" / "run.h5"), datasets(folder / "short" / "run.h5"))
@@ -74,7 +74,7 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(chunks, "put_chunks", full_disk)
-    monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 16)
+    monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 16)
     with pytest.raises(OSError, match=r"run\.h5 could not be written: No space"):
         simulate(case, path, force=True)
     assert (path / "run.h5").read_bytes() == before

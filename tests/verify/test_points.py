@@ -11,7 +11,7 @@ import pytest
 from tests.conftest import StopAt, assert_same_bits, datasets, run_of, small_case
 from vipetsc.case import Case, CaseError
 from vipetsc.case.schema import AnalysisTable
-from vipetsc.dynamics import recorder, simulate
+from vipetsc.dynamics import recorded_sizes, simulate
 from vipetsc.io import export
 from vipetsc.io.read import open_run
 from vipetsc.spectra import histories
@@ -269,7 +269,7 @@ def test_records_of_points_do_not_depend_on_what_else_is_kept(tmp_path, monkeypa
     }.items()
 
     assert np.count_nonzero(runs["whole"]["sites/force"]) > 0
-    monkeypatch.setattr(recorder, "CHUNK_SAMPLES", 40)
+    monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 40)
     assert simulate(whole, tmp_path / "stopped", stop=StopAt(2)).resumable
     assert simulate(whole, tmp_path / "stopped").complete
     assert_same_bits(runs["whole"], datasets(tmp_path / "stopped" / "run.h5"))

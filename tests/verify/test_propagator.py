@@ -13,7 +13,8 @@ from vipetsc.case import Case
 from vipetsc.contact.law import create_contacts
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.propagator.nodes import collocation
-from vipetsc.dynamics.propagator.series import StepSeries, first_onset
+from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.taylor import first_onset
 from vipetsc.lattice import Contact, pass_bands
 from vipetsc.lattice.chain import Chain
 

@@ -12,6 +12,7 @@ from vipetsc.case import Case
 from vipetsc.dynamics.engine import FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.engine import Propagator
+from vipetsc.dynamics.propagator.step_choice import refusal
 from vipetsc.dynamics.propagator.tangent import no_samples
 
 
@@ -50,7 +51,7 @@ def test_ten_thousand_sites_are_set_up_and_restored():
     sites = {"first": 5, "spacing": 10, "count": 10_000}
     case = small_case(lattice={"cells": 100_100}, contacts={"sites": sites}, time={"sample_interval": 1e-4})
     model = case.model()
-    assert Propagator.refusal(model) is None
+    assert refusal(model) is None
     layout = Layout(model, MPI.COMM_SELF)
     engine = Propagator(model, layout)
     assert engine.fill(no_samples(model, layout, 2)) == FillResult(0)

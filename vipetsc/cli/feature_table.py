@@ -109,9 +109,9 @@ def _sentences(error: CaseError) -> str:
 
 def _propagator_refusal(case: Case) -> str:
     """Why the propagator does not suit ``case``."""
-    from vipetsc.dynamics.propagator.engine import Propagator
+    from vipetsc.dynamics.propagator.step_choice import refusal
 
-    return Propagator.refusal(case.model()) or ""
+    return refusal(case.model()) or ""
 
 
 def _modes_refusal(case: Case) -> str:

@@ -13,9 +13,9 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from vipetsc.case import Case, Model
-from vipetsc.dynamics.propagator.engine import Propagator, step_series
+from vipetsc.dynamics.engine_choice import PROPAGATOR, choose_engine
 from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.dynamics.run import select_engine
+from vipetsc.dynamics.propagator.step_choice import refusal, step_series
 from vipetsc.lattice import bloch, pass_bands, waves_at
 
 # Of ts: seconds an accepted step of 8vr and a mass in it; radians of the top band in a step, steps an episode costs.
@@ -115,23 +115,23 @@ class Cost:
 def estimate(case: Case, ranks: int = 1) -> Cost:
     """The cost of a run of ``case`` on so many ranks; every site is assumed to meet the linear wave of the drive."""
     model = case.model()
-    kind, note = select_engine(case, model)
+    engine, note = choose_engine(case, model)
     episodes = expected_episodes(model)
 
     by_ts = functools.partial(_runge_kutta_seconds, model, episodes)
     exact = None
-    if not case.petsc and Propagator.refusal(model) is None and (series := step_series(model)):
+    if not case.petsc and refusal(model) is None and (series := step_series(model)):
         own_rows = OwnRows.of(series)
         exact = functools.partial(_propagator_seconds, model, series, own_rows, episodes)
-        if own_rows.cells and kind is Propagator:
+        if own_rows.cells and engine == PROPAGATOR:
             note = own_rows.describe(ranks)
 
     cost_on: Callable[[int], Seconds] = by_ts
-    if kind is Propagator and exact is not None:
+    if engine == PROPAGATOR and exact is not None:
         cost_on = exact
     seconds = cost_on(ranks)
     return Cost(
-        engine=kind.name,
+        engine=engine,
         note=note if case.time.engine != "ts" else None,
         episodes=episodes,
         seconds=seconds.total,

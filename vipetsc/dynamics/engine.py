@@ -41,11 +41,6 @@ class Engine(ABC):
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         """Create an engine for ``model`` at rest at t = 0, on all ranks; it ends early on a request to ``stop``."""
 
-    @classmethod
-    def refusal(cls, model: Model) -> str | None:
-        """Why this engine is not the one for ``model``, in words; None if it is."""
-        return None
-
     @abstractmethod
     def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
         """Begin in motion, on all ranks: own ``cells`` (cell, 2 dof), displacements in m before velocities in m/s.

@@ -12,8 +12,8 @@ import numpy as np
 from vipetsc.case import CaseError, Model
 from vipetsc.case.case_file import Problem
 from vipetsc.case.schema import OutputTable
-from vipetsc.dynamics.propagator.engine import step_series
-from vipetsc.dynamics.recorder import chunk_samples, possible_output, recorded_cells, written_together
+from vipetsc.dynamics.propagator.step_choice import step_series
+from vipetsc.dynamics.recorded_sizes import chunk_samples, possible_output, recorded_cells, written_together
 from vipetsc.io.store import GATHER_LIMIT
 
 # States that an engine holds, each of 2 numbers a mass: two for each stage of a method and its saved copies; measured.

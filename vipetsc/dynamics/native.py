@@ -5,11 +5,11 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from petsc4py import PETSc
-
 from llvmlite import binding
 from numba.core.types import ExternalFunction, int32, int64, voidptr
 from numba.extending import intrinsic
+
+from vipetsc.dynamics.petsc_library import petsc_library
 
 external: Any = ExternalFunction
 get_read, restore_read, get_write, restore_write, local_size = _vectors = [
@@ -23,12 +23,6 @@ ghosts_begin, ghosts_end = _ghosts = [
 scatter_begin, scatter_end = _scatters = [
     external(f"VecScatter{part}", int32(int64, int64, int64, int32, int32)) for part in ("Begin", "End")
 ]
-
-
-def petsc_library() -> ctypes.CDLL:
-    """The PETSc library to which petsc4py is linked."""
-    # The handle of the extension module also finds PETSc's symbols; a library found by name might be another PETSc.
-    return ctypes.CDLL(PETSc.__file__)
 
 
 @cache

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 
 from vipetsc.case import Case, CaseError, CaseFile, Problem
 from vipetsc.case.schema import RENAMED_OPTIONS, PetscTable, only_looks
-from vipetsc.dynamics.native import petsc_library
+from vipetsc.dynamics.petsc_library import petsc_library
 
 RENAMING_VERSION = (3, 25)
 

@@ -18,6 +18,7 @@ from vipetsc.case.html import html_table
 from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine, FillResult
+from vipetsc.dynamics.engine_choice import EngineChoice, choose_engine
 from vipetsc.dynamics.fastest_cell import fastest_cell
 from vipetsc.dynamics.initial import set_in_motion
 from vipetsc.dynamics.layout import Layout
@@ -38,8 +39,7 @@ from vipetsc.process import compiling
 if TYPE_CHECKING:
     import xarray as xr
 
-# In the order in which engine = "auto" tries them.
-ENGINES = (Propagator, Integrator)
+ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Propagator, Integrator)}
 # Cells times samples between two looks at requests to stop: a fraction of a second.
 BLOCK_CELLS = 1_000_000
 NOTICED = 1.0  # s of the compiler's clock, in which kernels that are there may be loaded
@@ -163,15 +163,15 @@ def simulate(
     case = with_database(case)
     check_options(case)
     model = case.model()
-    kind, refusal = select_engine(case, model)
-    check_memory(model, case.output, kind.name, ranks)
+    choice = choose_engine(case, model)
+    check_memory(model, case.output, choice.name, ranks)
 
     # The guard first: the others see only samples that it accepts.
     watching: list[type[Observer]] = [Guard, *observers, Ledger]
     if progress:
         watching.append(ProgressReport)
-    opens = opening if kind.opens and not observers else None
-    simulation = Simulation(case, model, kind, refusal, stop, watching, opens)
+    opens = opening if ENGINES[choice.name].opens and not observers else None
+    simulation = Simulation(case, model, choice, stop, watching, opens)
     if isinstance(target, RunOutput):
         result = simulation.make(target)
         return replace(result, held=memory.dataset) if folder is None else result
@@ -200,12 +200,11 @@ def result_of(attributes: Mapping[str, Any], resumable: bool, folder: Path | Non
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation: case and model, engine and why it is not the one asked for, observers, opening of a new run."""
+    """A simulation: case, model and engine, observers, opening of a new run."""
 
     case: Case
     model: Model
-    kind: type[Engine]
-    refusal: str | None
+    engine: EngineChoice
     stop: StopRequest | None
     watching: Sequence[type[Observer]]
     opening: Callable[[], Opening | None] | None = None
@@ -220,7 +219,7 @@ class Simulation:
         sys.audit("vipetsc.set-up", self.case.name)
         with log.SET_UP, petsc_options(options_of(self.case)):
             layout = Layout(self.model, output.comm, dashpots=True)
-            engine = self.kind(self.model, layout, self.stop)
+            engine = ENGINES[self.engine.name](self.model, layout, self.stop)
         with released(engine, output.comm):
             meter = EnergyMeter(self.model, layout)
             run = Run(Setup(self.case, self.model, layout, meter, engine, output), self.watching)
@@ -233,7 +232,7 @@ class Simulation:
             with log.SAMPLES:
                 ending, sentence = run.advance()
             with log.ENDING:
-                note = {"engine_note": self.refusal} if self.refusal else {}
+                note = {"engine_note": self.engine.refused} if self.engine.refused else {}
                 return run.finish(ending, sentence, begin, note)
 
 
@@ -247,15 +246,6 @@ def released(engine: Engine, comm: MPI.Comm) -> Iterator[None]:
             engine.destroy()
         raise
     engine.destroy()
-
-
-def select_engine(case: Case, model: Model) -> tuple[type[Engine], str | None]:
-    """The engine that ``case`` names, for ``auto`` the first, and None; or the last, which suits all, and why."""
-    engine = next((engine for engine in ENGINES if engine.name == case.time.engine), ENGINES[0])
-    refusal = engine.refusal(model)
-    if options_of(case) and engine is not ENGINES[-1]:
-        refusal = "PETSc options require ts"
-    return (engine, None) if refusal is None else (ENGINES[-1], f"{engine.name} refused: {refusal}")
 
 
 class Run:

@@ -14,8 +14,8 @@ import xarray as xr
 
 from vipetsc.case import Case, Sweep
 from vipetsc.dynamics import simulate
+from vipetsc.dynamics.engine_choice import PROPAGATOR
 from vipetsc.dynamics.opening import Opening
-from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.io.atomic import Arrays
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest
@@ -74,7 +74,7 @@ class LinearHistory(NamedTuple):
 
     def opening(self, case: Case) -> Opening | None:
         """The samples before the first contact with which ``case`` begins; None without any, or without exact steps."""
-        if self.statistics["engine"] != Propagator.name:
+        if self.statistics["engine"] != PROPAGATOR:
             return None
         waves = reached(self.envelope, case)
         before_contact = np.count_nonzero((waves < MARGIN).all(axis=1))

@@ -14,7 +14,7 @@ import xarray as xr
 import vipetsc
 from vipetsc.case import Case, Sweep
 from vipetsc.dynamics.opening import Opening
-from vipetsc.dynamics.recorder import recorded_cells
+from vipetsc.dynamics.recorded_sizes import recorded_cells
 from vipetsc.io.atomic import discard, write_text
 from vipetsc.io.folder import origin
 from vipetsc.io.netcdf import write_netcdf

@@ -87,7 +87,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
     """Numbers that follow from a case of a run: bands, drive, times, samples, file size, cost on ``ranks`` ranks."""
     from vipetsc.dynamics.cost import estimate
     from vipetsc.dynamics.memory import check_indices, memory_available, memory_needed
-    from vipetsc.dynamics.recorder import recorded_cells, written_together
+    from vipetsc.dynamics.recorded_sizes import recorded_cells, written_together
 
     model = case.model()
     check_indices(model)

@@ -87,8 +87,9 @@ the sum over forces up to then. All are smooth in a and b: Legendre coefficients
 their moments with these polynomials, of the substeps before, and within a substep at its nodes.
 
 **Modules**, from the lattice to the engine. ``rows``: powers of the lattice's matrix, row by row. ``series``: how many
-of them count, and how far. ``stencil``: P on a rank's cells. ``clusters``: contact DoFs, their groups and tables.
-``nodes``: tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep.
+of them count, and how far. ``groups``: contact DoFs and their groups. ``step_choice``: the length of a step.
+``taylor``: values of the series. ``stencil``: P on a rank's cells. ``clusters``: tables of contact DoFs. ``nodes``:
+tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep.
 ``advance``: substeps up to a change of modes. ``forces``: changes up to the step's end. ``engine``: steps up to the
 sample. ``dashpots``, ``free_losses``, ``loss_modes``, ``loss_tables``, ``losses``: what dashpots dissipate. ``tangent``
 and ``tangent_kernels``: variations.

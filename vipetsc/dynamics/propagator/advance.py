@@ -38,8 +38,8 @@ from vipetsc.dynamics.propagator.collocation import (
 )
 from vipetsc.dynamics.propagator.losses import PairLosses, accumulate_losses
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN
-from vipetsc.dynamics.propagator.series import ROUNDING, copy, first_onset, shift
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, select_active, write_on_tape
+from vipetsc.dynamics.propagator.taylor import ROUNDING, copy, first_onset, shift
 
 # How an advance ended: at the end of the step, on a change of modes, on one of a site that is to rest instead, or
 # without progress.

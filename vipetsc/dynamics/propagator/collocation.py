@@ -35,8 +35,9 @@ from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.law import contact_force
 from vipetsc.dynamics.drives import drive_force
 from vipetsc.dynamics.propagator.nodes import NODES
-from vipetsc.dynamics.propagator.series import MOST_TERMS, evaluate, shift
+from vipetsc.dynamics.propagator.series import MOST_TERMS
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial
+from vipetsc.dynamics.propagator.taylor import evaluate, shift
 
 # Sweeps beyond which a substep is cut instead: so many suffice up to h omega = 8, where the error is far from small
 # enough. Any limit of some tens serves.

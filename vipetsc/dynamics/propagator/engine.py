@@ -1,15 +1,12 @@
 """The engine of exact linear steps: from sample to sample, each cluster's contacts within every step.
 
 A step is the product of the state with P(H) (sec. 1 of the derivation in the package's docstring) and, for the clusters
-whose sites may touch or whose drives are on, what their forces leave behind (sec. 2 to 6). ``step_series`` chooses H: a
-sample interval over a whole number, long, because a step costs the same whatever its length, but not so long that many
-sites feel one another within it. ``take_steps`` is the loop over the steps of a block of samples; ``Propagator`` holds
-its records and is the engine that a simulation sees.
+whose sites may touch or whose drives are on, what their forces leave behind (sec. 2 to 6). ``take_steps`` is the loop
+over the steps of a block of samples; ``Propagator`` holds its records and is the engine that a simulation sees.
 """
 
 import sys
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -22,76 +19,16 @@ from vipetsc.contact.tracker import Tracks
 from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
-from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion, group_dofs
+from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.dashpots import DashpotRows
 from vipetsc.dynamics.propagator.forces import Forces, follow_contacts
 from vipetsc.dynamics.propagator.free_losses import create_loss_stencil
 from vipetsc.dynamics.propagator.losses import FreeLosses, PairLosses, add_free_losses, loss_by_forces
-from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import Halo, HaloRegions, Stencil, apply_propagator, create_stencil, exchange
+from vipetsc.dynamics.propagator.step_choice import step_series
 from vipetsc.dynamics.propagator.substeps import Cluster
 from vipetsc.dynamics.samples import Samples, take_sample
-from vipetsc.lattice import ToneBurst
 from vipetsc.parallel import StopRequest, on_every_rank
-
-# The terms (omega H)^k / k! grow before they fall, to 5.5 at this omega H, and their rounding with them.
-LARGEST_OMEGA_H = 3.2
-# Steps a sample interval may be cut into.
-MOST_PARTS = 16
-# Sites of one cluster beyond which plain time stepping costs less.
-MOST_SITES = 32
-# Rough costs in us that decide the step's length.
-STEP_COST = 20.0  # of a step
-CELL_COST = 0.03  # of a cell in a step
-SITE_COST = 10.0  # of a sample's contacts, for each site of a cluster
-# The series is cut off at this fraction of the run's relative tolerance, or where rounding makes it as large.
-SERIES_TOLERANCE = 1e-4
-LEAST_TOLERANCE = 1e-15
-
-
-@lru_cache(maxsize=4)
-def step_series(model: Model) -> StepSeries | None:
-    """The step that divides the sample interval and fits the lattice at the least cost; None if there is none.
-
-    Long steps are few, but sites that feel one another within a step must be followed together.
-    """
-    tolerance = max(SERIES_TOLERANCE * model.rtol, LEAST_TOLERANCE)
-    bursts = [drive.waveform.highest for drive in model.drives if isinstance(drive.waveform, ToneBurst)]
-    fastest = max(bursts, default=0.0)
-
-    best = None
-    least = np.inf
-    for parts in range(1, MOST_PARTS + 1):
-        # The cost of the steps alone grows from here on.
-        cost = parts * (STEP_COST + CELL_COST * model.chain.cells)
-        if cost >= least:
-            break
-        series = StepSeries(model.chain, model.sample_interval / parts, tolerance)
-        too_long = max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H
-        if too_long or model.chain.cells < series.width:
-            continue
-
-        # Every DoF of a cluster is moved by every other one: the mean size of a DoF's cluster.
-        sizes = np.diff(group_dofs(model, series.reach).first)
-        cost += SITE_COST * float((sizes**2).sum() / sizes.sum())
-        if cost < least:
-            best = series
-            least = cost
-    return best
-
-
-def _no_step(model: Model) -> str:
-    """Why not even the shortest step suits ``model``: too few cells for its band, or waves too fast for its series."""
-    tolerance = max(SERIES_TOLERANCE * model.rtol, LEAST_TOLERANCE)
-    series = StepSeries(model.chain, model.sample_interval / MOST_PARTS, tolerance)
-    step = f"a step of {series.interval:.3g} s, time.sample_interval over {MOST_PARTS},"
-    if model.chain.cells < series.width:
-        return f"{model.chain.cells} cells are fewer than the {series.width} cells that {step} couples"
-
-    bursts = [drive.waveform.highest for drive in model.drives if isinstance(drive.waveform, ToneBurst)]
-    fastest = max([series.omega_max_h / series.interval, *bursts])
-    return f"{step} is too long for {fastest:.5g} rad/s, of the drive or the lattice"
-
 
 PROGRESS = np.dtype([(name, np.int64) for name in ("steps", "last", "failed", "cluster")] + [("time", float)])
 """Steps done and the last one to do; of a failure its step (beyond the last one if there is none), its cluster (-1 if
@@ -242,26 +179,6 @@ class Propagator(Engine):
     def steps(self) -> int:
         """Linear steps done."""
         return int(self._record.progress["steps"][0])
-
-    @classmethod
-    def refusal(cls, model: Model) -> str | None:
-        """Why it does not suit ``model``: springs that are not linear; too few cells; too many sites close together."""
-        if not model.chain.cell.is_linear:
-            return "its steps require linear springs, but some springs have a quadratic or cubic part"
-        series = step_series(model)
-        if series is None:
-            return _no_step(model)
-
-        numbers, first = group_dofs(model, series.reach)
-        counts = np.add.reduceat(numbers >= 0, first[:-1], dtype=np.int64)
-        largest = int(counts.argmax())
-        if counts[largest] <= MOST_SITES:
-            return None
-        cells = sorted(model.chain.sites[i] + 1 for i in numbers[first[largest] :][: counts[largest]])
-        return (
-            f"{len(cells)} sites between cells {cells[0]} and {cells[-1]} lie within {series.reach} cells of one"
-            f" another (at most {MOST_SITES} may)"
-        )
 
     def begin(self, cells: np.ndarray, motion: np.ndarray, energy: float) -> None:
         self._layout.place(cells, energy, self._components[0])

@@ -32,16 +32,9 @@ from vipetsc.contact.tracker import (
 from vipetsc.dynamics.drives import create_drives
 from vipetsc.dynamics.layout import Layout, join
 from vipetsc.dynamics.propagator.advance import CHANGED, DONE, ORDER, RESTS, advance_cluster
-from vipetsc.dynamics.propagator.clusters import (
-    DofTables,
-    Groups,
-    contact_dofs,
-    create_dof_tables,
-    create_responses,
-    group_dofs,
-    groups_within_reach,
-)
+from vipetsc.dynamics.propagator.clusters import DofTables, create_dof_tables, create_responses, groups_within_reach
 from vipetsc.dynamics.propagator.dashpots import DashpotRows
+from vipetsc.dynamics.propagator.groups import Groups, contact_dofs, group_dofs
 from vipetsc.dynamics.propagator.loss_tables import create_losses, no_losses
 from vipetsc.dynamics.propagator.losses import PairLosses, begin_losses
 from vipetsc.dynamics.propagator.nodes import collocation

@@ -15,8 +15,9 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.clusters import DofTables, Groups, contact_dofs
+from vipetsc.dynamics.propagator.clusters import DofTables
 from vipetsc.dynamics.propagator.dashpots import NO_DASHPOTS, DashpotRows
+from vipetsc.dynamics.propagator.groups import Groups, contact_dofs
 from vipetsc.dynamics.propagator.loss_modes import SMALLEST_MODE, mode_count, overlaps
 from vipetsc.dynamics.propagator.losses import FreeLosses, PairLosses
 from vipetsc.dynamics.propagator.nodes import NODES

@@ -4,8 +4,7 @@ Within a step nothing but linear springs and dashpots acts on most of the lattic
 s = (t - t_0)/H whose coefficients are rows of ``rows`` times the state (sec. 1 and 7 of the derivation in the package's
 docstring). ``StepSeries`` cuts it off where the remainder is below the tolerance, in powers as in cells, and sums what
 is left out into ``truncation``, a bound on the relative error of a step. Cells far from the ends and from cells that
-differ share one set of rows; others get their own (sec. 8). The kernels below evaluate and shift such a series and find
-the first time at which a site, moving freely, meets its clearance (sec. 2).
+differ share one set of rows; others get their own (sec. 8). ``taylor`` evaluates such a series.
 
 **Notation.** M, K and C are the lattice's matrices of masses, springs and dashpots; H is the step in s;
 A = H^2 M^-1 K; P = P(H) takes the state at a step's beginning to that at its end in free motion. A *term* is a power
@@ -25,14 +24,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import factorial
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vipetsc.compiled import kernel
-from vipetsc.contact.changes import LANDED_W
-from vipetsc.contact.law import gap_of
 from vipetsc.dynamics.propagator.rows import Bounds, bounds_of, local_recursion, power_rows
 from vipetsc.lattice.chain import Chain
 
@@ -41,8 +36,6 @@ from vipetsc.lattice.chain import Chain
 MOST_TERMS = 24
 # Cells whose rows are computed together: they take about 100 kB each, too much for all cells at once.
 BATCH = 64
-# Lengths below this fraction of the step are rounding.
-ROUNDING = 1e-15
 # Entries of P below this fraction of the tolerance are dropped; ``truncation`` counts them.
 SMALL_ENTRY = 1e-3
 
@@ -280,95 +273,3 @@ class StepSeries:
         is_large = self._interior_magnitudes > SMALL_ENTRY * self.tolerance
         entries = np.where(is_large, self.stencil(self._interior_rows), 0.0)
         return entries[:, :, self._outermost - self.reach : self._outermost + self.reach + 1]
-
-
-@kernel
-def copy(source: np.ndarray, target: np.ndarray) -> None:
-    """Fill all rows of ``target`` (row, column) with the first ones of ``source``."""
-    for i in range(target.shape[0]):
-        for j in range(target.shape[1]):
-            target[i, j] = source[i, j]
-
-
-@kernel
-def shift(taylor: np.ndarray, s: float, out: np.ndarray) -> None:
-    """Expand series ``taylor`` (dof, coefficient) about ``s`` instead of 0, into ``out``, which may be ``taylor``."""
-    dofs, coefficients = taylor.shape
-    copy(taylor, out[:dofs])
-    # Horner's scheme k times over: the k-th pass leaves the coefficient of (x - s)^k in place.
-    for j in range(dofs):
-        for k in range(coefficients - 1):
-            for i in range(coefficients - 2, k - 1, -1):
-                out[j, i] += s * out[j, i + 1]
-
-
-@kernel
-def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
-    """Value and slope of a ``series`` at ``s``, by Horner's scheme."""
-    value = 0.0
-    slope = 0.0
-    for k in range(series.size - 1, -1, -1):
-        slope = slope * s + value
-        value = value * s + series[k]
-    return value, slope
-
-
-@kernel
-def _onset_on_side(series: np.ndarray, site: Any, side: float, curvature: float, length: float) -> float:
-    """First s in [0, length] at which w is on the clearance of one ``side`` and grows; 2 if there is none.
-
-    ``curvature`` bounds |w''| over the length, so that a parabola bounds w towards this side: up to where that
-    meets the clearance nothing can have happened.
-    """
-    tolerance = LANDED_W * site.scale
-    clearance = gap_of(site, side)
-    # No stop on this side.
-    if clearance == np.inf:
-        return 2.0
-
-    s = 0.0
-    while s <= length:
-        w, rate = evaluate(series, s)
-        gap = clearance - side * w
-        closing = side * rate
-        if gap < 0.5 * tolerance and closing > 0.0:
-            # A Newton step, where the curvature changes it by less than the tolerance.
-            newton = gap / closing
-            if curvature * newton * newton < tolerance:
-                s = max(s + newton, 0.0)
-            return s
-
-        # The root of curvature/2 d^2 + closing d = gap, without cancellation. The gap is taken larger by the
-        # tolerance: so far beyond the clearance an onset is still met. Without curvature a site that does not close
-        # never meets it: the step is then infinite, or NaN if the site rests, and both end the loop.
-        gap += tolerance
-        root = np.sqrt(max(closing * closing + 2.0 * curvature * gap, 0.0))
-        step = 2.0 * gap / (closing + root) if closing > 0.0 else (root - closing) / curvature
-        s += max(step, ROUNDING)
-    return 2.0
-
-
-@kernel
-def first_onset(series: np.ndarray, site: Any, length: float) -> float:
-    """First s in [0, length] at which w comes within rounding of a clearance of the ``site`` and grows.
-
-    2 if none does: more than any length, since the whole step has the length 1.
-    """
-    # On 0 <= s <= length the sum of |a_k| length^k bounds |w|, that of k (k - 1) |a_k| length^(k-2) bounds |w''|.
-    bound = 0.0
-    curvature = 0.0
-    scale = 1.0
-    for k in range(series.size):
-        bound += abs(series[k]) * scale
-        if k >= 2:
-            curvature += k * (k - 1) * abs(series[k]) * scale / (length * length)
-        scale *= length
-
-    # Most sites keep away from both clearances: no search.
-    tolerance = LANDED_W * site.scale
-    if bound < min(site.clearance, site.clearance_minus) - tolerance:
-        return 2.0
-
-    plus = _onset_on_side(series, site, 1.0, curvature, length)
-    minus = _onset_on_side(series, site, -1.0, curvature, length)
-    return min(plus, minus)

@@ -17,7 +17,7 @@ from vipetsc.contact.law import FREE
 from vipetsc.dynamics.drives import Drives, drive_end
 from vipetsc.dynamics.propagator.clusters import DofTables
 from vipetsc.dynamics.propagator.nodes import NODES, Collocation
-from vipetsc.dynamics.propagator.series import ROUNDING
+from vipetsc.dynamics.propagator.taylor import ROUNDING
 
 COUNTS = ("substeps", "rejected", "landings", "switches")
 SUBSTEP_STATE = np.dtype(

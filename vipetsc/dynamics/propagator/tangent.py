@@ -23,6 +23,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.clusters import expand_free_motion
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.stencil import Halo, exchange
+from vipetsc.dynamics.propagator.step_choice import refusal
 from vipetsc.dynamics.propagator.substeps import create_tape
 from vipetsc.dynamics.propagator.tangent_kernels import Variations, linearise, move_variations
 from vipetsc.dynamics.samples import Samples
@@ -96,7 +97,7 @@ class TangentPropagator(Propagator):
         sites = site_records(model, np.arange(len(model.chain.sites)))
         if (np.abs(sites["mode"]) == PERMANENT).any():
             return "contacts touch or are precompressed at rest; variations are not supported for them"
-        return super().refusal(model)
+        return refusal(model)
 
     def place(self, cells: np.ndarray, speed: float) -> None:
         """Begin at ``cells``; ``speed`` in m/s is a typical one of relative motion.

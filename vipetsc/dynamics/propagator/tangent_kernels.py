@@ -22,9 +22,9 @@ from vipetsc.contact.law import CLIPPED, elastic_force_and_slope, gap_of
 from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.collocation import accumulate_moments, node_responses, update_taylor
 from vipetsc.dynamics.propagator.nodes import NODES
-from vipetsc.dynamics.propagator.series import copy, shift
 from vipetsc.dynamics.propagator.stencil import Halo, Stencil, apply_propagator, exchange
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, select_cluster
+from vipetsc.dynamics.propagator.taylor import copy, shift
 
 
 class Variations(NamedTuple):

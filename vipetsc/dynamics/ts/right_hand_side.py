@@ -18,6 +18,7 @@ from vipetsc.dynamics import native
 from vipetsc.dynamics.drives import DRIVE, Drives, drive_force
 from vipetsc.dynamics.lattice_record import COEFFICIENTS, COUPLING, MASS, NONLINEAR, SPRING, LatticeRecord, Shape
 from vipetsc.dynamics.native import pointer
+from vipetsc.dynamics.petsc_library import petsc_library
 from vipetsc.dynamics.site_dofs import SITE_DOFS, relative_motion
 from vipetsc.dynamics.springs import (
     damping_powers,
@@ -204,7 +205,7 @@ def register(ts: PETSc.TS, lattice: LatticeRecord) -> None:
     context["length"] = tuple(tables[name].size for name in _TABLES)
     # PETSc holds bare pointers: all that they point to must live as long as ts.
     ts.setAttr("callback", (callback, context, lattice))
-    error = native.petsc_library().TSSetRHSFunction(
+    error = petsc_library().TSSetRHSFunction(
         ctypes.c_void_p(ts.handle),
         ctypes.c_void_p(None),
         ctypes.c_void_p(callback.address),

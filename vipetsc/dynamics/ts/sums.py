@@ -16,6 +16,7 @@ from numba.core.ccallback import CFunc
 from vipetsc.compiled import cfunc, njit
 from vipetsc.dynamics import native
 from vipetsc.dynamics.native import pointer
+from vipetsc.dynamics.petsc_library import petsc_library
 from vipetsc.dynamics.vectors import LANES, add, add_product, prefetch, store, zeros
 
 # PETSc's number of the operation, in the order of its _VecOps.
@@ -91,7 +92,7 @@ def register_sums(vector: PETSc.Vec) -> None:
 def _set_operation(vector: PETSc.Vec) -> None:
     """Let ``vector`` add by the compiled callback."""
     callback = ctypes.c_void_p(_compile().address)
-    error = native.petsc_library().VecSetOperation(ctypes.c_void_p(vector.handle), ctypes.c_int(MAXPY), callback)
+    error = petsc_library().VecSetOperation(ctypes.c_void_p(vector.handle), ctypes.c_int(MAXPY), callback)
     if error:
         raise RuntimeError(f"VecSetOperation failed with PETSc error {error}")
 

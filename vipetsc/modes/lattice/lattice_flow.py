@@ -20,8 +20,8 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.propagator.engine import LARGEST_OMEGA_H
 from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.step_choice import LARGEST_OMEGA_H
 from vipetsc.dynamics.propagator.tangent import TangentPropagator
 from vipetsc.lattice import Chain, Drive, ToneBurst
 from vipetsc.modes.balance.harmonics import Stops

@@ -1,0 +1,30 @@
+"""Which engine simulates a case; known before any kernel is loaded."""
+
+from typing import NamedTuple
+
+from vipetsc.case import Case, Model
+from vipetsc.dynamics.options import options_of
+from vipetsc.dynamics.propagator.step_choice import refusal
+
+PROPAGATOR = "propagator"
+TS = "ts"  # which suits every lattice
+
+
+class EngineChoice(NamedTuple):
+    """The ``name`` of an engine in case files; ``refused`` says why it is not the one that the case asks for, or None.
+
+    A case that asks for none gets the propagator, if it can.
+    """
+
+    name: str
+    refused: str | None
+
+
+def choose_engine(case: Case, model: Model) -> EngineChoice:
+    """The engine that ``case`` names, by default the propagator; ``ts`` where that does not suit its ``model``."""
+    if case.time.engine == TS:
+        return EngineChoice(TS, None)
+    reason = "PETSc options require ts" if options_of(case) else refusal(model)
+    if reason is None:
+        return EngineChoice(PROPAGATOR, None)
+    return EngineChoice(TS, f"{PROPAGATOR} refused: {reason}")

@@ -1,0 +1,45 @@
+"""What of a run is recorded, by which ranks, and in chunks of how many samples; known before any kernel is loaded."""
+
+import h5py
+
+from vipetsc.case import CaseError, Model, Problem
+from vipetsc.case.schema import OutputTable
+from vipetsc.io.store import GATHER_LIMIT
+
+# A chunk is at most this many samples, and at most this many bytes of fields on a rank.
+CHUNK_SAMPLES = 256
+CHUNK_BYTES = 64 * 2**20
+
+
+def recorded_cells(output: OutputTable, cells: int) -> range:
+    """Cells (0-based) whose fields are recorded, of a lattice with so many ``cells``."""
+    first, last = output.window or (1, cells)
+    return range(first - 1, last, output.every)
+
+
+def written_together(model: Model, output: OutputTable, ranks: int) -> bool:
+    """Whether each of the ``ranks`` writes the fields of its own cells into one common file."""
+    sample_bytes = len(output.fields) * model.chain.cell.dofs * 8 * len(recorded_cells(output, model.chain.cells))
+    large = sample_bytes * -(-model.samples // output.stride) > GATHER_LIMIT
+    return ranks > 1 and (output.writer == "parallel" or (output.writer == "auto" and large))
+
+
+def possible_output(output: OutputTable, ranks: int) -> OutputTable:
+    """The ``output`` as the h5py of these ``ranks`` can write it: where it has no MPI, ``auto`` gathers.
+
+    Raises CaseError if every rank shall write and cannot.
+    """
+    if ranks == 1 or h5py.get_config().mpi:
+        return output
+    if output.writer == "parallel":
+        remedy = (
+            "needs an h5py with MPI support (Debian: python3-h5py-mpi; conda-forge: h5py=*=mpi_openmpi*);"
+            ' "gather" does not need it'
+        )
+        raise CaseError([Problem("output.writer", output.writer, remedy)])
+    return output.model_copy(update={"writer": "gather"})
+
+
+def chunk_samples(sample_bytes: int) -> int:
+    """Number of samples in a chunk, if a rank stores ``sample_bytes`` of fields for each."""
+    return min(max(CHUNK_BYTES // max(sample_bytes, 1), 1), CHUNK_SAMPLES)
