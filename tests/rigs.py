@@ -62,7 +62,8 @@ def rate_of(states: SteadyStates, omega: float, amplitude: float):
         joins.append((host, (site + pair.next_cell) % chain.cells * d + pair.resonator, stops))
 
     beyond = []
-    for cell, spring in itertools.product(range(-1, chain.cells), chain.cell.springs):
+    for cell, number in itertools.product(range(-1, chain.cells), range(len(chain.cell.springs))):
+        spring = chain.spring(cell, number)
         other = cell + spring.next_cell
         is_inside = cell >= 0 and other < chain.cells
         if spring.is_linear or not (is_inside or (spring.next_cell and chain.ends == "fixed")):

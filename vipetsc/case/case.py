@@ -16,7 +16,7 @@ from vipetsc.case.disorder import DisorderTable, with_drawn
 from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_speed
 from vipetsc.case.features import refusals
 from vipetsc.case.html import case_html
-from vipetsc.case.inhomogeneity import check_inhomogeneity
+from vipetsc.case.inhomogeneity import check_inhomogeneity, check_right_wall
 from vipetsc.case.initial import Beginning, InitialTable, beginning_of, check_initial
 from vipetsc.case.model import Model
 from vipetsc.case.points import check_points
@@ -266,6 +266,9 @@ def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[
     # Checked a second time: the absorbing end and the wall of a drive have their cells only now.
     driven = [drive.cell for _, drive in resolved["drive"].every]
     problems = list(check_inhomogeneity(resolved["lattice"], driven))
+    for path, drive in resolved["drive"].every:
+        if drive.end == "right" and not problems:
+            problems += check_right_wall(resolved["lattice"], f"{path}.end")
     if problems:
         return problems
 

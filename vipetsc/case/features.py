@@ -90,8 +90,8 @@ def _other_lattices(kind: type[CaseFile], lattice: LatticeTable) -> Iterator[Pro
 
     cell, wrong = check_cell(lattice)
     if cell and not wrong:
-        if not cell.is_linear:
-            yield from _refusal(kind, "nonlinear springs", "lattice.cell.springs")
+        for key in lattice.nonlinear_keys[:1]:
+            yield from _refusal(kind, "nonlinear springs", key)
         if cell.is_damped:
             yield from _refusal(kind, "damping", "lattice", "damped")
     if lattice.ends == "periodic":

@@ -1,7 +1,7 @@
 """Masses, springs and dashpots of all cells, from profiles, scatter and absorbing ends.
 
 A quantity is named as in a cell's table: ``masses[2]``, ``springs[1].stiffness``, ``springs[1].damping``,
-``grounding[3]``, counted from 1.
+``springs[1].quadratic``, ``springs[1].cubic``, ``grounding[3]``, counted from 1.
 """
 
 import re
@@ -13,15 +13,15 @@ import numpy as np
 from vipetsc.case.case_file import LARGEST, Problem
 from vipetsc.case.inhomogeneity_sections import AbsorbingTable, AnyProfile, Deviation, Profile
 from vipetsc.case.schema import LatticeTable
-from vipetsc.lattice import Chain, Coefficients, UnitCell, Variation
+from vipetsc.lattice import Chain, SpringTerms, UnitCell, Variation
 from vipetsc.lattice.ends import absorber
 
-QUANTITY = re.compile(r"(masses|grounding)\[([1-9]\d*)\]|springs\[([1-9]\d*)\]\.(stiffness|damping)")
+QUANTITY = re.compile(r"(masses|grounding)\[([1-9]\d*)\]|springs\[([1-9]\d*)\]\.(stiffness|damping|quadratic|cubic)")
 MOST_VARIED = 10**8  # cells that may differ: every rank holds them all
 
 
 def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
-    """The name in ``Coefficients`` and the column of a quantity; None if the cell has none of that name."""
+    """The name in ``Variation`` and the column of a quantity; None if the cell has none of that name."""
     match = QUANTITY.fullmatch(key)
     if match is None:
         return None
@@ -71,20 +71,26 @@ def _drawn(deviation: Deviation, seed: int, key: str, values: np.ndarray) -> tup
     return drawn, ""
 
 
-def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[Coefficients, list[Problem]]:
-    """Masses, springs and dashpots of all cells without Rayleigh damping, and what is wrong with what differs."""
-    arrays = Chain(cell, lattice.cells).coefficients(0, lattice.cells)
+def _arrays(chain: Chain, start: int, stop: int) -> dict[str, np.ndarray]:
+    """The arrays of the cells ``start`` to ``stop`` of ``chain``, by their names in ``Variation``."""
+    return chain.coefficients(start, stop)._asdict() | chain.spring_terms(start, stop)._asdict()
+
+
+def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[dict[str, np.ndarray], list[Problem]]:
+    """Arrays of all cells without Rayleigh damping, by their names in ``Variation``, and what is wrong with them."""
+    arrays = _arrays(Chain(cell, lattice.cells), 0, lattice.cells)
     problems: list[Problem] = []
 
     def put(key: str, path: str, change: Callable[[np.ndarray], tuple[np.ndarray, str]]) -> None:
         place = place_of(key, cell)
         if place is None:
             remedy = f"the cell has {cell.dofs} masses and {len(cell.springs)} springs; as in masses[1], grounding[1]"
-            problems.append(Problem(path, None, f"{remedy}, springs[1].stiffness or springs[1].damping"))
+            terms = ", ".join(f"springs[1].{term}" for term in ("stiffness", "damping", *SpringTerms._fields))
+            problems.append(Problem(path, None, f"{remedy}, {terms}"))
             return
 
         name, index = place
-        column = getattr(arrays, name)[:, index]
+        column = arrays[name][:, index]
         column[:], wrong = change(column.copy())
         wrong = wrong or _wrong_values(name, column)
         if wrong:
@@ -101,10 +107,12 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[Coefficients, list[Prob
 
 
 def _wrong_values(name: str, column: np.ndarray) -> str:
-    """Problems with the values (cells,) of a quantity called ``name`` in ``Coefficients``; "" if nothing."""
+    """Problems with the values (cells,) of a quantity called ``name`` in ``Variation``; "" if nothing."""
     size = np.abs(column)
     if not np.all((size < LARGEST) & ((size > 1 / LARGEST) | (column == 0))):
         return f"is not a number, or not between {1 / LARGEST:g} and {LARGEST:g}, in some cells"
+    if name in SpringTerms._fields:
+        return ""
     least = column.min()
     if least < 0 or (least == 0 and name in ("masses", "stiffness")):
         where = f"cell {int(column.argmin()) + 1}"
@@ -123,8 +131,8 @@ def cell_variation(lattice: LatticeTable) -> Variation | None:
     if damping:
         # After profiles and scatter: Rayleigh damping is in proportion to the masses and springs that there are.
         grounding, dashpots = damping.fitted(cell)
-        arrays.grounding[:] += damping.mass * arrays.masses + grounding
-        arrays.damping[:] += damping.stiffness * arrays.stiffness + dashpots
+        arrays["grounding"] += damping.mass * arrays["masses"] + grounding
+        arrays["damping"] += damping.stiffness * arrays["stiffness"] + dashpots
 
     absorbing = lattice.absorbing
     if absorbing and absorbing.cells and absorbing.strength:
@@ -132,15 +140,14 @@ def cell_variation(lattice: LatticeTable) -> Variation | None:
         assert graded.variation is not None and graded.variation.grounding is not None
         extra = graded.variation.grounding - graded.coefficients(-2, -1).grounding
         if absorbing.end != "left":
-            arrays.grounding[-absorbing.cells :] += extra
+            arrays["grounding"][-absorbing.cells :] += extra
         if absorbing.end != "right":
             # The strength grows towards the end, hence the mirrored order on the left.
-            arrays.grounding[: absorbing.cells] += extra[::-1]
+            arrays["grounding"][: absorbing.cells] += extra[::-1]
 
-    reference = Chain(lattice.unit_cell(), 2).coefficients(0, 1)
-    named = zip(Coefficients._fields, arrays, reference, strict=True)
+    reference = _arrays(Chain(lattice.unit_cell(), 2), 0, 1)
     # Every rank holds these arrays: those that equal the reference are left out.
-    differing = {name: array for name, array, uniform in named if np.any(array != uniform)}
+    differing = {name: array for name, array in arrays.items() if np.any(array != reference[name])}
     return Variation(**differing) if differing else None
 
 
@@ -155,6 +162,21 @@ def check_inhomogeneity(lattice: LatticeTable, driven: Sequence[int]) -> Iterato
         yield from vary(lattice, lattice.undamped_cell())[1]
     if lattice.absorbing is not None:
         yield from _check_absorbing(lattice, lattice.absorbing, driven)
+
+
+def check_right_wall(lattice: LatticeTable, key: str) -> list[Problem]:
+    """Problems with a drive that moves the right wall of a valid lattice, by the ``key`` that names this end.
+
+    The springs to the left wall are as the reference cell's, and are checked with it.
+    """
+    cell = lattice.unit_cell()
+    last = lattice.cells - 1
+    chain = Chain(cell, lattice.cells, lattice.ends, variation=cell_variation(lattice))
+    springs = [chain.spring(last, number) for number, spring in enumerate(cell.springs) if spring.next_cell]
+    if all(spring.is_linear and not spring.damping for spring in springs):
+        return []
+    remedy = f"a wall can only move a linear spring: omit damping, quadratic and cubic in cell {lattice.cells}"
+    return [Problem(key, "right", remedy)]
 
 
 def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: Sequence[int]) -> Iterator[Problem]:

@@ -82,8 +82,7 @@ class NfrcCase(Case):
         if nfrc.infinite is None:
             update["infinite"] = not needs_modes(chain)
         if nfrc.symmetric is None:
-            is_odd = all(spring.is_odd for spring in cell.springs)
-            update["symmetric"] = is_odd and not gaps_of_sites(contacts, list(chain.clearances))
+            update["symmetric"] = chain.is_odd and not gaps_of_sites(contacts, list(chain.clearances))
         if nfrc.over == "amplitude":
             update["fixed"] = nfrc.fixed or [sections["drive"].frequency]
         nfrc = nfrc.model_copy(update=update)
@@ -130,8 +129,8 @@ class NfrcCase(Case):
                 return sections, [replace(p, remedy=f"{p.remedy} (with {options.over} = {value:.6g})") for p in wrong]
             read.append(sections)
 
-        laws = [check_cell(sections["lattice"])[0] for sections in read]
-        if len({tuple(spring.is_linear for spring in cell.springs) for cell in laws if cell is not None}) > 1:
+        chains = [build_chain(sections["lattice"], sections["contacts"]) for sections in read]
+        if len({tuple((place.cell, place.number) for place in nonlinear_places(chain)) for chain in chains}) > 1:
             remedy = f"a spring is linear at {options.over} = {low:g} and has no harmonics; begin beside it"
             return read[0], [Problem("nfrc.range", options.range, remedy)]
 
@@ -183,7 +182,8 @@ class NfrcCase(Case):
             if small := [r for r in nfrc.restitutions if r < least]:
                 yield Problem("nfrc.restitutions", small, f"below {least:g} this damping increases without bound")
             cell = check_cell(sections["lattice"])[0] if valid("lattice") else None
-            if sections["contacts"].sites in (0, []) and cell is not None and cell.is_linear:
+            is_linear = cell is not None and not sections["lattice"].nonlinear_keys
+            if sections["contacts"].sites in (0, []) and is_linear:
                 remedy = "give a cell with a contact, or a spring that is not linear"
                 yield Problem("contacts.sites", sections["contacts"].sites, remedy)
 
@@ -260,7 +260,7 @@ class NfrcCase(Case):
 
 def needs_modes(chain: Chain) -> bool:
     """Whether the response of ``chain`` follows from its modes: Bloch waves are those of equal cells without loss."""
-    return chain.is_damped or not chain.is_uniform() or bool(chain.pairs) or not chain.cell.is_linear
+    return chain.is_damped or not chain.is_uniform() or bool(chain.pairs) or not chain.is_linear
 
 
 def _check_drives(nfrc: NfrcTable, drives: DriveTable) -> Iterator[Problem]:
@@ -279,7 +279,7 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     if nfrc.symmetric and gaps:
         remedy = "contacts that differ on their two sides make even harmonics; omit it"
         yield Problem("nfrc.symmetric", True, remedy)
-    if nfrc.symmetric and not all(spring.is_odd for spring in chain.cell.springs):
+    if nfrc.symmetric and not chain.is_odd:
         yield Problem("nfrc.symmetric", True, "a quadratic spring makes even harmonics; omit it")
     stops = gaps or [(clearance, clearance) for clearance in chain.clearances]
     smallest = min((min(gap) for gap in stops), default=np.inf)
@@ -294,9 +294,9 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     reason = "not yet: in an infinite lattice contacts join the pair of masses that the cell names"
     if chain.is_damped:
         reason = "in a lattice with dashpots a wave from far away has decayed before it arrives"
-    elif not chain.is_uniform():
+    elif not chain.linearised().is_uniform():
         reason = "a wave of equal cells does not pass cells that differ as it came"
-    elif not chain.cell.is_linear:
+    elif not chain.is_linear:
         reason = "a wave in springs that are not linear changes on its way"
     if nfrc.source == "wave":
         yield Problem("nfrc.source", "wave", f'{reason}; source = "force" drives a mass')
@@ -306,7 +306,7 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     if dofs > MOST_DOFS:
         remedy = f"{dofs} masses: all modes of a lattice with dashpots, unlike cells or other contact pairs are needed"
         yield Problem("lattice.cells", chain.cells, f"{remedy}, of at most {MOST_DOFS} masses")
-    elif not chain.cell.is_linear:
+    elif not chain.is_linear:
         places = len(chain.sites) + len(nonlinear_places(chain))
         unknowns = places * 2 * (nfrc.harmonics + 1)
         if unknowns > MOST_UNKNOWNS:
@@ -323,7 +323,7 @@ def _check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:
         yield Problem("nfrc.open_ends", True, "the lattice of an incident wave has no ends; omit it")
     elif not absorbing:
         yield Problem("nfrc.open_ends", True, "says that absorbing ends reflect nothing; give [lattice.absorbing]")
-    elif cell is not None and not cell.is_linear:
+    elif cell is not None and sections["lattice"].nonlinear_keys:
         remedy = "beyond its ends a lattice goes on with linear springs; omit it, or quadratic and cubic"
         yield Problem("nfrc.open_ends", True, remedy)
     elif moved and absorbing.end in (moved, "both"):

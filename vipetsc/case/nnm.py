@@ -173,7 +173,7 @@ class NnmCase(CaseFile):
         """Whether orbits are shot on all ranks together, by matrix-free Newton-Krylov."""
         cell = self.lattice.unit_cell()
         of_chain = self.nnm.system == "chain"
-        return of_chain and self.nnm.is_krylov(cell.dofs * self.lattice.cells, cell.is_linear)
+        return of_chain and self.nnm.is_krylov(cell.dofs * self.lattice.cells, not self.lattice.nonlinear_keys)
 
     @property
     def condensed(self) -> bool:

@@ -62,7 +62,7 @@ def check_size(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> list[Pro
     most = MOST_MASSES
     what = "with dense matrices"
     dofs = lattice.cells * cell.dofs
-    if nnm.is_krylov(dofs, cell.is_linear):
+    if nnm.is_krylov(dofs, not lattice.nonlinear_keys):
         most = MOST_OF_LATTICE
         what = "on all ranks"
 
@@ -94,9 +94,9 @@ def check_reduced(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell
         if getattr(lattice, key):
             remedy = "the reduced model is that of one cell, which stands for all others; omit cells that differ"
             yield Problem(f"lattice.{key}", None, remedy)
-    if not cell.is_linear:
+    for key in lattice.nonlinear_keys:
         remedy = "the reduced model holds springs at their middle, with half of their stiffness; a quadratic or cubic"
-        yield Problem("lattice.cell.springs", None, f"{remedy} part has no such half; omit quadratic and cubic")
+        yield Problem(key, None, f"{remedy} part has no such half; omit quadratic and cubic")
 
 
 def check_gaps(contacts: ContactsTable, gaps: Gaps, valid: Valid) -> Iterator[Problem]:
@@ -121,7 +121,7 @@ def check_lattice(
     if not valid("contacts"):
         return
     yield from check_pairs(lattice, contacts, cell, sites)
-    if not sites and cell.is_linear:
+    if not (sites or lattice.nonlinear_keys):
         yield Problem("contacts.sites", [], f"give cells from 1 to {lattice.cells}")
 
     # Nothing but the stops acts on such a lattice from outside: their mean force moves it away.
@@ -168,10 +168,10 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
         remedy = f"{masses} masses: all modes of a lattice with unlike cells or other contact pairs are needed"
         yield Problem("lattice.cells", chain.cells, f"{remedy}, of at most {MOST_DOFS} masses")
     unknowns = count * (nnm.harmonics + 1)  # fewer for motions of odd harmonics alone
-    if not cell.is_linear and unknowns > MOST_UNKNOWNS:
+    if not chain.is_linear and unknowns > MOST_UNKNOWNS:
         remedy = f"{count} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
         yield Problem("nnm.harmonics", nnm.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
-    if nnm.multipliers and not cell.is_linear:
+    if nnm.multipliers and not chain.is_linear:
         remedy = "move variations by exact linear steps, which springs that are not linear do not have; omit it"
         yield Problem("nnm.multipliers", nnm.multipliers, remedy)
     elif nnm.multipliers and masses > MOST_OF_LATTICE:
@@ -190,8 +190,9 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
 def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iterator[Problem]:
     """Keys of [nnm] that do not fit the shooting method of a lattice of such cells."""
     dofs = lattice.cells * cell.dofs
-    krylov = nnm.is_krylov(dofs, cell.is_linear)
-    if not cell.is_linear and (krylov or nnm.multipliers or nnm.start_frequency):
+    is_linear = not lattice.nonlinear_keys
+    krylov = nnm.is_krylov(dofs, is_linear)
+    if not is_linear and (krylov or nnm.multipliers or nnm.start_frequency):
         key = next(key for key in ("multipliers", "start_frequency", "shooting") if getattr(nnm, key))
         remedy = "moves variations by exact linear steps, which springs that are not linear do not have; omit it, or"
         yield Problem(f"nnm.{key}", getattr(nnm, key), f'{remedy} system = "condensed"')

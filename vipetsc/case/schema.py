@@ -169,6 +169,20 @@ class LatticeTable(Section):
     scatter: ScatterTable | None = None
     absorbing: AbsorbingTable | None = None
 
+    @property
+    def nonlinear_keys(self) -> list[str]:
+        """Keys of the case by which springs have, or may have in some cells, a quadratic or a cubic part.
+
+        Raises ValueError for an invalid cell.
+        """
+        keys = [] if self.undamped_cell().is_linear else ["lattice.cell.springs"]
+        scattered = self.scatter.quantities if self.scatter else {}
+        for section, quantities in (("lattice.profiles", self.profiles or {}), ("disorder.cells", scattered)):
+            for name in quantities:
+                if name.endswith((".quadratic", ".cubic")):
+                    keys.append(f'{section}."{name}"')
+        return keys
+
     def unit_cell(self) -> UnitCell:
         """The unit cell: ``cell``, or the preset's in its reading, damped; raises ValueError for an invalid one."""
         cell = self.undamped_cell()

@@ -188,6 +188,7 @@ FEW_SPRINGS: Table = {
     "contacts": {"sites": [2, 3]},
     "nnm": {"points": 1, "harmonics": 21, "truncation": 1e-3},
 }
+IN_CELL_2 = {"lattice": {"cells": 4, "profiles": {"springs[2].cubic": {"cells": [2], "value": 1e9}}}}
 SECOND_DRIVE = {"amplitude": 0.5, "frequency": 900.0, "cycles": 3, "cell": 6}
 CUBIC_CELL = {"springs": [HOST_SPRING, RESONATOR_SPRING | {"cubic": 1e9}]}
 MEASURED = {"time": [0.0, 1e-3, 2e-3, 3e-3, 4e-3], "value": [0.0, 1.0, -1.0, 0.5, 0.0]}
@@ -203,6 +204,11 @@ FEATURES: tuple[Feature, ...] = (
         {"nnm": {"own": {"smooth": [{"start": 0, "end": 1, "cubic": 0.5}]}}},
         # Each of these springs has unknown harmonics.
         scaled={"nfrc": {"nfrc": {"points": 2, "harmonics": 3}}, "condensed": FEW_SPRINGS},
+    ),
+    Feature(
+        "smooth springs in few cells",
+        _lattice(profiles={"springs[2].cubic": {"cells": [6, 13], "value": 1e9}}),
+        scaled={"nfrc": {"nfrc": {"points": 2, "harmonics": 3}}, "condensed": FEW_SPRINGS | IN_CELL_2},
     ),
     Feature("profiles of cells", _lattice(profiles={"masses[1]": {"first": 4e-3, "last": 4.1e-3}})),
     Feature("disorder of cells", {"disorder": {"cells": {"masses[1]": {"relative": 0.01}}}}),

@@ -9,19 +9,19 @@ from vipetsc.case import Model
 from vipetsc.dynamics.drives import Drives, create_drives
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.site_dofs import create_site_dofs, site_records
-from vipetsc.dynamics.spring_law import SPRING_LAW, spring_laws
-from vipetsc.lattice import Chain, Spring
+from vipetsc.dynamics.spring_law import SPRING_LAW
+from vipetsc.lattice import Chain
 
 MASS = np.dtype([("inverse_mass", np.float64), ("first", np.int64), ("last", np.int64)])
 """A mass of the cell: 1/kg; its rows of the couplings, half open."""
 COUPLING = np.dtype([("offset", np.int64), ("other", np.int64), ("stiffness", np.float64), ("spring", np.int64)])
 """A spring as one of its masses sees it: cells to the other mass, that mass, N/m, the spring's number."""
 NONLINEAR = np.dtype(
-    [("mass", np.int64), ("offset", np.int64), ("other", np.int64), ("sign", np.float64), ("law", SPRING_LAW)]
+    [(name, np.int64) for name in ("mass", "offset", "other", "law", "stride")] + [("sign", np.float64)]
 )
-"""A spring that is not linear as one of its masses sees it: that mass, cells to the other one, that one; 1 at the end
-``start`` of the spring, which comes first, -1 at the other: the sign by which the other mass is ahead where the spring
-is longer; its law.
+"""A spring that is not linear as one of its masses sees it: that mass, cells to the other one, that one; the number of
+the law in the rank's first cell, and the step from a cell's law to the next one's; 1 at the end ``start`` of the
+spring, which comes first, -1 at the other: the sign by which the other mass is ahead where the spring is longer.
 """
 SPRING = np.dtype([("start", np.int64), ("end", np.int64), ("next_cell", np.int64), ("stiffness", np.float64)])
 """A spring of the cell: its masses, whether ``end`` is in the next cell, N/m."""
@@ -56,6 +56,7 @@ class LatticeRecord(NamedTuple):
     """A rank's part of a lattice: sizes, tables of the dtypes above, its sites and its drives.
 
     ``site_dofs`` (site,) of dtype ``SITE_DOFS`` and ``contacts`` (site,) of dtype ``SITE`` are those of the same sites.
+    ``spring_laws`` (law,) of dtype ``SPRING_LAW`` are those that ``nonlinear`` refers to.
     Where cells differ or there are dashpots, each cell has its own ``inverse_masses`` (dof, cell) in 1/kg and
     ``stiffness`` (spring, 1 + cell) in N/m, which begins with the cell before, and where dashpots are integrated
     ``grounding`` (dof, cell) and ``damping`` (spring, 1 + cell) in N s/m; else these are empty.
@@ -69,6 +70,7 @@ class LatticeRecord(NamedTuple):
     contacts: np.ndarray
     drives: Drives
     nonlinear: np.ndarray
+    spring_laws: np.ndarray
     inverse_masses: np.ndarray
     grounding: np.ndarray
     stiffness: np.ndarray
@@ -94,6 +96,7 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
     rows = np.searchsorted([coupling.mass for coupling in couplings], np.arange(layout.dofs + 1)).tolist()
     masses = [(1 / mass, *bounds) for mass, bounds in zip(cell.masses, pairwise(rows), strict=True)]
     inverse_masses, grounding, stiffness, damping = _coefficients(chain, layout)
+    nonlinear, laws = _nonlinear_couplings(chain, layout)
     return LatticeRecord(
         shape=shape,
         masses=np.array(masses, MASS),
@@ -102,7 +105,8 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
         site_dofs=create_site_dofs(model, layout, (shape.left_ghost, shape.right_ghost)),
         contacts=site_records(model, layout.contacts),
         drives=drives,
-        nonlinear=_nonlinear_couplings(cell.springs),
+        nonlinear=nonlinear,
+        spring_laws=laws,
         inverse_masses=inverse_masses,
         grounding=grounding,
         stiffness=stiffness,
@@ -131,21 +135,33 @@ def _create_shape(chain: Chain, layout: Layout) -> Shape:
     )
 
 
-def _nonlinear_couplings(springs: tuple[Spring, ...]) -> np.ndarray:
-    """Records of dtype ``NONLINEAR`` of both ends of every spring that is not linear."""
-    springs = tuple(spring for spring in springs if not spring.is_linear)
-    couplings = np.zeros(2 * len(springs), NONLINEAR)
-    couplings["mass"] = np.ravel([(s.start, s.end) for s in springs])
-    couplings["other"] = np.ravel([(s.end, s.start) for s in springs])
-    couplings["offset"] = np.ravel([(s.next_cell, -s.next_cell) for s in springs])
-    couplings["sign"] = [1.0, -1.0] * len(springs)
-    couplings["law"] = np.repeat(spring_laws(springs), 2)
-    return couplings
+def _nonlinear_couplings(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Both ends of each of a cell's springs that is not linear in some cell, of dtype ``NONLINEAR``, and the laws."""
+    # One law of each spring where cells have equal ones; else one for each cell, from that before the first one on.
+    table = np.stack(chain.spring_terms(layout.start - 1, layout.stop), axis=-1)
+    if np.array_equal(table, np.broadcast_to(table[:1], table.shape)):
+        table = table[:1]
+    numbers = np.flatnonzero(table.any(axis=(0, 2)))
+    per_spring = len(table)
+    stride = int(per_spring > 1)
+
+    couplings = []
+    for row, number in enumerate(numbers.tolist()):
+        spring = chain.cell.springs[number]
+        offset = int(spring.next_cell)
+        own_law = row * per_spring + stride
+        couplings.append((spring.start, offset, spring.end, own_law, stride, 1.0))
+        # The law of a spring from the cell before is stored with that cell.
+        couplings.append((spring.end, -offset, spring.start, own_law - stride * offset, stride, -1.0))
+    laws = np.zeros(len(numbers) * per_spring, SPRING_LAW)
+    for place, name in enumerate(SPRING_LAW.names or ()):
+        laws[name] = table[:, numbers, place].T.ravel()
+    return np.array(couplings, NONLINEAR), laws
 
 
 def _coefficients(chain: Chain, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The arrays ``COEFFICIENTS`` of a rank's cells."""
-    if chain.is_uniform() and not layout.damped:
+    if chain.linearised().is_uniform() and not layout.damped:
         none = np.zeros(0)
         return none, none, none, none
 

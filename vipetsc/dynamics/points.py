@@ -98,14 +98,14 @@ class PointMotion:
                 continue
             # A spring between cells belongs to the left one.
             owner = 1 + min(coupling.offset, 0)
-            spring = chain.cell.springs[coupling.spring]
+            spring = chain.spring(cell - 1 + owner, coupling.spring)
             is_start = coupling.offset > 0 or (coupling.offset == 0 and spring.start == mass)
             springs.append(
                 _SpringAtPoint(
                     column=int(np.searchsorted(self.cells, other)) if is_inside else -1,
                     mass=coupling.other,
-                    stiffness=float(coefficients.stiffness[owner, coupling.spring]),
-                    damping=float(coefficients.damping[owner, coupling.spring]),
+                    stiffness=spring.stiffness,
+                    damping=spring.damping,
                     spring=spring,
                     direction=1 if is_start else -1,
                 )

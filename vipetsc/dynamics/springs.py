@@ -173,7 +173,8 @@ def nonlinear_force_on(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: i
     for s in range(lattice.nonlinear.size):
         coupling = lattice.nonlinear[s]
         if coupling.mass == mass:
-            total += coupling.sign * nonlinear_force(coupling.law, _elongation(y, lattice, s, cell))
+            law = lattice.spring_laws[coupling.law + coupling.stride * cell]
+            total += coupling.sign * nonlinear_force(law, _elongation(y, lattice, s, cell))
     return total
 
 
@@ -186,7 +187,8 @@ def add_nonlinear_energies(y: np.ndarray, lattice: LatticeRecord, first: int, en
             # A spring counts where it starts; one that starts in the wall on the left, where it ends.
             at_wall = first + i + coupling.offset < 0 and lattice.shape.left_ghost < 0
             if coupling.sign > 0.0 or at_wall:
-                energies[i] += nonlinear_energy(coupling.law, _elongation(y, lattice, s, first + i))
+                law = lattice.spring_laws[coupling.law + coupling.stride * (first + i)]
+                energies[i] += nonlinear_energy(law, _elongation(y, lattice, s, first + i))
 
 
 @kernel

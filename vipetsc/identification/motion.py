@@ -13,7 +13,7 @@ from vipetsc.dynamics.spring_law import spring_laws
 from vipetsc.identification.motion_begin import MotionBegin, begin_contacts
 from vipetsc.identification.motion_rates import CurvedSprings, Lattice, MotionState, Slopes
 from vipetsc.identification.motion_steps import DONE, integrate
-from vipetsc.lattice import Chain, places_of
+from vipetsc.lattice import Chain, nonlinear_places
 from vipetsc.modes.shooting.dop853 import STAGES
 
 # Errors are relative to a motion, and to derivatives, of at least this fraction of the linear wave: derivatives begin
@@ -199,14 +199,12 @@ def respond(
 
 def _curved_springs(chain: Chain, slopes: Slopes) -> CurvedSprings:
     """The springs of ``chain`` that have a quadratic or cubic part, or in which one is sought that is zero now."""
-    springs = chain.cell.springs
     has_slope = slopes.curves.any(axis=(0, 2))
-    numbers = [number for number, spring in enumerate(springs) if has_slope[number] or not spring.is_linear]
-    places = places_of(chain, numbers)
+    places = nonlinear_places(chain, also=np.flatnonzero(has_slope).tolist())
     return CurvedSprings(
         ends=np.array([(place.start, place.end) for place in places], np.int64).reshape(-1, 2),
         numbers=np.array([place.number for place in places], np.int64),
-        laws=spring_laws(springs),
+        laws=spring_laws([place.law for place in places]),
     )
 
 

@@ -38,8 +38,8 @@ class Slopes(NamedTuple):
 class CurvedSprings(NamedTuple):
     """Springs with a quadratic or cubic part, beyond their linear part, which is in K.
 
-    ``ends`` (place, 2): masses, -1 for a wall; ``numbers`` (place,) of the springs in the cell, which have the ``laws``
-    (spring of the cell,) of dtype ``SPRING_LAW``.
+    ``ends`` (place, 2): masses, -1 for a wall; ``numbers`` (place,) of the springs in the cell; ``laws`` (place,) of
+    dtype ``SPRING_LAW``.
     """
 
     ends: np.ndarray
@@ -164,7 +164,7 @@ def _add_curved_springs(lattice: Lattice, y: np.ndarray, out: np.ndarray) -> Non
     ends = lattice.curved.ends
     for k in range(lattice.curved.numbers.size):
         number = lattice.curved.numbers[k]
-        law = lattice.curved.laws[number]
+        law = lattice.curved.laws[k]
         z = difference(y, ends, k, 0, 0)
         slope = nonlinear_slope(law, z)
         for j in range(y.shape[1]):

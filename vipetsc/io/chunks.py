@@ -69,6 +69,8 @@ GIVEN = {
     "lattice/grounding": ("cell dof", "N s/m", "dashpot to ground"),
     "lattice/stiffness": ("cell spring", "N/m", "stiffness of the spring"),
     "lattice/damping": ("cell spring", "N s/m", "dashpot parallel to the spring"),
+    "lattice/quadratic": ("cell spring", "N/m^2", "coefficient of the spring's elongation squared in its force"),
+    "lattice/cubic": ("cell spring", "N/m^3", "coefficient of the spring's elongation cubed in its force"),
     "sites/cell": ("site", "1", "cell of the site"),
     "sites/clearance": ("site", "m", "clearance of the site"),
     "sites/clearance_minus": ("site", "m", "clearance for negative relative displacement, if it differs"),

@@ -9,9 +9,9 @@ import scipy
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
 
-from vipetsc.lattice.cell import UnitCell
+from vipetsc.lattice.cell import Spring, UnitCell
 from vipetsc.lattice.drive import Waveform
-from vipetsc.lattice.variation import Coefficients, Variation
+from vipetsc.lattice.variation import Coefficients, SpringTerms, Variation
 
 Ends = Literal["fixed", "free", "periodic"]
 
@@ -46,7 +46,7 @@ class Chain:
 
     def __post_init__(self) -> None:
         for name, array in self._varied.items():
-            shape = (self.cells, len(getattr(self._reference, name)))
+            shape = (self.cells, len(self._reference[name]))
             if array.shape != shape:
                 raise ValueError(f"variation of {name}: shape {array.shape}, not {shape}")
 
@@ -60,7 +60,7 @@ class Chain:
         """Whether each cell (cells,) has a mass, a spring or a dashpot other than the reference cell's."""
         differs = np.zeros(self.cells, bool)
         for name, array in self._varied.items():
-            differs |= np.any(array != getattr(self._reference, name), axis=1)
+            differs |= np.any(array != self._reference[name], axis=1)
         return differs
 
     @property
@@ -68,6 +68,32 @@ class Chain:
         """Whether there is a dashpot anywhere."""
         dashpots = [array for name, array in self._varied.items() if name in ("grounding", "damping")]
         return self.cell.is_damped or any(array.any() for array in dashpots)
+
+    @cached_property
+    def is_linear(self) -> bool:
+        """Whether no spring has a quadratic or a cubic part."""
+        arrays = [self._varied.get(name, self._reference[name]) for name in SpringTerms._fields]
+        return not any(array.any() for array in arrays) and all(spring.is_linear for spring in self._of_left_wall)
+
+    @property
+    def is_odd(self) -> bool:
+        """Whether the force of every spring at the elongation -z is minus that at z."""
+        quadratic = self._varied.get("quadratic", self._reference["quadratic"])
+        return not quadratic.any() and all(spring.is_odd for spring in self._of_left_wall)
+
+    @property
+    def _of_left_wall(self) -> list[Spring]:
+        """The springs to a wall on the left, which are as the reference cell's whatever the cells have."""
+        return [spring for spring in self.cell.springs if spring.next_cell and self.ends == "fixed"]
+
+    def linearised(self) -> "Chain":
+        """The lattice with the linear parts of its springs alone; itself if there is nothing else."""
+        remaining = {name: array for name, array in self._varied.items() if name not in SpringTerms._fields}
+        if self.cell.is_linear and len(remaining) == len(self._varied):
+            return self
+        springs = tuple(replace(spring, quadratic=0.0, cubic=0.0) for spring in self.cell.springs)
+        cell = replace(self.cell, springs=springs)
+        return replace(self, cell=cell, variation=Variation(**remaining) if remaining else None)
 
     def without_dashpots(self) -> "Chain":
         """The lattice with all dashpots left out; itself if it has none."""
@@ -116,16 +142,16 @@ class Chain:
         """Whether the lattice has each of ``cells``; a ring has all, as those behind its last are its first again."""
         return (cells >= 0) & (cells < self.cells) | (self.ends == "periodic")
 
-    @property
-    def _reference(self) -> Coefficients:
-        """Masses (dof,), springs (spring,) and dashpots of the reference cell."""
+    @cached_property
+    def _reference(self) -> dict[str, np.ndarray]:
+        """Arrays (dof,) or (spring,) of the reference cell, by the names in ``Coefficients`` and ``SpringTerms``."""
         cell = self.cell
-        return Coefficients(
-            masses=np.array(cell.masses),
-            grounding=np.array(cell.grounding or np.zeros(cell.dofs)),
-            stiffness=np.array([s.stiffness for s in cell.springs], float),
-            damping=np.array([s.damping for s in cell.springs], float),
-        )
+        of_springs = ("stiffness", "damping", "quadratic", "cubic")
+        return {
+            "masses": np.array(cell.masses),
+            "grounding": np.array(cell.grounding or np.zeros(cell.dofs)),
+            **{name: np.array([getattr(s, name) for s in cell.springs], float) for name in of_springs},
+        }
 
     def coefficients(self, start: int, stop: int) -> Coefficients:
         """Masses, springs and dashpots of the cells ``start`` to ``stop``.
@@ -133,17 +159,39 @@ class Chain:
         Cells beyond the ends are those of the ring, or as the reference cell: the spring to a wall on the left
         belongs to cell -1.
         """
+        return Coefficients(*self._arrays(Coefficients._fields, start, stop))
+
+    def spring_terms(self, start: int, stop: int) -> SpringTerms:
+        """What the springs of the cells ``start`` to ``stop``, as in ``coefficients``, have beyond linear parts."""
+        return SpringTerms(*self._arrays(SpringTerms._fields, start, stop))
+
+    def _arrays(self, names: tuple[str, ...], start: int, stop: int) -> list[np.ndarray]:
+        """The arrays of these ``names`` of the cells ``start`` to ``stop``."""
         cells = np.arange(start, stop)
         exists = self._exist(cells)
-        arrays = [np.tile(reference, (len(cells), 1)) for reference in self._reference]
-        coefficients = Coefficients(*arrays)
-        for name, varied in self._varied.items():
-            getattr(coefficients, name)[exists] = varied[cells[exists] % self.cells]
-        return coefficients
+        arrays = []
+        for name in names:
+            array = np.tile(self._reference[name], (len(cells), 1))
+            if name in self._varied:
+                array[exists] = self._varied[name][cells[exists] % self.cells]
+            arrays.append(array)
+        return arrays
+
+    def spring(self, cell: int, number: int) -> Spring:
+        """The spring of that ``number`` (from 0) that begins in a ``cell``, -1 in a wall on the left."""
+        linear = self.coefficients(cell, cell + 1)
+        terms = self.spring_terms(cell, cell + 1)
+        return replace(
+            self.cell.springs[number],
+            stiffness=float(linear.stiffness[0, number]),
+            damping=float(linear.damping[0, number]),
+            quadratic=float(terms.quadratic[0, number]),
+            cubic=float(terms.cubic[0, number]),
+        )
 
     def mean_cell(self, start: int, stop: int) -> UnitCell:
         """The reference cell with the mean masses, springs and dashpots of the cells ``start`` to ``stop``."""
-        if self.is_uniform(start, stop):
+        if self.linearised().is_uniform(start, stop):
             return self.cell
         means = [values.mean(axis=0).tolist() for values in self.coefficients(start, stop)]
         mean = Coefficients(*means)

@@ -21,17 +21,29 @@ class Coefficients(NamedTuple):
     damping: np.ndarray
 
 
+class SpringTerms(NamedTuple):
+    """What the springs of consecutive cells have beyond their linear parts, as ``Coefficients`` has these.
+
+    ``quadratic`` (cell, spring) in N/m^2, ``cubic`` (cell, spring) in N/m^3.
+    """
+
+    quadratic: np.ndarray
+    cubic: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class Variation:
-    """The arrays of ``Coefficients`` over all cells, None where every cell is as the reference cell; read-only.
+    """The arrays of ``Coefficients`` and ``SpringTerms`` over all cells, None where all are as the reference cell.
 
-    Two are equal if their arrays are, bit for bit.
+    They are read-only. Two variations are equal if their arrays are, bit for bit.
     """
 
     masses: np.ndarray | None = None
     grounding: np.ndarray | None = None
     stiffness: np.ndarray | None = None
     damping: np.ndarray | None = None
+    quadratic: np.ndarray | None = None
+    cubic: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name, array in self.items():

@@ -18,6 +18,7 @@ def kept_modes(chain: Chain) -> Modes:
     Raises ValueError as that does. Those of lattices whose cells differ are not kept: of a sweep over samples each has
     its own.
     """
+    chain = chain.linearised()
     dofs = chain.cells * chain.cell.dofs
     if chain.ends == "periodic" or not chain.is_uniform() or not LEAST_DOFS <= dofs <= modes.MOST_DOFS:
         return linear_modes(chain)

@@ -180,7 +180,7 @@ def is_proportional(case: Case) -> bool:
     """Whether the motion is proportional to the amplitude of a single drive until the first contact."""
     if case.initial or case.drive.more or other_pairs(case):
         return False
-    return case.lattice.unit_cell().is_linear
+    return case.model().chain.is_linear
 
 
 def signed_factor(case: Case) -> float:

@@ -74,7 +74,7 @@ def _no_step(model: Model) -> str:
 
 def refusal(model: Model) -> str | None:
     """Why linear steps do not suit ``model``: springs that are not linear, too few cells, too many sites close by."""
-    if not model.chain.cell.is_linear:
+    if not model.chain.is_linear:
         return "its steps require linear springs, but some springs have a quadratic or cubic part"
     series = step_series(model)
     if series is None:

@@ -20,6 +20,7 @@ from vipetsc.dynamics.lattice_record import COEFFICIENTS, COUPLING, MASS, NONLIN
 from vipetsc.dynamics.native import pointer
 from vipetsc.dynamics.petsc_library import petsc_library
 from vipetsc.dynamics.site_dofs import SITE_DOFS, relative_motion
+from vipetsc.dynamics.spring_law import SPRING_LAW
 from vipetsc.dynamics.springs import (
     damping_powers,
     inverse_mass,
@@ -124,7 +125,10 @@ def right_hand_side(t: float, y: np.ndarray, f: np.ndarray, lattice: LatticeReco
         damping_powers(y, lattice, f[shape.damping : shape.damping + n])
 
 
-_TABLES = ("masses", "couplings", "springs", "site_dofs", "contacts", "rows", "pieces", "nonlinear", *COEFFICIENTS)
+_TABLES = (
+    *("masses", "couplings", "springs", "site_dofs", "contacts", "rows", "pieces", "nonlinear", "spring_laws"),
+    *COEFFICIENTS,
+)
 
 
 def _c_struct(record: type) -> np.dtype:
@@ -169,6 +173,7 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
         carray(pointer(at.contacts), (size.contacts,), SITE),
         Drives(carray(pointer(at.rows), (size.rows,), DRIVE), carray(pointer(at.pieces), (size.pieces,), PIECE)),
         carray(pointer(at.nonlinear), (size.nonlinear,), NONLINEAR),
+        carray(pointer(at.spring_laws), (size.spring_laws,), SPRING_LAW),
         carray(pointer(at.inverse_masses), (size.inverse_masses,), np.float64),
         carray(pointer(at.grounding), (size.grounding,), np.float64),
         carray(pointer(at.stiffness), (size.stiffness,), np.float64),

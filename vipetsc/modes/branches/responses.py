@@ -157,7 +157,7 @@ def _axes(case: NfrcCase) -> Variables:
         "way": variable("way", np.array(WAYS), "1", "destination of the energy"),
         "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
     }
-    if not chain.cell.is_linear:
+    if not chain.is_linear:
         labels = [f"{place.cell + 1}.{place.number + 1}" for place in nonlinear_places(chain)]
         text = "cell in which a nonlinear spring begins (0: left wall), and its number there, both from 1"
         axes["spring"] = variable("spring", np.array(labels), "1", text)

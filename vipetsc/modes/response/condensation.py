@@ -57,7 +57,7 @@ def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
 def forces_of(case: NfrcCase, restitution: float) -> SiteForces:
     """The contacts of a ``case``, with a ``restitution``, and its springs that are not linear."""
     chain = case.model().chain
-    springs = [] if chain.cell.is_linear else [place.law for place in nonlinear_places(chain)]
+    springs = [place.law for place in nonlinear_places(chain)]
     return SiteForces(stops_of(case, restitution), springs)
 
 

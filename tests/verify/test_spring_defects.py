@@ -1,0 +1,249 @@
+"""Nonlinear springs in single cells: their motion against SciPy's, their energy, and lattices of equal cells."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from tests.conftest import run_of
+from tests.rigs import after_a_period
+from tests.steady_states import motion_at
+from vipetsc.case import Case, CaseError, CaseFile, LawCase, NnmCase
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.identification.motion import respond, slopes_between
+from vipetsc.identification.motion_begin import MotionBegin
+from vipetsc.lattice import linear_modes, nonlinear_places
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import first_state
+from vipetsc.modes.system import System
+
+pytestmark = pytest.mark.parallel(1)
+
+CELLS = 12
+MASSES = (4e-3, 2e-3)
+STIFFNESS = (1e4, 5e3)
+# Quadratic and cubic coefficients by the spring's cell and number: one in a cell, one between cells, one to the wall.
+TERMS = {(6, 2): (3e6, 4e9), (9, 1): (-2e6, 1e10), (CELLS, 1): (2e6, 5e9)}
+SPRINGS = [
+    {"start": 1, "end": 1, "stiffness": STIFFNESS[0], "next_cell": True},
+    {"start": 1, "end": 2, "stiffness": STIFFNESS[1]},
+]
+TABLE: dict[str, Any] = {
+    "name": "defects",
+    "lattice": {
+        "cells": CELLS,
+        "cell": {"masses": list(MASSES), "springs": SPRINGS},
+        "profiles": {
+            "springs[2].quadratic": {"cells": [6], "value": 3e6},
+            "springs[2].cubic": {"cells": [6], "value": 4e9},
+            "springs[1].quadratic": [0.0] * 8 + [-2e6, 0.0, 0.0, 2e6],
+            "springs[1].cubic": [0.0] * 8 + [1e10, 0.0, 0.0, 5e9],
+        },
+    },
+    "contacts": {"sites": []},
+    "drive": {"amplitude": 0.0},
+    "initial": {"kind": "velocity", "cell": 7, "velocity": 3.0},
+    "time": {"end": 0.02, "sample_interval": 2e-4, "engine": "ts", "rtol": 1e-12, "atol": 1e-14},
+    "output": {"figures": False, "points": [{"name": "near", "cell": 6, "mass": 2}, {"name": "last", "cell": CELLS}]},
+}
+RING: dict[str, Any] = {"ends": "periodic", "profiles": None}
+
+
+def changed(*, lattice: dict[str, Any] | None = None, **sections: Any) -> Case:
+    """The case of ``TABLE`` with some sections replaced, and some keys of its lattice."""
+    merged = {key: value for key, value in (TABLE["lattice"] | (lattice or {})).items() if value is not None}
+    return Case.from_table(TABLE | sections | {"lattice": merged})
+
+
+def forces_and_energy(u: np.ndarray) -> tuple[np.ndarray, float]:
+    """Forces (mass,) in N of all springs between two walls and their energy in J, spring by spring."""
+    forces = np.zeros(len(u))
+    energy = 0.0
+    for cell in range(CELLS + 1):
+        springs = [(1, 2 * cell - 2, 2 * cell)]
+        if cell:
+            springs.append((2, 2 * cell - 2, 2 * cell - 1))
+        for number, start, end in springs:
+            q, c = TERMS.get((cell, number), (0.0, 0.0))
+            k = STIFFNESS[number - 1]
+            z = (u[end] if end < len(u) else 0.0) - (u[start] if start >= 0 else 0.0)
+            pull = k * z + q * z**2 + c * z**3
+            energy += k * z**2 / 2 + q * z**3 / 3 + c * z**4 / 4
+            if start >= 0:
+                forces[start] += pull
+            if end < len(u):
+                forces[end] -= pull
+    return forces, energy
+
+
+@pytest.fixture(scope="module")
+def run():
+    return run_of(changed())
+
+
+@pytest.fixture(scope="module")
+def exact(run) -> np.ndarray:
+    """Displacements before velocities (time, 2 mass) by SciPy, from the run's first sample on."""
+    masses = np.tile(MASSES, CELLS)
+    begin = np.concatenate([run[name].values[0].ravel() for name in ("displacement", "velocity")])
+
+    def rate(_: float, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y[len(masses) :], forces_and_energy(y[: len(masses)])[0] / masses])
+
+    return solve_ivp(rate, (0, 0.02), begin, "DOP853", run["time"].values, rtol=1e-12, atol=1e-14).y.T
+
+
+def test_the_motion_is_that_of_scipy(run, exact):
+    """Displacements to 1e-8 of the largest one."""
+    u = run["displacement"].values.reshape(len(run["time"]), -1)
+    assert np.abs(u - exact[:, : 2 * CELLS]).max() < 1e-8 * np.abs(u).max()
+
+
+def test_the_motion_of_identification_is_that_of_scipy(run, exact):
+    """Without a parameter, which has no springs in single cells; to the tolerance of its steps."""
+    model = changed().model()
+    begin = MotionBegin(time=0.0, state=exact[0], slopes=np.zeros((4 * CELLS, 0)))
+    watched = np.arange(2 * CELLS)
+    slopes = slopes_between([], [], np.zeros(0), model)
+    motion = respond(model, slopes, run["time"].values, watched, begin=begin).motion
+    assert np.abs(motion[:, :, 0, 0] - exact[:, : 2 * CELLS]).max() < 1e-7 * np.abs(exact[:, : 2 * CELLS]).max()
+
+
+def test_its_energy_is_that_of_the_springs_and_is_conserved(run):
+    u = run["displacement"].values.reshape(len(run["time"]), -1)
+    energies = np.array([forces_and_energy(row)[1] for row in u])
+    stiffness = changed().model().chain.stiffness_matrix()
+    linear = [row @ (stiffness @ row) / 2 for row in u]
+    np.testing.assert_allclose(run["energy/spring"], energies, rtol=1e-12)
+    assert np.abs(energies - linear).max() > 0.05 * energies.max()
+    total = run["energy/kinetic"] + run["energy/spring"]
+    np.testing.assert_allclose(total, total[0], rtol=1e-9)
+
+
+def test_points_accelerate_by_the_springs_that_they_have(run):
+    u = run["displacement"].values.reshape(len(run["time"]), -1)
+    forces = np.array([forces_and_energy(row)[0] for row in u])
+    expected = forces[:, [11, 22]] / [MASSES[1], MASSES[0]]
+    np.testing.assert_allclose(run["points/acceleration"], expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_the_file_says_which_springs_differ(run):
+    assert run["lattice/cubic"].values[5].tolist() == [0.0, 4e9]
+    assert run["lattice/quadratic"].values[8].tolist() == [-2e6, 0.0]
+    assert "lattice/stiffness" not in run
+    assert Case.from_toml(run.attrs["case"]).model().chain == changed().model().chain
+
+
+@pytest.mark.parametrize("term", ["quadratic", "cubic"])
+def test_equal_lists_are_the_lattice_of_equal_cells(term):
+    """To the last bit, in a ring; and zeros in all cells but one are the spring of that one alone."""
+    values = {"quadratic": 2e6, "cubic": 4e9}
+    springs = [spring | {term: values[term]} for spring in SPRINGS]
+    lists = {f"springs[{number}].{term}": [values[term]] * CELLS for number in (1, 2)}
+    few = {f"springs[{number}].{term}": {"cells": [9], "value": values[term]} for number in (1, 2)}
+    others = [cell for cell in range(1, CELLS + 1) if cell != 9]
+    zeros = {f"springs[{number}].{term}": {"cells": others, "value": 0.0} for number in (1, 2)}
+    cell = {"masses": list(MASSES), "springs": springs}
+
+    equal = [run_of(changed(lattice=RING | lattice)) for lattice in ({"cell": cell}, {"profiles": lists})]
+    alone = [
+        run_of(changed(lattice=RING | lattice)) for lattice in ({"cell": cell, "profiles": zeros}, {"profiles": few})
+    ]
+    for first, second in (equal, alone):
+        for name in ("displacement", "velocity", "energy/kinetic", "energy/spring"):
+            assert first[name].values.tobytes() == second[name].values.tobytes()
+    assert not np.array_equal(equal[0]["displacement"], alone[0]["displacement"])
+
+
+def test_places_are_those_of_the_profile():
+    chain = changed().model().chain
+    places = nonlinear_places(chain)
+    assert [(place.cell + 1, place.number + 1) for place in places] == sorted(TERMS)
+    assert [(place.law.quadratic, place.law.cubic) for place in places] == [TERMS[key] for key in sorted(TERMS)]
+    assert [(place.start, place.end) for place in places] == [(10, 11), (16, 18), (22, -1)]
+    assert not chain.is_linear
+    assert not chain.is_odd
+
+
+def test_what_is_linear_is_that_of_equal_cells():
+    """Modes, and where the lattice differs from its cell, know the linear parts alone."""
+    chain = changed().model().chain
+    plain = changed(lattice={"profiles": None}).model().chain
+    assert chain.linearised() == plain
+    assert plain.is_linear and plain.linearised() is plain
+    assert linear_modes(chain) is linear_modes(plain)
+    assert chain.mean_cell(0, CELLS) == plain.cell
+    assert np.flatnonzero(chain.differs).tolist() == [5, 8, CELLS - 1]
+
+
+def test_the_system_of_normal_modes_has_the_springs():
+    nnm = {"system": "chain", "modes": [1], "energy": [0.0, 1.0]}
+    table = {key: TABLE[key] for key in ("name", "lattice", "contacts")}
+    system = System.from_case(NnmCase.from_table(table | {"nnm": nnm}))
+    u = 1e-3 * np.random.default_rng(1).standard_normal(2 * CELLS)
+    forces, energy = forces_and_energy(u)
+    np.testing.assert_allclose(system.forces(u), -forces, rtol=1e-10, atol=1e-10 * np.abs(forces).max())
+    assert system.energy(u, 0 * u) == pytest.approx(energy, rel=1e-12)
+    assert not system.odd
+
+
+def test_steady_states_come_back_after_a_period():
+    """By SciPy, to 1e-6, and with the even harmonics of quadratic springs."""
+    lattice = TABLE["lattice"] | {"damping": {"mass": 200.0}}
+    drive = {"waveform": "harmonic", "amplitude": 6.0, "frequency": 900.0, "cell": 7, "mass": 1}
+    options = {"source": "force", "over": "amplitude", "range": [6.0, 8.0], "fixed": [900.0], "harmonics": 15}
+    table = {"name": "defects", "lattice": lattice, "contacts": {"sites": []}, "drive": drive, "time": {"end": 0.1}}
+    case = NfrcCase.from_table(table | {"nfrc": options})
+    assert case.nfrc.symmetric is False
+    states = SteadyStates(case, 1.0, 900.0)
+    point = first_state(states)
+    assert states.measured(point.xi).outputs["largest_elongation"].shape == (3,)
+    motion = motion_at(states, point.xi, np.arange(CELLS))
+    state = np.concatenate([part.ravel() for part in motion])
+    end = after_a_period(states, point, state)
+    assert np.abs(end - state).max() < 1e-6 * np.abs(state).max()
+
+
+def test_scattered_coefficients_are_drawn_cell_by_cell():
+    lattice = {"profiles": {"springs[2].cubic": [4e9] * CELLS}}
+    disorder = {"seed": 3, "cells": {"springs[2].cubic": {"relative": 0.1}}}
+    cubic = changed(lattice=lattice, disorder=disorder).model().chain.spring_terms(0, CELLS).cubic
+    assert np.all(cubic[:, 0] == 0.0)
+    assert len(np.unique(cubic[:, 1])) == CELLS
+    assert np.std(cubic[:, 1] / 4e9) == pytest.approx(0.1, rel=0.5)
+
+
+WALL = {"waveform": "harmonic", "amplitude": 1e-4, "frequency": 900.0, "end": "right"}
+SITES = {"law": "bilinear", "stiffness": 1e5, "sites": [3], "clearance": 1e-4}
+
+
+@pytest.mark.parametrize(
+    ("kind", "sections", "key", "reason"),
+    [
+        (Case, {"drive": WALL, "initial": None}, "drive.end", "quadratic and cubic in cell 12"),
+        (LawCase, {"law": {}, "initial": None}, 'lattice.profiles."springs[2].quadratic"', "depend on their amplitude"),
+        (NnmCase, {"nnm": {"system": "reduced"}}, 'lattice.profiles."springs[2].quadratic"', "has no such half"),
+        (NnmCase, {"nnm": {"system": "chain", "shooting": "krylov"}}, "nnm.shooting", "exact linear steps"),
+    ],
+)
+def test_refusals(kind: type[CaseFile], sections: dict[str, Any], key: str, reason: str):
+    table = TABLE | {"contacts": SITES} | sections
+    readable = {name: value for name, value in table.items() if value is not None and name in kind.keywords()}
+    with pytest.raises(CaseError) as caught:
+        kind.from_table(readable)
+    problems = [problem for problem in caught.value.problems if problem.key == key]
+    assert any(reason in problem.remedy for problem in problems), caught.value.problems
+
+
+def test_a_right_wall_moves_a_linear_spring():
+    """Nonlinear springs elsewhere do not matter to it."""
+    profiles = {"springs[1].cubic": {"cells": [9], "value": 1e10}}
+    assert Case.from_table(TABLE | {"drive": WALL, "initial": {}, "lattice": TABLE["lattice"] | {"profiles": profiles}})
+
+
+def test_a_wrong_name_is_answered_with_the_names_that_there_are():
+    with pytest.raises(CaseError, match=r"springs\[1\]\.cubic"):
+        changed(lattice={"profiles": {"springs[3].cubic": {"cells": [6], "value": 4e9}}})
