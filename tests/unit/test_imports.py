@@ -34,6 +34,7 @@ FLOORS = (
     "register",
     "progress",
     "process",
+    "wording",
     "__init__",
 )
 SERIAL = ("lattice", "spectra", "figures")

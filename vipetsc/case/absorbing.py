@@ -64,7 +64,8 @@ def reflected(sources: Sequence[Source], sections: Sequence[EndSection]) -> floa
     energies = [source.energies(sections) for source in sources if not source.waveform.repeats]
     if energies:
         arriving, back = np.sum(energies, axis=0)
-        fractions.append(back / arriving if arriving > 0 else np.nan)
+        if arriving > 0:
+            fractions.append(back / arriving)
     finite = [fraction for fraction in fractions if np.isfinite(fraction)]
     return float(max(finite, default=np.nan))
 
@@ -109,12 +110,17 @@ def _first_end(
     table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: tuple[Drive, ...], cells: int, speed: float
 ) -> TriedEnd:
     """The first end that satisfies the bound of ``table``, for waves with a ``speed`` in cells/s."""
+    lengths = [length for length in LENGTHS if length <= cells // 3]
+    if table.cells:
+        lengths = [table.cells]
+
     sources = sources_of(drives, cell, ends, cells)
-    lengths = [table.cells] if table.cells else [length for length in LENGTHS if length <= cells // 3]
     best = np.inf
     for length in lengths:
-        # The dashpots take exp(-loss) of a wave's energy: the integral of strength x^3 through the end and back.
-        strengths = [table.strength] if table.strength else [2 * speed * loss / length for loss in LOSSES]
+        # The dashpots leave exp(-loss) of a wave's energy, the integral of strength x^3 through the end and back.
+        strengths = [2 * speed * loss / length for loss in LOSSES]
+        if table.strength:
+            strengths = [table.strength]
         for strength in strengths:
             sections = sections_of(table, cell, ends, length, strength)
             back = reflected(sources, sections)

@@ -3,6 +3,7 @@
 from typing import Any
 
 from vipetsc.case.case import Case
+from vipetsc.case.drive import DriveTable
 
 Changes = dict[str, dict[str, Any]]
 
@@ -27,8 +28,17 @@ def amplitude_unit(case: Case) -> str:
     """The unit of ``amplitude_of``."""
     initial = case.initial
     if case.drive.amplitude or initial is None:
-        return "m" if case.drive.end else case.drive.record.unit
-    return "m/s" if initial.kind == "velocity" else "m"
+        return drive_unit(case.drive)
+    if initial.kind == "velocity":
+        return "m/s"
+    return "m"
+
+
+def drive_unit(drive: DriveTable) -> str:
+    """The unit of the amplitude of a resolved ``drive``: that of its waveform, or m where it moves a wall."""
+    if drive.end:
+        return "m"
+    return drive.record.unit
 
 
 def has_free_amplitude(case: Case) -> bool:

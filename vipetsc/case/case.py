@@ -108,7 +108,9 @@ class Case(CaseFile):
             yield from check_inhomogeneity(lattice, driven)
 
         if valid("lattice.cells", "contacts.sites"):
-            initial = sections.get("initial") if valid("initial") else None
+            initial = None
+            if valid("initial"):
+                initial = sections.get("initial")
             yield from check_contacts(lattice, contacts, initial, valid)
             if cell and valid("contacts"):
                 yield from check_pairs(lattice, contacts, cell, site_cells(lattice, contacts))
@@ -213,12 +215,16 @@ class Case(CaseFile):
         for section, values in changes.items():
             merged = table.get(section, {}) | values
             table[section] = {key: value for key, value in merged.items() if value is not None}
-        return Case.from_table(table | ({} if name is None else {"name": name}), overrides)
+        if name is not None:
+            table["name"] = name
+        return Case.from_table(table, overrides)
 
     @property
     def contact_radius(self) -> float | None:
         """Radius in m of the spheres in contact, by default the preset's; None if it is unknown."""
-        return self.contacts.radius or (CONTACTS["radius"] if self.lattice.preset else None)
+        if self.contacts.radius is None and self.lattice.preset:
+            return CONTACTS["radius"]
+        return self.contacts.radius
 
     def runs(self) -> list[CaseFile]:
         """The case itself: verbs that simulate others vary it."""
@@ -235,7 +241,9 @@ class Case(CaseFile):
 
     def warnings(self) -> list[str]:
         """Warnings of settings that are allowed but probably unintended."""
-        options = (self.petsc.model_extra if self.petsc else None) or {}
+        options: Table = {}
+        if self.petsc:
+            options = self.petsc.model_extra or {}
         return [
             *unit_warnings(self.drive, self.model().chain),
             *loss_warnings(self.lattice),
@@ -292,7 +300,9 @@ def _touching_problems(sections: dict[str, Any], beginning: Beginning | None) ->
     is_to_next = values_of_sites(contacts, "next_cell", len(cells))
     at_rest = []
     for cell, reaches_on in zip(cells, is_to_next, strict=True):
-        touched = {cell, cell + 1} if reaches_on else {cell}
+        touched = {cell}
+        if reaches_on:
+            touched.add(cell + 1)
         at_rest.append(not touched & beginning.moving)
     yield from check_touching(contacts, clearances(sections["lattice"], contacts, len(cells)), at_rest)
 
@@ -306,6 +316,7 @@ def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]
         yield Problem("initial.frequency", initial.frequency, "the drive has a frequency; omit this key")
     if drive.amplitude != 0:
         return
+
     moves = initial is not None and initial.moves
     if not moves and valid("initial") and drive.kind == DEFAULT:
         yield Problem("drive.amplitude", 0.0, "must not be zero if the lattice starts at rest; see [initial]")
@@ -343,11 +354,12 @@ def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Ite
 def _too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[Problem]:
     """The problem of samples every ``interval`` s, asked for by ``key``, beyond the top band's Nyquist interval."""
     top = pass_bands(cell)[-1].high
-    nyquist = np.pi / top if top else np.inf
-    if interval < nyquist:
+    if top == 0 or interval < np.pi / top:
         return []
-    given = "" if interval == value else f"an interval of {interval:.4g} s is "
-    return [Problem(key, value, f"{given}too coarse for the bands; the top band's Nyquist interval is {nyquist:.4g} s")]
+    remedy = f"too coarse for the bands; the top band's Nyquist interval is {np.pi / top:.4g} s"
+    if interval != value:
+        remedy = f"an interval of {interval:.4g} s is {remedy}"
+    return [Problem(key, value, remedy)]
 
 
 def case_id(case: Case) -> str:

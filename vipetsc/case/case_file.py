@@ -33,6 +33,7 @@ from vipetsc.case.section import Section as Section
 from vipetsc.io.names import readable
 from vipetsc.plugins import only
 from vipetsc.register import PartError
+from vipetsc.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -53,8 +54,7 @@ class CaseError(ValueError):
         super().__init__(self.problems, source)  # the arguments of unpickling on other ranks
 
     def __str__(self) -> str:
-        plural = "s" if len(self.problems) > 1 else ""
-        return "\n  ".join([f"{self.source}: {len(self.problems)} problem{plural}", *map(str, self.problems)])
+        return "\n  ".join([f"{self.source}: {counted(len(self.problems), 'problem')}", *map(str, self.problems)])
 
 
 AnySection = TypeVar("AnySection", bound=Section)
@@ -194,7 +194,9 @@ class CaseFile(Section):
 
     def import_plugins(self) -> None:
         """Import the modules of the case, which another rank may have read; raises CaseError."""
-        problems = missing_parts(self.plugins) if self.plugins else []
+        if self.plugins is None:
+            return
+        problems = missing_parts(self.plugins)
         if problems:
             raise CaseError(problems, self.name)
 
@@ -272,7 +274,9 @@ def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
     """The problem of a key that is not one of ``valid``, with the nearest one that is."""
     parents, dot, key = path.rpartition(".")
     near = difflib.get_close_matches(key, list(valid), n=1, cutoff=0.5)
-    remedy = f"did you mean {parents}{dot}{near[0]}?" if near else f"valid keys: {', '.join(sorted(valid))}"
+    remedy = f"valid keys: {', '.join(sorted(valid))}"
+    if near:
+        remedy = f"did you mean {parents}{dot}{near[0]}?"
     return Problem(path, value, f"unknown key; {remedy}")
 
 
@@ -340,19 +344,27 @@ def _out_of_range(value: Any, path: str) -> Iterator[Problem]:
 
 def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
     """The problem behind one of pydantic's errors in section ``name``."""
-    # The types that were tried are no part of the path that a user knows, and items count from 1.
-    keys = [part for part in item["loc"] if isinstance(part, int) or not BRANCH.fullmatch(part)]
-    path = name + "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in keys)
+    path = name
+    for part in item["loc"]:
+        # Items count from 1, and the types that were tried are no part of the path that a user knows.
+        if isinstance(part, int):
+            path += f"[{part + 1}]"
+        elif not BRANCH.fullmatch(part):
+            path += f".{part}"
     if item["type"] == "extra_forbidden":
         fields = _section_at(kind, item["loc"][:-1]).model_fields
         return _unknown_key(path, item["input"], [field.alias or key for key, field in fields.items()])
+
     message = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    # pydantic reports the whole section as the input of a missing key.
-    value = None if item["type"] == "missing" else item["input"]
+    if item["type"] == "missing":
+        # pydantic reports the whole section as the input of a missing key.
+        return Problem(path, None, message)
+    value = item["input"]
     choices = item.get("ctx", {}).get("expected")
     if isinstance(value, str) and choices:
         near = difflib.get_close_matches(value, re.findall(r"'([^']+)'", choices), n=1, cutoff=0.4)
-        message += f"; did you mean {near[0]!r}?" if near else ""
+        if near:
+            message += f"; did you mean {near[0]!r}?"
     return Problem(path, value, message)
 
 
@@ -361,9 +373,14 @@ def _section_at(kind: type[Section], path: Iterable[int | str]) -> type[Section]
     choices: list[type[Section]] = []
     for key in path:
         fields = {field.alias or name: field.annotation for name, field in kind.model_fields.items()}
+        if key in fields:
+            choices = [*sections_in(fields[str(key)])] or choices
+            kind = choices[0]
         # A name of a type chooses among the sections that the key before it may be.
-        choices = [*sections_in(fields.get(str(key)))] or choices
-        kind = next((choice for choice in choices if choice.__name__ == key), choices[0] if key in fields else kind)
+        for choice in choices:
+            if choice.__name__ == key:
+                kind = choice
+                break
     return kind
 
 

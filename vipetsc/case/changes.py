@@ -46,8 +46,10 @@ def put(table: dict[str, Any], path: str, value: Any) -> list[Problem]:
     if item and isinstance(place, dict) and isinstance(place.get(item[1]), list):
         return _put_item(place[item[1]], int(item[2]) - 1, path, value)
     if not isinstance(place, dict):
-        kind = "does not exist" if place is None else "is a value, not a section"
-        return [Problem(path, value, f"{path.removesuffix(f'.{key}')} {kind}")]
+        reason = "is a value, not a section"
+        if place is None:
+            reason = "does not exist"
+        return [Problem(path, value, f"{path.removesuffix(f'.{key}')} {reason}")]
     if value is None and key not in place:
         return [Problem(path, None, "is not in the case, so that it cannot be removed")]
 
@@ -63,8 +65,10 @@ def value_at(table: dict[str, Any], path: str) -> Any:
     place: Any = table
     rest = path
     while rest:
+        if not isinstance(place, dict):
+            return None
         key, rest = _divided(place, rest)
-        place = _below(place, key) if isinstance(place, dict) else None
+        place = _below(place, key)
     return place
 
 
@@ -82,11 +86,15 @@ def _below(place: Any, key: str, put_missing: bool = False) -> Any:
     if not isinstance(place, dict):
         return place
     item = ITEM.fullmatch(key)
-    entries = place.get(item[1]) if item else None
-    if item and isinstance(entries, list):
+    if item and isinstance(place.get(item[1]), list):
+        entries = place[item[1]]
         number = int(item[2])
-        return entries[number - 1] if number <= len(entries) else None
-    return place.setdefault(key, {}) if put_missing else place.get(key)
+        if number > len(entries):
+            return None
+        return entries[number - 1]
+    if put_missing:
+        return place.setdefault(key, {})
+    return place.get(key)
 
 
 def _put_item(entries: list[Any], index: int, path: str, value: Any) -> list[Problem]:

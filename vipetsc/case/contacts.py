@@ -62,7 +62,8 @@ def check_per_site(
 
 def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
     """Problems with parameters of unused laws, missing parameters, and an unbounded damping."""
-    laws = values_of_sites(contacts, "law", count) if count else [contacts.law]
+    # Without sites the law of all is checked, which normal modes have though no site is listed.
+    laws = values_of_sites(contacts, "law", count) or [contacts.law]
     for key, parameter in PARAMETERS.items():
         values = values_of_sites(contacts, key, max(count, 1))
         is_given = any(value is not None for value in values)
@@ -132,6 +133,7 @@ def _check_stops(contacts: ContactsTable, gaps: list[float]) -> Iterator[Problem
     restitutions = values_of_sites(contacts, "restitution", len(gaps))
     precompressions = values_of_sites(contacts, "precompression", len(gaps))
     stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
+    # One problem is enough: sites of one kind would all have the same.
     for number, (plus, minus) in enumerate(stops, 1):
         if min(plus, minus) <= 0 and max(plus, minus) < np.inf:
             remedy = "contacts that touch at rest or are precompressed have a stop on one side only; set contacts.side"
@@ -226,11 +228,13 @@ def _describe_stop(side: str, gap: float) -> str:
     """Description of the stop on one ``side``: its clearance in mm, touching, or precompressed."""
     if gap > 0:
         return f"{side}{1e3 * gap:.4g} mm"
-    return f"touches on side {side}" if gap == 0 else f"precompressed by {-1e3 * gap:.4g} mm on side {side}"
+    if gap == 0:
+        return f"touches on side {side}"
+    return f"precompressed by {-1e3 * gap:.4g} mm on side {side}"
 
 
 def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple[Pair, ...]:
-    """The masses that each site joins; () if these are the cell's pair at all, and each in a cell of its own."""
+    """The masses that each site joins; () if all join the cell's own pair, and no cell has two sites."""
     pairs = []
     given = values_of_sites(contacts, "pair", count)
     next_cell = values_of_sites(contacts, "next_cell", count)
@@ -281,7 +285,14 @@ def gaps_of_sites(contacts: ContactsTable, gaps: list[float]) -> Gaps:
     for gap, side, minus_gap, precompression in zip(gaps, *values, strict=True):
         # Displacements count from the state under static load, in which the contact is pressed already.
         pressed = precompression or 0.0
-        plus = gap - pressed
-        minus = (gap if minus_gap is None else minus_gap) - pressed
-        stops.append((np.inf if side == "minus" else plus, np.inf if side == "plus" else minus))
-    return () if all(plus == minus for plus, minus in stops) else tuple(stops)
+        plus = minus = gap - pressed
+        if minus_gap is not None:
+            minus = minus_gap - pressed
+        if side == "minus":
+            plus = np.inf
+        elif side == "plus":
+            minus = np.inf
+        stops.append((plus, minus))
+    if all(plus == minus for plus, minus in stops):
+        return ()
+    return tuple(stops)

@@ -58,7 +58,9 @@ def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Seque
     sites = contacts.sites
     clearance = contacts.clearance
     assert isinstance(sites, list) and isinstance(clearance, list)
-    stiffness = [contacts.stiffness] if contacts.stiffness else []
+    stiffness = []
+    if contacts.stiffness:
+        stiffness.append(contacts.stiffness)
     return {
         "clearance": clearance,
         "sites": sites,
@@ -86,7 +88,9 @@ def scatter(
 
     # A resolved case has no modulus: what is drawn scales the stiffness, which is proportional to it.
     values = values_of(lattice, contacts)
-    values["modulus"] = [given.modulus] if given.modulus and values["stiffness"] else []
+    values["modulus"] = []
+    if given.modulus and values["stiffness"]:
+        values["modulus"] = [given.modulus]
     drawn, problems = _draw(disorder, values)
     if problems:
         return {}, problems

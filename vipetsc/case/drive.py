@@ -123,7 +123,7 @@ def _check_place(
     if cell and not cell.springs:
         yield Problem(f"{path}.end", drive.end, "a wall moves the springs attached to it, but the cell has none")
     elif cell and length:
-        place = _beside_wall(cell, drive.end, length)
+        place = _place_at_wall(cell, drive.end, length)
         for key in sorted(place.keys() & drive.model_fields_set):
             if getattr(drive, key) != place[key]:
                 remedy = f"omit it: the wall acts on mass {place['mass']} of cell {place['cell']}"
@@ -132,14 +132,19 @@ def _check_place(
 
 def _end_masses(cell: UnitCell, end: str) -> list[tuple[int, int]]:
     """Masses of the end's cell that springs tie to the wall, and these springs' numbers."""
-    springs = [(number, spring) for number, spring in enumerate(cell.springs) if spring.next_cell]
-    return [(spring.end if end == "left" else spring.start, number) for number, spring in springs]
+    masses = []
+    for number, spring in enumerate(cell.springs):
+        if spring.next_cell:
+            # On the left the wall takes the place of the cell before, in which such a spring starts.
+            mass = {"left": spring.end, "right": spring.start}[end]
+            masses.append((mass, number))
+    return masses
 
 
-def _beside_wall(cell: UnitCell, end: str, cells: int) -> Table:
+def _place_at_wall(cell: UnitCell, end: str, cells: int) -> Table:
     """The cell and the mass (from 1) of ``cells`` cells that the wall at an ``end`` acts on first."""
     mass, _ = _end_masses(cell, end)[0]
-    return {"cell": 1 if end == "left" else cells, "mass": mass + 1}
+    return {"cell": {"left": 1, "right": cells}[end], "mass": mass + 1}
 
 
 def frequency_of(cell: UnitCell, drive: OneDrive) -> float:
@@ -183,7 +188,7 @@ def wave_speed(cell: UnitCell, frequency: float) -> float:
 def check_wave(cell: UnitCell, drive: OneDrive, time: TimeTable) -> Iterator[Problem]:
     """Problems with a valid drive that sends out no wave, or one that never crosses the lattice."""
     frequency, speed = driven_wave(cell, drive)
-    key = "frequency" if drive.frequency else "wavenumber" if drive.wavenumber else "band"
+    key = next((name for name in ("frequency", "wavenumber") if getattr(drive, name)), "band")
     if not frequency > 0:
         yield Problem(
             f"drive.{key}", getattr(drive, key), "the frequency there is 0; choose another wavenumber or band"
@@ -214,7 +219,7 @@ def resolve_drive(drive: AnyDrive, cell: UnitCell, cells: int, frequency: float 
     if drive.record.ramp and drive.ramp is None:
         update["ramp"] = drive.record.ramp(drive, frequency)
     if drive.end:
-        update |= _beside_wall(cell, drive.end, cells)
+        update |= _place_at_wall(cell, drive.end, cells)
     return drive.model_copy(update=update)
 
 

@@ -86,7 +86,7 @@ def _texts(key: str, values: Sequence[Any]) -> list[str]:
     """A text for each value of a ``key``, of which no two are equal; numbers of values that are no plain text."""
     if all(type(value) in (int, float) for value in values) and len(set(values)) == len(values):
         return distinct(values)
-    texts = [value if isinstance(value, str) else "" for value in values]
-    if all(PLAIN.fullmatch(text) for text in texts) and len(set(texts)) == len(texts):
-        return texts
+    are_plain = all(isinstance(value, str) and PLAIN.fullmatch(value) for value in values)
+    if are_plain and len(set(values)) == len(values):
+        return list(values)
     return [f"no-{number}" for number in range(1, len(values) + 1)]

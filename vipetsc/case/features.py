@@ -37,7 +37,9 @@ UNLIKE_CELLS = {"profiles": "profiles", "scatter": "scatter", "absorbing": "abso
 
 def refuse_disorder(kind: type[CaseFile], table: Table) -> list[Problem]:
     """The problem of a section ``[disorder]`` in a ``table`` whose verb does not accept it."""
-    return list(_refusal(kind, "disorder", "disorder")) if "disorder" in table else []
+    if "disorder" not in table:
+        return []
+    return list(_refusal(kind, "disorder", "disorder"))
 
 
 def refusals(kind: type[CaseFile], sections: Mapping[str, Any], valid: Valid) -> Iterator[Problem]:
@@ -65,8 +67,9 @@ def _unlike_sites(kind: type[CaseFile], contacts: ContactsTable) -> Iterator[Pro
     for key in ("each", *SIDES, *JOINS):
         value = getattr(contacts, key)
         if value is not None:
-            shown = None if key == "each" else value
-            yield from _refusal(kind, "unlike sites", f"contacts.{key}", shown)
+            if key == "each":
+                value = None  # whole lists would fill the message
+            yield from _refusal(kind, "unlike sites", f"contacts.{key}", value)
 
     clearance = contacts.clearance
     if clearance == 0 or (isinstance(clearance, list) and 0 in clearance):

@@ -43,55 +43,88 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
     """The case ``name`` in a table: lattice, bands, contacts, ``drives`` in words; and its cell."""
     chain = model.chain
     cell = chain.cell
-    bands = pass_bands(cell) if cell.springs else []
-    # The edge at 0 is computed to rounding.
-    edges = [f"{band.low if band.low > ROUNDING * band.high else 0:.5g} to {band.high:.5g}" for band in bands]
-    masses = "1 mass" if cell.dofs == 1 else f"{cell.dofs} masses"
-    laws = model.used_laws[:MOST_SHOWN]
-    sites = [f"cell {site + 1}" for site in chain.sites]
+    masses = "1 mass"
+    if cell.dofs > 1:
+        masses = f"{cell.dofs} masses"
     rows = [
         ("lattice", f"{chain.cells} cells of {masses}, {ends} ends"),
-        ("pass bands in rad/s", first_few(edges)),
-        ("contact", "; ".join(dict.fromkeys(map(str, laws))) if chain.sites else ""),
-        ("sites", first_few(sites)),
-        ("clearance", first_few(describe_stops(model.gaps, chain.clearances))),
-        ("begins with", model.initial.describe() if model.initial else ""),
-        ("drive", "; ".join(drives) if model.is_driven else "none"),
-        ("end", f"{model.end:.5g} s, {model.samples} samples"),
+        ("pass bands in rad/s", first_few(_band_edges(cell))),
     ]
-    pair = chain.contact_pairs[0] if chain.sites else None
+
+    pair = None
+    if chain.sites:
+        pair = chain.contact_pairs[0]
+        laws = model.used_laws[:MOST_SHOWN]
+        rows += [
+            ("contact", "; ".join(dict.fromkeys(map(str, laws)))),
+            ("sites", first_few([f"cell {site + 1}" for site in chain.sites])),
+            ("clearance", first_few(describe_stops(model.gaps, chain.clearances))),
+        ]
+    if model.initial:
+        rows.append(("begins with", model.initial.describe()))
+    drive = "none"
+    if model.is_driven:
+        drive = "; ".join(drives)
+    rows += [("drive", drive), ("end", f"{model.end:.5g} s, {model.samples} samples")]
     return html_table(name, rows, cell_svg(cell, pair))
+
+
+def _band_edges(cell: UnitCell) -> list[str]:
+    """The edges of the pass bands of a ``cell`` in rad/s, as text; none of a cell without springs."""
+    if not cell.springs:
+        return []
+    edges = []
+    for band in pass_bands(cell):
+        low = band.low
+        # The edge at 0 is computed to rounding.
+        if low <= ROUNDING * band.high:
+            low = 0.0
+        edges.append(f"{low:.5g} to {band.high:.5g}")
+    return edges
 
 
 def first_few(items: Sequence[str]) -> str:
     """The first of ``items``, and how many there are if these are not all."""
-    more = f", ... ({len(items)})" if len(items) > MOST_SHOWN else ""
-    return ", ".join(items[:MOST_SHOWN]) + more
+    shown = ", ".join(items[:MOST_SHOWN])
+    if len(items) > MOST_SHOWN:
+        shown += f", ... ({len(items)})"
+    return shown
 
 
 def cell_svg(cell: UnitCell, pair: Pair | None) -> str:
     """The unit cell as SVG: masses by number, springs, the stops of a ``pair``, masses of the next cell dashed."""
     places = _places(cell)
     shift = max((x for x, _ in places), default=0.0) + COLUMN
+    next_places = [_moved(place, shift) for place in places]
     parts = []
+    beyond = set()
     for spring in cell.springs:
-        begin = places[spring.start]
-        end = _moved(places[spring.end], shift if spring.next_cell else 0.0)
-        parts.append(_zigzag(begin, end))
-    if pair is not None:
-        host = places[pair.host] if pair.host >= 0 else _moved(places[pair.resonator], 0.0, ROW)
-        parts.append(_stops(host, _moved(places[pair.resonator], shift if pair.next_cell else 0.0)))
+        end = places[spring.end]
+        if spring.next_cell:
+            end = next_places[spring.end]
+            beyond.add(spring.end)
+        parts.append(_zigzag(places[spring.start], end))
 
-    beyond = {spring.end for spring in cell.springs if spring.next_cell}
-    beyond |= {pair.resonator} if pair and pair.next_cell else set()
-    parts += [_mass(_moved(places[mass], shift), "", STYLE["next"]) for mass in sorted(beyond)]
+    top = min(y for _, y in places) - MARGIN
+    height = MARGIN - top
+    if pair is not None:
+        resonator = places[pair.resonator]
+        if pair.next_cell:
+            resonator = next_places[pair.resonator]
+            beyond.add(pair.resonator)
+        host = places[pair.host]
+        if pair.host < 0:
+            # The ground, below the mass that it stops.
+            host = _moved(places[pair.resonator], 0.0, ROW)
+            height += ROW
+        parts.append(_stops(host, resonator))
+
+    parts += [_mass(next_places[mass], "", STYLE["next"]) for mass in sorted(beyond)]
     for number, place in enumerate(places):
         label = f"mass {number + 1}: {cell.masses[number]:.4g} kg"
         parts.append(_mass(place, str(number + 1), STYLE["mass"], label))
 
     width = shift + 2 * MARGIN
-    top = min(y for _, y in places) - MARGIN
-    height = MARGIN - top + (ROW if pair and pair.host < 0 else 0.0)
     box = f'viewBox="{-MARGIN:g} {top:g} {width:g} {height:g}" width="{width:g}" height="{height:g}"'
     return f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="unit cell" {box}>{"".join(parts)}</svg>'
 
@@ -122,9 +155,14 @@ def _places(cell: UnitCell) -> list[Point]:
 
 
 def _through(cell: UnitCell, joined: Mapping[int, Sequence[int]]) -> list[int]:
-    """The shortest way from a mass that the cell before is tied to, to one that is tied to the next cell."""
-    entries = [(spring.end, spring.start) for spring in cell.springs if spring.next_cell]
-    entry, last = entries[0] if entries else (0, 0)
+    """The shortest path from a mass that the cell before is tied to, to one that is tied to the next cell."""
+    entry = last = 0
+    for spring in cell.springs:
+        if spring.next_cell:
+            entry = spring.end
+            last = spring.start
+            break
+
     paths = [[entry]]
     seen = {entry}
     for path in paths:
@@ -143,13 +181,16 @@ def _moved(place: Point, right: float, down: float = 0.0) -> Point:
 
 def _mass(place: Point, number: str, style: str, label: str = "") -> str:
     x, y = place
-    text = f'<text x="{x:g}" y="{y + 4:g}" {STYLE["text"]}>{number}</text>' if number else ""
-    title = f"<title>{escape(label)}</title>" if label else ""
-    return f'<g>{title}<circle cx="{x:g}" cy="{y:g}" r="{RADIUS:g}" {style}/>{text}</g>'
+    parts = [f'<circle cx="{x:g}" cy="{y:g}" r="{RADIUS:g}" {style}/>']
+    if label:
+        parts.insert(0, f"<title>{escape(label)}</title>")
+    if number:
+        parts.append(f'<text x="{x:g}" y="{y + 4:g}" {STYLE["text"]}>{number}</text>')
+    return f"<g>{''.join(parts)}</g>"
 
 
 def _directions(begin: Point, end: Point) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The first point, the way from it to the second, and the unit vector across that way."""
+    """The first point, the vector from it to the second, and the unit vector normal to that."""
     start = np.array(begin)
     along = np.array(end) - start
     length = float(np.hypot(*along)) or 1.0
@@ -162,7 +203,9 @@ def _zigzag(begin: Point, end: Point) -> str:
     start, along, across = _directions(begin, end)
     points = [start]
     for number in range(COILS + 1):
-        side = 0.0 if number in (0, COILS) else COIL_HEIGHT * (-1) ** number
+        side = COIL_HEIGHT * (-1) ** number
+        if number in (0, COILS):
+            side = 0.0
         points.append(start + along * (0.3 + 0.4 * number / COILS) + across * side)
     points.append(start + along)
     text = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
@@ -170,14 +213,14 @@ def _zigzag(begin: Point, end: Point) -> str:
 
 
 def _stops(host: Point, resonator: Point) -> str:
-    """The clearance between the masses of a contact pair: two stops that face each other beside their spring."""
+    """The clearance between the masses of a contact pair: two stops that face each other, next to their spring."""
     start, along, across = _directions(host, resonator)
     # From inside the circles, which are drawn over them.
-    beside = 0.7 * RADIUS
+    aside = 0.7 * RADIUS
     parts = []
     for near, far in ((0.0, 0.45), (1.0, 0.55)):
-        foot = start + along * near + across * beside
-        tip = start + along * far + across * beside
+        foot = start + along * near + across * aside
+        tip = start + along * far + across * aside
         ends = [foot, tip, tip + across * 6, tip - across * 6]
         text = " ".join(f"{x:.1f},{y:.1f}" for x, y in ends)
         parts.append(f'<polyline points="{text}" {STYLE["stop"]}/>')

@@ -119,8 +119,21 @@ class IdentifyCase(StudyCase):
         for number, record in enumerate(self.options.records):
             if isinstance(record.offset, list):
                 low, high = record.offset
-                name = "offset" if len(self.options.records) == 1 else f"offset {number + 1}"
-                parameters.append(SoughtParameter(name, "offset", (number,), low, high, (low + high) / 2, "s", False))
+                name = "offset"
+                if len(self.options.records) > 1:
+                    name += f" {number + 1}"
+                parameters.append(
+                    SoughtParameter(
+                        name=name,
+                        quantity="offset",
+                        members=(number,),
+                        low=low,
+                        high=high,
+                        start=(low + high) / 2,
+                        unit="s",
+                        is_logarithmic=False,
+                    )
+                )
         return parameters
 
     def case_of(self, values: Iterable[float], name: str = "model") -> Case:
@@ -135,8 +148,12 @@ class IdentifyCase(StudyCase):
 
 def _varied_sections(record: RecordTable) -> dict[str, Any]:
     """The sections of a case in which a ``record`` differs from it."""
-    initial = record.initial if isinstance(record.initial, dict) else {}
-    return {key: copy.deepcopy(keys) for key, keys in (("drive", record.drive), ("initial", initial)) if keys}
+    sections = {}
+    if record.drive:
+        sections["drive"] = copy.deepcopy(record.drive)
+    if isinstance(record.initial, dict) and record.initial:
+        sections["initial"] = copy.deepcopy(record.initial)
+    return sections
 
 
 def _case_problems(base: Case) -> Iterator[Problem]:
@@ -185,7 +202,7 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             )
             yield Problem(f"{at}.quantity", quantity, remedy)
         if quantity in DASHPOTS and any(value == 0 for value in values) and unknown.start is None:
-            what = "springs" if quantity == "dashpot" else "masses"
+            what = {"dashpot": "springs", "grounding": "masses"}[quantity]
             yield Problem(f"{at}.start", None, f"missing; the case has {what} without a dashpot to begin with")
 
         groups = groups_of(unknown, len(values))
@@ -198,9 +215,13 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
                 if (quantity, member) in taken:
                     yield Problem(f"{at}.of", unknown.of, f"{quantity} {member + 1} is sought twice")
                 taken.add((quantity, member))
-        if isinstance(unknown.start, list) and len(unknown.start) != len(groups):
-            yield Problem(f"{at}.start", unknown.start, f"give one number for each of the {len(groups)} values")
-        starts = unknown.start if isinstance(unknown.start, list) else [unknown.start]
+        starts: list[float | None]
+        if not isinstance(unknown.start, list):
+            starts = [unknown.start]
+        else:
+            starts = [*unknown.start]
+            if len(starts) != len(groups):
+                yield Problem(f"{at}.start", unknown.start, f"give one number for each of the {len(groups)} values")
         if any(start is not None and not low <= start <= high for start in starts):
             yield Problem(f"{at}.start", unknown.start, f"must lie within the bounds {low:g} and {high:g}")
 
@@ -227,11 +248,13 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
     masses = base.lattice.cells * dofs
     for number, record in enumerate(options.records, 1):
         at = f"identify.records[{number}]"
+        # The columns of the record itself.
         if (record.time is None) == (record.rate is None):
             yield Problem(f"{at}.time", record.time, "give the column of times or the rate in Hz, one of both")
         if isinstance(record.offset, list) and not record.offset[0] < record.offset[1]:
             yield Problem(f"{at}.offset", record.offset, "must be a number, or bounds [low, high] with low below high")
         yield from sensor_problems(record, at, base.lattice.cells, dofs, len(base.drive.every))
+
         if record.initial == "estimate" and masses > MOST_MASSES:
             remedy = f"of {masses} masses is too much to estimate; {MOST_MASSES} masses are possible"
             yield Problem(f"{at}.initial", "estimate", remedy)
@@ -242,6 +265,7 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
         except CaseError as error:
             for problem in error.problems:
                 yield replace(problem, key=f"{at}.{problem.key}")
+
     if not any(record.contact for record in options.records):
         for index, unknown in enumerate(options.unknowns, 1):
             if unknown.quantity in OF_SITES:

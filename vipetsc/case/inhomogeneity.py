@@ -25,6 +25,7 @@ def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
     match = QUANTITY.fullmatch(key)
     if match is None:
         return None
+
     masses_or_grounding, mass, spring, of_spring = match.groups()
     if masses_or_grounding:
         name = masses_or_grounding
@@ -190,8 +191,12 @@ def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: S
         yield Problem("lattice.absorbing.cells", n, f"half of the {lattice.cells} cells, or more")
         return
 
-    low = 0 if absorbing.end == "right" else n
-    high = lattice.cells if absorbing.end == "left" else lattice.cells - n
+    low = 0
+    high = lattice.cells
+    if absorbing.end != "right":
+        low += n
+    if absorbing.end != "left":
+        high -= n
     inside = [cell for cell in driven if not low < cell <= high]
     if inside:
         yield Problem("lattice.absorbing.end", absorbing.end, f"the driven cell {inside[0]} is in the absorbing end")

@@ -31,7 +31,10 @@ class Deviation(Section):
         """Values (n) of the quantity ``name`` about ``values`` (n); a larger n begins with the same numbers."""
         key = np.random.SeedSequence([seed, int.from_bytes(name.encode(), "little")])
         generator = np.random.Generator(np.random.Philox(key))
-        deviation = np.full(len(values), self.absolute) if self.relative is None else self.relative * np.abs(values)
+        if self.relative is None:
+            deviation = np.full(len(values), self.absolute)
+        else:
+            deviation = self.relative * np.abs(values)
         if self.distribution == "uniform":
             # A uniform distribution of half-width h has the standard deviation h / sqrt(3).
             return values + deviation * np.sqrt(3) * generator.uniform(-1, 1, len(values))
@@ -44,7 +47,9 @@ class Deviation(Section):
             return np.asarray(values * np.exp(np.sqrt(spread) * normal - spread / 2))
 
     def __str__(self) -> str:
-        size = f"{100 * self.relative:g} %" if self.relative is not None else f"{self.absolute:g}"
+        size = f"{self.absolute:g}"
+        if self.relative is not None:
+            size = f"{100 * self.relative:g} %"
         return f"{self.distribution}, deviation {size}"
 
 

@@ -118,23 +118,36 @@ class InitialTable(Section):
     def describe(self) -> str:
         """Description of the motion; empty for a lattice at rest."""
         if self.kind == "velocity":
-            struck = [f"{one.velocity:g} m/s of mass {one.mass} of cell {one.cell}" for _, one in self.strikes]
-            more = f", ... ({len(struck)})" if len(struck) > MOST_SHOWN else ""
-            return ", ".join(struck[:MOST_SHOWN]) + more
+            return self._describe_strikes()
         if self.kind == "file":
-            at = f" at {self.time:g} s" if self.time is not None else ""
-            return f"{self.path}{at}" + (f", orbit {self.orbit}" if self.orbit is not None else "")
+            text = str(self.path)
+            if self.time is not None:
+                text += f" at {self.time:g} s"
+            if self.orbit is not None:
+                text += f", orbit {self.orbit}"
+            return text
 
-        size = f"{self.amplitude:.4g} m" if self.amplitude else f"{self.energy or 0.0:.4g} J"
-        about = f", Om = {self.frequency:.4f} rad/s" if self.frequency else ""
+        size = f"{self.energy or 0.0:.4g} J"
+        if self.amplitude:
+            size = f"{self.amplitude:.4g} m"
+        if self.frequency:
+            size += f", Om = {self.frequency:.4f} rad/s"
         if self.kind == "mode":
-            return f"mode {self.number or f'near {self.near:g} rad/s'}, {size}{about}"
+            return f"mode {self.number or f'near {self.near:g} rad/s'}, {size}"
         if self.kind == "packet":
             return (
                 f"a packet of band {self.band} about kappa = {(self.wavenumber or 0) / np.pi:.4f} pi,"
-                f" {self.width:g} cells wide in cell {self.cell}, {size}{about}"
+                f" {self.width:g} cells wide in cell {self.cell}, {size}"
             )
         return ""
+
+    def _describe_strikes(self) -> str:
+        """The first of the masses that are struck, and the number of all if there are more."""
+        struck = [f"{one.velocity:g} m/s of mass {one.mass} of cell {one.cell}" for _, one in self.strikes]
+        text = ", ".join(struck[:MOST_SHOWN])
+        if len(struck) > MOST_SHOWN:
+            text += f", ... ({len(struck)})"
+        return text
 
     def packet(self, cell: UnitCell) -> Packet:
         """The packet, of 1 m; only of that kind."""
@@ -261,8 +274,10 @@ def _velocity(
         # That of the mass on its own springs while all others are held; without springs, of its contact.
         mass = fastest.mass - 1
         stiffness = sum(end.stiffness for end in chain.cell.couplings() if end.mass == mass)
-        omega = float(np.sqrt(stiffness / chain.cell.masses[mass])) if stiffness > 0 else touching(speed)
-        frequency = omega
+        if stiffness > 0:
+            frequency = float(np.sqrt(stiffness / chain.cell.masses[mass]))
+        else:
+            frequency = touching(speed)
     amplitude = initial.amplitude or speed / frequency
     return Beginning(initial.model_copy(update={"amplitude": amplitude}), frequency, fastest.cell)
 

@@ -5,7 +5,7 @@ Types, bounds and defaults come from the sections, units and texts from ``keys.t
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib.resources import files
 from typing import Any, get_args
@@ -21,6 +21,7 @@ from vipetsc.case.waveforms import DEFAULT, WAVEFORMS, waveform_record
 from vipetsc.lattice.contact import PARAMETERS, registered_law
 from vipetsc.plugins import only
 from vipetsc.register import LAW, PARTS, WAVEFORM, Parameter
+from vipetsc.wording import with_unit
 
 TITLE = "Every key of a case file"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -53,7 +54,9 @@ def unit_of(path: str, case: Table) -> str:
     """
     drive = case.get("drive", {})
     if path == "drive.amplitude":
-        return "m" if "end" in drive else _unit_of_waveform(drive.get("waveform") or DEFAULT)
+        if "end" in drive:
+            return "m"
+        return _unit_of_waveform(drive.get("waveform") or DEFAULT)
     parameter = _parameter_of(path, case)
     if parameter:
         return parameter.unit
@@ -65,33 +68,40 @@ def unit_of(path: str, case: Table) -> str:
         return ""
     unit, _ = unit_and_text(table.__name__, keys[-1])
     # A phrase says on what the unit depends.
-    return "" if " of " in unit or " or " in unit else unit
+    if " of " in unit or " or " in unit:
+        return ""
+    return unit
 
 
 def _unit_of_waveform(name: str) -> str:
     """Unit of the amplitude of a waveform; that of a force where the module that registers it is not imported."""
-    is_there = name in WAVEFORMS or name in PARTS[WAVEFORM]
-    return waveform_record(name).unit if is_there else "N"
+    if name in WAVEFORMS or name in PARTS[WAVEFORM]:
+        return waveform_record(name).unit
+    return "N"
 
 
 def _parameter_of(path: str, case: Table) -> Parameter | None:
     """The parameter of a registered law or waveform whose key has that ``path``; None for other keys."""
     section, _, key = path.partition(".parameters.")
-    registered: Mapping[str, Parameter] = {}
     if section == "contacts":
-        # The law itself may vary: any that takes the key tells its unit.
-        laws = [law for name in PARTS[LAW] if (law := registered_law(name)) and key in law.parameters]
-        registered = laws[0].parameters if laws else {}
+        # The law itself may vary: any that takes the key has its unit.
+        for name in PARTS[LAW]:
+            law = registered_law(name)
+            if law and key in law.parameters:
+                return law.parameters[key]
     elif section == "drive":
         name = case.get("drive", {}).get("waveform") or DEFAULT
-        registered = waveform_record(name).parameters if name in PARTS[WAVEFORM] else {}
-    return registered.get(key)
+        if name in PARTS[WAVEFORM]:
+            return waveform_record(name).parameters.get(key)
+    return None
 
 
 def _table_of(table: type[BaseModel] | None, key: str) -> type[BaseModel] | None:
     """The class of the table that ``key`` of a ``table`` is; None where it is no table."""
-    fields = table.model_fields if table else {}
-    choices = [fields[key].annotation] if key in fields else []
+    if table is None or key not in table.model_fields:
+        return None
+    # The types within a type, as in ``list[X] | None``, are appended while the loop runs.
+    choices = [table.model_fields[key].annotation]
     for choice in choices:
         choices += get_args(choice)
         if isinstance(choice, type) and issubclass(choice, BaseModel):
@@ -116,7 +126,7 @@ def json_schema(modules: Sequence[str] = ()) -> Schema:
             item.pop("title", None)
             if key == "wavenumber":
                 item["anyOf"] += [{"type": "string", "pattern": f"^{MULTIPLE_OF_PI}$"}]
-            item["description"] = f"{text} ({unit})" if unit else text
+            item["description"] = with_unit(text, unit)
         # A schema shows the first paragraph of the docstring.
         schema["description"] = schema.get("description", "").partition("\n\n")[0].replace("\n", " ").replace("``", "`")
     classes["PetscTable"]["additionalProperties"] = {"type": ["string", "number", "boolean"]}
@@ -160,10 +170,12 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
         yield from ("| key | value | unit | default | |", "|---|---|---|---|---|")
     for key, item in rows:
         unit, text = unit_and_text(name, key)
-        needed = "required" if key in schema.get("required", ()) else ""
         default = item.get("default")
-        is_table = "{" in str(default)  # which is shown by itself
-        shown_default = needed if default is None or is_table else f"`{_toml(default)}`"
+        shown_default = ""
+        if key in schema.get("required", ()):
+            shown_default = "required"
+        elif default is not None and "{" not in str(default):  # a table is shown by itself
+            shown_default = f"`{_toml(default)}`"
         yield f"| `{key}` | {_kind(item)} | {unit} | {shown_default} | {text} |"
         inner += [(f"{path}.{key}", reference) for reference in _references(item)]
     yield ""
@@ -189,7 +201,9 @@ def _toml(value: Any) -> str:
         return f"[{', '.join(map(_toml, value))}]"
     if isinstance(value, bool):
         return str(value).lower()
-    return f'"{value}"' if isinstance(value, str) else f"{value:g}"
+    if isinstance(value, str):
+        return f'"{value}"'
+    return f"{value:g}"
 
 
 def _kind(item: Schema) -> str:
@@ -205,7 +219,9 @@ def _kind(item: Schema) -> str:
         return f"list of {_count(item)}{_kind(item['items'])}"
     if item.get("type") == "object":
         values = item["additionalProperties"]
-        return "table" if values is True else f"table of {_kind(values)}"
+        if values is True:
+            return "table"
+        return f"table of {_kind(values)}"
     if "pattern" in item:
         return "text as described"
 
@@ -220,4 +236,6 @@ def _count(item: Schema) -> str:
     low = item.get("minItems", 0)
     if low == item.get("maxItems"):
         return f"{low} "
-    return f"{low} or more " if low else ""
+    if low:
+        return f"{low} or more "
+    return ""

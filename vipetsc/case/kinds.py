@@ -97,5 +97,8 @@ def contacts_of_one(contacts: ContactsTable, site: int, kind: SiteKind, cell: in
         changes["side"] = "minus"
     elif plus != minus:
         changes["clearance_minus"] = clearance * minus
-    first = clearance if plus == np.inf else clearance * plus
+    # The lesser clearance is on the side that has a stop.
+    first = clearance
+    if plus < np.inf:
+        first *= plus
     return changes | {"sites": [cell], "clearance": [first]}

@@ -12,8 +12,10 @@ from pydantic import Field
 from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.initial import file_hash
 from vipetsc.case.named_files import MISSING
+from vipetsc.case.points import masses_remedy
 from vipetsc.case.schema import Finite, Positive
 from vipetsc.io.names import path_named
+from vipetsc.wording import counted
 
 MOST_ROWS = 1_000_000
 LEAST_SAMPLES = 8
@@ -102,8 +104,11 @@ def read_measured(record: RecordTable) -> Measured:
     except OSError as error:
         raise MeasuredError("file", record.file, str(error.strerror or error)) from None
 
-    read = _hdf5_columns if path.suffix.lower() in HDF5 else _text_columns
+    read = _text_columns
+    if path.suffix.lower() in HDF5:
+        read = _hdf5_columns
     columns = read(path, record)
+
     lengths = {key: len(values) for key, values in columns.items()}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{key}: {length}" for key, length in lengths.items())
@@ -151,6 +156,7 @@ def _times(record: RecordTable, column: np.ndarray | None, count: int) -> np.nda
     times = column * record.time_factor
     if count < 2:
         return times
+
     interval = (times[-1] - times[0]) / (count - 1)
     even = times[0] + interval * np.arange(count)
     if not interval > 0:
@@ -185,13 +191,15 @@ def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
     if separator in (";", "\t") and not any("." in line for line in lines[1:]):
         # Where commas do not separate, they are those of decimals, except in names.
         decimals = [line.replace(",", ".") for line in lines]
-        has_names = not all(_is_number(field) for field in decimals[0].split(separator))
-        lines = [lines[0], *decimals[1:]] if has_names else decimals
+        if not all(_is_number(field) for field in decimals[0].split(separator)):
+            decimals[0] = lines[0]
+        lines = decimals
     rows = [[field.strip().strip('"') for field in line.split(separator)] for line in lines]
     names: list[str] = []
     # Measuring programs leave "nan" for what they miss: that is a number, though a bad one.
     if not all(_is_number(field) for field in rows[0]):
         names = rows.pop(0)
+
     widths = {len(row) for row in rows}
     if len(widths) != 1:
         raise MeasuredError("file", record.file, f"its lines have {' or '.join(map(str, sorted(widths)))} fields")
@@ -203,14 +211,23 @@ def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
 
     columns = {}
     for key, place in _wanted(record):
-        if isinstance(place, str) and place not in names:
-            known = f"there are {', '.join(names)}" if names else "the table has no line of names; give a number from 1"
-            raise MeasuredError(key, place, f"no column of that name; {known}")
-        index = names.index(place) if isinstance(place, str) else place - 1
+        index = _index_of(place, names, key)
         if not 0 <= index < table.shape[1]:
             raise MeasuredError(key, place, f"the table has the columns 1 to {table.shape[1]}")
         columns[key] = table[:, index]
     return columns
+
+
+def _index_of(place: Place, names: list[str], key: str) -> int:
+    """The column, from 0, of a ``place`` in a table with those ``names``; raises MeasuredError for an unused name."""
+    if isinstance(place, int):
+        return place - 1
+    if place in names:
+        return names.index(place)
+    remedy = f"there are {', '.join(names)}"
+    if not names:
+        remedy = "the table has no line of names; give a number from 1"
+    raise MeasuredError(key, place, f"no column of that name; {remedy}")
 
 
 def _is_number(field: str) -> bool:
@@ -228,23 +245,34 @@ def _hdf5_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
     try:
         with h5py.File(path) as file:
             for key, place in _wanted(record):
-                match = re.fullmatch(r"(.+?)(?:\[(\d+)\])?", str(place))
-                name, column = match.groups() if match else (str(place), None)
-                dataset = file.get(name)
-                if not isinstance(dataset, h5py.Dataset):
-                    raise MeasuredError(key, place, f"the file has no dataset {name}")
-                if dataset.size > MOST_ROWS * 100 or dataset.ndim != (1 if column is None else 2):
-                    shape = " x ".join(map(str, dataset.shape))
-                    raise MeasuredError(
-                        key, place, f'is an array of {shape}; write "{name}[1]" for the first column of two dimensions'
-                    )
-                if column is not None and not 1 <= int(column) <= dataset.shape[1]:
-                    raise MeasuredError(key, place, f"the dataset has the columns 1 to {dataset.shape[1]}")
-                values = dataset[:] if column is None else dataset[:, int(column) - 1]
-                columns[key] = np.asarray(values, float)
+                columns[key] = _hdf5_column(file, key, place)
     except (OSError, TypeError) as error:
         raise MeasuredError("file", record.file, f"is not an HDF5 file of numbers ({error})") from None
     return columns
+
+
+def _hdf5_column(file: h5py.File, key: str, place: Place) -> np.ndarray:
+    """The numbers at a ``place``: a dataset of one dimension, or with "[3]" behind its name the third column of two."""
+    name = str(place)
+    column: int | None = None
+    match = re.fullmatch(r"(.+?)\[(\d+)\]", name)
+    if match:
+        name = match[1]
+        column = int(match[2])
+    dimensions = 1 + (column is not None)
+
+    dataset = file.get(name)
+    if not isinstance(dataset, h5py.Dataset):
+        raise MeasuredError(key, place, f"the file has no dataset {name}")
+    if dataset.size > MOST_ROWS * 100 or dataset.ndim != dimensions:
+        shape = " x ".join(map(str, dataset.shape))
+        remedy = f'is an array of {shape}; write "{name}[1]" for the first column of two dimensions'
+        raise MeasuredError(key, place, remedy)
+    if column is None:
+        return np.asarray(dataset[:], float)
+    if not 1 <= column <= dataset.shape[1]:
+        raise MeasuredError(key, place, f"the dataset has the columns 1 to {dataset.shape[1]}")
+    return np.asarray(dataset[:, column - 1], float)
 
 
 def sensor_problems(record: RecordTable, at: str, cells: int, dofs: int, drives: int) -> Iterator[Problem]:
@@ -259,7 +287,7 @@ def sensor_problems(record: RecordTable, at: str, cells: int, dofs: int, drives:
                     f"{path}.cell", sensor.cell, "a force is that of a drive: give drive in place of cell and mass"
                 )
             if (sensor.drive or 1) > drives:
-                yield Problem(f"{path}.drive", sensor.drive, f"the case has {drives} drive{'s' * (drives > 1)}")
+                yield Problem(f"{path}.drive", sensor.drive, f"the case has {counted(drives, 'drive')}")
             continue
         if sensor.drive is not None:
             yield Problem(f"{path}.drive", sensor.drive, "applies to a force; give cell and mass")
@@ -268,5 +296,4 @@ def sensor_problems(record: RecordTable, at: str, cells: int, dofs: int, drives:
         elif sensor.cell > cells:
             yield Problem(f"{path}.cell", sensor.cell, f"the lattice has the cells 1 to {cells}")
         if sensor.mass is not None and sensor.mass > dofs:
-            has = "the one mass 1" if dofs == 1 else f"the masses 1 to {dofs}"
-            yield Problem(f"{path}.mass", sensor.mass, f"a cell has {has}")
+            yield Problem(f"{path}.mass", sensor.mass, masses_remedy(dofs))

@@ -16,7 +16,7 @@ def distinct(numbers: Sequence[float]) -> list[str]:
         shared = {text for text in texts if texts.count(text) > 1}
         if not shared:
             break
-        texts = [
-            f"{number:.{digits}g}" if text in shared else text for number, text in zip(numbers, texts, strict=True)
-        ]
+        for i, number in enumerate(numbers):
+            if texts[i] in shared:
+                texts[i] = f"{number:.{digits}g}"
     return texts

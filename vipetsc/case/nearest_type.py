@@ -22,9 +22,11 @@ def of_nearest_type(errors: Sequence[Any]) -> list[Any]:
         value, tried_type = _tried_type(error["loc"])
         if tried_type:
             is_whole_value = len(error["loc"]) == len(value) + 1
-            is_mistyped = is_whole_value and error["type"].endswith("_type")
+            cost = 1
+            if is_whole_value and error["type"].endswith("_type"):
+                cost = MISTYPED
             types = costs.setdefault(value, {})
-            types[tried_type] = types.get(tried_type, 0) + (MISTYPED if is_mistyped else 1)
+            types[tried_type] = types.get(tried_type, 0) + cost
 
     nearest = {value: min(types, key=lambda name: types[name]) for value, types in costs.items()}
     kept_errors = []

@@ -8,7 +8,8 @@ TOO_DEEP = f"tables and lists are nested more than {DEEPEST} levels deep; no key
 
 def is_deeper(value: Any, levels: int = DEEPEST) -> bool:
     """Whether tables and lists stand more than so many ``levels`` deep in ``value``."""
-    if not isinstance(value, dict | list):
+    if isinstance(value, dict):
+        value = list(value.values())
+    if not isinstance(value, list):
         return False
-    items = value.values() if isinstance(value, dict) else value
-    return levels == 0 or any(is_deeper(item, levels - 1) for item in items)
+    return levels == 0 or any(is_deeper(item, levels - 1) for item in value)

@@ -114,24 +114,27 @@ class NfrcCase(Case):
         """The resolved sections at the lower end of a key's range, and everything that is wrong within the range."""
         options, problems = read_section(NfrcTable, table["nfrc"], "nfrc")
         problems = problems or key_problems(table)
-        low, high = options.range if not problems else (0.0, 1.0)
-        if not low < high:
-            problems.append(Problem("nfrc.range", options.range, "must be [low, high]"))
         if problems:
             return {}, problems
+        low, high = options.range
+        if not low < high:
+            return {}, [Problem("nfrc.range", options.range, "must be [low, high]")]
 
         read = []
         for place in TRIED:
             value = low + place * (high - low)
+            sections: dict[str, Any] = {}
             member, problems = table_at(table, value)
-            sections, wrong = cls.read(member) if not problems else ({}, problems)
-            if wrong:
-                return sections, [replace(p, remedy=f"{p.remedy} (with {options.over} = {value:.6g})") for p in wrong]
+            if not problems:
+                sections, problems = cls.read(member)
+            if problems:
+                varied = f" (with {options.over} = {value:.6g})"
+                return sections, [replace(problem, remedy=problem.remedy + varied) for problem in problems]
             read.append(sections)
 
         chains = [build_chain(sections["lattice"], sections["contacts"]) for sections in read]
         if len({tuple((place.cell, place.number) for place in nonlinear_places(chain)) for chain in chains}) > 1:
-            remedy = f"a spring is linear at {options.over} = {low:g} and has no harmonics; begin beside it"
+            remedy = f"a spring is linear at {options.over} = {low:g} and has no harmonics; begin at another value"
             return read[0], [Problem("nfrc.range", options.range, remedy)]
 
         # What follows from the lattice follows from that at the lower end.
@@ -181,11 +184,11 @@ class NfrcCase(Case):
             least = least_restitution(contacts.damping or "paper")
             if small := [r for r in nfrc.restitutions if r < least]:
                 yield Problem("nfrc.restitutions", small, f"below {least:g} this damping increases without bound")
-            cell = check_cell(sections["lattice"])[0] if valid("lattice") else None
-            is_linear = cell is not None and not sections["lattice"].nonlinear_keys
-            if sections["contacts"].sites in (0, []) and is_linear:
-                remedy = "give a cell with a contact, or a spring that is not linear"
-                yield Problem("contacts.sites", sections["contacts"].sites, remedy)
+            if contacts.sites in (0, []) and valid("lattice"):
+                cell, _ = check_cell(sections["lattice"])
+                if cell is not None and not sections["lattice"].nonlinear_keys:
+                    remedy = "give a cell with a contact, or a spring that is not linear"
+                    yield Problem("contacts.sites", contacts.sites, remedy)
 
     def warnings(self) -> list[str]:
         """No warnings: those about runs in time do not concern steady states."""
@@ -225,7 +228,9 @@ class NfrcCase(Case):
         if self.nfrc.varies_key:
             assert self.drive.frequency is not None  # that of a resolved case
             return self.drive.frequency
-        return self.nfrc.fixed[0] if self.nfrc.over == "amplitude" else self.nfrc.range[0]
+        if self.nfrc.over == "amplitude":
+            return self.nfrc.fixed[0]
+        return self.nfrc.range[0]
 
     def laws(self, restitution: float) -> list[Contact]:
         """The law of each site with a ``restitution``; where each has a restitution of its own, with that."""
@@ -247,8 +252,16 @@ class NfrcCase(Case):
         curves = []
         for number, (member, case) in enumerate(self._members):
             for name, restitution, fixed in case.curves():
-                whole = f"{member.name}-{name}" if member.name else name
-                curves.append(ResponseCurve(whole, case, restitution, fixed, number, member.values))
+                curves.append(
+                    ResponseCurve(
+                        name="-".join(filter(None, (member.name, name))),
+                        case=case,
+                        restitution=restitution,
+                        fixed=fixed,
+                        member=number,
+                        values=member.values,
+                    )
+                )
         return curves
 
     def curves(self) -> list[tuple[str, float, float]]:
@@ -264,7 +277,7 @@ def needs_modes(chain: Chain) -> bool:
 
 
 def _check_drives(nfrc: NfrcTable, drives: DriveTable) -> Iterator[Problem]:
-    """Problems with further drives, which are resolved: beside a wave, or with frequencies of their own."""
+    """Problems with further drives, which are resolved: in addition to a wave, or with other frequencies."""
     for path, drive in drives.every[1:]:
         if nfrc.source == "wave":
             yield Problem(path, None, 'a wave that is incident acts alone; omit it, or nfrc.source = "force"')
@@ -297,7 +310,7 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     elif not chain.linearised().is_uniform():
         reason = "a wave of equal cells does not pass cells that differ as it came"
     elif not chain.is_linear:
-        reason = "a wave in springs that are not linear changes on its way"
+        reason = "a wave in springs that are not linear changes its shape as it travels"
     if nfrc.source == "wave":
         yield Problem("nfrc.source", "wave", f'{reason}; source = "force" drives a mass')
     elif nfrc.infinite:
@@ -356,5 +369,7 @@ def _check_waves(nfrc: NfrcTable, cell: UnitCell) -> Iterator[Problem]:
         frequencies = nfrc.fixed
     for frequency in frequencies:
         if nfrc.band not in [band for band, *_ in waves_at(cell, frequency)]:
-            where = "in no pass band" if nfrc.band is None else f"not in band {nfrc.band}"
+            where = "in no pass band"
+            if nfrc.band is not None:
+                where = f"not in band {nfrc.band}"
             yield Problem(key, frequency, f"lies {where}, so that no such wave is incident (rad/s)")

@@ -54,7 +54,9 @@ class MeasuredTable(Section):
             name += f" {self.band}"
         if self.part:
             name += f" {self.part[0]:g}-{self.part[1]:g}"
-        return f"width of {name} below {self.below:g}" if self.below else name
+        if self.below:
+            return f"width of {name} below {self.below:g}"
+        return name
 
     @property
     def is_of_runs(self) -> bool:
@@ -92,14 +94,20 @@ class ConstraintTable(MeasuredTable):
 
     def describe(self, unit: str) -> str:
         """The constraint in words; amplitudes have a ``unit``."""
-        bounds = [f"at least {self.at_least:g}" if self.at_least is not None else ""]
-        bounds.append(f"at most {self.at_most:g}" if self.at_most is not None else "")
-        return f"{self.name} {' and '.join(filter(None, bounds))}{self.at_amplitudes(unit)}"
+        bounds = []
+        if self.at_least is not None:
+            bounds.append(f"at least {self.at_least:g}")
+        if self.at_most is not None:
+            bounds.append(f"at most {self.at_most:g}")
+        return f"{self.name} {' and '.join(bounds)}{self.at_amplitudes(unit)}"
 
     def excess(self, value: float) -> float:
         """By how much a ``value`` is outside the bounds, over the bound's size (or 1 for a bound of 0); 0 inside."""
-        below = 0.0 if self.at_least is None else (self.at_least - value) / (abs(self.at_least) or 1.0)
-        above = 0.0 if self.at_most is None else (value - self.at_most) / (abs(self.at_most) or 1.0)
+        below = above = 0.0
+        if self.at_least is not None:
+            below = (self.at_least - value) / (abs(self.at_least) or 1.0)
+        if self.at_most is not None:
+            above = (value - self.at_most) / (abs(self.at_most) or 1.0)
         return max(below, above, 0.0)
 
 
@@ -143,14 +151,18 @@ def measured_problems(
         remedy = f"the driven band is the highest of {len(bands)}; band_share of another, or a drive on a lower one"
         yield Problem(f"{at}.measure", objective.measure, remedy)
     elif (objective.measure == "band_share") != (band is not None):
-        remedy = "only band_share has a band" if band else f"missing; band_share needs a band, 1 to {len(bands)}"
+        remedy = f"missing; band_share needs a band, 1 to {len(bands)}"
+        if band:
+            remedy = "only band_share has a band"
         yield Problem(f"{at}.band", band, remedy)
     elif band and band > len(bands):
         yield Problem(f"{at}.band", band, f"the cell has {len(bands)} bands")
     elif part and not band:
         yield Problem(f"{at}.part", part, "only band_share has a part of a band")
     elif part and band:
-        low, high = bands[band - 1].low, bands[band - 1].high
+        low = bands[band - 1].low
+        high = bands[band - 1].high
+        # The band of a cell that varies is another one in each design.
         if not part[0] < part[1] or (not varied and (part[1] <= low or part[0] >= high)):
             yield Problem(
                 f"{at}.part", part, f"must be [low, high] in rad/s and meet band {band}, {low:.5g}-{high:.5g}"
@@ -167,8 +179,9 @@ def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | N
 
     measures = response_measures(case)
     if name not in measures:
-        outputs = "" if case.output.points else "; those of points need output.points, forces output.forces"
-        remedy = f"is no measure of these responses; {_nearest(name, [*measures])}{outputs}"
+        remedy = f"is no measure of these responses; {_nearest(name, [*measures])}"
+        if not case.output.points:
+            remedy += "; those of points need output.points, forces output.forces"
         yield Problem(f"{at}.measure", name, remedy)
     if objective.amplitudes:
         remedy = "the amplitudes of responses are those of [nfrc]; omit them"
@@ -201,8 +214,10 @@ def _problems_of_runs(objective: MeasuredTable, at: str, base: Case) -> Iterator
     name = str(objective.measure)
     if name not in measures:
         valid = [*OF_SEARCHES, *(name for name in measures if name not in OF_SEARCHES)]
-        points = "" if base.output.points else "; those of points need output.points"
-        yield Problem(f"{at}.measure", name, f"is no measure of this case; {_nearest(name, valid)}{points}")
+        remedy = f"is no measure of this case; {_nearest(name, valid)}"
+        if not base.output.points:
+            remedy += "; those of points need output.points"
+        yield Problem(f"{at}.measure", name, remedy)
         return
 
     is_of_bands = measures[name].dimension == PART

@@ -75,7 +75,9 @@ class PartName:
 def module_names(table: Mapping[str, Any]) -> list[str]:
     """The modules that a parsed case names; none where the key is not as it should be."""
     section = table.get("plugins")
-    names = section.get("modules") if isinstance(section, dict) else None
+    if not isinstance(section, dict):
+        return []
+    names = section.get("modules")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return []
     return names
@@ -102,12 +104,15 @@ def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
     names = module_names(table)
     if not names:
         section = table.get("plugins")
-        is_empty = isinstance(section, dict) and "modules" not in section
-        return table, [Problem("plugins.modules", None, "missing; name files or modules")] if is_empty else []
+        if isinstance(section, dict) and "modules" not in section:
+            return table, [Problem("plugins.modules", None, "missing; name files or modules")]
+        return table, []
 
     table = with_located(table, Path())
     earlier = table["plugins"].get("parts")
-    recorded = earlier if isinstance(earlier, dict) else {}
+    recorded: dict[str, Any] = {}
+    if isinstance(earlier, dict):
+        recorded = earlier
     parts: dict[str, dict[str, Any]] = {}
     problems = []
     for number, name in enumerate(module_names(table)):
@@ -155,7 +160,9 @@ def missing_parts(table: PluginsTable) -> list[Problem]:
     problems = []
     # Modules that all other ranks have imported may be missing on one: the message says where.
     rank = launched_rank()
-    where = "" if rank is None else f"on rank {rank}: "
+    where = ""
+    if rank is not None:
+        where = f"on rank {rank}: "
     for number, name in enumerate(table.modules, 1):
         try:
             rows = _record(name)
@@ -184,13 +191,15 @@ def _record(name: str) -> list[tuple[str, str, dict[str, str]]]:
 def _all_rows(recorded: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Kind, name and record of all parts of a resolved table; what is no record is left to the check of types."""
     for kind, parts in recorded.items():
-        for part, row in parts.items() if isinstance(parts, dict) else ():
+        if not isinstance(parts, dict):
+            continue
+        for part, row in parts.items():
             if isinstance(row, dict):
                 yield kind, part, row
 
 
 def _rows_of(recorded: Mapping[str, Any], name: str) -> list[tuple[str, str, dict[str, Any]]]:
-    """Those of the module ``name``; a file may have been recorded elsewhere."""
+    """Kind, name and record of the parts of the module ``name``; a file may have been recorded elsewhere."""
     return [row for row in _all_rows(recorded) if Path(str(row[2].get("module"))).name == Path(name).name]
 
 

@@ -19,6 +19,13 @@ class PointTable(Section):
     mass: int = Field(1, ge=1)
 
 
+def masses_remedy(dofs: int) -> str:
+    """What to say of a mass beyond the ``dofs`` masses of a cell."""
+    if dofs == 1:
+        return "a cell has the one mass 1"
+    return f"a cell has the masses 1 to {dofs}"
+
+
 def check_points(
     points: list[PointTable], transmission: list[list[str]], cells: int | None, dofs: int | None
 ) -> Iterator[Problem]:
@@ -32,8 +39,7 @@ def check_points(
         if cells is not None and point.cell > cells:
             yield Problem(f"{at}.cell", point.cell, f"the lattice has the cells 1 to {cells}")
         if dofs is not None and point.mass > dofs:
-            has = "the one mass 1" if dofs == 1 else f"the masses 1 to {dofs}"
-            yield Problem(f"{at}.mass", point.mass, f"a cell has {has}")
+            yield Problem(f"{at}.mass", point.mass, masses_remedy(dofs))
         if point.name in names[: number - 1]:
             yield Problem(f"{at}.name", point.name, "names another point too; every point needs a name that differs")
 
@@ -41,8 +47,8 @@ def check_points(
         at = f"output.transmission[{number}]"
         missing = [name for name in pair if name not in names]
         if missing:
-            listed = f"there are {', '.join(names)}" if names else "there are none"
-            remedy = f"{', '.join(missing)}: no point of that name in output.points; {listed}"
+            listed = ", ".join(names) or "none"
+            remedy = f"{', '.join(missing)}: no point of that name in output.points; there are {listed}"
             yield Problem(at, pair, remedy)
         elif pair[0] == pair[1]:
             yield Problem(at, pair, 'names one point twice; give [from, to], as in ["base", "tip"]')

@@ -9,6 +9,7 @@ from vipetsc.case.section import Problem
 from vipetsc.lattice import Contact
 from vipetsc.lattice.contact import registered_factor, registered_law
 from vipetsc.register import Parameter
+from vipetsc.wording import with_unit
 
 # Indentations in m at which the formulas of a law are compared with each other, and those of its onset.
 DEPTHS = np.geomspace(1e-6, 1e-3, 7)
@@ -25,11 +26,11 @@ def check_parameters(
         yield Problem(f"{path}.{key}", given[key], remedy)
     for key, about in parameters.items():
         value = given.get(key)
-        unit = f" ({about.unit})" if about.unit else ""
         if value is None:
-            yield Problem(f"{path}.{key}", None, f"missing; needed for {owner}{unit}")
+            yield Problem(f"{path}.{key}", None, with_unit(f"missing; needed for {owner}", about.unit))
         elif not about.least <= value <= about.most:
-            yield Problem(f"{path}.{key}", value, f"must be from {about.least:g} to {about.most:g}{unit}")
+            bounds = f"must be from {about.least:g} to {about.most:g}"
+            yield Problem(f"{path}.{key}", value, with_unit(bounds, about.unit))
 
 
 def check_law_parameters(
@@ -39,18 +40,21 @@ def check_law_parameters(
     every: dict[str, Parameter] = {}
     for name in laws:
         law = registered_law(name)
-        every |= law.parameters if law else {}
+        if law:
+            every |= law.parameters
     names = ", ".join(f'"{name}"' for name in dict.fromkeys(laws))
     pairs = {(name, tuple(sorted((values or {}).items()))) for name, values in zip(laws, given, strict=True)}
 
     problems: dict[str, Problem] = {}
     for name, values in sorted(pairs):
         law = registered_law(name)
-        numbers = dict(values)
+        taken: Mapping[str, Parameter] = {}
+        owner = f"the law {names}"
+        if law:
+            taken = law.parameters
+            owner = f'the law "{name}"'
         # What another site's law takes may stand in the section for all.
-        taken = law.parameters if law else {}
-        relevant = {key: value for key, value in numbers.items() if key in taken or key not in every}
-        owner = f'the law "{name}"' if law else f"the law {names}"
+        relevant = {key: value for key, value in values if key in taken or key not in every}
         for problem in check_parameters(path, relevant, taken, owner):
             problems.setdefault(problem.key, problem)
     yield from problems.values()

@@ -108,7 +108,11 @@ def clearances(lattice: LatticeTable, contacts: ContactsTable, count: int) -> li
         return [given] * count
     if given is None and count == 0:
         return []
-    first, last = (given.first, given.last) if given else PRESETS[str(lattice.preset)].clearance_span(count)
+    if given is None:
+        first, last = PRESETS[str(lattice.preset)].clearance_span(count)
+    else:
+        first = given.first
+        last = given.last
     return [float(clearance) for clearance in np.geomspace(first, last, count)]
 
 
@@ -165,7 +169,9 @@ def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
     fitted = (damping.grounding, damping.springs)
     expected = [cell.dofs, len(cell.springs)]
     if loss is not None and (not loss or loss.keys() - bands or not cell.springs):
-        remedy = f"give it by band, 1 to {cell.dofs}" if cell.springs else "a cell without springs has no bands"
+        remedy = "a cell without springs has no bands"
+        if cell.springs:
+            remedy = f"give it by band, 1 to {cell.dofs}"
         yield Problem("lattice.damping.loss", loss, f"{remedy}, as in loss = {{ 2 = 0.02 }}")
     elif loss is not None and (damping.mass or damping.stiffness):
         yield Problem("lattice.damping.loss", loss, "give it, or mass and stiffness, not both")
@@ -177,7 +183,11 @@ def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Prob
     """Problems with the cells of the contacts and with their clearances."""
     sites = contacts.sites
     clearance = contacts.clearance
-    count = 0 if isinstance(sites, list) else sites.count if isinstance(sites, Span) else sites
+    count = 0
+    if isinstance(sites, int):
+        count = sites
+    elif isinstance(sites, Span):
+        count = sites.count
     if count > lattice.cells:  # before so many are placed
         yield Problem("contacts.sites", count, f"more sites than the lattice has cells, {lattice.cells}")
         return
@@ -206,12 +216,14 @@ def check_contacts(
 ) -> Iterator[Problem]:
     """Problems with the sites of a run that begins with the motion ``initial``, and with the law."""
     yield from check_sites(lattice, contacts)
-    is_unplaced = isinstance(contacts.sites, int) and lattice.preset is None  # a count needs a preset to place it
+    # Of a count without a preset to place it there are no cells.
+    sites = site_cells(lattice, contacts)
+    is_unplaced = isinstance(contacts.sites, int) and lattice.preset is None
     yield from check_stiffness(contacts, bool(contacts.sites) and not is_unplaced, valid)
 
-    sites = [] if is_unplaced else site_cells(lattice, contacts)
-    has_clearances = contacts.clearance is not None or lattice.preset is not None or not sites
-    gaps = clearances(lattice, contacts, len(sites)) if has_clearances else []
+    gaps: list[float] = []
+    if contacts.clearance is not None or lattice.preset is not None:
+        gaps = clearances(lattice, contacts, len(sites))
     if len(gaps) == len(sites):
         at_rest = [initial is None or initial.is_at_rest(site) for site in sites]
         yield from check_per_site(contacts, gaps, at_rest, valid)
@@ -266,7 +278,9 @@ def _resolved_initial(beginning: Beginning | None, drive: DriveTable) -> Initial
     """The motion at the beginning, with its frequency where nothing is driven; None for a lattice at rest."""
     if beginning is None:
         return None
-    frequency = beginning.frequency if drive.amplitude == 0 else None
+    frequency = None
+    if drive.amplitude == 0:
+        frequency = beginning.frequency
     return beginning.section.model_copy(update={"frequency": frequency})
 
 

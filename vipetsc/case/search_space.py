@@ -100,7 +100,9 @@ def search_space(bounds: VariablesTable, table: Table, base: Case) -> SearchSpac
     for row in rows:
         is_row = len(row.paths) > 1 and row.kind in ("log", "linear")
         for name, path in zip(row.names, row.paths, strict=True):
-            in_row = row.paths[0] if is_row and path.startswith(IN_ROWS) and path.endswith("]") else ""
+            in_row = ""
+            if is_row and path.startswith(IN_ROWS) and path.endswith("]"):
+                in_row = row.paths[0]
             start = _start(row, path, (table, resolved))
             variables.append(Variable(name, path, row.low, row.high, row.kind, start, in_row, row.choices))
     return SearchSpace(table, variables)
@@ -158,7 +160,9 @@ def row_of(key: str, given: Any, table: Table) -> VariableRow:
 
     kind, low, high = _range_of(given)
     value = value_at(table, key)
-    paths = [f"{key}[{i}]" for i in range(1, len(value) + 1)] if isinstance(value, list) else [key]
+    paths = [key]
+    if isinstance(value, list):
+        paths = [f"{key}[{i}]" for i in range(1, len(value) + 1)]
     return VariableRow(paths, paths, low, high, kind)
 
 
@@ -169,9 +173,14 @@ def _range_of(given: Any) -> tuple[Kind, float, float]:
     ((kind, pair),) = given.items()
     if kind not in RANGES or not isinstance(pair, list) or len(pair) != 2:
         raise ValueError(FORMS)
-    types = (int,) if kind == "whole" else (int, float)
+    types: tuple[type, ...] = (int, float)
+    numbers = "numbers"
+    if kind == "whole":
+        types = (int,)
+        numbers = "whole numbers"
+    # ``type`` rather than ``isinstance``: a boolean is an ``int`` for the latter.
     if not all(type(end) in types and abs(end) <= LARGEST for end in pair):
-        raise ValueError(f"the bounds must be {'whole ' if kind == 'whole' else ''}numbers up to {LARGEST:g}")
+        raise ValueError(f"the bounds must be {numbers} up to {LARGEST:g}")
 
     low, high = map(float, pair)
     if not low < high:
@@ -183,16 +192,24 @@ def _range_of(given: Any) -> tuple[Kind, float, float]:
 
 def _start(row: VariableRow, path: str, tables: Iterable[Table]) -> float:
     """The value of the variable at ``path`` in the first of the ``tables`` that has one; NaN without a number."""
-    values = [value for table in tables if (value := value_at(table, path)) is not None]
+    values = [value_at(table, path) for table in tables]
     if row.kind == "choice":
-        chosen = [row.choices.index(value) + 1 for value in values if value in row.choices]
-        return float(chosen[0]) if chosen else 1.0
-    # Wavenumbers may be text with pi.
-    numbers = [read for value in values if type(read := number(value)) in (int, float)]
-    return float(numbers[0]) if numbers else np.nan
+        for value in values:
+            if value is not None and value in row.choices:
+                return float(row.choices.index(value) + 1)
+        return 1.0
+
+    for value in values:
+        # Wavenumbers may be text with pi.
+        read = number(value)
+        if type(read) in (int, float):
+            return float(read)
+    return np.nan
 
 
 def case_of(table: Table, disorder: Any = None) -> Case:
     """The run in a ``table``, under one name, with ``disorder`` if that is given; raises CaseError."""
-    scatter = {} if disorder is None else {"disorder": disorder}
-    return Case.from_table({k: table[k] for k in table if k in Case.model_fields} | {"name": "design"} | scatter)
+    run = {key: value for key, value in table.items() if key in Case.model_fields} | {"name": "design"}
+    if disorder is not None:
+        run["disorder"] = disorder
+    return Case.from_table(run)

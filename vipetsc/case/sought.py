@@ -88,7 +88,9 @@ class SoughtParameter(NamedTuple):
 
     def to_coordinate(self, value: float) -> float:
         """The fit's coordinate of a ``value``."""
-        return float(np.log(value)) if self.is_logarithmic else (value - self.low) / (self.high - self.low)
+        if self.is_logarithmic:
+            return float(np.log(value))
+        return (value - self.low) / (self.high - self.low)
 
     def from_coordinate(self, z: float) -> float:
         """The value at the fit's coordinate ``z``, kept between the bounds, which rounding may miss."""
@@ -99,11 +101,14 @@ class SoughtParameter(NamedTuple):
 
     def slope(self, z: float) -> float:
         """Derivative of the value by the fit's coordinate at ``z``."""
-        return self.from_coordinate(z) if self.is_logarithmic else self.high - self.low
+        if self.is_logarithmic:
+            return self.from_coordinate(z)
+        return self.high - self.low
 
 
 def values_of(case: Case, quantity: str) -> list[float]:
     """The values of a ``quantity`` in a case: of its sites, of the masses or springs of its cell, of its drive."""
+    # Dashpots as the case lists them: Rayleigh damping would add to them.
     cell = case.lattice.undamped_cell()
     if quantity == "mass":
         return list(cell.masses)
@@ -113,6 +118,7 @@ def values_of(case: Case, quantity: str) -> list[float]:
         return list(cell.grounding) or [0.0] * len(cell.masses)
     if quantity == "amplitude":
         return [case.drive.amplitude]
+
     model = case.model()
     if quantity == "clearance":
         return list(model.chain.clearances)
@@ -155,11 +161,20 @@ def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float) ->
     name: str = unknown.quantity
     if unknown.of != "all":
         name += f" {'+'.join(str(member + 1) for member in members)}"
-    scale = unknown.scale or ("linear" if unknown.quantity in ON_LINEAR_SCALE else "logarithmic")
-    # The case may lie outside the bounds; the search does not.
-    start = min(max(start, low), high)
-    unit = UNITS.get(unknown.quantity, "1")
-    return SoughtParameter(name, unknown.quantity, members, low, high, start, unit, scale == "logarithmic")
+    is_logarithmic = unknown.quantity not in ON_LINEAR_SCALE
+    if unknown.scale:
+        is_logarithmic = unknown.scale == "logarithmic"
+    return SoughtParameter(
+        name=name,
+        quantity=unknown.quantity,
+        members=members,
+        low=low,
+        high=high,
+        # The case may lie outside the bounds; the search does not.
+        start=min(max(start, low), high),
+        unit=UNITS.get(unknown.quantity, "1"),
+        is_logarithmic=is_logarithmic,
+    )
 
 
 def parameters_of(unknown: UnknownTable, base: Case) -> list[SoughtParameter]:
@@ -167,8 +182,11 @@ def parameters_of(unknown: UnknownTable, base: Case) -> list[SoughtParameter]:
     values = values_of(base, unknown.quantity)
     parameters = []
     for number, members in enumerate(groups_of(unknown, len(values))):
-        start = unknown.start[number] if isinstance(unknown.start, list) else unknown.start
-        if start is None:
+        if isinstance(unknown.start, list):
+            start = unknown.start[number]
+        elif unknown.start is not None:
+            start = unknown.start
+        else:
             start = float(np.mean([values[member] for member in members]))
         parameters.append(_parameter(unknown, members, start))
     return parameters

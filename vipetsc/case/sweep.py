@@ -167,8 +167,10 @@ class Sweep(StudyCase):
     def number(self, name: str) -> int:
         """The number of the member ``name``, or of that number; raises CaseError if there is none."""
         ids = self.ids()
-        if name in ids or (name.isdecimal() and int(name) < self.count):
-            return ids.index(name) if name in ids else int(name)
+        if name in ids:
+            return ids.index(name)
+        if name.isdecimal() and int(name) < self.count:
+            return int(name)
         remedy = f"is not a member; ensemble.h5 lists the names (member), and the numbers go from 0 to {self.count - 1}"
         raise CaseError([Problem("--member", name, remedy)], self.name)
 
@@ -213,7 +215,7 @@ class Sweep(StudyCase):
     def wants_pictures(self) -> bool:
         """Whether the results are drawn, ``output.figures`` of the members."""
         output = self.table.get("output", {})
-        return bool(output.get("figures", True)) if isinstance(output, dict) else False
+        return isinstance(output, dict) and bool(output.get("figures", True))
 
     def names(self) -> dict[str, str]:
         """A short name for every key that varies: its last part, or all of it where that is not unique."""
@@ -223,12 +225,16 @@ class Sweep(StudyCase):
 def _site_count(table: Table) -> int:
     """The number of sites that a table asks for, which need not be a valid case; 0 where it does not say."""
     contacts = table.get("contacts", {})
-    sites = contacts.get("sites", 0) if isinstance(contacts, dict) else 0
+    if not isinstance(contacts, dict):
+        return 0
+    sites = contacts.get("sites", 0)
     if isinstance(sites, dict):
         sites = sites.get("count", 0)
     if isinstance(sites, list):
         return len(sites)
-    return sites if isinstance(sites, int) else 0
+    if isinstance(sites, int):
+        return sites
+    return 0
 
 
 def coordinate(values: Iterable[Any]) -> np.ndarray:
@@ -236,4 +242,10 @@ def coordinate(values: Iterable[Any]) -> np.ndarray:
     read = [number(value) for value in values]
     if all(type(value) in (int, float) for value in read):
         return np.array(read)
-    return np.array([value if isinstance(value, str) else json.dumps(value) for value in read], dtype=object)
+
+    texts = []
+    for value in read:
+        if not isinstance(value, str):
+            value = json.dumps(value)
+        texts.append(value)
+    return np.array(texts, dtype=object)

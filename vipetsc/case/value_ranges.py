@@ -57,8 +57,11 @@ def values_in(value: Any) -> tuple[Any, ...]:
         raise ValueError("the ends of a log range must be positive")
 
     first, last = map(float, ends)
-    spaced = np.geomspace if kind == "log" else np.linspace
-    return tuple(_without_rounding(value, max(abs(first), abs(last))) for value in spaced(first, last, count).tolist())
+    values = np.linspace(first, last, count)
+    if kind == "log":
+        values = np.geomspace(first, last, count)
+    largest = max(abs(first), abs(last))
+    return tuple(_without_rounding(value, largest) for value in values.tolist())
 
 
 def _without_rounding(value: float, largest: float) -> float:
@@ -70,8 +73,10 @@ def _without_rounding(value: float, largest: float) -> float:
     if abs(value) <= rounding * largest:
         return 0.0
     decimal = float(f"{value:.{DIGITS}g}")
+    if math.isclose(value, decimal, rel_tol=rounding):
+        return decimal
     # Other values keep their bits, and with them the names of members.
-    return decimal if math.isclose(value, decimal, rel_tol=rounding) else value
+    return value
 
 
 def axes_of(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], list[Problem]]:

@@ -89,17 +89,23 @@ class Variable(NamedTuple):
         if self.kind == "choice":
             return min(float(np.floor(position * self.high)) + 1, self.high)
         value = self.low + (self.high - self.low) * position
-        return float(np.round(value)) if self.kind == "whole" else value
+        if self.kind == "whole":
+            return float(np.round(value))
+        return value
 
     def in_case(self, value: float) -> Any:
         """A ``value`` as the case has it."""
         if self.kind == "choice":
             return copy.deepcopy(self.choices[int(value) - 1])
-        return int(value) if self.kind in ("whole", "site") else float(value)
+        if self.kind in ("whole", "site"):
+            return int(value)
+        return float(value)
 
     @property
     def step(self) -> float:
         """The distance in the unit cube of neighbouring values; 0 for real numbers."""
         if self.kind == "choice":
             return 1 / self.high
-        return 1 / (self.high - self.low) if self.kind in ("whole", "site") else 0.0
+        if self.kind in ("whole", "site"):
+            return 1 / (self.high - self.low)
+        return 0.0

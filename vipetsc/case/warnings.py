@@ -148,7 +148,9 @@ def length_warnings(model: Model) -> Iterator[str]:
             )
     if model.end <= drive.settled:
         # A drive that goes on has no end but that of its ramp.
-        part = "burst" if np.isfinite(drive.duration) else "drive's ramp"
+        part = "drive's ramp"
+        if np.isfinite(drive.duration):
+            part = "burst"
         yield f"time.end = {model.end:.6g} s is before the end of the {part}, at {drive.settled:.6g} s"
 
 
@@ -160,8 +162,11 @@ def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     if chain.ends == "periodic" or not (model.is_driven and waves_at(chain.cell, drive.frequency)):
         return
     # Sites are what a run is about; without them it is what is kept, or what is near the drive.
-    window = [cell - 1 for cell in output.window or (at + 1,)]
-    measured, name = (chain.sites, "site in cell") if chain.sites else (window, "cell")
+    name = "cell"
+    measured = [cell - 1 for cell in output.window or (at + 1,)]
+    if chain.sites:
+        name = "site in cell"
+        measured = [*chain.sites]
     for end, cell in (("left", 0), ("right", chain.cells - 1)):
         if chain.coefficients(cell, cell + 1).grounding.sum() > sum(chain.cell.grounding):
             continue  # it absorbs

@@ -19,6 +19,7 @@ from vipetsc.lattice import ToneBurst, Waveform
 from vipetsc.lattice.drive import impulse, main_frequency, ramped, spline
 from vipetsc.plugins import call
 from vipetsc.register import PARTS, WAVEFORM, Parameter, PartError, WaveformPart, reserve
+from vipetsc.wording import counted
 
 CYCLES = 30  # of a burst, where they are not given
 RAMP_PERIODS = 10  # of a harmonic drive's ramp, where it is not given
@@ -125,7 +126,7 @@ def _describe_samples(drive: "OneDrive") -> str:
 WAVEFORMS = {
     "burst": WaveformRecord(
         build=_build_burst,
-        describe=lambda drive: f"{drive.cycles} cycle{'s' * (drive.cycles != 1)}, {_omega(drive)}",
+        describe=lambda drive: f"{counted(drive.cycles, 'cycle')}, {_omega(drive)}",
         takes=("cycles", "envelope"),
     ),
     "harmonic": WaveformRecord(

@@ -27,6 +27,7 @@ from vipetsc.progress import Progress, say
 from vipetsc.studies.ensemble import COMPLETE, FAILED, FORMAT_VERSION, MISSING, SCALED, STATUS, Results, assemble
 from vipetsc.studies.linear_run import LinearRun, leading_cell, linear_name
 from vipetsc.studies.sweep_runs import SweepRuns
+from vipetsc.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -353,7 +354,8 @@ def summarise(sentences: Sequence[str]) -> list[str]:
 
     summary = []
     for texts in kinds.values():
-        members = "1 member" if len(texts) == 1 else f"{len(texts)} members"
-        example = ", for instance" if len(set(texts)) > 1 else ""
-        summary.append(f"{members}{example}: {max(texts)}")
+        members = counted(len(texts), "member")
+        if len(set(texts)) > 1:
+            members += ", for instance"
+        summary.append(f"{members}: {max(texts)}")
     return summary

@@ -21,6 +21,7 @@ from vipetsc.cli.tables import first_few, table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import BRANCHES
 from vipetsc.parallel import on_root
+from vipetsc.wording import counted
 
 if TYPE_CHECKING:
     from vipetsc.modes.branches.branch import Branch
@@ -117,8 +118,7 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
         fixed_unit += f", {case.drive.frequency:.6g} rad/s"
 
     low, high = options.range
-    count = len(case.every_curve())
-    curves = "1 curve" if count == 1 else f"{count} curves"
+    curves = counted(len(case.every_curve()), "curve")
     parity = "odd only" if options.symmetric else "even and odd"
 
     lattice = dict(lattice_rows(case))
@@ -141,7 +141,7 @@ def _isola_rows(case: NfrcCase) -> Rows:
     options = case.nfrc
     if not options.isolas:
         return []
-    places = "1 place" if options.isolas == 1 else f"{options.isolas} places"
+    places = counted(options.isolas, "place")
     searches = []
     if "amplitudes" in options.isola_search:
         searches.append(f"by amplitudes up to {options.isola_reach:g} times larger or smaller")

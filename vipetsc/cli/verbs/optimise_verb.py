@@ -6,6 +6,7 @@ from vipetsc.cli.drawing import Pictures
 from vipetsc.cli.tables import first_few
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import OPTIMUM
+from vipetsc.wording import counted
 
 
 def search_designs(plan: OptimiseCase, work: Work) -> Outcome:
@@ -21,9 +22,8 @@ def optimise_rows(plan: OptimiseCase, ranks: int) -> Rows:
     responses: Rows = []
     if plan.options.measures_responses:
         case = plan.responses(plan.base)
-        count = len(case.every_curve())
         low, high = case.nfrc.range
-        curves = "1 curve" if count == 1 else f"{count} curves"
+        curves = counted(len(case.every_curve()), "curve")
         responses = [("responses", f"{curves} of each design over the {case.nfrc.over}, {low:g} to {high:g}")]
     variables = first_few([variable.name for variable in plan.variables()])
     return [

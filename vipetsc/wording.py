@@ -1,0 +1,16 @@
+"""Numbers with nouns and names with units, as tables, messages and pictures write them."""
+
+
+def counted(number: int | str, noun: str) -> str:
+    """A ``number``, or its text, with a ``noun`` whose plural ends in s: "1 site", "5 sites"."""
+    text = str(number)
+    if text == "1":
+        return f"{text} {noun}"
+    return f"{text} {noun}s"
+
+
+def with_unit(name: str, unit: str) -> str:
+    """A ``name`` with its ``unit`` in brackets, as "time (s)"; without one where the unit is "1" or empty."""
+    if unit in ("", "1"):
+        return name
+    return f"{name} ({unit})"
