@@ -276,3 +276,14 @@ def test_a_fast_separation_pulls_unless_it_is_clipped_or_the_approach_has_a_floo
     assert Contact("hertz", 1e6, 0.7, adhesion="clip").dissipation_factor(-1.0, 0.1) == 0
     floored = Contact("hertz", 1e6, 0.7, approach_floor=0.5)
     assert floored.dissipation_factor(1.0, -1e-12) == pytest.approx(1 - 0.9)
+
+
+@pytest.mark.parametrize("cells", [100, 235, 400])
+def test_the_wave_of_a_long_ring_is_that_of_a_short_one(cells):
+    """A short burst decays before it is once round: the ring's length does not matter, nor does the driven cell."""
+    burst = ToneBurst(1.0, 1023.3, 8)
+    short = Chain(four_band("calibrated"), 64, "periodic").wave_scale(burst)
+
+    ring = Chain(four_band("calibrated"), cells, "periodic")
+    assert ring.wave_scale(burst) == pytest.approx(short, rel=1e-6)
+    assert ring.wave_scale(burst, cell=cells // 3) == pytest.approx(short, rel=1e-6)

@@ -261,7 +261,9 @@ class Chain:
         dynamic = cut.stiffness_matrix() - diags(cut.masses() * omega**2)
         force = np.zeros(cut.cells * self.cell.dofs, complex)
         force[driven * self.cell.dofs + mass] = 1.0
-        response = float(np.abs(scipy.sparse.linalg.spsolve(dynamic.tocsc(), force)).max())
+        # Eliminated column by column in SciPy's own order, a ring loses all digits: waves grow on their way along it.
+        order = "MMD_AT_PLUS_A" if self.ends == "periodic" else "COLAMD"
+        response = float(np.abs(scipy.sparse.linalg.spsolve(dynamic.tocsc(), force, permc_spec=order)).max())
         return response * drive.peak
 
 
