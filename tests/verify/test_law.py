@@ -218,6 +218,7 @@ def law_by_hand() -> ScatteringLaw:
         upper=upper,
         dissipated=1 - transmitted - upper,
         contact=0 * z,
+        dashpots=0 * z,
         onset=times,
         separation=times,
         release=times,

@@ -16,10 +16,11 @@ from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import PRESETS, Positive
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.warnings import wave_warnings
-from vipetsc.lattice import max_group_velocity, waves_at
+from vipetsc.lattice import max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.packet import packet_speeds
 
 LARGEST = 1e9  # cells times samples of a run
+RESOLVED = 8  # times the top band's edge: frequencies that the samples of a damped lattice resolve
 SHORTEST = 64  # cells of the ring: more than the propagator's band
 SLOWEST = 1e-9  # cells/s, so that a standing wave needs a run that is too large, and is refused for this reason
 
@@ -55,8 +56,9 @@ class OneSite:
 
     ``kind`` is the number of the site's kind; ``clearance`` in m is that on the side where it is less.
 
-    Runs end at ``end`` s, after ``samples``. ``band`` (from 0) is the drive's, in which all but 1e-3 of the energy is
-    faster than ``slow`` cells/s; ``towards`` is +1 if the site lies at higher cells than the drive, else -1.
+    Runs end at ``end`` s, after ``samples`` of ``interval`` s. ``band`` (from 0) is the drive's, in which all but 1e-3
+    of the energy is faster than ``slow`` cells/s; ``towards`` is +1 if the site lies at higher cells than the drive,
+    else -1.
     """
 
     cells: int
@@ -69,6 +71,7 @@ class OneSite:
     slow: float
     end: float
     samples: int
+    interval: float
 
 
 class LawCase(Case):
@@ -78,7 +81,6 @@ class LawCase(Case):
 
     verb = section = "law"
     refuses: ClassVar[Mapping[str, str]] = {
-        "damping": "not yet: what dashpots take on the way would count as lost at the site",
         "nonlinear springs": "waves in springs that are not linear depend on their amplitude without any contact too",
         "profiles": "the law compares the waves that arrive at a site and leave it, in equal cells",
         "scatter": "the law compares the waves that arrive at a site and leave it, in equal cells",
@@ -188,6 +190,9 @@ class LawCase(Case):
         assert law.distance is not None and clearance is not None
         cell = model.chain.cell
         interval = model.sample_interval
+        if cell.is_damped:
+            # The contact's force follows from samples, and has parts far above the bands.
+            interval = min(interval, np.pi / (RESOLVED * pass_bands(cell)[-1].high))
         band, slow, _ = packet_speeds(cell, model.drive, model.drive_mass)
         end = law.distance / max(slow, SLOWEST) + law.settle * model.drive.duration
         samples = int(np.ceil(end / interval))
@@ -205,6 +210,7 @@ class LawCase(Case):
             slow=slow,
             end=samples * interval,
             samples=samples,
+            interval=interval,
         )
 
     def _nearest_site(self) -> tuple[int, int, int]:

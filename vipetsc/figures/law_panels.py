@@ -18,6 +18,7 @@ ENERGIES: dict[str, dict[str, Any]] = {
     "upper": {"label": "U, upper bands", "color": style.VERMILION, "ls": style.DOTTED},
     "dissipated": {"label": "L, dissipated", "color": style.ORANGE, "ls": "-."},
 }
+DASHPOTS: dict[str, Any] = {"label": "D, dashpots", "color": style.GREEN, "ls": style.DASHED}
 FLOOR = 1e-5  # of the energy that arrives, which a logarithmic axis shows
 MARKS: dict[str, dict[str, Any]] = {
     "forward": {},
@@ -34,12 +35,16 @@ class LawCurve(NamedTuple):
 
 
 def law(data: xr.Dataset) -> Figure:
-    """Draw over z: T, R, U and L; what leaves by band and direction; T, U and U/(1-T) from the onset on."""
+    """Draw over z: T, R, U, L (and D); what leaves by band and direction; T, U and U/(1-T) from the onset on."""
     z = data["z"].values
     figure = style.new_figure(style.PAGE, 2.9)
     all_energies, by_band, onset = figure.subplots(1, 3)
     for name, look in ENERGIES.items():
         _draw_curve(all_energies, z, _curve(data, name), look)
+    sums_to_one = "T + R + U + L + other bands = 1"
+    if "dashpots" in data:
+        _draw_curve(all_energies, z, _curve(data, "dashpots"), DASHPOTS)
+        sums_to_one = "T + R + U + L + D + rest = 1"
     _draw_bands(by_band, data)
     for name in ("transmitted", "upper"):
         _draw_curve(onset, z - 1, _curve(data, name), ENERGIES[name])
@@ -56,7 +61,7 @@ def law(data: xr.Dataset) -> Figure:
     by_band.set(yscale="log", ylim=(FLOOR / 10, 1.5))
     onset.set(xscale="log", xlabel="z - 1", xlim=(max((z[1] - 1) / 2, 1e-4), 3), ylim=(0, 1.02))
 
-    all_energies.set_title("T + R + U + L + other bands = 1", fontsize=8)
+    all_energies.set_title(sums_to_one, fontsize=8)
     by_band.set_title("by band; circles: backward", fontsize=8)
     matched = float(data.attrs["matched_z"])
     if np.isfinite(matched):

@@ -95,7 +95,7 @@ class Source:
         if not flux.any():
             return flux
 
-        ahead, behind = self._amplitudes(waves, side)
+        ahead, behind = amplitudes_sent(waves, self.load, end)
         if wall is None:
             return np.asarray(flux * np.abs(ahead) ** 2)
 
@@ -107,26 +107,6 @@ class Source:
         if distance < NEAR:
             return np.asarray(flux * np.abs(ahead + image) ** 2)
         return np.asarray(flux * (np.abs(ahead) ** 2 + np.abs(image) ** 2))
-
-    def _amplitudes(self, waves: Waves, side: Side) -> tuple[np.ndarray, np.ndarray]:
-        """Amplitudes at the driven cell of an infinite lattice: of the waves towards an end, and of the others."""
-        towards, back, coupling, step = side
-        d = self.cell.dofs
-        half = len(waves.factor) // 2
-        scale = np.abs(waves.dynamic).max()
-
-        # Unknowns are the cell's displacement and the amplitudes: equation of motion, what the couplings feel of it.
-        matrix = np.zeros((3, d, d + 2 * half), complex)
-        matrix[0, :, :d] = waves.dynamic
-        matrix[0, :, d : d + half] = coupling @ (waves.shape * step)[:, towards]
-        matrix[0, :, d + half :] = coupling.T @ (waves.shape / step)[:, back]
-        matrix[1, :, :d] = coupling.T
-        matrix[1, :, d : d + half] = -coupling.T @ waves.shape[:, towards]
-        matrix[2, :, :d] = coupling
-        matrix[2, :, d + half :] = -coupling @ waves.shape[:, back]
-        right = np.concatenate([self.load / scale, np.zeros(2 * d)])
-        amplitudes = np.linalg.lstsq(matrix.reshape(3 * d, -1) / scale, right, rcond=None)[0][d:]
-        return amplitudes[:half], amplitudes[half:]
 
     def _densities(self, omegas: np.ndarray, section: EndSection, absorbs: bool) -> np.ndarray:
         """Energies (2, omega) in J s/rad that arrive at a ``section`` and that come back from it."""
@@ -143,6 +123,30 @@ class Source:
             arriving = sent[i] * np.exp(-2 * distance * Side.at(end, waves).decay())
             out[:, i] = arriving.sum(), arriving @ reflections(z, waves, end)
         return out
+
+
+def amplitudes_sent(waves: Waves, load: np.ndarray, end: End) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitudes at a cell of an infinite lattice that a ``load`` (dof,) in N on its masses sends out.
+
+    They are (wave,) of the waves towards an ``end`` and of the others, both in m, at the frequency of ``waves``.
+    """
+    towards, back, coupling, step = Side.at(end, waves)
+    d = len(load)
+    half = len(waves.factor) // 2
+    scale = np.abs(waves.dynamic).max()
+
+    # Unknowns are the cell's displacement and the amplitudes: equation of motion, what the couplings feel of it.
+    matrix = np.zeros((3, d, d + 2 * half), complex)
+    matrix[0, :, :d] = waves.dynamic
+    matrix[0, :, d : d + half] = coupling @ (waves.shape * step)[:, towards]
+    matrix[0, :, d + half :] = coupling.T @ (waves.shape / step)[:, back]
+    matrix[1, :, :d] = coupling.T
+    matrix[1, :, d : d + half] = -coupling.T @ waves.shape[:, towards]
+    matrix[2, :, :d] = coupling
+    matrix[2, :, d + half :] = -coupling @ waves.shape[:, back]
+    right = np.concatenate([load / scale, np.zeros(2 * d)])
+    amplitudes = np.linalg.lstsq(matrix.reshape(3 * d, -1) / scale, right, rcond=None)[0][d:]
+    return amplitudes[:half], amplitudes[half:]
 
 
 def integrate(densities: Callable[[np.ndarray], np.ndarray], edges: np.ndarray) -> np.ndarray:

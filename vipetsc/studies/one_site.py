@@ -10,6 +10,10 @@ enough to have arrived. The fraction of a band and direction is (E - E0)/E_in, p
 is R backward, and U in the bands above. With the dissipated energy and what a closed contact holds, over A^2 E_in, the
 fractions sum to 1, to the ledger's accuracy, since the drive works as without a site; T = 1 where nothing is touched.
 
+**Dashpots.** Energies are then those that flow past the site (``studies.site_waves``), and E_in is what arrives there:
+what dashpots take before and after is in no fraction. What they take at the site, where the waves overlap, is a
+fraction of its own: what the others leave. It goes to zero with the dashpots, to the accuracy of the contact's force.
+
 **z** is the largest |w| of the linear wave at the site over the clearance. The bilinear law scales exactly: with a
 given z, the fractions do not depend on the clearance. Hertz's does through its stiffness kc D^(1/2): the law is that of
 one clearance, by default the geometric mean of the sites'.
@@ -22,6 +26,7 @@ those of runs spread evenly over z (1 +- min(jitter, (z - 1)/10)).
 
 import itertools
 from collections.abc import Iterable
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +41,11 @@ from vipetsc.io.netcdf import tabulated, write_netcdf
 from vipetsc.io.records import Record
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.directions import by_direction, wave_energies
+from vipetsc.studies.pair_motion import PairMotion
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.ring import Ring
-from vipetsc.studies.scattering_law import BACKWARD, FORWARD, LAYOUT, NEAR, POINT_LAYOUT, ScatteringLaw
+from vipetsc.studies.scattering_law import BACKWARD, DAMPED, FORWARD, LAYOUT, NEAR, POINT_LAYOUT, ScatteringLaw
+from vipetsc.studies.site_waves import SiteWaves
 
 LINEAR = 0.0  # the z of the run without a site
 STEP = np.sqrt(2.0)  # between neighbouring points to begin with
@@ -90,7 +97,8 @@ class ScatteringRuns:
         self.setting = self.ring.setting
 
         # All runs with a site are measured against the one without.
-        self.recorded.make([LINEAR], lambda z: self._linear())
+        linear_run = self._linear_at_site if self.cell.is_damped else self._linear
+        self.recorded.make([LINEAR], lambda z: linear_run())
         linear = self.records[LINEAR]
         self.peak = linear["peak"]
         self.reference = np.array(linear["energy"])
@@ -101,9 +109,15 @@ class ScatteringRuns:
         """Records of the runs, by z."""
         return self.recorded.records
 
+    @cached_property
+    def site_waves(self) -> SiteWaves:
+        """The waves at the site of a lattice with dashpots."""
+        return SiteWaves(self.case.model(), self.setting, self.ring.kind.pair)
+
     def make(self, points: Iterable[float], progress: bool = False) -> None:
         """Simulate the missing runs with a site at ``points``; raises RuntimeError if one fails. Collective."""
-        self.recorded.make(points, self._scattered, what="runs of the law", progress=progress)
+        work = self._scattered_at_site if self.cell.is_damped else self._scattered
+        self.recorded.make(points, work, what="runs of the law", progress=progress)
 
     def amplitude(self, z: float) -> float:
         """Amplitude of the drive in N, for a largest linear relative displacement of ``z`` clearances."""
@@ -112,22 +126,37 @@ class ScatteringRuns:
     def _linear(self) -> Record:
         """The run without a site: the wave at the site over time, and its energies at the end."""
         setting = self.setting
-        drive = self.case.model().drive
         run = self.ring.run_to_end(1.0, with_site=False)
         energy, speed = wave_energies(self.cell, *_last_state(run))
-        since_burst = setting.end - drive.duration
+        since_burst = setting.end - self.case.model().drive.duration
         late = (speed * setting.towards > 0) & (np.abs(speed) * since_burst < setting.distance)
 
         # The run is simulated twice: its last sample in all cells and all samples of the site fit where all would not.
         motion = self.ring.motion(self.ring.run_at_site(1.0, with_site=False))
+        return self._arrival(motion) | {
+            "energy": by_direction(energy, setting.towards * speed).tolist(),
+            "under_way": float(energy[late[:, setting.band], setting.band].sum()),
+        }
+
+    def _linear_at_site(self) -> Record:
+        """The run without a site in a lattice with dashpots: the wave at the site, and the energies that pass there."""
+        waves = self.site_waves
+        motion = self.ring.motion(self.ring.run_at_site(1.0, with_site=False))
+        return self._arrival(motion) | {
+            "displacement": motion.displacement[:, 0].tolist(),
+            "energy": waves.energies().tolist(),
+            "under_way": waves.late(self.setting.end - self.case.model().drive.duration),
+            "taken_before": waves.taken_before(),
+        }
+
+    def _arrival(self, motion: PairMotion) -> Record:
+        """The wave at the site, from the ``motion`` under 1 N without the site."""
         w = motion.displacement[:, 0]
         rate = motion.velocity[:, 0]
         return {
             "peak": self.ring.peak_of(motion),
             "time": motion.time.tolist(),
-            "envelope": np.hypot(w, rate / drive.frequency).tolist(),
-            "energy": by_direction(energy, setting.towards * speed).tolist(),
-            "under_way": float(energy[late[:, setting.band], setting.band].sum()),
+            "envelope": np.hypot(w, rate / self.case.model().drive.frequency).tolist(),
         }
 
     def _scattered(self, z: Any) -> Record:
@@ -140,7 +169,33 @@ class ScatteringRuns:
         energy, speed = wave_energies(self.cell, u, v)
         # What still moves near the site at the end is counted among what leaves: this shows how much it is.
         near = (np.arange(-NEAR, NEAR + 1) + setting.site) % setting.cells
+        return {
+            "energy": (by_direction(energy, setting.towards * speed) / square).tolist(),
+            "near": float((self.cell.masses * v[near] ** 2).sum()) / square,
+        } | self._contact(run, amplitude)
 
+    def _scattered_at_site(self, z: Any) -> Record:
+        """A run with the site in a lattice with dashpots; energies over the amplitude's square."""
+        amplitude = self.amplitude(z)
+        square = amplitude**2
+        run = self.ring.run_at_site(amplitude, with_site=True, beside=NEAR)
+        motion = self.ring.motion(run)
+        contact = self._contact(run, amplitude)
+        linear = amplitude * np.array(self.records[LINEAR]["displacement"])
+        force = self.site_waves.force(motion, linear, contact["onset"], contact["separation"])
+
+        energy = self.site_waves.energies(force / amplitude)
+        sent_out = float((energy - self.reference).sum())
+        last = run["velocity"].values[-1]
+        return {
+            "energy": energy.tolist(),
+            "near": float((self.cell.masses * last**2).sum()) / square,
+            "dashpots": -sent_out - contact["dissipated"] - contact["contact"],
+        } | contact
+
+    def _contact(self, run: xr.Dataset, amplitude: float) -> Record:
+        """What a ``run`` under ``amplitude`` in N says of the contact; energies over the amplitude's square."""
+        square = amplitude**2
         first_contact = np.nan
         last_contact = np.nan
         onset = run["impacts/onset"].values
@@ -148,13 +203,10 @@ class ScatteringRuns:
             first_contact = float(onset.min())
             last_contact = float(np.nanmax(run["impacts/separation"].values))
         linear = self.records[LINEAR]
-        release = np.interp(last_contact, linear["time"], linear["envelope"]) * amplitude / setting.clearance
-
+        release = np.interp(last_contact, linear["time"], linear["envelope"]) * amplitude / self.setting.clearance
         return {
-            "energy": (by_direction(energy, setting.towards * speed) / square).tolist(),
             "dissipated": float(run["energy/dissipated"][-1]) / square,
             "contact": float(run["energy/contact"][-1]) / square,
-            "near": float((self.cell.masses * v[near] ** 2).sum()) / square,
             "episodes": len(onset),
             "onset": first_contact,
             "separation": last_contact,
@@ -198,6 +250,7 @@ class ScatteringRuns:
             "upper": share[band + 1 :].sum(),
             "dissipated": record.get("dissipated", 0.0) / self.arrived,
             "contact": record.get("contact", 0.0) / self.arrived,
+            "dashpots": record.get("dashpots", 0.0) / self.arrived,
             "near": record.get("near", 0.0) / self.arrived,
             "onset": record.get("onset", np.nan),
             "separation": record.get("separation", np.nan),
@@ -220,9 +273,10 @@ class ScatteringRuns:
             "amplitude": [self.amplitude(z) for z in points],
             "interpolation_error": [errors[z] for z in points],
         }
-        for name in (*POINT_LAYOUT, "near", "episodes"):
+        of_points = [name for name in POINT_LAYOUT if name not in DAMPED or self.cell.is_damped]
+        for name in (*of_points, "near", "episodes"):
             values[name] = np.array([mean[name] for mean, _ in outcomes])
-        for name in POINT_LAYOUT:
+        for name in of_points:
             values[f"{name}_scatter"] = np.array([deviation[name] for _, deviation in outcomes])
         data = xr.Dataset(tabulated(LAYOUT, values), attrs=provenance(self.recorded.comm) | self._about())
 
@@ -243,7 +297,8 @@ class ScatteringRuns:
         # The burst's own length, as deviation of sin^4: the square of its Hann window.
         burst = np.linspace(0, 1, 1001)
         sent = self.case.model().drive.duration * _deviation(burst, np.sin(np.pi * burst) ** 4)
-        return {
+        of_dashpots = {"taken_before": linear["taken_before"]} if self.cell.is_damped else {}
+        return of_dashpots | {
             "case": self.case.to_toml(),
             "drive_band": setting.band + 1,
             "clearance": setting.clearance,

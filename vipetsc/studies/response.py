@@ -16,7 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from vipetsc.io.records import Record
-from vipetsc.lattice import Band, Chain, UnitCell, WaveCompliance, bloch, pass_bands, waves_at
+from vipetsc.lattice import Band, Chain, OpenCompliance, UnitCell, WaveCompliance, bloch, pass_bands, waves_at
 from vipetsc.lattice.chain import Pair
 
 LOWEST = 0.15  # z of the first of the bins
@@ -32,6 +32,10 @@ TOP = 1.02
 
 def self_response(cell: UnitCell, omega: np.ndarray, pair: Pair) -> np.ndarray:
     """g (omega) in m/N of a ``pair`` in an infinite lattice at frequencies ``omega`` in rad/s, below the real axis."""
+    if cell.is_damped:
+        # Two cells, for a contact that joins them, which go on in both directions.
+        chain = Chain(cell, 2, sites=(0,), pairs=(pair,))
+        return OpenCompliance(chain, open_ends=("left", "right")).at(omega)[:, 0, 0]
     return WaveCompliance(Chain(cell, 1, sites=(0,), pairs=(pair,)), infinite=True).at(omega)[:, 0, 0]
 
 

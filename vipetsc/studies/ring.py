@@ -12,6 +12,7 @@ drive is in the midst of the lattice, not at a wall. ``LawCase.one_site`` choose
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from vipetsc.case.kinds import NO_SITES, contacts_of_one
@@ -45,16 +46,22 @@ class Ring:
 
     def motion(self, run: xr.Dataset) -> PairMotion:
         """The relative motion of the site's masses in a ``run_at_site``."""
-        return PairMotion.between(run, [0], [self.kind.pair])
+        (column,) = np.flatnonzero(run["cell"].values == self.setting.site + 1)
+        return PairMotion.between(run, [int(column)], [self.kind.pair])
 
     def run_to_end(self, amplitude: float, *, with_site: bool) -> xr.Dataset:
         """A run under ``amplitude`` in N of which all cells are kept at the first and the last sample."""
         return self._run(amplitude, with_site, {"stride": self.setting.samples})
 
-    def run_at_site(self, amplitude: float, *, with_site: bool) -> xr.Dataset:
-        """A run under ``amplitude`` in N of which all samples of the site's cells are kept."""
+    def run_at_site(self, amplitude: float, *, with_site: bool, beside: int = 0) -> xr.Dataset:
+        """A run under ``amplitude`` in N of which all samples of the site's cells are kept.
+
+        So are those of as many cells ``beside`` it, on both sides.
+        """
         cell = self.setting.site + 1
-        return self._run(amplitude, with_site, {"window": [cell, cell + self.kind.pair.next_cell]})
+        first = max(cell - beside, 1)
+        last = min(cell + self.kind.pair.next_cell + beside, self.setting.cells)
+        return self._run(amplitude, with_site, {"window": [first, last]})
 
     def _contacts(self) -> dict[str, Any]:
         """The changes of ``[contacts]`` that leave one site of the kind."""
@@ -72,7 +79,7 @@ class Ring:
             # Where the case moves a wall, a force sends a wave of the same form.
             drive={"cell": 1, "amplitude": amplitude, "end": None},
             contacts=contacts,
-            time={"end": setting.end},
+            time={"end": setting.end, "sample_interval": setting.interval},
             output=output,
         )
         return self.recorded.run_in_memory(case)[0]

@@ -26,10 +26,12 @@ POINT_LAYOUT = {
     "share": ("z band direction", "1", "outgoing fraction by band and direction"),
     "dissipated": ("z", "1", "dissipated fraction"),
     "contact": ("z", "1", "fraction stored in a closed contact at the end"),
+    "dashpots": ("z", "1", "fraction that dashpots take at the site, where waves overlap"),
     "onset": ("z", "s", "time of the first contact"),
     "separation": ("z", "s", "time at which the last contact ends"),
     "release": ("z", "1", "linear envelope over the clearance at the end of the last contact"),
 }
+DAMPED = {"dashpots"}  # fractions that the file of a lattice without dashpots does not have
 LAYOUT = {
     "z": ("z", "1", "largest relative displacement of the linear wave at the site, over the clearance"),
     "band": ("band", "1", "band, from 1"),
@@ -58,9 +60,10 @@ class ScatteringOutcome(NamedTuple):
     """Outcome of a wave at one site, arrays over z; fractions of the energy that arrives in the drive's band.
 
     ``share`` (..., band, direction) is what leaves by band, forward (0) and backward (1): in the drive's band these are
-    ``transmitted`` and ``reflected``; ``upper`` is all of the bands above. ``dissipated`` and ``contact``, held by a
-    closed contact at the end, make the sum 1. ``onset`` and ``separation`` are the times in s of the first and the
-    last contact, NaN without any; ``release`` is the linear envelope over the clearance at the latter.
+    ``transmitted`` and ``reflected``; ``upper`` is all of the bands above. ``dissipated`` in the contact, ``contact``,
+    held by a closed contact at the end, and ``dashpots``, taken by those at the site, make the sum 1. ``onset`` and
+    ``separation`` are the times in s of the first and the last contact, NaN without any; ``release`` is the linear
+    envelope over the clearance at the latter.
     """
 
     share: np.ndarray
@@ -69,6 +72,7 @@ class ScatteringOutcome(NamedTuple):
     upper: np.ndarray
     dissipated: np.ndarray
     contact: np.ndarray
+    dashpots: np.ndarray
     onset: np.ndarray
     separation: np.ndarray
     release: np.ndarray
@@ -103,10 +107,13 @@ class ScatteringLaw:
     @classmethod
     def of(cls, data: xr.Dataset) -> Self:
         """The law in the content of ``law.h5``."""
+        none = xr.zeros_like(data["dissipated"])
+        mean = {name: data.get(name, none).values for name in ScatteringOutcome._fields}
+        scatter = {name: data.get(f"{name}_scatter", none).values for name in ScatteringOutcome._fields}
         return cls(
             z=data["z"].values,
-            mean=ScatteringOutcome(**{name: data[name].values for name in ScatteringOutcome._fields}),
-            scatter=ScatteringOutcome(**{name: data[f"{name}_scatter"].values for name in ScatteringOutcome._fields}),
+            mean=ScatteringOutcome(**mean),
+            scatter=ScatteringOutcome(**scatter),
             drive_band=int(data.attrs["drive_band"]) - 1,
             clearance=float(data.attrs["clearance"]),
             peak=float(data.attrs["peak"]),
@@ -165,7 +172,8 @@ class ScatteringLaw:
     def summary(self) -> list[tuple[str, str]]:
         """Rows of a table that describe the law: its ring, the packet, its points and a few of its values."""
         about = self.about
-        sums = self.mean.share.sum(axis=(1, 2)) + self.mean.dissipated + self.mean.contact
+        mean = self.mean
+        sums = mean.share.sum(axis=(1, 2)) + mean.dissipated + mean.contact + mean.dashpots
         arrives = f"at {about['arrival']:.4g} s, {about['spread']:.4g} times as long as the burst"
         rows = [
             ("ring", f"{about['cells']} cells, site at {about['distance']}, clearance {self.clearance:.5g} m"),
@@ -175,6 +183,9 @@ class ScatteringLaw:
                 f"{len(self.z)} from z = 1 to {self.z[-1]:g}; fractions sum to 1 within {abs(sums - 1).max():.0e}",
             ),
         ]
+        if "taken_before" in about:
+            taken = f"take {about['taken_before']:.3g} of the wave before the site"
+            rows.append(("dashpots", f"{taken}, up to {np.abs(mean.dashpots).max():.2g} at the site"))
         rows += [(f"z = {z:g}", self._fractions_at(z)) for z in LISTED if z < self.z[-1]]
 
         best = "no energy is transferred to bands above the driven one"
@@ -183,10 +194,12 @@ class ScatteringLaw:
         return [*rows, ("matched", best)]
 
     def _fractions_at(self, z: float) -> str:
-        """T, R, U and the dissipated fraction L at ``z`` with their scatter."""
+        """T, R, U and the dissipated fraction L at ``z``, of dashpots D, with their scatter."""
         mean = self.at(z)
         scatter = self.deviation(z)
         symbols = {"T": "transmitted", "R": "reflected", "U": "upper", "L": "dissipated"}
+        if "taken_before" in self.about:
+            symbols["D"] = "dashpots"
         return ", ".join(
             f"{symbol} {getattr(mean, name):.3f}+-{getattr(scatter, name):.3f}" for symbol, name in symbols.items()
         )

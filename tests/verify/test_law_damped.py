@@ -1,0 +1,153 @@
+"""The scattering law in a lattice with dashpots: fluxes past the site, their decay, and the limit without damping."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from tests.one_site import COARSE, law_case
+from vipetsc.case import LawCase
+from vipetsc.figures.registry import draw
+from vipetsc.parallel import StopRequest
+from vipetsc.studies.one_site import LINEAR, ScatteringRuns, make_law
+from vipetsc.studies.scattering_law import BACKWARD, FORWARD
+from vipetsc.studies.site_waves import spectrum_of
+
+FRACTIONS = ("transmitted", "reflected", "upper", "dissipated", "dashpots")
+
+
+def damped_case(damping: dict[str, float], **law: Any) -> LawCase:
+    """The small law with dashpots and a lossy contact."""
+    table = law_case(contacts={"restitution": 0.7}, law=COARSE | law).model_dump(by_alias=True, exclude_none=True)
+    table["lattice"]["damping"] = damping
+    # What was resolved without dashpots is resolved anew.
+    del table["law"]["distance"]
+    return LawCase.from_table(table)
+
+
+def make_runs(folder: Path, case: LawCase) -> ScatteringRuns:
+    """The runs of a law on this rank, none of which has been made."""
+    folder.mkdir(exist_ok=True)
+    return ScatteringRuns(case, folder, MPI.COMM_SELF, StopRequest())
+
+
+def fractions(runs: ScatteringRuns, z: float) -> dict[str, float]:
+    """The fractions of a single run by name."""
+    runs.make([z])
+    runs.jittered = lambda point: [point]
+    mean, _ = runs.outcomes(z)
+    return {name: float(mean[name]) for name in FRACTIONS}
+
+
+@pytest.fixture(scope="module")
+def undamped(tmp_path_factory) -> dict[str, float]:
+    """The fractions without dashpots, from the waves at the end of the run."""
+    return fractions(make_runs(tmp_path_factory.mktemp("undamped"), damped_case({})), 1.3)
+
+
+def test_without_damping_the_fluxes_are_the_waves_at_the_end(undamped, tmp_path):
+    """Dashpots that take 3e-8 of the wave: the energies that pass the site are those found in all cells at the end."""
+    runs = make_runs(tmp_path, damped_case({"mass": 1e-6}))
+    assert runs.records[LINEAR]["taken_before"] < 1e-7
+
+    weak = fractions(runs, 1.3)
+
+    for name in FRACTIONS:
+        assert weak[name] == pytest.approx(undamped[name], abs=4e-4), name
+
+
+@pytest.mark.slow
+def test_the_law_tends_to_the_undamped_one_as_dashpots_become_weaker(undamped, tmp_path):
+    """A quarter of the damping: less than half of the difference, and of what dashpots take at the site."""
+    strong, weak = (fractions(make_runs(tmp_path / str(c), damped_case({"mass": c})), 1.3) for c in (2.0, 0.5))
+
+    assert strong["dashpots"] > 0.005
+    for name in FRACTIONS:
+        far = abs(strong[name] - undamped[name])
+        assert abs(weak[name] - undamped[name]) < 0.5 * far + 4e-4, name
+
+
+def test_the_wave_decays_on_its_way_as_that_of_dashpots_to_ground(tmp_path):
+    """Dashpots of c m on every mass m take exp(-c t) of the energy: t is the distance over the group velocity."""
+    runs = make_runs(tmp_path, damped_case({"mass": 2.0}))
+    waves = runs.site_waves
+    distance = runs.setting.distance
+    band = runs.setting.band
+    sent = waves.weight[:, band] * waves.flux[0, :, band] * np.abs(waves.leaving_drive[:, band]) ** 2
+    expected = sent @ np.exp(-2.0 * distance / waves.speed[:, band]) / sent.sum()
+
+    assert 1 - waves.taken_before() == pytest.approx(expected, rel=2e-4)
+    assert expected < 0.95
+
+
+@pytest.mark.slow
+def test_the_power_through_springs_is_that_of_the_waves(tmp_path):
+    """Of a run with contacts: through springs three cells from the site, forward and backward, with the waves' decay.
+
+    Backward it is what arrives less what is reflected: three cells away the waves interfere little.
+    """
+    away = 3
+    runs = make_runs(tmp_path, damped_case({"stiffness": 5e-6}, settle=3.0))
+    ring = runs.ring
+    setting = ring.setting
+    amplitude = runs.amplitude(4.0)
+    run = ring.run_at_site(amplitude, with_site=True, beside=away + 1)
+    contact = runs._contact(run, amplitude)
+    linear = amplitude * np.array(runs.records[LINEAR]["displacement"])
+    waves = runs.site_waves
+    force = waves.force(ring.motion(run), linear, contact["onset"], contact["separation"])
+
+    [spring] = [spring for spring in runs.cell.springs if spring.next_cell]
+    amplitudes = waves.amplitudes(force / amplitude)
+
+    def through(cell: int) -> float:
+        """Energy in J for a drive of 1 N through the spring from ``cell`` to the next one."""
+        i = int(np.flatnonzero(run["cell"].values == cell)[0])
+        motion = [run[name].values for name in ("displacement", "velocity")]
+        (u, v), (next_u, next_v) = ([f[:, i, spring.start] for f in motion], [f[:, i + 1, spring.end] for f in motion])
+        pull = spring.stiffness * (u - next_u) + spring.damping * (v - next_v)
+        return float((pull * (v + next_v) / 2).sum() * setting.interval / amplitude**2)
+
+    def carried(direction: int, spectrum: np.ndarray, cells: float) -> float:
+        """Energy in J of waves with a ``spectrum`` at the site, so many ``cells`` from it in their direction."""
+        there = spectrum * waves.factor[direction] ** cells
+        return float((waves.weight * waves.flux[direction] * np.abs(there) ** 2).sum())
+
+    site = setting.site + 1
+    assert through(site + away) == pytest.approx(carried(FORWARD, amplitudes[0], away + 0.5), abs=1e-3 * runs.arrived)
+    returning = carried(BACKWARD, amplitudes[1], away + 0.5)
+    coming = carried(FORWARD, waves.arriving, -away - 0.5)
+    assert through(site - away - 1) == pytest.approx(coming - returning, abs=2e-3 * runs.arrived)
+    assert returning > 0.05 * runs.arrived
+
+
+def test_the_spectrum_at_any_frequency_is_the_transform():
+    """At the frequencies of a fast transform, and between them."""
+    rng = np.random.default_rng(3)
+    signal = rng.normal(size=77)
+    step = 1e-3
+    at_bins = 2 * np.pi * np.fft.rfftfreq(77, step)
+    np.testing.assert_allclose(spectrum_of(signal, step, at_bins), step * np.fft.rfft(signal), atol=1e-14)
+
+    between = np.array([[100.0, 777.0]])
+    expected = step * np.exp(-1j * np.multiply.outer(between, step * np.arange(77))) @ signal
+    np.testing.assert_allclose(spectrum_of(signal, step, between), expected, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_the_file_and_the_picture_have_what_dashpots_take(tmp_path):
+    case = damped_case({"mass": 10.0}, largest=1.3, finest=0.5)
+    law = make_law(case, tmp_path, MPI.COMM_SELF)
+
+    total = law.mean.share.sum(axis=(1, 2)) + law.mean.dissipated + law.mean.contact + law.mean.dashpots
+    np.testing.assert_allclose(total, 1, atol=1e-12)
+    assert law.mean.dashpots[0] == 0  # nothing is touched
+    assert law.mean.dashpots[-1] > 0.01
+    assert law.about["taken_before"] == pytest.approx(0.27, abs=0.02)
+    assert any(name == "dashpots" for name, _ in law.summary())
+    assert [path.name for path in draw("law", [tmp_path])] == ["law.png"]
