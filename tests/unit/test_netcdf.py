@@ -94,6 +94,31 @@ def test_fields_stay_in_the_file_until_they_are_used(tmp_path):
         assert not any(variable._in_memory for variable in variables)
 
 
+@pytest.mark.parametrize(
+    "key", [(1, 0), (slice(None, None, -1), 1), ([2, 0, 2], slice(None)), ([2, 0], [1, 0, 0]), (-1, slice(1, 0))]
+)
+def test_fields_are_read_where_they_are_indexed(tmp_path, key):
+    """Positions in any order and twice, steps backwards and empty ranges, of which HDF5 knows none."""
+    write_netcdf(tmp_path / "a.h5", measured())
+    with open_netcdf(tmp_path / "a.h5", "run") as data:
+        np.testing.assert_array_equal(data["velocity"][key].values, measured()["velocity"][key].values)
+
+
+def test_files_of_xarray_itself_are_read(tmp_path):
+    """Dimensions without a coordinate, which netCDF-4 has datasets for, texts and attributes of every type."""
+    attributes = {"whole": 3, "several": [1.5, 2.5], "words": ["a", "b"], "word": "µm"}
+    written = xr.Dataset({"field": (("row", "time"), np.arange(6.0).reshape(2, 3), attributes)}, {"time": [1, 2, 3]})
+    written["field"].encoding["_FillValue"] = None
+    written["label"] = ("row", ["first", "second"])
+    written.to_netcdf(tmp_path / "a.nc", format="NETCDF4", engine="h5netcdf")
+
+    with open_netcdf(tmp_path / "a.nc", "state") as data:
+        assert data.variables.keys() == {"field", "time", "label"}
+        assert data["field"].dims == ("row", "time")
+        assert data["label"].values.tolist() == ["first", "second"]
+        assert {name: np.asarray(value).tolist() for name, value in data["field"].attrs.items()} == attributes
+
+
 def test_files_of_another_kind_are_refused(tmp_path):
     """A missing file, one that is no HDF5 and one of another program are refused with what they lack."""
     with pytest.raises(OSError, match="missing"):

@@ -106,7 +106,8 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
 
     try:
         # Names first: measuring writes files, and a wrong --fig must leave none.
-        figure_names(pictures.source, names, folders)
+        if names is not None:
+            figure_names(pictures.source, names, folders)
     except KeyError as error:
         raise FolderError(f"--fig: {error.args[0]}") from None
     if pictures.prepare:

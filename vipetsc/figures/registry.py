@@ -145,18 +145,22 @@ def figures_of(source: str, folders: Sequence[Path]) -> dict[str, FigureSpec]:
     return specs | {name: FigureSpec(name, source, function) for name, function in registered.items()}
 
 
-def figure_names(source: str, names: Sequence[str] | None = None, folders: Sequence[Path] = ()) -> list[str]:
+def figure_names(
+    source: str, names: Sequence[str] | None = None, folders: Sequence[Path] = (), files: Files | None = None
+) -> list[str]:
     """Return ``names``, by default those of all figures of ``source``; raise KeyError for one that is not of it.
 
     The measures in the ``folders`` of sweeps are names of figures too; by default those that most readers look at.
+    ``files`` are results that the caller has opened and will close.
     """
     specified = [*figures_of(source, folders)]
     measures: dict[str, str] = {}
     if source == SWEEP:
-        for folder in with_ensemble(folders):
-            measures |= {
-                measure_pages.figure_name(name): name for name in measure_pages.measures_of(open_ensemble(folder))
-            }
+        with Files() as opened_here:
+            opened = opened_here if files is None else files
+            for folder in with_ensemble(folders):
+                ensemble = opened.get(folder, open_ensemble)
+                measures |= {measure_pages.figure_name(name): name for name in measure_pages.measures_of(ensemble)}
     if names is None:
         return [*(name for name in measures if not measure_pages.is_on_request(measures[name])), *specified]
 
@@ -241,7 +245,7 @@ def drawings(
     Warnings in the files are the figures' labels. A drawing can be called as long as its ``files`` are open. Raises
     KeyError as ``figure_names``.
     """
-    chosen = figure_names(source, names, folders)
+    chosen = figure_names(source, names, folders, files)
     if source == SWEEP:
         return _sweep_drawings(chosen, folders, files, by_name=names is not None)
     named = figures_of(source, folders)

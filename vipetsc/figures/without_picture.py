@@ -40,7 +40,7 @@ def reasons_without_pictures(
     if source == RUN:
         run, analysis = run_and_analysis(folders[0], files)
         specs = figures_of(source, folders)
-        for name in figure_names(source, names, folders):
+        for name in figure_names(source, names, folders, files):
             without = specs[name].without
             reasons[name] = without(run, analysis) if without else ""
     elif source == BRANCHES:
@@ -77,7 +77,7 @@ def _reasons_of_sweeps(folders: Sequence[Path], files: Files, names: Sequence[st
     reasons: dict[str, str] = {}
     specs = figures_of(SWEEP, folders)
     ensembles = [files.get(folder, open_ensemble) for folder in with_ensemble(folders)]
-    for name in figure_names(SWEEP, names, folders):
+    for name in figure_names(SWEEP, names, folders, files):
         spec = specs.get(name)
         if spec:
             if name in expected and not any(specified_drawings(spec, ensembles, files)):

@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Collection, Hashable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -26,9 +25,15 @@ from vipetsc.io.errors import ResultFileError, UnreadableFileError
 # xarray loads pandas, which takes as long as all else that a command needs before it begins: functions import it.
 if TYPE_CHECKING:
     import xarray as xr
+    from xarray.backends import CachingFileManager
 
 Variables: TypeAlias = "dict[str, xr.Variable]"
 """Variables of a dataset by name."""
+
+# Attributes that describe dimensions, and the name of a dimension that no coordinate describes.
+OF_DIMENSIONS = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "DIMENSION_LABELS", "coordinates"}
+OF_DIMENSIONS |= {"_Netcdf4Dimid", "_Netcdf4Coordinates", "_nc3_strict", "_NCProperties"}
+NO_COORDINATE = b"This is a netCDF dimension but not a netCDF variable"
 
 
 def variable(dims: str | Sequence[str], values: Any, units: str, long_name: str, **attributes: Any) -> xr.Variable:
@@ -113,19 +118,18 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     as HDF5, ResultFileError, a ValueError, if it is not of this kind.
     """
     import xarray as xr
+    from xarray.backends import CachingFileManager
 
     sys.audit("vipetsc.read", str(path))
+    files = CachingFileManager(h5py.File, str(path), mode="r")
     try:
-        groups = xr.open_groups(path, engine="h5netcdf", phony_dims="access", decode_cf=False)
-        links = _links(path)
-    # Files of other programs have types and links that h5netcdf does not know, and meets with any exception.
+        variables, attributes = _contents(files)
+    # Files of other programs have types and links that h5py does not know, and meets with any exception.
     except Exception as error:
+        files.close()
         raise _unreadable(path, kind, error) from error
-    data = _flat(groups, links)
-    closing = ExitStack()
-    for group in groups.values():
-        closing.callback(group.close)
-    data.set_close(closing.close)
+    data = xr.Dataset(variables, attrs=attributes)
+    data.set_close(files.close)
 
     present: set[str] = set()  # variables and groups
     for name in data.variables:
@@ -167,50 +171,86 @@ def _refuse_other_kinds(path: str | Path, kind: str, missing: Sequence[str]) -> 
         raise ResultFileError(f"{path} is not a {kind} of vipetsc: it lacks {', '.join(missing)}")
 
 
-def _links(path: str | Path) -> set[PurePosixPath]:
-    """The soft links in a file, to coordinates outside a group."""
-    with h5py.File(path) as file:
-        groups = [file]
-
-        def collect(_: str, item: h5py.Group | h5py.Dataset) -> None:
-            if isinstance(item, h5py.Group):
-                groups.append(item)
-
-        file.visititems(collect)
-        links = set()
-        for group in groups:
-            for key in group:
-                if isinstance(group.get(key, getlink=True), h5py.SoftLink):
-                    links.add(PurePosixPath(group.name) / key)
-    return links
-
-
-def _flat(groups: dict[str, xr.Dataset], links: Collection[PurePosixPath]) -> xr.Dataset:
-    """All groups in one dataset, names of variables, dimensions and attributes by their paths; ``links`` are left out.
-
-    The coordinate of a dimension stands in the same group, or in the nearest one that holds it.
-    """
+def _contents(files: CachingFileManager) -> tuple[Variables, dict[str, Any]]:
+    """The variables of all groups of the file that ``files`` opens, and the groups' attributes, by their paths."""
     import xarray as xr
+    from xarray.core import indexing
 
-    nodes: dict[PurePosixPath, xr.Dataset] = {}
-    scales: set[PurePosixPath] = set()
-    for group, data in groups.items():
-        node = PurePosixPath(group)
-        nodes[node] = data.drop_vars([link.name for link in links if link.parent == node])
-        scales |= {node / str(name) for name, item in nodes[node].variables.items() if item.dims == (name,)}
+    from vipetsc.io.stored_array import StoredArray
 
-    def coordinate(node: PurePosixPath, dim: Hashable) -> str:
-        """The path of the coordinate of a dimension in a group; without a coordinate, its path in this group."""
-        candidates = [group / str(dim) for group in (node, *node.parents)]
-        nearest = next((path for path in candidates if path in scales), candidates[0])
-        return str(nearest).strip("/")
-
-    variables: dict[str, xr.Variable] = {}
+    variables: Variables = {}
     attributes: dict[str, Any] = {}
-    for node, data in nodes.items():
-        for name, item in data.variables.items():
-            renamed = item.copy(deep=False)  # values stay in the file
-            renamed.dims = tuple(coordinate(node, dim) for dim in item.dims)
-            variables[str(node / str(name)).strip("/")] = renamed
-        attributes |= {str(node / str(key)).strip("/"): value for key, value in data.attrs.items()}
-    return xr.Dataset(variables, attrs=attributes)
+    with files.acquire_context() as file:
+        for group in _groups(file):
+            attributes |= {_path(group.name, key): value for key, value in _attributes(group).items()}
+            for dataset in _datasets(group):
+                dims = [_dimension(file, dataset, axis) for axis in range(dataset.ndim)]
+                # Texts are short, and an array of numpy's has to know the longest.
+                if h5py.check_string_dtype(dataset.dtype):
+                    data = dataset.asstr()[...].astype(str)
+                else:
+                    data = indexing.LazilyIndexedArray(StoredArray(files, dataset))
+                variables[_path(dataset.name)] = xr.Variable(dims, data, _attributes(dataset))
+    return variables, attributes
+
+
+def _path(*parts: str) -> str:
+    """The path of ``parts`` in a file, as names of variables and of attributes have it."""
+    return str(PurePosixPath(*parts)).strip("/")
+
+
+def _groups(group: h5py.Group) -> Iterator[h5py.Group]:
+    """A ``group``, and then all those in it."""
+    yield group
+    for item in _members(group):
+        if isinstance(item, h5py.Group):
+            yield from _groups(item)
+
+
+def _datasets(group: h5py.Group) -> Iterator[h5py.Dataset]:
+    """The datasets of a ``group`` but for those that netCDF-4 has for dimensions without coordinates."""
+    for item in _members(group):
+        if isinstance(item, h5py.Dataset) and not bytes(item.attrs.get("NAME", b"")).startswith(NO_COORDINATE):
+            yield item
+
+
+def _members(group: h5py.Group) -> Iterator[Any]:
+    """What a ``group`` itself holds: soft links lead to coordinates of other groups."""
+    for name in group:
+        if isinstance(group.get(name, getlink=True), h5py.HardLink):
+            yield group[name]
+
+
+def _dimension(file: h5py.File, dataset: h5py.Dataset, axis: int) -> str:
+    """The dimension along an ``axis`` of a ``dataset``: the path of the scale that is attached to it.
+
+    A scale is its own dimension; an axis without a scale is one of its own.
+    """
+    if dataset.attrs.get("CLASS") == b"DIMENSION_SCALE" and dataset.ndim == 1:
+        return _path(dataset.name)
+    scales = dataset.attrs["DIMENSION_LIST"][axis] if "DIMENSION_LIST" in dataset.attrs else []
+    if len(scales):
+        return _path(file[scales[0]].name)
+    return _path(dataset.name, f"axis_{axis}")
+
+
+def _attributes(node: h5py.Group | h5py.Dataset) -> dict[str, Any]:
+    """The attributes of a group or a dataset without those by which HDF5 and netCDF-4 describe dimensions."""
+    attributes = {}
+    for key in node.attrs:
+        if key not in OF_DIMENSIONS:
+            attributes[key] = _attribute(node.attrs[key])
+    return attributes
+
+
+def _attribute(value: Any) -> Any:
+    """The ``value`` of an attribute: texts as str, several in a list; an array of one number as that number."""
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "surrogateescape")
+    if isinstance(value, h5py.Empty):
+        return np.array([], value.dtype)
+    if not isinstance(value, np.ndarray):
+        return value
+    if value.dtype.kind in "SO":
+        value = [_attribute(text) for text in value.flat]
+    return value[0] if len(value) == 1 else value

@@ -1,0 +1,32 @@
+"""Numbers that stay in an HDF5 file until they are used, for variables of xarray."""
+
+from typing import Any
+
+import h5py
+import numpy as np
+from xarray.backends import BackendArray, CachingFileManager
+from xarray.core import indexing
+
+
+class StoredArray(BackendArray):
+    """A ``dataset`` of an open file; what is indexed is read.
+
+    xarray closes files that were not used for long: ``files`` opens the file again.
+    """
+
+    def __init__(self, files: CachingFileManager, dataset: h5py.Dataset) -> None:
+        self.shape = dataset.shape
+        self.dtype = dataset.dtype
+        self._files = files
+        self._name = dataset.name
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
+        """The values at ``key``, an array or a number."""
+        # HDF5 takes a list of positions along one axis at most.
+        return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER_1VECTOR, self._read)
+
+    def _read(self, key: tuple[Any, ...]) -> Any:
+        """The values at ``key``: for each axis a number, a slice or, along one of them, an array of positions."""
+        positions = tuple(part.tolist() if isinstance(part, np.ndarray) else part for part in key)
+        with self._files.acquire_context() as file:
+            return file[self._name][positions]
