@@ -162,7 +162,7 @@ def test_all_modes_of_a_lattice_may_be_asked_for():
 def test_modes_keep_their_digits_beside_one_that_was_hit_exactly(monkeypatch):
     """The iterated eigenvalue of the mode that is hit exceeds the others as far as the shift is small."""
     # PETSc's own solver loses most there.
-    monkeypatch.setattr(eigen, "DIRECT", (("petsc",), ()))
+    monkeypatch.setattr(eigen, "ON_ONE_RANK", ("petsc",))
     matrices = matrices_of("fixed", 4)
     hit = modes_near(matrices, matrices.rows, 1.0).frequency[3]
     modes = modes_near(matrices, matrices.rows, hit)

@@ -206,7 +206,7 @@ def test_a_curve_over_a_cubic_coefficient(tmp_path):
     assert first == pytest.approx((0.1 / (1 - 0.64 + 0.08j)).real, rel=1e-3)
     assert last < first
 
-    with pytest.raises(CaseError, match="begin beside it"):
+    with pytest.raises(CaseError, match="begin at another value"):
         from_zero = DUFFING["nfrc"] | options | {"range": [0.0, 0.5]}
         NfrcCase.from_table(DUFFING | {"contacts": STOP, "nfrc": from_zero})
 
@@ -214,7 +214,7 @@ def test_a_curve_over_a_cubic_coefficient(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "key", "reason"),
     [
-        ({"nfrc": {"source": "wave", "range": [0.5, 1.0]}}, "nfrc.source", "changes on its way"),
+        ({"nfrc": {"source": "wave", "range": [0.5, 1.0]}}, "nfrc.source", "changes its shape as it travels"),
         ({"nfrc": DUFFING["nfrc"] | {"harmonics": 2000}}, "nfrc.harmonics", "unknown harmonics"),
         ({"lattice": TWO_MASSES["lattice"]}, "contacts.sites", "a spring that is not linear"),
     ],

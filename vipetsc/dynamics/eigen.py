@@ -14,8 +14,9 @@ from vipetsc.case import CaseError
 from vipetsc.case.case_file import Problem
 from vipetsc.dynamics.matrices import LatticeMatrices
 
-# Direct solvers for one rank, for several; the first that PETSc has. MUMPS takes ten times as long for a band.
-DIRECT = ("superlu", "petsc"), ("superlu_dist", "mumps")
+# Direct solvers, of which the first that PETSc has is taken. MUMPS takes ten times as long for a band.
+ON_ONE_RANK = ("superlu", "petsc")
+ON_SEVERAL = ("superlu_dist", "mumps")
 TOLERANCE = 1e-11
 # Of each search, that for further copies of a mode too: it ends as soon as one mode has converged, mostly one farther
 # away. With 4 restarts it gave up near the edge of a band, where modes crowd, and copies of ring modes were missing.
@@ -58,6 +59,7 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     def distance(value: complex) -> float:
         return float(abs(np.sqrt(max(value.real, 0.0)) - near))
 
+    # A generalised Hermitian problem, K and M being symmetric and M positive definite.
     eps = load_slepc().EPS().create(matrices.comm)
     eps.setOperators(matrices.stiffness, matrices.mass)
     eps.setProblemType(eps.ProblemType.GHEP)
@@ -104,7 +106,9 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
 def _solve_directly(st: Any) -> None:
     """Let the spectral transformation ``st`` invert with a direct solver."""
     st.setType("sinvert")
-    solvers = DIRECT[1] if st.comm.size > 1 else DIRECT[0]
+    solvers = ON_ONE_RANK
+    if st.comm.size > 1:
+        solvers = ON_SEVERAL
     solver = next((name for name in solvers if name == "petsc" or PETSc.Sys.hasExternalPackage(name)), None)
     ksp = st.getKSP()
     ksp.setType("preonly")
@@ -124,5 +128,7 @@ def _mode(matrices: LatticeMatrices, value: float, vector: PETSc.Vec) -> tuple[f
     shape = vector.array_r.reshape(-1, matrices.chain.cell.dofs) / np.sqrt(vector.dot(momentum))
     residual.axpy(-value, momentum)
     # A lattice with free ends moves as a whole: its square frequency is zero up to rounding, of either sign.
-    frequency = 0.0 if value < 1e-12 * matrices.largest else float(np.sqrt(value))
+    frequency = 0.0
+    if value >= 1e-12 * matrices.largest:
+        frequency = float(np.sqrt(value))
     return frequency, shape, residual.norm() / (matrices.largest * momentum.norm())

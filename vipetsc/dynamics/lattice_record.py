@@ -117,21 +117,32 @@ def create_record(model: Model, layout: Layout) -> LatticeRecord:
 def _create_shape(chain: Chain, layout: Layout) -> Shape:
     """Sizes and indices of the part of ``chain`` that ``layout`` gives to this rank."""
     left, right = layout.neighbours()
-    behind_left = layout.size + layout.ghost_rows * (left is not None)
+    # Behind the owned components lie the ghosts of the left neighbour, then those of the right one.
+    ghosted = layout.size
+    left_ghost = right_ghost = damping = -1
+    if left is not None:
+        left_ghost = ghosted
+        ghosted += layout.ghost_rows
+    if right is not None:
+        right_ghost = ghosted
+        ghosted += layout.ghost_rows
+    if layout.damped:
+        damping = 2 * layout.dofs * layout.owned
+
     return Shape(
         cells=layout.owned,
         dofs=layout.dofs,
         paired=bool(chain.pairs),
         owned=layout.size,
-        ghosted=behind_left + layout.ghost_rows * (right is not None),
+        ghosted=ghosted,
         exchange=layout.comm.size > 1 or layout.periodic,
-        left_ghost=-1 if left is None else layout.size,
-        right_ghost=-1 if right is None else behind_left,
+        left_ghost=left_ghost,
+        right_ghost=right_ghost,
         left_free=chain.ends == "free" and left is None,
         right_free=chain.ends == "free" and right is None,
         work=layout.rows * layout.owned,
         dissipated=layout.dissipated,
-        damping=2 * layout.dofs * layout.owned if layout.damped else -1,
+        damping=damping,
     )
 
 

@@ -63,10 +63,15 @@ class Layout:
         """Cells to the left and to the right of this rank's; None beyond an end, or on an empty rank."""
         if not self.owned:
             return None, None
-        left, right = self.start - 1, self.stop
+        left: int | None = self.start - 1
+        right: int | None = self.stop
         if self.periodic:
-            return left % self.cells, right % self.cells
-        return (left if left >= 0 else None), (right if right < self.cells else None)
+            return (self.start - 1) % self.cells, self.stop % self.cells
+        if self.start == 0:
+            left = None
+        if self.stop == self.cells:
+            right = None
+        return left, right
 
     def state_indices(self, cells: ArrayLike) -> np.ndarray:
         """Global indices (cell, 2 dofs) of the displacements and then of the velocities of ``cells``, mass by mass."""
@@ -165,5 +170,7 @@ def join(checkpoints: Sequence[Mapping[str, np.ndarray]], keys: Mapping[str, str
     joined = {}
     for name, key in keys.items():
         table = np.concatenate([checkpoint[name] for checkpoint in checkpoints])
-        joined[name] = table[np.argsort(table[key])] if key else table
+        if key:
+            table = table[np.argsort(table[key])]
+        joined[name] = table
     return joined

@@ -46,11 +46,13 @@ class LatticeMatrices:
         self.comm = comm
         self.rows = chain.cells * chain.cell.dofs
         self.start, self.stop = cell_cuts(chain.cells, comm.size)[comm.rank : comm.rank + 2]
-        # Before any assembly: a count beyond the index type would wrap around unseen.
+        # Before any assembly: a count beyond the index type would become another number without an error.
         self._check_indices()
         stiffness = on_every_rank(comm, lambda: chain.stiffness_rows(self.start, self.stop))
         joined = self._joined_rows(joints)
-        self.stiffness = self._matrix((stiffness + joined).tocsr() if joints else stiffness)
+        if joints:
+            stiffness = (stiffness + joined).tocsr()
+        self.stiffness = self._matrix(stiffness)
 
         coefficients = chain.coefficients(self.start - 1, self.stop)
         masses = coefficients.masses[1:]
@@ -76,10 +78,14 @@ class LatticeMatrices:
         for joint in joints:
             ends = [end for end in (joint.host, joint.resonator) if end >= 0]
             for row, column in itertools.product(ends, ends):
-                if first <= row < last:
-                    rows.append(row - first)
-                    columns.append(column)
-                    values.append(joint.stiffness if row == column else -joint.stiffness)
+                if not first <= row < last:
+                    continue
+                rows.append(row - first)
+                columns.append(column)
+                value = joint.stiffness
+                if row != column:
+                    value = -value
+                values.append(value)
         return csr_matrix((values, (rows, columns)), shape=(last - first, self.rows))
 
     def _check_indices(self) -> None:

@@ -18,7 +18,7 @@ from vipetsc.io.store import GATHER_LIMIT
 
 # States that an engine holds, each of 2 numbers a mass: two for each stage of a method and its saved copies; measured.
 STAGES = {"2a": 2, "3bs": 4, "5f": 6, "5dp": 7, "5bs": 8, "6vr": 9, "7vr": 10, "8vr": 13}
-STATES_BESIDE_STAGES = 4.6
+FURTHER_STATES = 4.6
 PROPAGATOR_STATES = 3.0
 # Copies of a chunk on the rank that keeps it, and further ones on rank 0 while the chunks of all are gathered.
 COPIES = 2
@@ -60,9 +60,16 @@ def _bytes_of_states(model: Model, engine: str, ranks: int) -> float:
     cell = model.chain.cell
     owned = -(-chain.cells // ranks)
     per_cell = 2 * cell.dofs + chain.is_damped
-    tables = 0 if chain.is_uniform() and not chain.is_damped else 2 * (cell.dofs + len(cell.springs))
-    states = 2 * STAGES[model.method] + STATES_BESIDE_STAGES if engine == "ts" else PROPAGATOR_STATES
-    differing = sum(array.nbytes for _, array in chain.variation.items()) if chain.variation else 0
+    states = PROPAGATOR_STATES
+    if engine == "ts":
+        states = 2 * STAGES[model.method] + FURTHER_STATES
+    tables = 0
+    if chain.is_damped or not chain.is_uniform():
+        tables = 2 * (cell.dofs + len(cell.springs))
+
+    differing = 0
+    if chain.variation:
+        differing = sum(array.nbytes for _, array in chain.variation.items())
     if engine == "propagator" and differing and (series := step_series(model)):
         # Rows of the step, and with dashpots of the losses in it.
         numbers = (2 * cell.dofs) ** 2 * (2 * series.reach + 1) * (1 + chain.is_damped)
@@ -75,14 +82,13 @@ def _bytes_of_chunk(model: Model, output: OutputTable, ranks: int, own_sites: in
     chain = model.chain
     recorded = len(recorded_cells(output, chain.cells))
     per_cell = len(output.fields) * chain.cell.dofs
-    per_site = 2 if output.forces else 1
+    per_site = 1 + bool(output.forces)  # losses, and forces if they are kept
     local = min(-(-chain.cells // ranks), recorded) * per_cell + per_site * own_sites
     every = recorded * per_cell + per_site * len(chain.sites)
+    if ranks == 1 or written_together(model, output, ranks):
+        return 8 * min(chunk_samples(8 * local), model.samples) * COPIES * local
     # A chunk that is gathered lies on rank 0 whole: its length follows from all cells.
-    together = ranks == 1 or written_together(model, output, ranks)
-    rows = min(chunk_samples(8 * (local if together else every)), model.samples)
-    gathered = 0 if together else GATHERED * every
-    return 8 * rows * (COPIES * local + gathered)
+    return 8 * min(chunk_samples(8 * every), model.samples) * (COPIES * local + GATHERED * every)
 
 
 def memory_available() -> int:

@@ -74,7 +74,7 @@ class Observer:
 
     @property
     def due(self) -> bool:
-        """Whether a checkpoint should be made now."""
+        """Whether a checkpoint should be written now."""
         return False
 
     def flush(self) -> None:
@@ -146,10 +146,12 @@ class Ledger(Observer):
 
     def statistics(self) -> dict[str, Any]:
         """``ledger_error``: largest residual over the largest work; ``work`` and ``dissipated`` in J at the end."""
-        error = self.worst / self.most_work if self.most_work else 0.0
-        numbers = {"ledger_error": error}
+        numbers = {"ledger_error": 0.0}
+        if self.most_work:
+            numbers["ledger_error"] = self.worst / self.most_work
         if np.isnan(self.work):
             return numbers
+
         numbers |= {"work": self.work, "dissipated": self.dissipated}
         if self.setup.model.chain.is_damped:
             numbers["dissipated_by_damping"] = self.dissipated_by_damping

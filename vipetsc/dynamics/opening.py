@@ -37,7 +37,9 @@ class Opening(NamedTuple):
 
     def values(self, name: str) -> np.ndarray:
         """The samples of the variable ``name`` of the run, scaled."""
-        scale = self.factor**2 if name.startswith("energy/") else self.factor
+        scale = self.factor
+        if name.startswith("energy/"):
+            scale = self.factor**2
         return np.asarray(self.run[name].values[: self.samples] * scale)
 
     def put_field(self, name: str, cells: slice, stride: int, out: np.ndarray) -> None:

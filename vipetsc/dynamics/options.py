@@ -16,7 +16,9 @@ RENAMING_VERSION = (3, 25)
 def options_of(case: CaseFile | None) -> dict[str, str]:
     """The PETSc options of ``case`` by name."""
     table = getattr(case, "petsc", None)
-    return table.model_dump() if table else {}
+    if table is None:
+        return {}
+    return table.model_dump()
 
 
 def with_database(case: Case) -> Case:
@@ -24,7 +26,9 @@ def with_database(case: Case) -> Case:
     database = PETSc.Options().getAll()
     names = [name for name in database if name.startswith("ts_") and not only_looks(name)]
     given = {name: database[name] or "true" for name in names} | options_of(case)
-    return case.model_copy(update={"petsc": PetscTable.model_validate(given)}) if given else case
+    if not given:
+        return case
+    return case.model_copy(update={"petsc": PetscTable.model_validate(given)})
 
 
 def name_in_petsc(name: str, version: tuple[int, ...] | None = None) -> str:

@@ -147,6 +147,7 @@ class PointMotion:
         shape = len(times), len(self._terms)
         displacement, velocity, acceleration = np.zeros((3, *shape))
         drives = drive_forces(self._drives, times)
+        at_wall = np.zeros(len(times))
         for point, terms in enumerate(self._terms):
             u = motion[:, terms.mass, terms.column]
             v = motion[:, dofs + terms.mass, terms.column]
@@ -155,8 +156,10 @@ class PointMotion:
 
             total = -terms.grounding * v
             for at in terms.springs:
-                other_u = motion[:, at.mass, at.column] if at.column >= 0 else np.zeros(len(times))
-                other_v = motion[:, dofs + at.mass, at.column] if at.column >= 0 else np.zeros(len(times))
+                other_u = other_v = at_wall
+                if at.column >= 0:
+                    other_u = motion[:, at.mass, at.column]
+                    other_v = motion[:, dofs + at.mass, at.column]
                 total += at.stiffness * (other_u - u)
                 if at.damping:
                     total += at.damping * (other_v - v)

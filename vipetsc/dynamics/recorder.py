@@ -40,29 +40,40 @@ class Recorder(Observer):
         local = recorded[first:stop] - layout.start
         together = bool(setup.output.folder) and written_together(setup.model, output, layout.comm.size)
 
-        points = output.points or []
-        self._points = PointMotion(points, setup.model, layout) if points else None
-        self._of_sites = (LOSSES, FORCES) if output.forces else (LOSSES,)
+        self._of_sites: tuple[str, ...] = (LOSSES,)
+        if output.forces:
+            self._of_sites = (LOSSES, FORCES)
         self._energies = [energy for energy, name in ENERGIES.items() if name != DAMPED or setup.model.chain.is_damped]
         sampled = ["time", "field_time", *(ENERGIES[energy] for energy in self._energies)]
+        points = output.points or []
+        self._points: PointMotion | None = None
+        if points:
+            self._points = PointMotion(points, setup.model, layout)
+            sampled += MOTION
         setup.output.recording = Recording(
             given=_coordinates(setup.model, recorded) | _places(points),
             fields=tuple(output.fields),
             together=together,
             rows=-(-setup.model.samples // output.stride),
-            sampled=(*sampled, *MOTION) if points else sampled,
+            sampled=sampled,
             of_sites=self._of_sites,
         )
-        self._columns = np.array([[first, stop] if together else [0, len(recorded)]])
 
         numbers = len(output.fields) * layout.dofs * local.size + len(self._of_sites) * len(layout.sites)
-        # Gathered chunks lie on rank 0 together.
-        most = layout.comm.allreduce(numbers, MPI.MAX if together else MPI.SUM)
+        if together:
+            self._columns = np.array([[first, stop]])
+            most = layout.comm.allreduce(numbers, MPI.MAX)
+        else:
+            # Rank 0 keeps the chunks that it gathers from all ranks.
+            self._columns = np.array([[0, len(recorded)]])
+            most = layout.comm.allreduce(numbers, MPI.SUM)
         self._length = min(chunk_samples(8 * most), setup.output.longest)
         self._stride = output.stride
         self._shape = len(output.fields), self._length, layout.dofs, local.size
         self._moving = np.array([name == "velocity" for name in output.fields], np.int64)
-        self._first = int(local[0]) if local.size else 0
+        self._first = 0
+        if local.size:
+            self._first = int(local[0])
         self._begin_chunk()
 
     def _begin_chunk(self) -> None:
@@ -73,11 +84,17 @@ class Recorder(Observer):
         self._work = np.zeros((n, len(self.setup.model.drives)))
         sites = len(self.setup.layout.sites)
         self._losses = np.zeros((n, sites))
-        # Empty arrays are not filled.
-        takes_forces = FORCES in self._of_sites or (self._points is not None and self._points.sites.size > 0)
-        self._forces = np.zeros((n if takes_forces else 0, sites))
-        watched = self._points.own_cells.size if self._points else 0
-        self._motion = np.zeros((n, 2 * self.setup.layout.dofs, watched))
+
+        takes_forces = FORCES in self._of_sites
+        self._watched = np.zeros(0, np.int64)
+        if self._points:
+            takes_forces = takes_forces or self._points.sites.size > 0
+            self._watched = self._points.own_cells
+        # Engines do not fill empty arrays.
+        self._forces = np.zeros((0, sites))
+        if takes_forces:
+            self._forces = np.zeros((n, sites))
+        self._motion = np.zeros((n, 2 * self.setup.layout.dofs, self._watched.size))
         self._kept = {name: np.zeros(n) for name in ("time", *(ENERGIES[energy] for energy in self._energies))}
         self._fields = self.setup.output.room(self._shape)
 
@@ -102,7 +119,7 @@ class Recorder(Observer):
             interval=self.setup.model.sample_interval,
             forces=self._forces[here],
             motion=self._motion[here],
-            watched=self._points.own_cells if self._points else np.zeros(0, np.int64),
+            watched=self._watched,
         )
 
     def observe(self, block: Block) -> None:
@@ -121,8 +138,10 @@ class Recorder(Observer):
 
     def record(self, opening: Opening) -> None:
         """Store the samples of an ``opening`` as a chunk of rank 0; all ranks must call it."""
-        output = self.setup.output
-        output.append(self._opened(opening) if self.setup.layout.comm.rank == 0 else None)
+        chunk = None
+        if self.setup.layout.comm.rank == 0:
+            chunk = self._opened(opening)
+        self.setup.output.append(chunk)
         self._begin_chunk()
 
     def _opened(self, opening: Opening) -> dict[str, np.ndarray]:
@@ -181,7 +200,9 @@ class Recorder(Observer):
         sites = np.array(self.setup.layout.sites, np.int64)
         of_sites = [values[: self._held] for values in (self._losses, self._forces)][: len(self._of_sites)]
         rank_part = sites, np.array(of_sites), episodes, self._fields[:, : self._rows]
-        gathered = [rank_part] if recording.together or comm.size == 1 else comm.gather(rank_part)
+        gathered: list[Any] | None = [rank_part]
+        if comm.size > 1 and not recording.together:
+            gathered = comm.gather(rank_part)
         if gathered is None:
             return {}
 
@@ -191,7 +212,9 @@ class Recorder(Observer):
         log = np.concatenate(all_episodes)
         log["site"] += 1  # counted from 1
         # One rank's fields may be large: they are not copied.
-        all_cells = all_fields[0] if len(all_fields) == 1 else np.concatenate(all_fields, axis=3)
+        all_cells = all_fields[0]
+        if len(all_fields) > 1:
+            all_cells = np.concatenate(all_fields, axis=3)
         chunk = {"sites": ranges(numbers[order]), "impacts": log, "columns": self._columns}
         chunk |= dict(zip(self._of_sites, np.concatenate(all_of_sites, axis=2)[:, :, order], strict=True))
         return chunk | dict(zip(recording.fields, all_cells, strict=True))
@@ -209,12 +232,16 @@ class Recorder(Observer):
         sites = len(self.setup.model.chain.sites)
         radius = self.setup.case.contact_radius
         if sites and not self.episodes:
-            place = "the site" if sites == 1 else f"one of the {sites} sites"
             touching = sum(min(gap) <= 0 for gap in self.setup.model.gaps)
-            if not touching:
-                return [f"no contact: nothing reached {place}"]
-            place = "the site that touches its stop" if sites == 1 else f"one of the {touching} sites that touch"
-            return [f"no contact: nothing pressed {place} at rest"]
+            # Of one site there is no choice to speak of.
+            reached = "the site"
+            pressed = "the site that touches its stop"
+            if sites > 1:
+                reached = f"one of the {sites} sites"
+                pressed = f"one of the {touching} sites that touch"
+            if touching:
+                return [f"no contact: nothing pressed {pressed} at rest"]
+            return [f"no contact: nothing reached {reached}"]
 
         is_hertz = any(law.law == "hertz" for law in self.setup.model.used_laws)
         if radius is None or not is_hertz or self.deepest <= radius:

@@ -155,10 +155,14 @@ def simulate(
     if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
         install_abort_hook()
     memory = RunMemory(comm)
-    target = memory if folder is None else folder
+    target: str | Path | RunOutput = memory
+    if folder is not None:
+        target = folder
     if isinstance(target, RunMemory) and resume:
         raise ValueError("a run in memory cannot be resumed")
-    ranks = target.comm if isinstance(target, RunOutput) else comm
+    ranks = comm
+    if isinstance(target, RunOutput):
+        ranks = target.comm
     on_every_rank(ranks, case.import_plugins)
     case = with_database(case)
     check_options(case)
@@ -170,17 +174,23 @@ def simulate(
     watching: list[type[Observer]] = [Guard, *observers, Ledger]
     if progress:
         watching.append(ProgressReport)
-    opens = opening if ENGINES[choice.name].opens and not observers else None
-    simulation = Simulation(case, model, choice, stop, watching, opens)
+    if observers or not ENGINES[choice.name].opens:
+        opening = None
+    simulation = Simulation(case, model, choice, stop, watching, opening)
     if isinstance(target, RunOutput):
         result = simulation.make(target)
-        return replace(result, held=memory.dataset) if folder is None else result
+        if folder is None:
+            return replace(result, held=memory.dataset)
+        return result
 
     with claimed(comm, target, RUN, case.to_toml(), force=force, resume=resume) as claim:
         output = RunFolder(claim.folder, comm)
         # A run that a kill has ended between its file and its publication is published now.
         ended = output.ending()
-        result = result_of(ended, False, output.folder) if ended else simulation.make(output)
+        if ended:
+            result = result_of(ended, False, output.folder)
+        else:
+            result = simulation.make(output)
         if not result.resumable:
             claim.publish()
     return replace(result, folder=claim.path)
@@ -213,7 +223,9 @@ class Simulation:
         """Simulate into ``output``, from its last checkpoint on if it has one; all ranks must call it."""
         output.begin(self.case.to_toml())
         checkpoints = output.last_state()
-        opening = self.opening() if self.opening and checkpoints is None else None
+        opening = None
+        if self.opening and checkpoints is None:
+            opening = self.opening()
 
         begin = Begin(time.perf_counter(), time.process_time(), compiling.seconds)
         sys.audit("vipetsc.set-up", self.case.name)
@@ -303,7 +315,9 @@ class Run:
             if failure:
                 # Engines go through a block in one piece: episodes may have begun after the failure.
                 self.recorder.end = failure.time + setup.model.sample_interval
-                good = "none" if self.last is None else f"t = {self.last:.6g} s"
+                good = "none"
+                if self.last is not None:
+                    good = f"t = {self.last:.6g} s"
                 where = f"at t = {failure.time:.6g} s ({fastest_cell(setup)})"
                 return FAILED, f"{failure.reason}, {where}; last good sample: {good}"
             if filled.stopped and self.samples < total:

@@ -29,7 +29,10 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     masses = np.array([*chain.reduced_masses(), chain.cell.reduced_mass])[numbers]
     joins_next_cell = np.array([*(pair.next_cell for pair in chain.contact_pairs), False])[numbers]
     # A number below 0 takes any law that is used: without stops no law acts.
-    laws = [model.used_laws[i if model.laws and i >= 0 else 0] for i in numbers]
+    numbers_of_laws = [max(i, 0) for i in numbers]
+    if not model.laws:
+        numbers_of_laws = [0] * len(numbers_of_laws)
+    laws = [model.used_laws[i] for i in numbers_of_laws]
     sites = create_contacts(laws, gaps, masses, model.scale)
 
     least = gaps.min(axis=1)
@@ -45,7 +48,8 @@ def create_site_dofs(model: Model, layout: Layout, ghosts: tuple[int, int]) -> n
     ``ghosts`` are the first components of the neighbouring cells on the left and on the right.
     """
     chain = model.chain
-    n, d = layout.owned, layout.dofs
+    n = layout.owned
+    d = layout.dofs
 
     def end(cell: int, mass: int) -> tuple[int, int, int, int]:
         if mass < 0:

@@ -2,7 +2,7 @@
 
 A cell's sums run over its springs in the cell's order, whichever rank owns it and wherever in the loop it falls: the
 result does not depend on the partition, to the last bit. Where all cells are alike and undamped, a mass and a spring
-have one number each; else (``is_varied``) each cell has its own, and the same sums are made with them.
+have one number each; else (``is_varied``) each cell has its own, and the sums are the same.
 """
 
 import numpy as np

@@ -16,7 +16,7 @@ omega_max H, omega_max from Gershgorin's circles of M^-1/2 K M^-1/2, the terms f
 (1 + theta)/(2m-1)! of the velocity's amplitude; ``reach`` r is the distance in cells beyond which the rows of P sum to
 less than the tolerance. Both bounds and the entries dropped within the band make up ``truncation``. Since theta <= 3.2,
 no term exceeds the result by much, and the series is as good as rounding allows (Moler and Van Loan 2003). Cells at
-least r from an end share one stencil; the others have rows of their own.
+least r from an end have one stencil in common; the others have rows of their own.
 
 **2. Free motion of the contact DoFs** (``series``, ``clusters``). A DoF x = c u is a driven mass's displacement or the
 relative displacement w of a site, of two masses in one cell or in neighbouring ones, or of a mass to ground: c has an

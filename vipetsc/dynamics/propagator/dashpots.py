@@ -81,8 +81,8 @@ class DashpotRows:
         near = self.series.reach + 1
         if chain.ends != "periodic" and (cell < near or cell + 1 + near >= chain.cells):
             return self._number(cell, cell)
-        around = chain.coefficients(cell - near, cell + 1 + near + 1)
-        return self._number(b"".join(array.tobytes() for array in around), cell)
+        neighbourhood = chain.coefficients(cell - near, cell + 1 + near + 1)
+        return self._number(b"".join(array.tobytes() for array in neighbourhood), cell)
 
     def _number(self, key: object, cell: int) -> int:
         """The number of the kind with this ``key``, of which ``cell`` is the first one seen."""

@@ -158,10 +158,8 @@ def _pair_kernels(
     their cluster, and the number is -1 for one that is too far away.
     """
     chain = dashpots.chain
-    cells = responses.rates.shape[1]
-    powers = dashpots.powers
     numbers = np.full((len(groups.numbers), max(np.diff(groups.first), default=0)), -1)
-    known: dict[tuple[int, int, int], int] = {}
+    number_of: dict[tuple[int, int, int], int] = {}
     kernels: list[np.ndarray] = []
     modes = len(integrals)
     for targets, sources, j in _pairs(groups):
@@ -170,22 +168,33 @@ def _pair_kernels(
             if chain.ends == "periodic":
                 distance = distance % chain.cells
             key = (int(responses.table[target]), int(responses.table[source]), distance)
-            if key not in known:
-                known[key] = -1
-                # Dashpots that both reach, counted from the first one of each.
-                later = np.arange(cells)
-                earlier = later - distance
-                if chain.ends == "periodic":
-                    earlier = earlier % chain.cells
-                common = (earlier >= 0) & (earlier < cells)
-                first = responses.rates[key[0], later[common]].reshape(-1, powers)
-                second = responses.rates[key[1], earlier[common]].reshape(-1, powers)
-                products = first.T @ second
+            if key not in number_of:
+                number_of[key] = -1
+                products = _products(responses, dashpots, *key)
                 if products.any():
-                    known[key] = len(kernels)
+                    number_of[key] = len(kernels)
                     kernels.append(2 * dashpots.series.interval * np.tensordot(integrals, products, axes=2))
-            numbers[target, j] = known[key]
+            numbers[target, j] = number_of[key]
     return numbers, np.array(kernels).reshape(len(kernels), modes, modes)
+
+
+def _products(responses: _Responses, dashpots: DashpotRows, later: int, earlier: int, distance: int) -> np.ndarray:
+    """Sums (power, power) over the dashpots that two impulses reach, of the products of their rates' coefficients.
+
+    ``later`` and ``earlier`` are the tables of their responses; the first dashpot of the earlier one is ``distance``
+    cells to the right of that of the later one.
+    """
+    chain = dashpots.chain
+    cells = responses.rates.shape[1]
+    cells_of_later = np.arange(cells)
+    cells_of_earlier = cells_of_later - distance
+    if chain.ends == "periodic":
+        cells_of_earlier %= chain.cells
+    common = (cells_of_earlier >= 0) & (cells_of_earlier < cells)
+
+    first = responses.rates[later, cells_of_later[common]].reshape(-1, dashpots.powers)
+    second = responses.rates[earlier, cells_of_earlier[common]].reshape(-1, dashpots.powers)
+    return first.T @ second
 
 
 def _significant(kinds: np.ndarray, kernels: np.ndarray, groups: Groups) -> tuple[np.ndarray, np.ndarray]:

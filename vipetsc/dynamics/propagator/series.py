@@ -135,7 +135,7 @@ class StepSeries:
         if self.chain.variation is None:
             return left_out
         # Rows are computed as if the cells beyond were the reference cell. What that changes in them is at most what is
-        # left out, since it took a way out there and back: sec. 8.
+        # left out, since its influence went there and back: sec. 8.
         return 2 * left_out
 
     @cached_property

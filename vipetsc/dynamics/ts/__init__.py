@@ -13,7 +13,7 @@ the step. The result depends neither on the length of the lattice nor on its par
 order of its springs, and the maximum and all reductions are exact.
 
 **Steps and events** (``integrator``). PETSc 3.18's own event handling loses short contacts and switches the error
-control off around them, hence:
+control off where they occur, hence:
 
 - the modes of all sites are frozen inside a step, so that the right-hand side is smooth in it;
 - after each accepted step every site is searched for a change (see ``vipetsc.contact``), and one reduction finds the
@@ -23,7 +23,7 @@ control off around them, hence:
   was far too long for a contact;
 - TSRK restarts after every change, so that a first-same-as-last pair does not reuse a stage of the old modes, and at
   every sample, where a run may have gone on from a checkpoint;
-- after an onset the step is a small share of the contact's duration (Johnson 1985, sec. 11.4), since Hertz's force
+- after an onset the step is a small fraction of the contact's duration (Johnson 1985, sec. 11.4), since Hertz's force
   begins like (t - onset)^(3/2), which no method of high order resolves.
 
 The default pair is Verner's 8(7), ``8vr``.

@@ -20,14 +20,15 @@ from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout, join
 from vipetsc.dynamics.options import given_first_step
 from vipetsc.dynamics.samples import Samples, take_sample
+from vipetsc.dynamics.ts.onset import onset_fraction
 from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, register
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.parallel import StopRequest
 
 # PETSc's suggestions carry a safety factor 0.9; stretching one by this much keeps the error below the tolerance
-# and often saves a step on the way to a sample.
+# and often saves a step before a sample.
 STRETCH = 1.08
-# Steps and rejected trials for each site, on the way to one time, beyond which a run counts as stalled.
+# Steps and rejected trials for each site, before the next given time, beyond which a run counts as stalled.
 MOST_TRIALS = 10_000
 # A time step below this many rounding units of the time does not advance it reliably.
 SHORTEST_STEP = 8 * np.finfo(float).eps
@@ -36,13 +37,7 @@ FIRST_STEP = 0.002
 FREE_STEP = 0.05
 # A burst rises as t^3: steps that grow with t keep even the first samples' ledger small compared with the work.
 STEP_PER_TIME = 0.25
-# The step after an onset, as a fraction of the contact's duration, and the order of its error, both at a tolerance of
-# 1e-10: where all forces begin linearly, and else. Hertz's force begins as (t - onset)^(3/2), which no step of high
-# order likes: the velocity's error goes as h^(5/2). The fractions are those that the controller settles at.
-LINEAR_ONSET = 1 / 20, 8
-OTHER_ONSET = 1 / 200, 2.5
-LONGEST_ONSET = 0.1
-# An outcome of a landing beside those of the search: its site rests.
+# An outcome of a landing in addition to those of the search: its site rests.
 RESTS = -1
 # Work and losses do not decide the step.
 NO_TOLERANCE = 1e30
@@ -78,7 +73,10 @@ class Integrator(Engine):
         self.time = 0.0
         self.state = layout.create_vector()
         register_sums(self.state)  # before it is duplicated
-        self.rates = layout.create_vector() if model.chain.pairs else self.state
+        # Only contacts of other pairs of masses are observed with rates of the whole state.
+        self.rates = self.state
+        if model.chain.pairs:
+            self.rates = layout.create_vector()
         self.saved = self.state.duplicate()
         self.step = given_first_step(FREE_STEP / model.drive.frequency)
         self.free_step = self.step
@@ -89,9 +87,7 @@ class Integrator(Engine):
         self._interval = model.sample_interval
         self._breaks = np.unique(np.concatenate([drive.waveform.breaks for drive in model.drives]))
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
-        begin_linearly = all(law.onset_exponent == 1 for law in model.used_laws)
-        fraction, order = LINEAR_ONSET if begin_linearly else OTHER_ONSET
-        self._onset_fraction = min(fraction * (model.rtol / 1e-10) ** (1 / order), LONGEST_ONSET)
+        self._onset_fraction = onset_fraction(model.used_laws, model.rtol)
         self.observe(self.tracker.start)
 
     def _create_ts(self, model: Model, layout: Layout) -> PETSc.TS:
@@ -209,7 +205,10 @@ class Integrator(Engine):
             self.step = suggestion
         self.counts["steps"] += 1
 
-        end = target if count == 1 else self.time + h
+        # The last step ends on the target itself, not on a sum that is rounded.
+        end = target
+        if count > 1:
+            end = self.time + h
         self.observe(self.tracker.end, end)
         with log.SEARCH:
             change = self._first_change(h)
@@ -240,7 +239,10 @@ class Integrator(Engine):
         if np.isfinite(suggestion) and ts.getConvergedReason() >= 0:
             return suggestion
 
-        self.step = suggestion if np.isfinite(suggestion) else 0.1 * h
+        # The error of a trial that overflows is not finite, and no step follows from it: a much shorter one is tried.
+        self.step = suggestion
+        if not np.isfinite(suggestion):
+            self.step = 0.1 * h
         self.saved.copy(self.state)
         ts.restartStep()
         return None
@@ -252,13 +254,16 @@ class Integrator(Engine):
         """
         comm = self.comm
         tracker = self.tracker
-        candidate = comm.rank if change.position == position else comm.size
-        # A site whose motion is NaN would land for ever; the reduction that finds the owner tells all ranks.
+        candidate = comm.size
+        if change.position == position:
+            candidate = comm.rank
+        # A site whose motion is NaN would land for ever; all ranks learn of it by the reduction that finds the owner.
         if not np.isfinite(tracker.end).all():
             candidate = -1
         owner = comm.allreduce(candidate, MPI.MIN)
         if owner < 0:
             raise StalledError("the motion of a site is not finite")
+
         attempt = Landing(length=position * h, longest=h, residual=np.inf, attempts=0)
         outcome = RETRY
         self.counts["landings"] += 1
@@ -273,8 +278,9 @@ class Integrator(Engine):
             if self._trial(length) is None:
                 return
             self.observe(tracker.end, self.time + length)
-            judged = self._judge(attempt, change) if comm.rank == owner else None
-            attempt, outcome = comm.bcast(judged, owner)
+            if comm.rank == owner:
+                attempt, outcome = self._judge(attempt, change)
+            attempt, outcome = comm.bcast((attempt, outcome), owner)
 
         tracker.accept_step(length)
         self.time += length
@@ -322,8 +328,10 @@ class Integrator(Engine):
 
     def _rest(self, owner: int, change: ModeChange) -> None:
         """Let the site of a ``change`` of the rank ``owner`` rest, and set the step with which to go on."""
-        numbers = self.tracker.tracks.sites["number"]
-        number = self.comm.bcast(int(numbers[change.site]) if self.comm.rank == owner else -1, owner)
+        number = -1
+        if self.comm.rank == owner:
+            number = int(self.tracker.tracks.sites["number"][change.site])
+        number = self.comm.bcast(number, owner)
         was_free = not self._any_open
         self.tracker.rest(number, self.time, self.layout.losses(self.state.array_r))
         self._restart(was_free)
