@@ -11,7 +11,8 @@ from vipetsc.case.nnm_table import NnmTable
 from vipetsc.lattice import Chain, WaveCompliance, four_band
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
-from vipetsc.modes.balance.harmonics import SiteForces, Stops
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches.condensed import condensed_system, state_of
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.point import Point

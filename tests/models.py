@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vipetsc.lattice import Contact, contact_stiffness, four_band
-from vipetsc.modes.balance.harmonics import Stops
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.system import SmoothSpring, System
 
 # SPEC section 9: the clearance, the radius and Poisson's ratio of the four-band lattice's contacts.

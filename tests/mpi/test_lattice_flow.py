@@ -13,7 +13,7 @@ from tests.conftest import on_two
 from tests.models import CLEARANCE, four_band_contact
 from vipetsc.lattice import Chain
 from vipetsc.lattice.cell import four_band
-from vipetsc.modes.balance.harmonics import Stops
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 
 COMM = MPI.COMM_WORLD

@@ -24,7 +24,8 @@ from vipetsc.io.state import State
 from vipetsc.lattice import Chain, Contact, WaveCompliance, four_band, pass_bands
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
-from vipetsc.modes.balance.harmonics import SiteForces, Stops
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import claim_branches, follow_all

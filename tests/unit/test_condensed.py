@@ -13,7 +13,8 @@ from vipetsc.modes.balance import conservative
 from vipetsc.modes.balance.arcs import arcs
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import SiteForces, Stops
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.problem import ContinuationError
 
 Symmetry = Literal["at rest", "odd", "any"]

@@ -104,7 +104,7 @@ def test_a_restitution_is_warned_of_where_losses_are_not_computed():
     [
         ({"contacts": {"law": "power"}}, r"contacts\.exponent: missing"),
         ({"contacts": {"exponent": 3.0}}, r"contacts\.exponent = 3.0: applies only to law"),
-        ({"contacts": {"clearance": 0.0, "side": "plus"}}, "without one there are none"),
+        ({"contacts": {"clearance": 0.0, "side": "plus"}}, "no motion about it is linear"),
         ({"contacts": {"each": {"law": ["bilinear", "hertz", "hertz"]}}}, "contacts.each"),
         ({"contacts": {"pair": [2, 2]}}, r"contacts\.pair"),
         ({"lattice": {"absorbing": {"cells": 2, "strength": 1.0}}}, r"lattice\.absorbing"),

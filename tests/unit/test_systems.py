@@ -9,7 +9,7 @@ from tests.models import CLEARANCE, four_band_contact, reduced_model
 from vipetsc.case import CaseError
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell, diatomic
-from vipetsc.modes.balance.harmonics import Stops
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.shooting import Shooting

@@ -8,7 +8,7 @@ import pytest
 from tests.condensed_branches import condensed_branch, condensed_breather, condensed_problem, displacement
 from tests.models import CLEARANCE, four_band_contact, kerschen_system, reduced_model
 from vipetsc.lattice import Chain, four_band
-from vipetsc.modes.balance.harmonics import Stops
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches.condensed import state_of
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.shooting.dop853 import Dop853Flow

@@ -9,8 +9,9 @@ from scipy.integrate import solve_ivp
 from tests.steady_states import motion_at, nfrc_case
 from vipetsc.lattice import Contact, DenseCompliance
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import SiteForces, Stops
+from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.hill import LEAST_OF_FINITE, Hill
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
 

@@ -12,7 +12,7 @@ import pytest
 
 from tests.breathers import BREATHER_FREQUENCY, breather_case, breather_chain
 from tests.models import CLEARANCE, four_band_contact
-from vipetsc.modes.balance.harmonics import Stops
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.lattice import floquet

@@ -12,7 +12,7 @@ from tests.models import GRAZING_ENERGY, IN_PHASE, OUT_OF_PHASE, four_band_conta
 from tests.verify.conftest import follow
 from vipetsc.case.nnm_table import Guards, NnmTable
 from vipetsc.lattice import Chain, four_band
-from vipetsc.modes.balance.harmonics import Stops
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.branches.branch_checks import BranchMonitor, suspects
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.continuation.special import locate

@@ -8,7 +8,7 @@ import pytest
 from tests.models import CLEARANCE, OUT_OF_PHASE, four_band_contact, reduced_model
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.lattice import four_band
-from vipetsc.modes.balance.harmonics import Stops
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.continuation.arclength import Continuation
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.shooting.maps import MAPS

@@ -58,8 +58,7 @@ class NnmCase(CaseFile):
     verb = section = "nnm"
     kept_by_resume: ClassVar[str] = "the system, map and flow with which its branches were started"
     refuses: ClassVar[Mapping[str, str]] = {
-        "absorbing ends": "absorbing ends are dashpots, with which no free motion repeats itself",
-        "touching stops": "branches begin with linear motions within the clearance, and without one there are none",
+        "absorbing ends": "absorbing ends are dashpots, with which no free motion repeats itself"
     }
 
     @classmethod

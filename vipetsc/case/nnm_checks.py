@@ -100,16 +100,13 @@ def check_reduced(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell
 
 
 def check_gaps(contacts: ContactsTable, gaps: Gaps, valid: Valid) -> Iterator[Problem]:
-    """Problems with contacts that touch or are pressed at rest; ``gaps`` are the clearances in m on both sides."""
+    """Problems with contacts that touch at rest; ``gaps`` are the clearances in m on both sides."""
     if not valid("contacts.clearance"):
         return
-    smallest = min((min(gap) for gap in gaps), default=1.0)
-    if smallest < 0:
-        remedy = "not yet: linear modes do not include contacts that are pressed at rest; omit it"
-        yield Problem("contacts.precompression", contacts.precompression, remedy)
-    elif smallest == 0 and contacts.clearance_minus == 0:
-        remedy = "branches begin with linear motions within the clearance, and without one there are none"
-        yield Problem("contacts.clearance_minus", 0.0, f"{remedy}; give a clearance above 0")
+    if any(0 in gap for gap in gaps):
+        remedy = "a contact that touches at rest resists on one side only: no motion about it is linear, however small"
+        key = "clearance_minus" if contacts.clearance_minus == 0 else "clearance"
+        yield Problem(f"contacts.{key}", 0.0, f"{remedy}; give a clearance above 0, or a precompression")
 
 
 def check_lattice(

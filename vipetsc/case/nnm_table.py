@@ -32,12 +32,13 @@ class SmoothSpringTable(Section):
 class PairTable(Section):
     """A contact between ``host`` (0 is the ground) and ``resonator`` (1-based) with its ``clearance`` in m.
 
-    The law and the sides of its stops are those of ``[contacts]``, whose lists ``each`` are over these contacts.
+    The law, the sides of its stops and the precompression are those of ``[contacts]``, whose lists ``each`` are over
+    these contacts.
     """
 
     host: Annotated[int, Field(ge=0)]
     resonator: Annotated[int, Field(ge=1)]
-    clearance: Positive
+    clearance: Annotated[float, Field(ge=0)]
 
 
 class SystemTable(Section):

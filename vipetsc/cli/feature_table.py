@@ -225,8 +225,17 @@ FEATURES: tuple[Feature, ...] = (
     ),
     Feature("two clearances", _contacts(clearance_minus=2e-4), _contacts(clearance_minus=2e-4)),
     Feature("unequal clearances", _contacts(clearance=[1e-4, 2e-4]), _own_contacts((1, 0.1), (0, 0.2))),
-    Feature("touching stops", _contacts(clearance=0.0, side="plus", restitution=1.0)),
-    Feature("preload", _contacts(precompression=2e-4, side="plus", restitution=1.0)),
+    Feature(
+        "touching stops",
+        _contacts(clearance=0.0, side="plus", restitution=1.0),
+        merged(_own_contacts((1, 0.0)), _contacts(side="plus", restitution=1.0)),
+    ),
+    Feature(
+        "preload",
+        _contacts(precompression=2e-4, side="plus", restitution=1.0),
+        # Not so deep that the two masses move as one.
+        merged(_own_contacts((1, 0.0)), _contacts(precompression=1e-6, side="plus", restitution=1.0)),
+    ),
     Feature(
         "a law for each site", _contacts(each={"law": ["bilinear", "hertz"], "stiffness": [1e5, 1e7]}, stiffness=None)
     ),

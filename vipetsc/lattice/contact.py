@@ -126,6 +126,11 @@ class Contact:
             raise ValueError("the law power needs an exponent")
         return self.exponent
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether the force is proportional to the indentation; what a user's module registers counts as nonlinear."""
+        return self.law in LAWS and self.onset_exponent == 1
+
     def elastic_force(self, x: ArrayLike) -> np.ndarray:
         """f in N at the indentation ``x`` in m; zero for x <= 0."""
         x = np.maximum(x, 0.0)

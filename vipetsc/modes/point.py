@@ -17,7 +17,7 @@ QUANTITIES: dict[str, tuple[str, type, str, str]] = {
     "closed": ("closed", float, "1", "fraction of the time with a contact closed"),
     "energy_tangent": ("rise", float, "J", "dE along the tangent"),
     "step": ("step", float, "1", "arclength of the step that led here"),
-    "episodes": ("contacts", int, "1", "contact episodes in the arc that is shot"),
+    "episodes": ("contacts", int, "1", "contact episodes in the arc that is shot; openings of pressed ones"),
     "newton": ("newton", int, "1", "Newton steps"),
     "index": ("number", int, "1", "number of the regular point, or of the one after a special point"),
     "resonance": ("resonance", int, "1", "k of the k:1 tongue of an energy fold; else 1 or 0"),

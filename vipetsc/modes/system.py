@@ -11,7 +11,7 @@ from scipy.sparse import issparse
 
 from vipetsc.case.nnm import NnmCase
 from vipetsc.lattice import Chain, Contact, Spring, UnitCell, nonlinear_places
-from vipetsc.modes.balance.harmonics import Stops
+from vipetsc.modes.balance.stops import Stops
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,8 @@ class ContactPair:
     """Contact between two masses (0-based), with stops on both sides of a ``clearance`` in m.
 
     ``host`` may be None for a contact with the ground; w = u_resonator - u_host. The stop on the side of negative w is
-    at ``clearance_minus`` if that is not None. A clearance of inf is that of a side without a stop.
+    at ``clearance_minus`` if that is not None. A clearance of inf is that of a side without a stop, a negative one that
+    of a contact that is pressed at rest, where a static load balances its force.
     """
 
     host: int | None
@@ -54,11 +55,11 @@ class SmoothSpring(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """M u'' + K u + contact forces + smooth spring forces = 0.
+    """M u'' + K u + contact forces + smooth spring forces = 0, u from the state at rest.
 
     ``masses`` (n,) in kg, ``stiffness`` (n, n) in N/m, symmetric. Raises ValueError if a mass is not positive, the
-    stiffness is not symmetric, an index lies outside the system, a clearance is not positive, or a contact dissipates:
-    normal modes exist in conservative systems.
+    stiffness is not symmetric, an index lies outside the system, a contact touches at rest (no motion about that is
+    linear, however small), or a contact dissipates: normal modes exist in conservative systems.
     """
 
     masses: np.ndarray
@@ -74,8 +75,12 @@ class System:
             raise ValueError(f"the stiffness must be a symmetric matrix of shape ({n}, {n})")
 
         for pair in self.contacts:
-            if pair.stops.clearance <= 0:
-                raise ValueError(f"clearance {pair.stops.clearance!r} must be positive (m)")
+            if pair.stops.clearance == 0:
+                raise ValueError("clearance 0.0 must be positive (m), or negative of a contact that is pressed at rest")
+            if pair.stops.is_pressed and max(pair.stops.plus, pair.stops.minus) < np.inf:
+                raise ValueError(
+                    f"clearance {pair.stops.clearance!r} is that of a contact pressed at rest, which has one stop"
+                )
             if pair.law.restitution != 1:
                 raise ValueError(
                     f"restitution {pair.law.restitution!r} dissipates; nonlinear normal modes need restitution = 1"
@@ -182,10 +187,28 @@ class System:
         """Clearances (contacts, 2) in m on the sides + and -; inf where there is no stop."""
         return np.array([(p.stops.plus, p.stops.minus) for p in self.contacts]).reshape(-1, 2)
 
+    @cached_property
+    def is_pressed(self) -> np.ndarray:
+        """Which contacts (contacts,) are pressed at rest."""
+        return np.array([pair.stops.is_pressed for pair in self.contacts], bool)
+
+    @property
+    def is_linear_at_rest(self) -> bool:
+        """Whether motions about rest are linear up to where contacts open or close."""
+        return not self.springs and all(pair.stops.is_linear_at_rest for pair in self.contacts)
+
+    def sides_at(self, w: np.ndarray) -> np.ndarray:
+        """The sides (..., contacts), 1 or -1, whose stops are the nearest ones at relative displacements ``w``.
+
+        A contact that is pressed at rest has one side, on which it opens.
+        """
+        plus, minus = self.clearances.T
+        return np.where(self.is_pressed, np.where(plus < minus, 1, -1), np.where(w < 0, -1, 1))
+
     def clearances_at(self, w: np.ndarray) -> np.ndarray:
         """Clearances (..., contacts) in m on the sides of the relative displacements ``w`` (..., contacts)."""
         plus, minus = self.clearances.T
-        return np.where(w < 0, minus, plus)
+        return np.where(self.sides_at(w) < 0, minus, plus)
 
     @property
     def odd(self) -> bool:
@@ -193,11 +216,19 @@ class System:
         plus, minus = self.clearances.T
         return np.array_equal(plus, minus) and all(s.law.is_odd for s in self.springs)
 
-    def linear_modes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) without contact."""
-        # Only dense solvers give all modes.
+    @cached_property
+    def stiffness_at_rest(self) -> np.ndarray:
+        """Stiffness (n, n) in N/m for small motions, with the slope of each contact that is pressed at rest."""
         stiffness = self.stiffness if isinstance(self.stiffness, np.ndarray) else self.stiffness.toarray()
-        squared, shapes = eigh(stiffness, np.diag(self.masses))
+        if not self.is_pressed.any():
+            return stiffness
+        slopes = np.array([pair.stops.slope_at_rest for pair in self.contacts])
+        return np.asarray(stiffness + self.contact_rows.T @ (slopes[:, None] * self.contact_rows))
+
+    def linear_modes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) of small motions about rest."""
+        # Only dense solvers give all modes.
+        squared, shapes = eigh(self.stiffness_at_rest, np.diag(self.masses))
         # eigh leaves the signs open: the largest displacement of each mode is positive.
         signs = np.sign(shapes[np.abs(shapes).argmax(0), range(self.dofs)])
         # A rigid-body motion has an eigenvalue of zero, which rounding may make negative.
@@ -211,9 +242,9 @@ class System:
         return "in-phase" if first * second > 0 else "out-of-phase"
 
     def gaps(self, u: np.ndarray) -> np.ndarray:
-        """|w| - clearance in m of every contact at displacements ``u`` (..., n); shape (..., contacts)."""
+        """How far every contact is beyond its stop in m at displacements ``u`` (..., n), shape (..., contacts)."""
         w = u @ self.contact_rows.T
-        return np.abs(w) - self.clearances_at(w)
+        return self.sides_at(w) * w - self.clearances_at(w)
 
     def forces(self, u: np.ndarray) -> np.ndarray:
         """Restoring forces (n,) in N at displacements ``u`` (n,) in m."""
@@ -234,10 +265,10 @@ class System:
         return float(total)
 
     def grazing_energy(self, mode: int) -> float:
-        """Energy in J at which linear mode ``mode`` (0-based) first touches a contact; inf if it never does."""
+        """Energy in J at which linear mode ``mode`` (0-based) first closes or opens a contact; inf if it never does."""
         omega, shapes = self.linear_modes()
         reach = np.abs(self.contact_rows @ shapes[:, mode])
-        nearest = self.clearances.min(axis=1)
+        nearest = np.abs(self.clearances.min(axis=1))
         amplitude = (nearest[reach > 0] / reach[reach > 0]).min(initial=np.inf)
         if not np.isfinite(amplitude):  # times omega = 0 of a rigid-body motion it would be no number
             return np.inf

@@ -22,6 +22,7 @@ from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.clusters import expand_free_motion
 from vipetsc.dynamics.propagator.engine import Propagator
+from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Halo, exchange
 from vipetsc.dynamics.propagator.step_choice import refusal
 from vipetsc.dynamics.propagator.substeps import create_tape
@@ -93,10 +94,13 @@ class TangentPropagator(Propagator):
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
-        """Why it does not suit ``model``: what the engine refuses, and contacts that touch or are pressed at rest."""
+        """Why it does not suit ``model``: what the engine refuses, and contacts that touch at rest.
+
+        About such a contact no motion is linear, however small; one that is pressed at rest has a slope.
+        """
         sites = site_records(model, np.arange(len(model.chain.sites)))
-        if (np.abs(sites["mode"]) == PERMANENT).any():
-            return "contacts touch or are precompressed at rest; variations are not supported for them"
+        if ((np.abs(sites["mode"]) == PERMANENT) & (sites["preload"] == 0)).any():
+            return "contacts touch at rest; variations are not supported for them"
         return refusal(model)
 
     def place(self, cells: np.ndarray, speed: float) -> None:
@@ -121,8 +125,11 @@ class TangentPropagator(Propagator):
         if self._layout.comm.allreduce(bool((closed & (sites["damping"] != 0)).any())):
             raise StalledError("a contact that dissipates is closed at the beginning")
 
-        sites["mode"] = np.where(closed, np.sign(w) * CLOSED, 0)
-        sites["approach"] = np.where(closed, np.sign(w) * speed, 1.0)
+        # Contacts that are pressed at rest stay as they are, closed or open: substeps end where they open and close.
+        is_held = np.abs(sites["mode"]) == PERMANENT
+        side = np.where(is_held, np.sign(sites["mode"]), np.sign(w))
+        sites["mode"] = np.where(is_held, sites["mode"], np.where(closed, side * CLOSED, 0))
+        sites["approach"] = np.where(closed | is_held, side * speed, 1.0)
         # No contact has just begun or ended, where forces are not smooth and the first substeps are short.
         clusters.history["onset"] = -np.inf
         clusters.history["duration"] = 1.0
@@ -144,6 +151,7 @@ class TangentPropagator(Propagator):
         """Begin and end (substep, 2) in s of the substeps in which a site was closed, and the number of contacts.
 
         They are those of the sites that this rank logs; one contact takes several substeps, which follow each other.
+        Of contacts that are pressed at rest the number is that of their openings.
         """
         tape = self._forces.clusters.tape
         spans = [np.zeros((0, 2))]
@@ -151,10 +159,25 @@ class TangentPropagator(Propagator):
         for c in np.flatnonzero(self._forces.logs):
             rows = tape.rows[c, : tape.used[c]]
             begin = rows["begin"] + rows["position"] * self.series.interval
-            spans.append(np.column_stack([begin, begin + rows["length"] * self.series.interval]))
+            is_held = np.abs(rows["mode"]) >= PERMANENT
+            is_open = self._open_rows(c, rows, is_held)
+            intervals = np.column_stack([begin, begin + rows["length"] * self.series.interval])
+            spans.append(intervals[~is_open])
             # The first substep after an onset is marked; a contact that is closed from the start has none on the tape.
-            episodes += int(np.sum((rows["onset"] > 0) | (begin == 0.0)))
+            episodes += int(np.sum(((rows["onset"] > 0) | (begin == 0.0)) & ~is_held))
+            for site in np.unique(rows["site"][is_held]):
+                of_site = is_open[rows["site"] == site]
+                episodes += int(np.sum(of_site & ~np.append(False, of_site[:-1])))
         return np.concatenate(spans), episodes
+
+    def _open_rows(self, c: int, rows: np.ndarray, is_held: np.ndarray) -> np.ndarray:
+        """Which ``rows`` (row,) of the tape of cluster ``c`` are of an open site, as those that ``is_held`` may be."""
+        # A substep ends where such a site opens or closes: its middle tells.
+        w = self._forces.clusters.tape.motion[c, : len(rows), 0, NODES // 2]
+        sites = self._forces.clusters.contacts[self._forces.dofs.first[c] + rows["site"]]
+        side = np.sign(rows["mode"])
+        clearance = np.where(side > 0, sites["clearance"], sites["clearance_minus"])
+        return np.asarray(is_held & (side * w < clearance))
 
     def _linearise(self) -> _Linearisation:
         """Compute the matrices of the orbit from the tape."""

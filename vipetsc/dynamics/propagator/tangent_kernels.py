@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel, njit
-from vipetsc.contact.law import CLIPPED, elastic_force_and_slope, gap_of
+from vipetsc.contact.law import CLIPPED, PERMANENT, elastic_force_and_slope, gap_of
 from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.collocation import accumulate_moments, node_responses, update_taylor
 from vipetsc.dynamics.propagator.nodes import NODES
@@ -50,7 +50,11 @@ def _slopes(site: Any, row: Any, w: float, v: float) -> tuple[float, float, floa
         # The force is clipped to zero.
         return 0.0, 0.0, 0.0
     side = 1.0 if row.mode > 0 else -1.0
-    elastic, slope = elastic_force_and_slope(site.elastic, side * w - gap_of(site, side))
+    depth = side * w - gap_of(site, side)
+    if abs(row.mode) >= PERMANENT and depth <= 0.0:
+        # A contact that is pressed at rest has opened.
+        return 0.0, 0.0, 0.0
+    elastic, slope = elastic_force_and_slope(site.elastic, depth)
     g = 1.0 + site.damping * v / row.approach
     by_rate = -side * elastic * site.damping / row.approach
     return -slope * g, by_rate, -by_rate * v / row.approach

@@ -6,5 +6,6 @@ harmonics, ``breather`` branches of conservative motions, ``hill`` the stability
 
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces, Stops
+from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
 from vipetsc.modes.balance.hill import Hill
+from vipetsc.modes.balance.stops import Stops

@@ -6,6 +6,7 @@ a linear mode, or at a frequency in a gap: there a describing function, z = b + 
 1 + G(Om) F_1/a = 0 and the mean from b + G(0) F_0 = 0, and the other harmonics are brought in with a growing weight.
 """
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -31,6 +32,10 @@ SLOPE_STEP = 1e-5
 # Largest size of a describing function, in clearances, and the mean over the amplitude that is none.
 LARGEST = 1e3
 LEAST_MEAN = 1e-14
+# Of a contact that is pressed at rest the smallest size, in its depth there, and the sizes that are tried: its force
+# softens as it opens and hardens beyond, so that the two ends do not tell whether there is a motion.
+LEAST_OF_PRESSED = 1e-2
+TRIED_OF_PRESSED = 41
 # As the harmonics above the first are brought in: first step of their weight, how far the motion may change in one,
 # and the smallest.
 FIRST_WEIGHT = 0.1
@@ -130,13 +135,24 @@ class HarmonicFrame:
         )
 
     def _episodes(self, episodes: list[Episode]) -> int:
-        """Contact episodes in the part of the period that an arc of shooting would cover."""
+        """How often contacts close, or open if they are pressed at rest, in the arc that shooting would cover."""
         end = np.pi / 2 if self.balance.forces.odd else np.pi
+        middles: list[float] = []
+        for pair, stops in enumerate(self.balance.forces.contacts):
+            spans = [(episode.onset, episode.onset + episode.length) for episode in episodes if episode.pair == pair]
+            middles += [(begin + stop) / 2 for begin, stop in (_between(spans) if stops.is_pressed else spans)]
+
         count = 0
-        for episode in episodes:
-            middle = (episode.onset + episode.length / 2 + PHASE_ROUNDING) % (2 * np.pi)
-            count += middle < end + 2 * PHASE_ROUNDING
+        for middle in middles:
+            count += (middle + PHASE_ROUNDING) % (2 * np.pi) < end + 2 * PHASE_ROUNDING
         return count
+
+
+def _between(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The intervals of phase between ``spans``, which are in their order and less than a period together."""
+    after = [*spans[1:], *((begin + 2 * np.pi, stop) for begin, stop in spans[:1])]
+    gaps = [(stop, begin) for (_, stop), (begin, _) in zip(spans, after, strict=True)]
+    return [(begin, stop) for begin, stop in gaps if stop > begin]
 
 
 class ConservativeMotions:
@@ -214,8 +230,8 @@ class ConservativeMotions:
         return 0.0
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
-        """Folds of the energy and of the frequency, where there is contact."""
-        if left.episodes or self.forces.springs:
+        """Folds of the energy and of the frequency, where the motion is not linear."""
+        if left.episodes or not self.forces.is_linear_at_rest:
             yield SpecialKind("fold-energy", lambda p: p.energy_tangent)
             yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
 
@@ -320,6 +336,7 @@ def describing_motion(forces: SiteForces, place: int, g: PlaceCompliance, omega:
             f"no breather starts at {omega:g} rad/s on a spring without a cubic part: of a harmonic motion its "
             "quadratic force has a mean and a second harmonic alone; give it a cubic part, or begin at another place"
         )
+    is_pressed = place < len(forces.contacts) and forces.contacts[place].is_pressed
     z = np.zeros((forces.pairs, 2), complex)
 
     def force(mean: float, amplitude: float) -> np.ndarray:
@@ -333,18 +350,29 @@ def describing_motion(forces: SiteForces, place: int, g: PlaceCompliance, omega:
         # Odd forces have no mean. Of forces that harden it lies between 0 and that of the force at 0; of others the
         # balance of all harmonics will find it.
         without = static_balance(0.0)
-        if forces.odd or abs(without) <= LEAST_MEAN * amplitude or static_balance(-without) * without >= 0:
+        furthest = -without
+        while is_pressed and static_balance(furthest) * without > 0 and abs(furthest) < LARGEST * amplitude:
+            furthest *= 2
+        if forces.odd or abs(without) <= LEAST_MEAN * amplitude or static_balance(furthest) * without >= 0:
             return 0.0
-        return float(brentq(static_balance, -without, 0.0))
+        return float(brentq(static_balance, furthest, 0.0))
 
     def balance(amplitude: float) -> float:
         return amplitude + g.dynamic * float(force(mean_of(amplitude), amplitude)[1])
 
     size = forces.amplitude_scale(place, g.dynamic)
-    if balance(size) * balance(LARGEST * size) >= 0:
-        raise ContinuationError(
-            f"no breather starts at {omega:g} rad/s: the compliance of its site is {g.dynamic:.4g} m/N there, and a "
-            f"force that hardens needs a negative one of moderate size; change nnm.start_frequency"
-        )
-    amplitude = float(brentq(balance, size, LARGEST * size, rtol=1e-12))
-    return DescribedMotion(mean=mean_of(amplitude), amplitude=amplitude)
+    sizes = [size, LARGEST * size]
+    if is_pressed:
+        sizes = (size * np.geomspace(LEAST_OF_PRESSED, LARGEST, TRIED_OF_PRESSED)).tolist()
+    for low, high in itertools.pairwise(sizes):
+        if balance(low) * balance(high) < 0:
+            amplitude = float(brentq(balance, low, high, rtol=1e-12))
+            return DescribedMotion(mean=mean_of(amplitude), amplitude=amplitude)
+
+    needs = "a force that hardens needs a negative one of moderate size"
+    if is_pressed:
+        needs = "the force of a contact that is pressed at rest balances it at no amplitude"
+    raise ContinuationError(
+        f"no breather starts at {omega:g} rad/s: the compliance of its site is {g.dynamic:.4g} m/N there, and "
+        f"{needs}; change nnm.start_frequency"
+    )

@@ -37,8 +37,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.lattice import Contact, Spring
+from vipetsc.lattice import Spring
 from vipetsc.modes.balance.arcs import arcs, common, cut, minima
+from vipetsc.modes.balance.stops import Stops
 
 # Samples per period of the last harmonic. Quintic Hermite interpolation over a step h has an error of at most
 # h^6 max|z^(6)| / (6! 2^6): here (2 pi/24)^6/46080 = 7e-9 of the last harmonic, less of all others.
@@ -174,6 +175,18 @@ class ForceSeries:
         changes = np.any(self._slopes, axis=1) | np.any(self._rates, axis=1)
         return np.flatnonzero(changes)
 
+    def add_load(self, pair: int, stops: Stops, z: np.ndarray) -> None:
+        """Take off what a static load balances of a contact pressed at rest, and what a spring in its place has."""
+        mean = float(z[0].real)
+        self.forces[pair, 0] -= stops.load
+        self.potential[pair] -= stops.load * mean + stops.energy_at_rest
+
+        self.forces[pair, : len(z)] -= stops.spring * z
+        self._slopes[pair, 0] -= stops.spring
+        # The mean of z^2 of a one-sided series.
+        squared = mean**2 + float(np.sum(np.abs(z[1:]) ** 2)) / 2
+        self.potential[pair] -= stops.spring * squared / 2
+
     def add_dashpot(self, pair: int, rate: float, z: np.ndarray) -> None:
         """Add a force of ``rate`` z' in N of a pair whose elongation has the harmonics ``z`` (K + 1,)."""
         self.forces[pair, : len(z)] += 1j * rate * np.arange(len(z)) * z
@@ -206,45 +219,6 @@ class ForceSeries:
         return matrix
 
 
-class Stops(NamedTuple):
-    """The ``law`` of a contact, and where its stops are: clearances in m on the sides ``plus`` and ``minus``.
-
-    inf: there is no stop; negative: it is pressed at rest, where a static load balances its force. On the way to a
-    state with stops that touch at rest the force has a factor ``weight``, and a dashpot of ``drag`` in N s/m beside it.
-    """
-
-    law: Contact
-    plus: float
-    minus: float
-    weight: float = 1.0
-    drag: float = 0.0
-
-    @classmethod
-    def both(cls, law: Contact, clearance: float) -> "Stops":
-        """Stops at the same ``clearance`` in m on both sides."""
-        return cls(law, clearance, clearance)
-
-    @property
-    def clearance(self) -> float:
-        """The smaller clearance in m."""
-        return min(self.plus, self.minus)
-
-    def force(self, w: float) -> float:
-        """Elastic force in N at the relative displacement ``w`` in m, without what a static load balances."""
-        elastic = self.law.elastic_force(w - self.plus) - self.law.elastic_force(-w - self.minus)
-        return float(elastic)
-
-    def energy(self, w: float) -> float:
-        """Elastic energy in J at the relative displacement ``w`` in m."""
-        return float(self.law.elastic_energy(w - self.plus) + self.law.elastic_energy(-w - self.minus))
-
-    @property
-    def load(self) -> float:
-        """Force in N, on the side + positive, that a static load balances."""
-        plus, minus = (float(self.law.elastic_force(max(-gap, 0.0))) for gap in (self.plus, self.minus))
-        return self.weight * (plus - minus)
-
-
 class SiteForces:
     """The pairs of a system, one row each of arrays: contacts with their ``Stops``, then nonlinear springs.
 
@@ -262,14 +236,19 @@ class SiteForces:
         both_sides = all(stops.plus == stops.minus for stops in self.contacts)
         return both_sides and all(spring.is_odd for spring in self.springs)
 
+    @property
+    def is_linear_at_rest(self) -> bool:
+        """Whether motions about rest are linear up to where contacts open or close."""
+        return not self.springs and all(stops.is_linear_at_rest for stops in self.contacts)
+
     def amplitude_scale(self, place: int, g: float) -> float:
         """Amplitude in m at which the pair ``place`` with the compliance ``g`` in m/N begins to feel its force.
 
-        That of a contact is the clearance. For a spring |g c| a^2 = 1, with its cubic coefficient c, which is not 0: of
-        its force at z = a cos theta only the cubic part has a first harmonic.
+        That of a contact is the clearance, or the depth by which it is pressed. For a spring |g c| a^2 = 1, with its
+        cubic coefficient c, which is not 0: of its force at z = a cos theta only the cubic part has a first harmonic.
         """
         if place < len(self.contacts):
-            return self.contacts[place].clearance
+            return abs(self.contacts[place].clearance)
         cubic = self.springs[place - len(self.contacts)].cubic
         return float(1 / np.sqrt(np.abs(g * cubic)))
 
@@ -286,7 +265,8 @@ class SiteForces:
                 for begin, end in arcs(np.ascontiguousarray(side * motion[pair, :, :3]), clearance):
                     arc = Episode(pair, side, begin, end - begin, approach=0.0)
                     self._add_arc(series, arc, motion[pair], z, omega)
-            series.forces[pair, 0] -= stops.load
+            if stops.is_pressed:
+                series.add_load(pair, stops, z[pair])
             if stops.drag:
                 series.add_dashpot(pair, stops.drag * omega, z[pair])
 

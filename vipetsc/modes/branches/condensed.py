@@ -69,10 +69,15 @@ class Condensed(NamedTuple):
 
 
 def condensed_system(system: System, options: NnmTable) -> ConservativeMotions:
-    """The motions of a ``system`` condensed onto its contacts and springs."""
+    """The motions of a ``system`` condensed onto its contacts and springs.
+
+    A contact that is pressed at rest is a spring of the linear system: without it a chain of grains would have no
+    stiffness.
+    """
     rows = np.vstack([system.contact_rows, system.spring_rows])
-    forces = SiteForces([pair.stops for pair in system.contacts], [spring.law for spring in system.springs])
-    return ConservativeMotions(DenseCompliance(system.masses, system.stiffness, rows), forces, options)
+    stops = [pair.stops._replace(spring=pair.stops.slope_at_rest) for pair in system.contacts]
+    forces = SiteForces(stops, [spring.law for spring in system.springs])
+    return ConservativeMotions(DenseCompliance(system.masses, system.stiffness_at_rest, rows), forces, options)
 
 
 class CondensedMethod(NnmMethod):

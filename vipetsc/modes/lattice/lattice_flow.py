@@ -24,7 +24,7 @@ from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.step_choice import LARGEST_OMEGA_H
 from vipetsc.dynamics.propagator.tangent import TangentPropagator
 from vipetsc.lattice import Chain, Drive, ToneBurst
-from vipetsc.modes.balance.harmonics import Stops
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.problem import FlowError
 
 # Errors allowed in a contact's substep, relative to its speed.

@@ -8,7 +8,8 @@ from vipetsc.case.drive import build_drive
 from vipetsc.case.nfrc import NfrcCase, needs_modes
 from vipetsc.case.resolve import build_chain
 from vipetsc.lattice import ModalCompliance, OpenCompliance, WaveCompliance, nonlinear_places
-from vipetsc.modes.balance.harmonics import SiteForces, Stops
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.balance.stops import Stops
 
 
 class DrivenPoints(NamedTuple):

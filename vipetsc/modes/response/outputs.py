@@ -14,7 +14,8 @@ import numpy as np
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.response_measures import WALLS
 from vipetsc.lattice import Chain, ModalCompliance, WaveCompliance
-from vipetsc.modes.balance.harmonics import Episode, Stops
+from vipetsc.modes.balance.harmonics import Episode
+from vipetsc.modes.balance.stops import Stops
 from vipetsc.spectra.measures import QUANTITIES
 
 # Samples a harmonic of the period in which a largest value is looked for, and those of a contact episode.

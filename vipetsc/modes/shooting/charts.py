@@ -58,10 +58,10 @@ class DenseChart(Chart):
 
 
 class Relative(DenseChart):
-    """Initial values over the largest one, period over its value; gaps over their clearance.
+    """Initial values over the largest one, period over its value; gaps over their clearance D.
 
     Where an arc starts at rest, the resonator's displacement is replaced by w = u_resonator - u_host over
-    max(|w|, D), or else a large common motion would hide the changes of w that make and break contacts.
+    max(|w|, |D|), or else a large common motion would hide the changes of w that make and break contacts.
     """
 
     def __init__(self, system: System, x: np.ndarray, period: float, rest: bool = True) -> None:
@@ -70,7 +70,7 @@ class Relative(DenseChart):
         self.weights = np.eye(len(x)) / self.size
         if rest:
             for row, pair in zip(system.contact_rows, system.contacts, strict=True):
-                scale = min(max(abs(row @ x), pair.stops.clearance), self.size)
+                scale = min(max(abs(row @ x), abs(pair.stops.clearance)), self.size)
                 self.weights[pair.resonator] = row / scale
         self.inverse = np.linalg.inv(self.weights)
         self._derivative = block_diag(self.inverse, period)
@@ -130,10 +130,10 @@ class Grazing(DenseChart):
         self.size = float(np.abs(x).max())
         self.period = period
         w = system.contact_rows @ x
-        nearest = int(np.abs(np.abs(w) / system.clearances_at(w) - 1).argmin())
+        nearest = int(np.abs(system.sides_at(w) * w / system.clearances_at(w) - 1).argmin())
         self.row = system.contact_rows[nearest]
         self.index = system.contacts[nearest].resonator
-        self.sign = float(np.sign(self.row @ x))
+        self.sign = float(system.sides_at(w)[nearest])
         self.clearance = float(system.clearances_at(w)[nearest])
         if self.clearance == np.inf:
             self.sign = -self.sign
@@ -172,5 +172,5 @@ CHARTS: dict[str, type[Relative | Logarithmic | Grazing]] = {
 def near_grazing(system: System, x: np.ndarray) -> bool:
     """Whether a contact of an orbit that starts at rest at ``x`` (n,) is near its clearance there."""
     w = system.contact_rows @ x
-    distance = np.abs(np.abs(w) / system.clearances_at(w) - 1)
+    distance = np.abs(system.sides_at(w) * w / system.clearances_at(w) - 1)
     return bool(distance.min(initial=np.inf) < NEAR_GRAZING)

@@ -23,7 +23,10 @@ SMALLEST_STEP = 1e-15
 
 
 class CompiledSystem(NamedTuple):
-    """A ``System`` for kernels: ``rows`` (contacts, n) with w = rows u, ``spring_rows`` (springs, n) likewise."""
+    """A ``System`` for kernels: ``rows`` (contacts, n) with w = rows u, ``spring_rows`` (springs, n) likewise.
+
+    ``load`` (n,) in N are static forces on the masses, which balance contacts that are pressed at rest.
+    """
 
     inverse_mass: np.ndarray
     stiffness: np.ndarray
@@ -31,6 +34,7 @@ class CompiledSystem(NamedTuple):
     contacts: np.ndarray
     spring_rows: np.ndarray
     springs: np.ndarray
+    load: np.ndarray
 
 
 class FlowStep(NamedTuple):
@@ -79,6 +83,7 @@ def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.nd
     for i in range(n):
         for j in range(columns):
             pull[first + i, j] = 0.0
+        pull[first + i, 0] = system.load[i]
         for k in range(n):
             s = system.stiffness[i, k]
             if s != 0.0:
@@ -132,8 +137,11 @@ def close(system: CompiledSystem, y: np.ndarray, side: np.ndarray) -> None:
     """The sides on which the contacts are closed at the displacements in column 0 of ``y``, 0 for open ones."""
     for c in range(side.size):
         w = elongation(system.rows, c, y, 0, 0, system.inverse_mass.size)
-        clearance = system.contacts[c].minus if w < 0.0 else system.contacts[c].plus
-        side[c] = np.sign(w) if abs(w) > clearance else 0
+        side[c] = 0
+        if w > system.contacts[c].plus:
+            side[c] = 1
+        elif -w > system.contacts[c].minus:
+            side[c] = -1
 
 
 @njit
@@ -183,7 +191,8 @@ class Arc:
 
     ``start`` and ``end`` (2n,) hold displacements in m, then velocities in m/s; ``sensitivity`` (2n, 2n) is
     d end/d start; ``events`` (changes, 4) lists time in s, contact, side (1 or -1) and kind (1 onset, -1 separation);
-    ``closed`` the seconds with a contact closed.
+    ``episodes`` counts how often contacts close, or open if they are pressed at rest, and ``closed`` are the seconds
+    with a contact closed.
     """
 
     duration: float
@@ -212,6 +221,7 @@ class Flow(ABC):
             contacts=contacts,
             spring_rows=system.spring_rows,
             springs=spring_laws([spring.law for spring in system.springs]),
+            load=np.array([pair.stops.load for pair in system.contacts]) @ system.contact_rows,
         )
         self.omega = float(system.linear_modes()[0][-1])
 
@@ -227,8 +237,11 @@ class Flow(ABC):
         y = np.hstack([np.asarray(start, float)[:, None], np.eye(len(start))])
         y, events, closed = self._advance(y, duration, period)
 
-        closed_at_start = np.count_nonzero(self.system.gaps(start[: self.system.dofs]) > 0)
-        episodes = closed_at_start + np.count_nonzero(events[:, 3] == 1)
+        # Contacts that are not at the start as they are at rest, and changes away from what they are at rest.
+        is_pressed = self.system.is_pressed
+        is_closed = self.system.gaps(start[: self.system.dofs]) > 0
+        away = np.where(is_pressed, -1, 1)[events[:, 1].astype(int)]
+        episodes = np.count_nonzero(is_closed != is_pressed) + np.count_nonzero(events[:, 3] == away)
         return Arc(
             duration=duration,
             start=start,

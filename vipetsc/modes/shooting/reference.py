@@ -219,7 +219,7 @@ class Newmark(Flow):
         if not _newmark(self.compiled, y, h, path):
             raise FlowError("Newmark's implicit step does not converge")
 
-        side = np.sign(path @ self.system.contact_rows.T) * (self.system.gaps(path) > 0)
+        side = self.system.sides_at(path @ self.system.contact_rows.T) * (self.system.gaps(path) > 0)
         before = side[:-1]
         after = side[1:]
         events = []

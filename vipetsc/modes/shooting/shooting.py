@@ -246,9 +246,9 @@ class ShootingEquations(ABC, Generic[A]):
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
         """Folds of the energy and of the frequency."""
-        # Without nonlinear springs an orbit without contact lies on a linear branch, whose energy and frequency turn by
-        # rounding alone: folds are sought between two orbits that both have contacts.
-        if self.system.springs or (left.episodes and right.episodes):
+        # Where all contacts are as at rest an orbit may lie on a linear branch, whose energy and frequency turn by
+        # rounding alone: folds are then sought between two orbits that both have contacts which close or open.
+        if not self.system.is_linear_at_rest or (left.episodes and right.episodes):
             yield SpecialKind("fold-energy", lambda p: p.energy_tangent, finish=self.with_resonance)
             yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
 
@@ -351,7 +351,7 @@ class Shooting(ShootingEquations[Arc]):
         doubles the period (the others); 0 doubles the period of quarter-period orbits.
         """
         yield from super().special_kinds(left, right)
-        if not (self.system.springs or left.episodes or right.episodes):
+        if self.system.is_linear_at_rest and not (left.episodes or right.episodes):
             return
         # The half-traces of a quarter map belong to half a period. There a multiplier of -1 returns after the whole
         # period, which breaks the symmetry; multipliers +-i, half-trace 0, are -1 over the period and double it.

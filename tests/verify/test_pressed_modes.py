@@ -1,0 +1,326 @@
+"""Normal modes about contacts that are pressed at rest: exact periods, a chain of grains, orbits by SciPy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from scipy.integrate import quad, solve_ivp
+from scipy.optimize import brentq
+
+from tests.condensed_branches import condensed_branch
+from vipetsc.case import Case, CaseError, NnmCase
+from vipetsc.case.nnm_table import NnmTable
+from vipetsc.lattice import Contact
+from vipetsc.modes.branches.condensed import Condensed, condensed_system, state_of
+from vipetsc.modes.branches.lattices import LatticeMethod
+from vipetsc.modes.branches.orbits import ShootingMethod
+from vipetsc.modes.continuation.arclength import Continuation
+from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.orbit import sample_orbit
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.shooting.start import linear_start
+from vipetsc.modes.system import ContactPair, System
+from vipetsc.studies.linear_modes import pressed_contacts
+
+pytestmark = pytest.mark.parallel(1)
+
+MASS = 2.0
+SPRING = 3.0
+STOP = 40.0
+DEPTH = 0.1
+EXPONENTS = {"bilinear": 1.0, "hertz": 1.5}
+
+
+def potential(u: float, law: str) -> float:
+    """Energy in J of the spring, of a contact that is pressed by ``DEPTH`` at u = 0, and of its load."""
+    n = EXPONENTS[law]
+    stored = (max(u + DEPTH, 0.0) ** (n + 1) - DEPTH ** (n + 1)) / (n + 1)
+    return SPRING * u**2 / 2 + STOP * (stored - DEPTH**n * u)
+
+
+def exact_period(energy: float, law: str) -> float:
+    """The period in s by quadrature of the potential, in pieces from where the contact opens."""
+    reach = np.sqrt(2 * energy / SPRING) + 2 * STOP * DEPTH**2  # beyond both ends
+    low, high = (brentq(lambda u: potential(u, law) - energy, 0.0, end, xtol=1e-16) for end in (-reach, reach))
+
+    def time(begin: float, stop: float) -> float:
+        # u = begin + (stop - begin) sin^2 phi: the root of the speed at both ends leaves the integrand smooth.
+        def slowness(phi: float) -> float:
+            u = begin + (stop - begin) * np.sin(phi) ** 2
+            speed = np.sqrt(2 * max(energy - potential(u, law), 1e-300) / MASS)
+            return float((stop - begin) * np.sin(2 * phi) / speed)
+
+        return quad(slowness, 0, np.pi / 2, epsabs=0, epsrel=1e-9, limit=200)[0]
+
+    if low < -DEPTH:
+        return 2 * (time(low, -DEPTH) + time(-DEPTH, high))
+    return 2 * time(low, high)
+
+
+def pressed_mass(law: str, side: int = 1) -> System:
+    """A mass on a spring, pressed against a stop of the ground on one ``side``."""
+    plus, minus = (-DEPTH, np.inf) if side > 0 else (np.inf, -DEPTH)
+    return System.assemble([MASS], [(None, 0, SPRING)], [ContactPair(None, 0, plus, Contact(law, STOP), minus)])
+
+
+@pytest.mark.parametrize("law", ["hertz", "bilinear"])
+def test_a_pressed_mass_has_its_exact_period(law):
+    """From the linear motion about rest on, through the opening of the contact, on either side of the mass."""
+    slope = EXPONENTS[law] * STOP * DEPTH ** (EXPONENTS[law] - 1)
+    opening = potential(-DEPTH, law)
+    for side in (1, -1):
+        system = pressed_mass(law, side)
+        assert system.linear_modes()[0] == pytest.approx(np.sqrt((SPRING + slope) / MASS))
+        problem = Shooting(Dop853Flow(system), MAPS["half"])
+        start = linear_start(problem, 0, opening / 100)
+        steps = Continuation(problem, start, NnmTable(points=26, largest_step=0.3, first_step=0.1))
+
+        last = steps.point
+        opened = []
+        for point in steps:
+            opened += [p for p in locate(problem, last, steps.passed, "auto", True) if p.kind == "grazing"]
+            assert point.period == pytest.approx(exact_period(point.energy, law), rel=1e-8)
+            assert point.episodes == (point.energy > opening)
+            last = point
+        assert last.energy > 30 * opening
+        assert [p.energy for p in opened] == pytest.approx([opening], rel=1e-10)
+
+
+def test_a_bilinear_contact_is_linear_until_it_opens():
+    """No folds of a linear branch: a contact of Hertz has them sought from the beginning on, a linear one has not."""
+    for law in ("hertz", "bilinear"):
+        problem = Shooting(Dop853Flow(pressed_mass(law)), MAPS["half"])
+        point = linear_start(problem, 0, potential(-DEPTH, law) / 100)
+        assert bool(list(problem.special_kinds(point, point))) == (law == "hertz")
+
+
+@pytest.mark.parametrize("law", ["hertz", "bilinear"])
+def test_harmonic_balance_of_a_pressed_mass_has_its_exact_period(law):
+    """Mean and even harmonics, and the time without contact, are those of the potential."""
+    opening = potential(-DEPTH, law)
+    _, points = condensed_branch(pressed_mass(law), 0, opening / 4, truncation=1e-6, points=14, largest_step=0.2)
+    assert points[-1].energy > opening
+    for point in points:
+        assert point.period == pytest.approx(exact_period(point.energy, law), rel=1e-7)
+        assert point.episodes == (point.energy > opening)
+        assert (point.closed < 1) == (point.energy > opening)
+
+
+BEADS = 3
+BEAD = 0.01
+GRAIN = 1e6
+PRESSED = 1e-4
+GRAINS: dict[str, Any] = {
+    "name": "grains",
+    "lattice": {"cells": BEADS, "cell": {"masses": [BEAD], "springs": []}},
+    "contacts": {
+        "law": "hertz",
+        "stiffness": GRAIN,
+        "sites": [1, 1, 2, 3],
+        "clearance": 0.0,
+        "precompression": PRESSED,
+        # The left wall, two pairs of neighbours, and the right wall: those that approach each other press.
+        "each": {
+            "pair": [[0, 1], [1, 1], [1, 1], [0, 1]],
+            "next_cell": [False, True, True, False],
+            "side": ["minus", "minus", "minus", "plus"],
+        },
+    },
+    "nnm": {
+        "system": "chain",
+        "modes": [2],
+        "tolerance": 1e-12,
+        "first_step": 0.1,
+        "largest_step": 0.3,
+        "points": 20,
+        # In a chain that is its own mirror image two contacts open at once, at either end of the orbit.
+        "guards": {"contacts": 4},
+    },
+}
+
+
+def grain_forces(u: np.ndarray) -> np.ndarray:
+    """Forces in N on the beads of a chain of grains between walls, which a static force presses together."""
+    pressed = np.maximum(PRESSED - np.diff(u, prepend=0.0, append=0.0), 0.0) ** 1.5
+    return GRAIN * (pressed[:-1] - pressed[1:])
+
+
+@pytest.fixture(scope="module")
+def grains():
+    """The branch of the second mode of a chain of grains, and its problem."""
+    case = NnmCase.from_table(GRAINS)
+    problem = ShootingMethod(case, MPI.COMM_SELF).shooting
+    start = linear_start(problem, 1, problem.system.grazing_energy(1) / 100)
+    return problem, [start, *Continuation(problem, start, case.nnm)]
+
+
+def test_grains_have_the_modes_of_a_chain_of_springs(grains):
+    """Pressed grains are springs of the slope of Hertz's force: 2 sqrt(s/m) sin(n pi/(2 N + 2)) between walls."""
+    problem, points = grains
+    slope = 1.5 * GRAIN * np.sqrt(PRESSED)
+    exact = 2 * np.sqrt(slope / BEAD) * np.sin(np.arange(1, BEADS + 1) * np.pi / (2 * BEADS + 2))
+    assert problem.system.linear_modes()[0] == pytest.approx(exact, rel=1e-12)
+    # Towards small amplitudes the branch tends to it, by a tenth of the depth to 1 %.
+    assert 2 * np.pi * points[0].frequency == pytest.approx(exact[1], rel=1e-2)
+    assert points[0].frequency != pytest.approx(exact[1] / (2 * np.pi), rel=1e-5)
+
+
+def test_orbits_of_grains_return_by_scipy(grains):
+    """Before contacts open and after, an orbit comes back after its period by equations of its own."""
+    problem, points = grains
+    assert points[-1].episodes >= 2
+    for point in (points[4], points[-1]):
+        start = np.append(point.x, 0 * point.x)
+        motion = solve_ivp(
+            lambda t, y: np.append(y[BEADS:], grain_forces(y[:BEADS]) / BEAD),
+            (0.0, point.period),
+            start,
+            method="DOP853",
+            rtol=1e-11,
+            atol=1e-15,
+        )
+        end = motion.y[:, -1]
+        assert np.abs(end[:BEADS] - point.x).max() < 1e-6 * np.abs(point.x).max()
+        kinetic = BEAD * end[BEADS:] @ end[BEADS:] / 2
+        assert kinetic < 1e-10 * point.energy
+    u, v = sample_orbit(problem, points[-1])
+    energies = [problem.system.energy(*state) for state in zip(u, v, strict=True)]
+    assert np.ptp(energies) < 1e-10 * points[-1].energy
+
+
+def test_grains_condensed_onto_their_contacts_move_as_orbits(grains):
+    """Without any spring but the contacts, harmonic balance meets the orbits of shooting."""
+    problem, _ = grains
+    case = NnmCase.from_table(GRAINS | {"nnm": GRAINS["nnm"] | {"method": "condensed", "truncation": 1e-6}})
+    condensed = Condensed.from_case(case)
+    system = problem.system
+    omega, shapes = system.linear_modes()
+    amplitude = np.sqrt(2 * 0.8 * system.grazing_energy(1)) / omega[1]
+    start = condensed.motions.from_mode(system.contact_rows @ shapes[:, 1] * amplitude, float(omega[1]))
+    point = [start, *Continuation(condensed.motions, start, case.nnm.model_copy(update={"points": 6}))][-1]
+    assert point.episodes
+
+    u = np.concatenate(list(state_of(condensed.motions, point, 1).values()))
+    assert system.energy(u, 0 * u) == pytest.approx(point.energy, rel=1e-6)
+    orbit = corrected(problem, u, point.period)
+    assert orbit.period == pytest.approx(point.period, rel=1e-7)
+    assert orbit.episodes == point.episodes
+
+
+def corrected(problem: Any, u: np.ndarray, period: float) -> Any:
+    """The orbit to which a ``problem`` of shooting corrects a motion from rest at ``u``."""
+    frame = problem.frame_at("relative", u, period, np.empty(0))
+    row = np.append(u / np.linalg.norm(u), 0.0)
+    attempt = frame.solve(frame.xi, row, row @ frame.xi)
+    assert attempt.converged
+    return frame.measures(attempt)
+
+
+SITES: dict[str, Any] = {
+    "name": "sites",
+    "lattice": {
+        "cells": 14,
+        "cell": {
+            "masses": [4e-3, 2e-3],
+            "springs": [
+                {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True},
+                {"start": 1, "end": 2, "stiffness": 5e3},
+            ],
+        },
+    },
+    "contacts": {
+        "law": "hertz",
+        "stiffness": 1e7,
+        "sites": [7, 9],
+        "clearance": 0.0,
+        "side": "plus",
+        "precompression": 2e-4,
+    },
+    "nnm": {"system": "chain", "shooting": "krylov", "modes": [28], "tolerance": 1e-12},
+}
+# A frequency between the bands and the linear mode of a pressed site: that of a contact that opens.
+OPENING = 8000.0
+
+
+def test_the_state_at_rest_is_that_of_a_run():
+    """Stiffness, load and energy of small and large motions are those with which runs are made."""
+    nnm = System.from_case(NnmCase.from_table(SITES))
+    time = {"end": 0.01, "sample_interval": 1e-4}
+    drive = {"amplitude": 1.0, "frequency": 1000.0, "cycles": 3, "cell": 4}
+    model = Case.from_table(
+        {key: SITES[key] for key in ("lattice", "contacts")} | {"time": time, "drive": drive}
+    ).model()
+
+    rest = nnm.stiffness_at_rest - nnm.stiffness
+    for joint in pressed_contacts(model):
+        row = np.zeros(nnm.dofs)
+        row[[joint.host, joint.resonator]] = -1.0, 1.0
+        rest -= joint.stiffness * np.outer(row, row)
+    assert np.abs(rest).max() == 0
+    assert np.all(nnm.forces(np.zeros(nnm.dofs)) == 0)
+    assert nnm.energy(np.zeros(nnm.dofs), np.zeros(nnm.dofs)) == 0
+
+
+@pytest.fixture(scope="module")
+def opening():
+    """The breather of the first site whose contact opens, by Bloch waves, and the dense system of its lattice."""
+    nnm = {"system": "condensed", "start_frequency": [OPENING], "truncation": 1e-6, "tolerance": 1e-11}
+    case = NnmCase.from_table(SITES | {"nnm": nnm})
+    condensed = Condensed.from_case(case)
+    point = condensed.motions.from_gap(OPENING, np.array([1.0, 0.0]))
+    return condensed, point, System.from_chain(case.chain(), [*condensed.motions.forces.contacts])
+
+
+def test_a_breather_of_a_pressed_site_is_an_orbit(opening):
+    """By waves, by all modes with a spring in the place of the contact, and by shooting: one motion."""
+    condensed, point, system = opening
+    assert point.episodes == 1
+    by_modes = condensed_system(system, condensed.motions.control).from_gap(OPENING, np.array([1.0, 0.0]))
+    assert by_modes.x == pytest.approx(point.x, abs=1e-9 * np.abs(point.x).max())
+    assert by_modes.energy == pytest.approx(point.energy, rel=1e-9)
+
+    u = np.concatenate(list(state_of(condensed.motions, point, 2).values()))
+    end = Dop853Flow(system).arc(np.append(u, 0 * u), point.period, point.period).end
+    assert np.abs(end[: len(u)] - u).max() < 1e-4 * np.abs(u).max()
+    assert system.energy(u, 0 * u) == pytest.approx(point.energy, rel=1e-6)
+
+
+def test_shooting_without_matrices_finds_the_orbit_of_pressed_sites(opening):
+    """Variations pass the opening of a contact: the lattice is shot on all ranks as with dense matrices."""
+    condensed, point, system = opening
+    lattice = LatticeMethod(NnmCase.from_table(SITES), MPI.COMM_SELF).lattice
+    u = np.concatenate(list(state_of(condensed.motions, point, 2).values()))
+    orbit = corrected(lattice, u, point.period)
+    dense = corrected(Shooting(Dop853Flow(system), MAPS["half"], 1e-12), orbit.x, orbit.period)
+
+    assert dense.x == pytest.approx(orbit.x, abs=1e-8 * np.abs(orbit.x).max())
+    assert dense.period == pytest.approx(orbit.period, rel=1e-9)
+    assert dense.energy == pytest.approx(orbit.energy, rel=1e-9)
+    assert (orbit.episodes, dense.episodes) == (1, 1)
+    assert orbit.closed == pytest.approx(dense.closed, abs=1e-9)
+
+    flow = Dop853Flow(system)
+    start = np.append(orbit.x, 0 * orbit.x)
+    change = np.random.default_rng(1).standard_normal(len(start)) * np.repeat([1.0, OPENING], len(u))
+    moved = lattice.flow.gather(lattice.arc(orbit.x, orbit.period).move(lattice.flow.scatter(change[None])))[0]
+    expected = flow.arc(start, orbit.period / 2, orbit.period).sensitivity @ change
+    for half in (slice(0, len(u)), slice(len(u), None)):
+        assert np.abs(moved - expected)[half].max() < 1e-6 * np.abs(expected[half]).max()
+
+
+def test_a_stop_that_touches_among_pressed_ones_is_refused():
+    """About a contact that is open or pressed there are linear motions, about one that touches there are none."""
+
+    def with_clearances(clearances: list[float]) -> dict[str, Any]:
+        each = {"precompression": [1e-4, 0.0]}
+        return SITES | {"contacts": SITES["contacts"] | {"clearance": clearances, "each": each, "precompression": None}}
+
+    assert NnmCase.from_table(with_clearances([0.0, 1e-4])).gaps() == ((-1e-4, np.inf), (1e-4, np.inf))
+    with pytest.raises(CaseError, match="no motion about it is linear"):
+        NnmCase.from_table(with_clearances([0.0, 0.0]))

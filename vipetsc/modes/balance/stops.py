@@ -1,0 +1,69 @@
+"""The stops of a contact: its law, and where it acts on both sides of the state at rest."""
+
+from typing import NamedTuple, Self
+
+from vipetsc.lattice import Contact
+
+
+class Stops(NamedTuple):
+    """The ``law`` of a contact, and where its stops are: clearances in m on the sides ``plus`` and ``minus``.
+
+    inf: there is no stop; negative: it is pressed at rest, where a static load balances its force. On the way to a
+    state with stops that touch at rest the force has a factor ``weight``, and a dashpot of ``drag`` in N s/m beside it.
+    A linear system may have a ``spring`` in N/m in the place of a pressed contact: harmonics are then those of the
+    force less the spring's.
+    """
+
+    law: Contact
+    plus: float
+    minus: float
+    weight: float = 1.0
+    drag: float = 0.0
+    spring: float = 0.0
+
+    @classmethod
+    def both(cls, law: Contact, clearance: float) -> Self:
+        """Stops at the same ``clearance`` in m on both sides."""
+        return cls(law, clearance, clearance)
+
+    @property
+    def clearance(self) -> float:
+        """The smaller clearance in m."""
+        return min(self.plus, self.minus)
+
+    def force(self, w: float) -> float:
+        """Elastic force in N at the relative displacement ``w`` in m, without what a static load balances."""
+        elastic = self.law.elastic_force(w - self.plus) - self.law.elastic_force(-w - self.minus)
+        return float(elastic) - self.load
+
+    def energy(self, w: float) -> float:
+        """Energy in J of the contact and of the load at the relative displacement ``w`` in m, 0 at rest."""
+        elastic = float(self.law.elastic_energy(w - self.plus) + self.law.elastic_energy(-w - self.minus))
+        return elastic - self.energy_at_rest - self.load * w
+
+    @property
+    def is_pressed(self) -> bool:
+        """Whether the contact is pressed at rest."""
+        return self.clearance < 0
+
+    @property
+    def is_linear_at_rest(self) -> bool:
+        """Whether motions about rest are linear up to where contacts open or close."""
+        return not self.is_pressed or self.law.is_linear
+
+    @property
+    def slope_at_rest(self) -> float:
+        """Stiffness in N/m for small motions about rest: the slope of the force of a pressed contact, else 0."""
+        return float(self.law.elastic_slope(-self.clearance)) if self.is_pressed else 0.0
+
+    @property
+    def energy_at_rest(self) -> float:
+        """Elastic energy in J at rest."""
+        plus, minus = (float(self.law.elastic_energy(-gap)) for gap in (self.plus, self.minus))
+        return self.weight * (plus + minus)
+
+    @property
+    def load(self) -> float:
+        """Force in N, on the side + positive, that a static load balances."""
+        plus, minus = (float(self.law.elastic_force(max(-gap, 0.0))) for gap in (self.plus, self.minus))
+        return self.weight * (plus - minus)
