@@ -13,7 +13,7 @@ from tests.rigs import after_a_period
 from tests.steady_states import motion_at
 from vipetsc.case import Case, CaseError, CaseFile, LawCase, NnmCase
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.identification.motion import respond, slopes_between
+from vipetsc.identification.motion import MotionCoefficients, respond, slopes_between
 from vipetsc.identification.motion_begin import MotionBegin
 from vipetsc.lattice import linear_modes, nonlinear_places
 from vipetsc.modes.response.steady import SteadyStates
@@ -107,8 +107,9 @@ def test_the_motion_of_identification_is_that_of_scipy(run, exact):
     model = changed().model()
     begin = MotionBegin(time=0.0, state=exact[0], slopes=np.zeros((4 * CELLS, 0)))
     watched = np.arange(2 * CELLS)
-    slopes = slopes_between([], [], np.zeros(0), model)
-    motion = respond(model, slopes, run["time"].values, watched, begin=begin).motion
+    coefficients = MotionCoefficients.of(model)
+    slopes = slopes_between([], [], np.zeros(0), model, coefficients)
+    motion = respond(model, coefficients, slopes, run["time"].values, watched, begin=begin).motion
     assert np.abs(motion[:, :, 0, 0] - exact[:, : 2 * CELLS]).max() < 1e-7 * np.abs(exact[:, : 2 * CELLS]).max()
 
 

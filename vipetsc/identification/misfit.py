@@ -10,7 +10,7 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import Measured
 from vipetsc.dynamics.drives import create_drives, drive_forces
 from vipetsc.identification.initial_state import WIDTH, InitialState, initial_state, state_of
-from vipetsc.identification.motion import MotionError, RecordedMotion, respond, slopes_between
+from vipetsc.identification.motion import MotionCoefficients, MotionError, RecordedMotion, respond, slopes_between
 from vipetsc.identification.motion_begin import MotionBegin
 from vipetsc.identification.motion_rates import SHORT
 
@@ -142,9 +142,11 @@ class Misfit:
         model = self.plan.record_case(self.case(z), number).model()
         inner, estimated = self.columns(number, active)
         lower, upper, widths = self._models(z, number, inner)
-        slopes = slopes_between(lower, upper, widths, model, others=len(estimated))
+        coefficients = MotionCoefficients.of(model)
+        slopes = slopes_between(lower, upper, widths, model, coefficients, others=len(estimated))
         return respond(
             model,
+            coefficients,
             slopes,
             times=self.times(z, number, end)[::stride],
             watched=self.watched[number] if watched is None else watched,

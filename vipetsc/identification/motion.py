@@ -76,16 +76,20 @@ def gains_of(model: Model) -> np.ndarray:
 
 
 def slopes_between(
-    lower: Sequence[Model], upper: Sequence[Model], widths: np.ndarray, model: Model, others: int = 0
+    lower: Sequence[Model],
+    upper: Sequence[Model],
+    widths: np.ndarray,
+    model: Model,
+    middle: MotionCoefficients,
+    others: int = 0,
 ) -> Slopes:
-    """Derivatives of the coefficients of ``model`` by central differences between models (parameter,).
+    """Derivatives of ``middle``, the coefficients of ``model``, by central differences between models (parameter,).
 
     ``widths`` (parameter,) are the distances of the parameter's values in ``lower`` and ``upper``; parameters are
     numbers of order one, so that all derivatives of a motion have its magnitude. MotionCoefficients are affine in most
     parameters and smooth in the others, so that no truncation is seen. Behind these parameters come ``others``, on
     which no coefficient depends.
     """
-    middle = MotionCoefficients.of(model)
     count = len(widths) + others
     number = len(middle.sites)
     slopes = Slopes(
@@ -138,6 +142,7 @@ class RecordedMotion(NamedTuple):
 
 def respond(
     model: Model,
+    coefficients: MotionCoefficients,
     slopes: Slopes,
     times: np.ndarray,
     watched: np.ndarray,
@@ -146,12 +151,11 @@ def respond(
 ) -> RecordedMotion:
     """The motion of ``model`` and its derivatives at the rising ``times`` (sample,) in s.
 
-    It starts as ``begin`` says, by default from rest at t = 0. ``watched`` are masses (0-based, cell by cell); without
-    ``touches`` no site ever closes. Raises MotionError.
+    ``coefficients`` are the model's. The motion starts as ``begin`` says, by default from rest at t = 0. ``watched``
+    are masses (0-based, cell by cell); without ``touches`` no site ever closes. Raises MotionError.
     """
     chain = model.chain
-    coefficients = MotionCoefficients.of(model)
-    sites = coefficients.sites
+    sites = coefficients.sites.copy()
     if not touches:
         sites["clearance"] = sites["clearance_minus"] = np.inf
     drives = create_drives(model.drives, range(len(model.drives)))

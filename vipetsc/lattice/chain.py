@@ -1,7 +1,7 @@
 """A finite lattice: its cells, its ends, its contact sites, its linear response."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -252,19 +252,29 @@ class Chain:
         imaginary part stands for the finite burst. Scales exactly with the drive's amplitude. A lattice
         longer than LONGEST cells is cut there: the wave is evanescent at that frequency.
         """
-        cut = Chain(self.cell, min(self.cells, LONGEST), self.ends)
+        cells = min(self.cells, LONGEST)
         driven = cell
-        if cell >= cut.cells // 2:
-            driven = max(cut.cells - (self.cells - cell), 0)  # as far from the right end as in the whole lattice
+        if cell >= cells // 2:
+            driven = max(cells - (self.cells - cell), 0)  # as far from the right end as in the whole lattice
 
         omega = drive.frequency * (1 - 1j / drive.cycles)
-        dynamic = cut.stiffness_matrix() - diags(cut.masses() * omega**2)
-        force = np.zeros(cut.cells * self.cell.dofs, complex)
-        force[driven * self.cell.dofs + mass] = 1.0
-        # Eliminated column by column in SciPy's own order, a ring loses all digits: waves grow on their way along it.
-        order = "MMD_AT_PLUS_A" if self.ends == "periodic" else "COLAMD"
-        response = float(np.abs(scipy.sparse.linalg.spsolve(dynamic.tocsc(), force, permc_spec=order)).max())
-        return response * drive.peak
+        return _largest_response(self.cell, cells, self.ends, driven * self.cell.dofs + mass, omega) * drive.peak
+
+
+# The cases of a sweep or a fit, of which most differ in their contacts or the drive's amplitude, have it in common.
+@lru_cache(maxsize=64)
+def _largest_response(cell: UnitCell, cells: int, ends: Ends, driven: int, omega: complex) -> float:
+    """Largest displacement in m of a lattice of equal cells under 1 N at the complex frequency ``omega`` in rad/s.
+
+    The force acts on the mass of the number ``driven``, from 0, cell by cell.
+    """
+    chain = Chain(cell, cells, ends)
+    dynamic = chain.stiffness_matrix() - diags(chain.masses() * omega**2)
+    force = np.zeros(cells * cell.dofs, complex)
+    force[driven] = 1.0
+    # Eliminated column by column in SciPy's own order, a ring loses all digits: waves grow on their way along it.
+    order = "MMD_AT_PLUS_A" if ends == "periodic" else "COLAMD"
+    return float(np.abs(scipy.sparse.linalg.spsolve(dynamic.tocsc(), force, permc_spec=order)).max())
 
 
 def cells_between(cell: ArrayLike, other: int, cells: int, ends: Ends) -> np.ndarray:
