@@ -80,7 +80,7 @@ class NfrcCase(Case):
 
         update: dict[str, Any] = {"restitutions": nfrc.restitutions or [contacts.restitution]}
         if nfrc.infinite is None:
-            update["infinite"] = not needs_modes(chain)
+            update["infinite"] = nfrc.source == "wave" or not needs_modes(chain)
         if nfrc.symmetric is None:
             update["symmetric"] = chain.is_odd and not gaps_of_sites(contacts, list(chain.clearances))
         if nfrc.over == "amplitude":
@@ -91,7 +91,12 @@ class NfrcCase(Case):
             first = nfrc.fixed[0] if nfrc.over == "amplitude" else nfrc.range[0]
             fastest = max(waves_at(cell, first), key=lambda wave: wave[2], default=None)
             nfrc = nfrc.model_copy(update={"band": fastest and fastest[0]})
-        return sections | {"nfrc": nfrc}, [*_check_waves(nfrc, cell), *_check_searches(nfrc, chain)]
+        problems = [
+            *_check_waves(nfrc, cell),
+            *_check_ground(sections | {"nfrc": nfrc}, chain),
+            *_check_searches(nfrc, chain),
+        ]
+        return sections | {"nfrc": nfrc}, problems
 
     @classmethod
     def _read_family(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
@@ -271,9 +276,14 @@ class NfrcCase(Case):
         return [(f"r{of_r}-{of_f}", r, f) for (of_r, r), (of_f, f) in itertools.product(restitutions, fixed)]
 
 
+def has_waves(chain: Chain) -> bool:
+    """Whether motions of ``chain`` consist of Bloch waves, which are those of equal linear cells without loss."""
+    return chain.is_uniform() and chain.is_linear and not chain.is_damped
+
+
 def needs_modes(chain: Chain) -> bool:
-    """Whether the response of ``chain`` follows from its modes: Bloch waves are those of equal cells without loss."""
-    return chain.is_damped or not chain.is_uniform() or bool(chain.pairs) or not chain.is_linear
+    """Whether the response of the finite ``chain`` is computed from its modes, those of contacts of other pairs too."""
+    return not has_waves(chain) or bool(chain.pairs)
 
 
 def _check_drives(nfrc: NfrcTable, drives: DriveTable) -> Iterator[Problem]:
@@ -290,8 +300,7 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     """Problems with a wave, an infinite lattice, or symmetric motions that the lattice does not have."""
     gaps = gaps_of_sites(contacts, list(chain.clearances))
     if nfrc.symmetric and gaps:
-        remedy = "contacts that differ on their two sides make even harmonics; omit it"
-        yield Problem("nfrc.symmetric", True, remedy)
+        yield Problem("nfrc.symmetric", True, "contacts that differ on their two sides make even harmonics; omit it")
     if nfrc.symmetric and not chain.is_odd:
         yield Problem("nfrc.symmetric", True, "a quadratic spring makes even harmonics; omit it")
     stops = gaps or [(clearance, clearance) for clearance in chain.clearances]
@@ -301,20 +310,10 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     if nfrc.source == "wave" and smallest <= 0:
         remedy = "a wave's amplitude counts in clearances, and a contact has none; a force can be given"
         yield Problem("nfrc.source", "wave", remedy)
-    if not needs_modes(chain):
+    if not has_waves(chain):
+        yield from _no_waves(nfrc, chain)
+    if not needs_modes(chain) or nfrc.infinite or nfrc.source == "wave":
         return
-
-    reason = "not yet: in an infinite lattice contacts join the pair of masses that the cell names"
-    if chain.is_damped:
-        reason = "in a lattice with dashpots a wave from far away has decayed before it arrives"
-    elif not chain.linearised().is_uniform():
-        reason = "a wave of equal cells does not pass cells that differ as it came"
-    elif not chain.is_linear:
-        reason = "a wave in springs that are not linear changes its shape as it travels"
-    if nfrc.source == "wave":
-        yield Problem("nfrc.source", "wave", f'{reason}; source = "force" drives a mass')
-    elif nfrc.infinite:
-        yield Problem("nfrc.infinite", True, f"{reason}; omit it, and give the lattice absorbing ends")
     dofs = chain.cells * chain.cell.dofs
     if dofs > MOST_DOFS:
         remedy = f"{dofs} masses: all modes of a lattice with dashpots, unlike cells or other contact pairs are needed"
@@ -325,6 +324,30 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
         if unknowns > MOST_UNKNOWNS:
             remedy = f"{places} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
             yield Problem("nfrc.harmonics", nfrc.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
+
+
+def _no_waves(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
+    """Problems with an infinite lattice whose motions do not consist of Bloch waves."""
+    reason = "a wave in springs that are not linear changes its shape as it travels"
+    if chain.is_damped:
+        reason = "in a lattice with dashpots a wave from far away has decayed before it arrives"
+    elif not chain.linearised().is_uniform():
+        reason = "a wave of equal cells does not pass cells that differ as it came"
+    if nfrc.source == "wave":
+        yield Problem("nfrc.source", "wave", f'{reason}; source = "force" drives a mass')
+    elif nfrc.infinite:
+        yield Problem("nfrc.infinite", True, f"{reason}; omit it, and give the lattice absorbing ends")
+
+
+def _check_ground(sections: dict[str, Any], chain: Chain) -> Iterator[Problem]:
+    """Problems with a mean force of the ground on a lattice that no wall holds."""
+    nfrc = sections["nfrc"]
+    absorbing = sections["lattice"].absorbing
+    is_open = nfrc.infinite or (nfrc.open_ends and absorbing.end == "both")
+    has_walls = chain.ends == "fixed" and not is_open
+    if not has_walls and not nfrc.symmetric and any(pair.host < 0 for pair in chain.contact_pairs):
+        reason = "contacts to ground that differ on their two sides have a mean force, which pushes a lattice away"
+        yield Problem("contacts.pair", None, f"{reason} that no wall holds; give stops on both sides at one distance")
 
 
 def _check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:

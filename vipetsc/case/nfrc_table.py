@@ -24,10 +24,10 @@ class NfrcTable(Section):
     ``family``, which are lists or ranges as in ``[sweep]``. Over the path of a key (``contacts.clearance``, in the
     key's unit) ``fixed`` are amplitudes, at the drive's frequency, and the case is resolved anew at each value.
 
-    The lattice is ``infinite``, or ends where its cells do: always if it has dashpots, cells that differ, or contacts
-    between other masses than the cell's pair. With ``open_ends`` it goes on for ever as the reference cell in the place
-    of its absorbing ends. ``harmonics`` is the number of the last one; motions that are not ``symmetric``
-    (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too.
+    The lattice is ``infinite``, or ends where its cells do: always if it has dashpots or cells that differ, and under a
+    force also by default if contacts join other masses than the cell's pair. With ``open_ends`` it goes on for ever as
+    the reference cell in the place of its absorbing ends. ``harmonics`` is the number of the last one; motions that are
+    not ``symmetric`` (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too.
 
     Besides folds the points are located where states become stable or unstable (``special_points``: Neimark-Sacker,
     period doubling, branch points), or ``all`` where the number of growing perturbations changes. At ``isolas`` places

@@ -6,14 +6,14 @@ factors are at most one, and a stretch costs the same whatever its length. An in
 on either side. Cf. Lopez Sancho et al., J. Phys. F 15 (1985) 851, who double stretches.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vipetsc.lattice.bands import waves_at
-from vipetsc.lattice.chain import Chain
+from vipetsc.lattice.chain import Chain, Pair
 from vipetsc.lattice.waves import NEUTRAL, BlochWaves, bloch_waves, cell_between, coupling_blocks, energy_flux
 
 AT_REST = 1e-12  # a contact pair that moves less than this fraction of its cell does not move
@@ -73,7 +73,7 @@ class WaveCompliance:
 
     Relative displacements w = u_resonator - u_host of the contact pairs follow from pairs of opposite forces, and by
     forces on single masses at the ``points``, which are (cell, mass) from 0. At omega = 0 forces on a lattice that is
-    free to move must sum to zero.
+    free to move, as an infinite one is, must sum to zero.
     """
 
     chain: Chain
@@ -83,10 +83,16 @@ class WaveCompliance:
     @property
     def cells(self) -> list[int]:
         """The cells that are loaded, and the ends."""
-        loaded = {*self.chain.sites, *self.chain.resonator_cells, *(cell for cell, _ in self.points)}
+        loaded = {*self.chain.sites, *self._resonator_cells, *(cell for cell, _ in self.points)}
         if not self.infinite and self.chain.ends != "periodic":
             loaded |= {0, self.chain.cells - 1}
         return sorted(loaded) or [0]
+
+    @property
+    def _resonator_cells(self) -> tuple[int, ...]:
+        """The cell of each site's resonator; an infinite lattice does not close to a ring."""
+        chain = replace(self.chain, ends="fixed") if self.infinite else self.chain
+        return chain.resonator_cells
 
     def response(self, omegas: ArrayLike) -> np.ndarray:
         """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s, on or below the axis.
@@ -137,9 +143,13 @@ class WaveCompliance:
         factor = waves.factor[0, channel] ** direction
         state = waves.state[0, :, channel]
         shape = cell_between(cell, waves, state, factor * state)
-        relative = shape[cell.resonator] - shape[cell.host]
+
+        pairs = self.chain.contact_pairs
+        relative = _relative_motion(pairs[0], shape, factor)
         if abs(relative) < AT_REST * np.abs(shape).max():
             raise ValueError(f"the contact pair does not move in the wave of band {band} at {omega:g} rad/s")
+        # A pair like the first one moves as it does, but for the phase.
+        ratios = [1.0 if pair == pairs[0] else _relative_motion(pair, shape, factor) / relative for pair in pairs]
 
         origin = self.chain.sites[0]
         return IncidentWave(
@@ -147,7 +157,7 @@ class WaveCompliance:
             band=band,
             direction=direction,
             wavenumber=wavenumbers[0],
-            relative=factor ** (np.array(self.chain.sites) - origin),
+            relative=factor ** (np.array(self.chain.sites) - origin) * ratios,
             flux=abs(energy_flux(omega, state)) / abs(relative) ** 2,
             shape=shape / relative,
             factor=factor,
@@ -214,7 +224,7 @@ class WaveCompliance:
 
         loads = np.zeros((len(first_row) * cell.dofs, pairs + len(self.points)))
         chain = self.chain
-        places = zip(chain.sites, chain.resonator_cells, chain.contact_pairs, strict=True)
+        places = zip(chain.sites, self._resonator_cells, chain.contact_pairs, strict=True)
         for j, (site, resonator_cell, pair) in enumerate(places):
             loads[first_row[resonator_cell] + pair.resonator, j] = 1
             # The ground does not move.
@@ -317,6 +327,16 @@ class WaveCompliance:
             place %= self.chain.cells
         inside = place > 0 and (stretch.right is None or place <= stretch.length)
         return place if inside else None
+
+
+def _relative_motion(pair: Pair, shape: np.ndarray, factor: complex) -> complex:
+    """Relative displacement in m of a ``pair`` in the cell of a wave of the ``shape`` (dofs,) in m there.
+
+    The next cell has ``factor`` times that shape; the ground does not move.
+    """
+    resonator = shape[pair.resonator] * factor if pair.next_cell else shape[pair.resonator]
+    host = shape[pair.host] if pair.host >= 0 else 0.0
+    return complex(resonator - host)
 
 
 def _right_half(omegas: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

@@ -50,7 +50,7 @@ def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
         ends = ("left", "right") if absorbing.end == "both" else (absorbing.end,)
         without = build_chain(case.lattice.model_copy(update={"absorbing": None}), case.contacts)
         return OpenCompliance(without, places, ends)
-    if needs_modes(chain):
+    if needs_modes(chain) and not case.nfrc.infinite:
         return ModalCompliance(chain, places)
     return WaveCompliance(chain, bool(case.nfrc.infinite), places)
 

@@ -1,0 +1,198 @@
+"""An incident wave in an infinite lattice whose contacts join other masses than the cell's pair.
+
+Contacts to the ground, with the next cell and two in one cell: energy, mirror images, direct solutions of long
+lattices, and a run in time before waves come back from the ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.sparse import diags
+from scipy.sparse.linalg import spsolve
+
+from tests.conftest import run_of
+from vipetsc.case import Case, CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.lattice import Chain, Spring, UnitCell, WaveCompliance
+from vipetsc.lattice.chain import Pair
+from vipetsc.modes.response.state import Measures
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import first_state
+
+# A row of masses on which resonators sit, with springs between neighbouring resonators as well.
+SPRINGS = (Spring(0, 0, 1e4, next_cell=True), Spring(0, 1, 5e3), Spring(1, 1, 1e3, next_cell=True))
+CELL = UnitCell((4e-3, 2e-3), SPRINGS, host=0, resonator=1)
+PAIRS = (Pair(-1, 1), Pair(1, 0, next_cell=True), Pair(0, 1), Pair(-1, 0))
+SITES = (500, 501, 503, 503)
+
+
+def rows_of(chain: Chain) -> np.ndarray:
+    """Rows (pair, mass) that take relative displacements from those of masses; of a chain that is no ring."""
+    d = chain.cell.dofs
+    rows = np.zeros((len(chain.sites), chain.cells * d))
+    for row, site, pair in zip(rows, chain.sites, chain.contact_pairs, strict=True):
+        row[(site + pair.next_cell) * d + pair.resonator] = 1
+        if pair.host >= 0:
+            row[site * d + pair.host] = -1
+    return rows
+
+
+@pytest.mark.parametrize("omega", [400.0 - 40j, 1000.0 - 40j, 3000.0 - 90j])
+def test_compliances_are_those_of_a_long_damped_lattice(omega):
+    """Waves of these frequencies decay before they reach an end of the matrices that are solved."""
+    chain = Chain(CELL, 1000, "free", SITES, (1e-4,) * 4, pairs=PAIRS)
+    dynamic = chain.stiffness_matrix().tocsc() - omega**2 * diags(chain.masses(), format="csc")
+    rows = rows_of(chain)
+    expected = rows @ spsolve(dynamic.astype(complex), rows.T.astype(complex))
+    found = WaveCompliance(chain, infinite=True).at(omega)[0]
+    assert np.abs(found - expected).max() < 1e-10 * np.abs(expected).max()
+
+
+def test_the_ends_of_a_ring_do_not_join_an_infinite_lattice():
+    """A contact of the last cell with the next one is that of any two neighbours."""
+    pair = (Pair(1, 0, next_cell=True),)
+    last = Chain(CELL, 5, "periodic", (4,), (1e-4,), pairs=pair)
+    inner = replace(last, sites=(1,))
+    answers = [WaveCompliance(chain, infinite=True).at(1000.0) for chain in (last, inner)]
+    assert answers[0] == pytest.approx(answers[1], rel=1e-12)
+
+
+def test_the_relative_motions_of_a_wave_are_differences_of_its_field():
+    chain = Chain(CELL, 1000, "fixed", SITES, (1e-4,) * 4, pairs=PAIRS)
+    wave = WaveCompliance(chain, infinite=True).incident(1000.0, 1, -1)
+    field = wave.field(range(chain.cells)).ravel()
+    assert wave.relative == pytest.approx(rows_of(chain) @ field, rel=1e-12)
+    assert wave.relative[0] == pytest.approx(1.0)
+
+
+# The same row without springs between resonators is its own mirror image.
+ROW = {
+    "masses": [4e-3, 2e-3],
+    "springs": [{"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 5e3}],
+}
+GROUND = {"pair": [0, 2], "sites": [12, 14]}
+NEIGHBOURS = {"pair": [1, 1], "next_cell": True, "sites": [12, 14]}
+# A resonator meets the next one; in another cell one meets its host and the ground.
+SEVERAL = {
+    "sites": [10, 12, 12],
+    "clearance": [1e-4, 3e-5, 1e-4],
+    "each": {"pair": [[2, 2], [1, 2], [0, 2]], "next_cell": [True, False, False]},
+}
+# In the mirror image of 24 cells cell n is 25 - n, and the contact of cells n and n + 1 that of 24 - n and 25 - n.
+MIRRORED = {
+    "ground": (GROUND, GROUND | {"sites": [13, 11]}),
+    "neighbours": (NEIGHBOURS, NEIGHBOURS | {"sites": [12, 10]}),
+    "several": (SEVERAL, SEVERAL | {"sites": [14, 13, 13]}),
+}
+
+
+def wave_case(contacts: dict[str, Any], **nfrc: Any) -> NfrcCase:
+    """Lossy sites under a wave of 1000 rad/s of 2.5 clearances, or as ``nfrc`` says."""
+    common = {"law": "bilinear", "stiffness": 1e4, "clearance": 1e-4, "restitution": 0.5}
+    steps = {"harmonics": 15, "first_step": 0.2, "largest_step": 1.0, "range": [2.5, 9.0]}
+    return NfrcCase.from_table(
+        {
+            "name": "x",
+            "lattice": {"cells": 24, "cell": ROW},
+            "contacts": common | contacts,
+            "drive": {"frequency": 1000.0, "cycles": 3, "amplitude": 1.0, "cell": 4},
+            "nfrc": steps | nfrc,
+        }
+    )
+
+
+def measures_of(case: NfrcCase, restitution: float) -> Measures:
+    """The measures of the state at the beginning of the range."""
+    states = SteadyStates(case, restitution, case.nfrc.fixed[0])
+    return states.measured(first_state(states).xi)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MIRRORED)
+def test_energy_and_mirror_images(name):
+    """T + R + U + L = 1 in contact, and a wave from the other side moves the mirrored sites alike."""
+    forward, backward = (
+        measures_of(wave_case(contacts, direction=direction), 0.5)
+        for direction, contacts in zip(("forward", "backward"), MIRRORED[name], strict=True)
+    )
+    assert forward.episodes >= 4
+    assert (forward.closed > 0).all()
+    assert forward.fractions.sum() == pytest.approx(1.0, abs=1e-9)
+    assert forward.fractions.min() > 1e-4
+
+    assert backward.fractions == pytest.approx(forward.fractions, rel=1e-7)
+    assert backward.largest == pytest.approx(forward.largest, rel=1e-7)
+    assert backward.unstable == forward.unstable
+
+
+@pytest.mark.slow
+def test_a_steady_state_under_a_wave_is_where_a_long_run_ends():
+    """A force far away makes the wave; contacts to the ground and with the next cell move as computed."""
+    omega = 1000.0
+    period = 2 * np.pi / omega
+    contacts = {
+        "law": "bilinear",
+        "stiffness": 1e4,
+        "clearance": 1e-4,
+        "restitution": 0.3,
+        "sites": [320, 322],
+        "each": {"pair": [[0, 2], [1, 1]], "next_cell": [False, True]},
+    }
+    # Waves go 8 cells a period: they come back from the ends after the run.
+    lattice = {"cells": 640, "cell": ROW}
+    drive = {"waveform": "harmonic", "frequency": omega, "cell": 300}
+    table = {"name": "x", "lattice": lattice, "contacts": contacts, "drive": drive}
+    options = {"harmonics": 31, "largest_step": 1.0, "first_step": 0.2}
+
+    amplitude = 2.5
+    case = NfrcCase.from_table(table | {"nfrc": options | {"range": [amplitude, 9.0]}})
+    measures = measures_of(case, 0.3)
+    assert measures.unstable == 0
+    assert measures.episodes == 4
+
+    # The force of the run alone would move the first site by 2.5 clearances.
+    forced = NfrcCase.from_table(table | {"nfrc": options | {"source": "force", "infinite": True, "range": [0.1, 1.0]}})
+    relative = SteadyStates(forced, 0.3, omega).linear_motion(omega).harmonics[0, 1]
+    force = amplitude * 1e-4 / abs(relative)
+    samples = 64
+    run = Case.from_table(
+        table
+        | {
+            "drive": drive | {"amplitude": force, "ramp": 20 * period},
+            "time": {"engine": "propagator", "end": 60 * period, "sample_interval": period / samples},
+            "output": {"window": [320, 323]},
+        }
+    )
+    u = run_of(run)["displacement"].values[-1 - 4 * samples : -1]
+    turns = np.exp(-2j * np.pi * np.arange(len(u)) / samples)
+    motions = (u[:, 0, 1], u[:, 3, 0] - u[:, 2, 0])
+    found = [2 * np.abs(np.mean(turns * motion)) for motion in motions]
+    assert found == pytest.approx(np.abs(measures.harmonics[:, 1]).tolist(), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("lattice", "nfrc"),
+    [
+        ({}, {}),
+        ({}, {"source": "force", "infinite": True}),
+        ({"ends": "free"}, {"source": "force"}),
+        ({"ends": "periodic"}, {"source": "force"}),
+        ({"absorbing": {"cells": 8, "strength": 1.0, "end": "both"}}, {"source": "force", "open_ends": True}),
+    ],
+)
+def test_the_ground_does_not_push_a_lattice_without_walls(lattice, nfrc):
+    """The mean force of a stop on one side is balanced by walls alone."""
+    case = wave_case(GROUND)
+    table = case.model_dump(by_alias=True, exclude_none=True)
+    table["contacts"] |= {"side": "plus"}
+    table["lattice"] |= lattice
+    table["drive"]["cell"] = 12
+    table["nfrc"] = {"range": [0.9, 1.6]} | nfrc
+    with pytest.raises(CaseError) as caught:
+        NfrcCase.from_table(table)
+    assert [problem.key for problem in caught.value.problems] == ["contacts.pair"]
+    assert "mean force" in caught.value.problems[0].remedy
