@@ -5,7 +5,6 @@ constant of it, would keep the old code. Here the name of the cache folder conta
 modules from which it uses kernels or constants, and of the tables of numbers, because compiled code contains constants.
 """
 
-import ast
 import hashlib
 import logging
 import os
@@ -18,6 +17,8 @@ from typing import Any, TypeVar, overload
 
 import numba
 from numba.core import event
+from numba.core.caching import FunctionCache
+from numba.core.runtime import rtsys
 
 from vipetsc.kernel import Kernel
 from vipetsc.process import compiling, launched_rank, say
@@ -28,6 +29,8 @@ logger = logging.getLogger(__name__)
 
 PARENTS: set[Path] = set()  # folders in which kernels are stored
 HAS_KERNELS = re.compile(rb"^(from|import) (vipetsc\.compiled|numba)\b", re.MULTILINE)
+IMPORTS = re.compile(r"^[ \t]*from ([\w.]+) import (\([^)]*\)|.*)$", re.MULTILINE)
+NAME = re.compile(r"\w+")
 
 
 @overload
@@ -78,14 +81,29 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
         # Callbacks and kernels with a signature are compiled here, others at their first call.
         if signature:
             compiling.start()
+        keeps = _can_keep(folder.parent)
         try:
-            return compiler(*signature, cache=_can_keep(folder.parent), **options)(function)
+            compiled = compiler(*signature, cache=keeps, **options)(function)
+            if keeps and not signature:
+                compiled._cache = _KeptCode(function)
+            return compiled
         finally:
             if signature:
                 compiling.stop()
             config.CACHE_DIR = chosen
 
     return decorate
+
+
+class _KeptCode(FunctionCache):
+    """Machine code of a function that is compiled at its first call."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The code for a signature, or None; numba would first prepare to compile, which takes longer than to load."""
+        # All that finished code needs: the functions by which it allocates.
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
 
 class CompilerListener(event.Listener):
@@ -180,10 +198,11 @@ def _imports(package: Path, path: Path) -> list[Path]:
         return []
 
     names = []
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == package.name:
+    # Not by Python's parser, which takes longer for all files with kernels than a short run does.
+    for module, imported in IMPORTS.findall(text.decode("utf-8")):
+        if module.split(".")[0] == package.name:
             # What is imported may be a module, or a name in one.
-            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            names += [module, *(f"{module}.{name}" for name in NAME.findall(imported))]
     files = [package.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names]
     return [file for file in files if file.exists()]
 
