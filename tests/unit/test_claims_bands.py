@@ -100,7 +100,7 @@ def put_bands(
         parts = Parts.of(pass_bands(cell))
         v = velocity(case)
         spectrum = dispersion(v, masses, TIME[1]).folded()
-        energy = part_energies(v, masses, TIME[1], parts.edges)
+        energy = part_energies(v, masses, TIME[1], parts.edges).total
         if case.contacts.law in laws:
             energy = change(energy)
 
@@ -160,7 +160,7 @@ def test_energy_is_counted_in_its_own_band():
     cell = case.lattice.unit_cell()
     parts = Parts.of(pass_bands(cell))
 
-    energy = part_energies(in_two_bands(case), cell.masses, TIME[1], parts.edges).mean(axis=1)
+    energy = part_energies(in_two_bands(case), cell.masses, TIME[1], parts.edges).total.mean(axis=1)
 
     share = dict(zip(parts.names, energy / energy.sum(), strict=True))
     # What the record's ends spread over other bands is some thousandths.

@@ -12,12 +12,12 @@ from vipetsc.spectra import (
     Dispersion,
     Parts,
     band_energies,
+    block_means,
     dispersion,
     front_arrival,
     ibtet,
     kinetic_energy,
     part_energies,
-    part_maps,
     ridge,
     taper,
     wavenumber_content,
@@ -103,7 +103,7 @@ def test_parts_are_a_partition(nt, n, seed, inner):
     signal = noise((nt, n), seed)
 
     # The trapezoidal rule is the one in which cosines of a DCT-I are orthogonal.
-    energy = part_energies(signal[..., None], [2.0], 0.1, edges).sum(axis=0)
+    energy = part_energies(signal[..., None], [2.0], 0.1, edges).total.sum(axis=0)
     assert trapezoid(energy) == pytest.approx(trapezoid(np.sum(signal**2, axis=1)), rel=1e-12)
 
 
@@ -111,21 +111,16 @@ def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
     """Energies and maps of parts are those of the parts themselves, computed at once or in blocks."""
     velocity = noise((64, 10, 2))
     edges = [0.0, 8.0, 20.0, np.inf]
-    energy = part_energies(velocity, MASSES, 0.1, edges)
+    energy = part_energies(velocity, MASSES, 0.1, edges).total
     total = kinetic_energy(velocity, MASSES).sum(axis=1)
     assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=1e-12)
 
     for memory in (1.0, 2e4):
         monkeypatch.setattr("vipetsc.spectra.band_energies.COLUMNS", 6)
-        assert np.allclose(part_energies(velocity, MASSES, 0.1, edges, memory=memory), energy, rtol=1e-12)
+        assert np.allclose(part_energies(velocity, MASSES, 0.1, edges, memory=memory).total, energy, rtol=1e-12)
 
     (middle,) = split(velocity, 0.1, edges[1:3])
     assert np.allclose(kinetic_energy(middle, MASSES).sum(axis=1), energy[1], rtol=1e-12)
-
-    # In blocks of 5 times and 3 cells, kept in single precision.
-    maps = part_maps(velocity, MASSES, 0.1, [edges[:2], edges[1:3]], (5, 3), 1.0)
-    assert maps.shape == (2, 13, 4)
-    assert np.allclose(maps[1, 2, 1], kinetic_energy(middle, MASSES)[10:15, 3:6].mean(), rtol=1e-6)
 
 
 @settings(max_examples=60)
@@ -141,10 +136,30 @@ def test_few_times_give_the_energy_of_a_part_at_every_sample(nt, one, other, see
     (part,) = split(velocity, interval, edges)
     expected = kinetic_energy(part, MASSES).sum(axis=1)
 
-    energy = part_energies(velocity, MASSES, interval, edges)
+    energy = part_energies(velocity, MASSES, interval, edges).total
     # An empty part has the energy 0.
     tolerance = 1e-12 * expected.max() + 1e-300
     assert np.allclose(energy, [expected], rtol=0, atol=tolerance)
+
+
+@settings(max_examples=60)
+@given(st.integers(2, 300), st.floats(0, 1), st.floats(0, 1), st.integers(1, 9), st.integers(1, 7), st.booleans())
+def test_maps_of_parts_are_means_of_their_energy(nt, one, other, samples, cells, whole):
+    """Means over blocks of samples and cells, the last ones shorter, of the energy at every sample."""
+    interval = 0.1
+    highest = np.pi / interval
+    edges = sorted((highest * one, highest * other))
+    velocity = noise((nt, 5, 2))
+
+    (part,) = split(velocity, interval, edges)
+    energy = kinetic_energy(part, MASSES)
+    expected = block_means(block_means(energy, samples, 0), cells, 1)
+
+    kept = {"mapped": (0,), "sizes": (samples, cells), "memory": np.inf if whole else 1.0}
+    found = part_energies(velocity, MASSES, interval, [*edges, np.inf], **kept)
+    # Kept in single precision.
+    assert found.maps.dtype == np.float32
+    assert np.allclose(found.maps, [expected], rtol=1e-6, atol=1e-12 * energy.max() + 1e-300)
 
 
 def test_a_narrow_part_takes_few_times_and_a_wide_one_every_stride():
@@ -158,8 +173,8 @@ def test_a_narrow_part_takes_few_times_and_a_wide_one_every_stride():
 
     velocity = noise((100, 3, 2))
     edges = [0.0, 20.0, np.inf]
-    every = part_energies(velocity, MASSES, 0.1, edges, 1)
-    tenth = part_energies(velocity, MASSES, 0.1, edges, 10)
+    every = part_energies(velocity, MASSES, 0.1, edges, 1).total
+    tenth = part_energies(velocity, MASSES, 0.1, edges, 10).total
     assert np.allclose(every[0], tenth[0], rtol=1e-12)
     assert not np.allclose(every[1], tenth[1], rtol=0.1)
 
@@ -169,7 +184,7 @@ def test_a_tone_stays_in_its_part():
     t = np.arange(2001) * 1e-3
     velocity = ((1 - np.cos(np.pi * t)) * np.sin(200 * t))[:, None, None]
 
-    energy = part_energies(velocity, [1.0], 1e-3, [0.0, 100.0, 300.0, np.inf]).sum(axis=1)
+    energy = part_energies(velocity, [1.0], 1e-3, [0.0, 100.0, 300.0, np.inf]).total.sum(axis=1)
     assert energy[1] / energy.sum() > 1 - 1e-6
 
 

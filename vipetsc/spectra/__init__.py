@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from vipetsc.spectra.band_energies import Parts, front_arrival, ibtet, part_energies, part_maps
+from vipetsc.spectra.band_energies import Parts, front_arrival, ibtet, part_energies
 from vipetsc.spectra.directions import band_envelopes, by_direction, wave_energies
 from vipetsc.spectra.fits import FEWEST, PowerLaw, doubt, normalised, power_law
 from vipetsc.spectra.fourier import TAPER, Dispersion, dispersion, kinetic_energy, ridge, taper, wavenumber_content

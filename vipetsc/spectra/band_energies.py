@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft
+from scipy.special import diric
 
 from vipetsc.lattice import Band
-from vipetsc.spectra.fourier import kinetic_energy
 from vipetsc.spectra.pooling import block_means, blocks
 
 COLUMNS = 64  # histories of masses that are transformed together
@@ -67,15 +67,34 @@ class Parts:
         return np.array([bool(b) and i > driven for i, b in enumerate(self.bands)])
 
 
+class PartEnergies(NamedTuple):
+    """Kinetic energies in J of parts of the frequency axis, by frequency filters.
+
+    ``total`` (part, t) are summed over the cells, ``maps`` (mapped part, t', cell') means over blocks of samples and
+    cells, in single precision.
+    """
+
+    total: np.ndarray
+    maps: np.ndarray
+
+
 def part_energies(
-    velocity: np.ndarray, masses: ArrayLike, interval: float, edges: ArrayLike, stride: int = 1, memory: float = np.inf
-) -> np.ndarray:
-    """Kinetic energy (part, t) in J of every part, from ``velocity`` (t, cell, dof) in m/s, summed over the cells.
+    velocity: np.ndarray,
+    masses: ArrayLike,
+    interval: float,
+    edges: ArrayLike,
+    stride: int = 1,
+    memory: float = np.inf,
+    mapped: Sequence[int] = (),
+    sizes: tuple[int, int] = (1, 1),
+) -> PartEnergies:
+    """Kinetic energies of every part, from ``velocity`` (t, cell, dof) in m/s; maps of the parts ``mapped``.
 
     The energy of a part from the frequency low to high has frequencies up to high - low and between 2 low and 2 high.
     It is computed at as few even times as tell these apart (the filtered spectrum is folded onto them), which gives it
     at every sample. A last part that is too wide for that, the region above the bands, is taken at every ``stride``-th
-    and interpolated. ``velocity`` may be stored; no more than ``memory`` bytes of it are read at once.
+    and interpolated; it has no map. ``velocity`` may be stored; no more than ``memory`` bytes of it are read at once.
+    Maps are means over blocks of ``sizes`` (samples, cells).
     """
     nt, cells, dofs = velocity.shape
     last = nt - 1
@@ -85,40 +104,29 @@ def part_energies(
     steps.append(_fewest_steps(parts[-1], last, stride))
 
     energies = [np.zeros(count + 1) for count in steps]
+    maps = np.empty((len(mapped), -(-nt // sizes[0]), -(-cells // sizes[1])), np.float32)
     weights = np.asarray(masses) / (8 * last**2)
-    for block in blocks(cells, 8 * dofs * nt, memory):
-        held = np.asarray(velocity[:, block])
+    # Blocks hold whole columns of the maps.
+    for block in blocks(maps.shape[2], 8 * dofs * nt * sizes[1], memory):
+        held = np.asarray(velocity[:, block.start * sizes[1] : block.stop * sizes[1]])
+        of_cells = {number: np.zeros((steps[number] + 1, held.shape[1])) for number in mapped}
         # Mass by mass: the cells of one lie together where runs in memory hold them.
         for mass, first in itertools.product(range(dofs), range(0, held.shape[1], COLUMNS)):
-            spectrum = _cosines(held[:, first : first + COLUMNS, mass])
+            together = slice(first, first + COLUMNS)
+            spectrum = _cosines(held[:, together, mass])
             spectrum[[0, -1]] *= 0.5
-            for energy, part in zip(energies, parts, strict=True):
-                filtered = _folded(spectrum[part.low : part.high + 1], part.low, len(energy) - 1)
+            for number, (energy, part) in enumerate(zip(energies, parts, strict=True)):
+                filtered = _folded(spectrum[part.low : part.high + 1], part.low, steps[number])
                 energy += weights[mass] * np.einsum("tc,tc->t", filtered, filtered)
+                if number in of_cells:
+                    of_cells[number][:, together] += weights[mass] * filtered**2
 
-    return np.array([_at_samples(energy, part, last) for energy, part in zip(energies, parts, strict=True)])
+        for row, number in enumerate(mapped):
+            columns = block_means(of_cells[number], sizes[1], 1)
+            maps[row, :, block] = _means_over_samples(columns, parts[number], last, sizes[0])
 
-
-def part_maps(
-    velocity: np.ndarray, masses: ArrayLike, interval: float, ranges: ArrayLike, sizes: Sequence[int], memory: float
-) -> np.ndarray:
-    """Kinetic energy (part, t', cell') in J of cells in each part, means over blocks of ``sizes`` (samples, cells).
-
-    ``ranges`` (part, 2) are the parts' lowest and highest frequencies in rad/s, as consecutive edges of ``Parts``.
-    """
-    nt, cells, dofs = velocity.shape
-    last = nt - 1
-    bounds = np.searchsorted(np.pi * np.arange(nt) / (last * interval), np.asarray(ranges))
-    maps = np.empty((len(bounds), -(-nt // sizes[0]), -(-cells // sizes[1])), np.float32)
-    for block in blocks(maps.shape[2], 8 * nt * dofs * sizes[1], min(memory, 8 * nt * COLUMNS)):
-        held = np.asarray(velocity[:, block.start * sizes[1] : block.stop * sizes[1]])
-        spectrum = _cosines(held.reshape(nt, -1)) / (2 * last)
-        for p, (low, high) in enumerate(bounds):
-            inside = np.zeros_like(spectrum)
-            inside[low:high] = spectrum[low:high]
-            energy = kinetic_energy(_cosines(inside).reshape(held.shape), masses)
-            maps[p, :, block] = block_means(block_means(energy, sizes[0], 0), sizes[1], 1)
-    return maps
+    total = [_at_samples(energy, part, last) for energy, part in zip(energies, parts, strict=True)]
+    return PartEnergies(np.array(total), maps)
 
 
 def _cosines(columns: np.ndarray) -> np.ndarray:
@@ -190,12 +198,38 @@ def _at_samples(energy: np.ndarray, part: _Cosines, last: int) -> np.ndarray:
     if 3 * width > steps and steps < 2 * part.high:  # too wide: cosines are not distinguished
         return np.interp(np.linspace(0, steps, last + 1), np.arange(steps + 1), energy)
 
-    # Each amplitude at few times goes to the cosine of the energy that it stands for.
-    waves = np.union1d(np.arange(width + 1), np.arange(2 * part.low, 2 * part.high + 1))
-    amplitudes = fft.dct(energy, type=1) / (2 * steps)
-    amplitudes[[0, -1]] *= 0.5
-    spread = np.bincount(_looks_like(waves, last), amplitudes[_looks_like(waves, steps)], last + 1)
+    waves, amplitudes = _waves_of_energy(energy, part)
+    spread = np.bincount(_looks_like(waves, last), amplitudes, last + 1)
     return np.maximum(_folded(spread, 0, last), 0.0)
+
+
+def _waves_of_energy(energy: np.ndarray, part: _Cosines) -> tuple[np.ndarray, np.ndarray]:
+    """The cosines (wave) in the ``energy`` (t', ...) of a ``part`` at few even times, and half of their amplitudes."""
+    width = part.high - part.low
+    steps = len(energy) - 1
+    waves = np.union1d(np.arange(width + 1), np.arange(2 * part.low, 2 * part.high + 1))
+    amplitudes = fft.dct(energy, type=1, axis=0) / (2 * steps)
+    amplitudes[[0, -1]] *= 0.5
+    # Each amplitude at few times goes to the cosine of the energy that it stands for.
+    return waves, amplitudes[_looks_like(waves, steps)]
+
+
+def _means_over_samples(energy: np.ndarray, part: _Cosines, last: int, size: int) -> np.ndarray:
+    """Means over each ``size`` of ``last`` + 1 samples of the ``energy`` (t', cell) of a ``part`` at few even times."""
+    if part.high < part.low:
+        return np.zeros((-(-(last + 1) // size), energy.shape[1]))
+    if len(energy) == last + 1:
+        return block_means(energy, size, 0)
+
+    waves, amplitudes = _waves_of_energy(energy, part)
+    radians = np.pi * waves / last  # of a wave in a sample
+    first = np.arange(0, last + 1, size)
+    counts = np.minimum(size, last + 1 - first)
+    # The mean of a cosine over even times is its value at their middle times Dirichlet's kernel.
+    middles = np.cos(np.outer(first + (counts - 1) / 2, radians))
+    means = middles * diric(radians, size)
+    means[-1] = middles[-1] * diric(radians, counts[-1])
+    return np.maximum(2 * means @ amplitudes, 0.0)
 
 
 def front_arrival(energy: np.ndarray) -> int:

@@ -42,7 +42,18 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
     parts = spectra.Parts.of(pass_bands(record.model.chain.cell))
     above = parts.above(record.model.drive.frequency)
     stride = record.options.band_stride
-    energy = spectra.part_energies(record.weighted, record.masses, record.interval, parts.edges, stride, record.memory)
+    bands = np.flatnonzero([bool(inside) for inside in parts.bands])
+    energies = spectra.part_energies(
+        record.weighted,
+        record.masses,
+        record.interval,
+        parts.edges,
+        stride=stride,
+        memory=record.memory,
+        mapped=bands.tolist() if "maps" in measures else (),
+        sizes=record.sizes,
+    )
+    energy = energies.total
     span = _span(record)
     total = energy[:, span.first : span.last].sum(axis=0)
     # The energy at an instant without motion has no fractions.
@@ -60,12 +71,8 @@ def band_energies(record: VelocityRecord, measures: Collection[str]) -> dict[str
 
     values = _transfers(record, energy, above, span, times)
     if "maps" in measures:
-        bands = np.flatnonzero([bool(inside) for inside in parts.bands])
-        ranges = np.column_stack([parts.edges[bands], parts.edges[bands + 1]])
         values["bands/band"] = bands + 1
-        values["bands/kinetic_energy"] = spectra.part_maps(
-            record.weighted, record.masses, record.interval, ranges, record.sizes, record.memory
-        )
+        values["bands/kinetic_energy"] = energies.maps
     return values | {
         "bands/edge": np.arange(len(parts.edges)),
         "bands/part": np.arange(1, len(parts.names) + 1),
