@@ -34,7 +34,8 @@ from vipetsc.parallel import StopRequest
 from vipetsc.spectra import ModalParts
 from vipetsc.studies.composition import Arriving, Network
 from vipetsc.studies.pair_motion import PairMotion
-from vipetsc.studies.prediction import SITE, read_prediction
+from vipetsc.studies.prediction import read_prediction
+from vipetsc.studies.prediction_runs import SITE
 from vipetsc.studies.recorded_runs import run_in_memory
 from vipetsc.studies.response import FIRST_LINE, TOP, Burst, SiteResponse, SiteResponses, in_contact, unit_phase
 
@@ -124,7 +125,7 @@ class Budget:
             sent = network._sent(network.received3, force) * network.centre
             third = third + 0.5 * (network._solve(network.between3, -1.0 * touching, sent, third) - third)
 
-        energies = network._energies(Arriving(waves, third, touching), self.sites, 0.0)
+        energies = network._energies(Arriving(waves, third, touching), self.sites, change=0.0, amplitude=0.0)
         return float(energies.into[int(self.data.attrs["drive_band"]) :].sum()), energies.dissipated
 
     def scatter(self, amplitude: float) -> Fractions:

@@ -15,7 +15,8 @@ from vipetsc.case import Case, CaseError
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.records import read_records
 from vipetsc.studies.composition import Network
-from vipetsc.studies.prediction import LINEAR, SITE, Records, amplitudes_of, composed, predict, site_points
+from vipetsc.studies.prediction import composed, predict
+from vipetsc.studies.prediction_runs import LINEAR, SITE, Records, amplitudes_of, site_points
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.response import BINS, SiteResponse, SiteResponses, in_contact
 

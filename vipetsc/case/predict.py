@@ -35,9 +35,9 @@ class PredictCase(LawCase):
 
     verb = section = "predict"
     refuses: ClassVar[Mapping[str, str]] = {
-        **{feature: reason for feature, reason in LawCase.refuses.items() if feature != "moved wall"},
-        "damping": "not yet: what dashpots take on the way would count as lost at the site",
-        "absorbing ends": "not yet: the wave between sites is followed in equal cells up to the ends",
+        feature: reason
+        for feature, reason in LawCase.refuses.items()
+        if feature not in ("moved wall", "absorbing ends")
     }
 
     def warnings(self) -> list[str]:

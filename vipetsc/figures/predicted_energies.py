@@ -12,6 +12,11 @@ from vipetsc.figures import panels, style
 LEAST = 1e-4  # of the work, the smallest energy shown
 MOST_SITES = 6  # with a name in the legend
 LOOKS: dict[str, dict[str, Any]] = {"predicted": {"lw": 1.2}, "simulated": {"ls": "", "marker": "o", "ms": 3.2}}
+LOSSES: dict[str, dict[str, Any]] = {
+    "dissipated": {"label": "contacts", "color": style.BLACK, "ls": "-"},
+    "dashpots": {"label": "dashpots", "color": style.GREEN, "ls": style.DASHED},
+    "absorbed": {"label": "those of the ends", "color": style.ORANGE, "ls": style.DOTTED},
+}
 MARKERS = "os^Dvp"  # of the simulated energies of bands, which differ in grey as the lines do
 ROW = 0.075  # height of a legend's row, as a fraction of the height of the axes
 SIDES = 0.04  # left and right of all amplitudes, as a fraction of their range in logarithms
@@ -32,8 +37,9 @@ def prediction(data: xr.Dataset) -> Figure:
     transferred.set_ylim(max(LEAST, _least(data, name) / 1.5), None)
     _put_legend_above(transferred, columns=2)
 
-    _draw_total(dissipated, data, "dissipated")
-    dissipated.set(title="Dissipated", ylabel="Energy / work", ylim=(0, None))
+    _draw_losses(dissipated, data)
+    dissipated.set(title="Dissipated", ylabel="Energy / work")
+    dissipated.set_ylim(0, None)
 
     _draw_bands(every_band, data)
     every_band.set(title="Every band", ylabel="Energy at the end / work", yscale="log", ylim=(LEAST, 1.5))
@@ -55,17 +61,30 @@ def prediction(data: xr.Dataset) -> Figure:
     rms = data.attrs.get(f"rms_{name}")
     if rms is not None:
         transferred.set_title(f"{title}: rms {rms:.3f} decades")
-        dissipated.set_title(f"Dissipated: error at most {data.attrs['worst_dissipated']:.3f}")
+        worst = max(data.attrs["worst_dissipated"], data.attrs.get("worst_dashpots", 0.0))
+        dissipated.set_title(f"Dissipated: error at most {worst:.3f}")
     panels.label_panels(grid.ravel())
     return figure
 
 
-def _draw_total(axes: Axes, data: xr.Dataset, name: str) -> None:
-    """Draw one energy in black, predicted and simulated."""
+def _draw_total(axes: Axes, data: xr.Dataset, name: str, color: str = style.BLACK, line: str = "-") -> None:
+    """Draw one energy in a ``color``, predicted with a ``line`` and simulated."""
     for kind, look in LOOKS.items():
         if f"{kind}/{name}" in data:
             values = data[f"{kind}/{name}"].values
-            axes.plot(data["amplitude"].values, values, color=style.BLACK, label=kind, **look)
+            axes.plot(data["amplitude"].values, values, **{"color": color, "ls": line, "label": kind} | look)
+
+
+def _draw_losses(axes: Axes, data: xr.Dataset) -> None:
+    """Draw what contacts dissipate, and in a lattice with dashpots what all of them, and absorbing ends alone, take."""
+    losses = [name for name in LOSSES if f"predicted/{name}" in data]
+    for name in losses:
+        _draw_total(axes, data, name, LOSSES[name]["color"], LOSSES[name]["ls"])
+    if len(losses) > 1:
+        # One entry a loss: lines and points are explained in the first panel.
+        handles = [axes.plot([], [], **LOSSES[name])[0] for name in losses]
+        axes.set_ylim(0, 1.25)
+        axes.legend(handles=handles, loc="upper left", ncols=len(losses), columnspacing=0.8)
 
 
 def _draw_bands(axes: Axes, data: xr.Dataset) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from vipetsc.lattice.bands import waves_at
 from vipetsc.lattice.chain import Chain, Pair
+from vipetsc.lattice.unit_loads import unit_loads
 from vipetsc.lattice.waves import NEUTRAL, BlochWaves, bloch_waves, cell_between, coupling_blocks, energy_flux
 
 AT_REST = 1e-12  # a contact pair that moves less than this fraction of its cell does not move
@@ -218,21 +219,7 @@ class WaveCompliance:
 
     def _loads(self) -> np.ndarray:
         """Unit loads (cells and dofs, pairs and points): rows that pick a relative displacement, or one of a mass."""
-        cell = self.chain.cell
-        pairs = len(self.chain.sites)
-        first_row = {number: i * cell.dofs for i, number in enumerate(self.cells)}
-
-        loads = np.zeros((len(first_row) * cell.dofs, pairs + len(self.points)))
-        chain = self.chain
-        places = zip(chain.sites, self._resonator_cells, chain.contact_pairs, strict=True)
-        for j, (site, resonator_cell, pair) in enumerate(places):
-            loads[first_row[resonator_cell] + pair.resonator, j] = 1
-            # The ground does not move.
-            if pair.host >= 0:
-                loads[first_row[site] + pair.host, j] = -1
-        for j, (number, mass) in enumerate(self.points, pairs):
-            loads[first_row[number] + mass, j] = 1
-        return loads
+        return unit_loads(self.chain, self._resonator_cells, self.points, self.cells)
 
     def _load_of(self, forces: np.ndarray) -> np.ndarray:
         """The load (cells and dofs, 1) that ``forces``, as of ``field``, amount to."""

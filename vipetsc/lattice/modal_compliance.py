@@ -26,6 +26,7 @@ from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.spring_places import SpringPlace, nonlinear_places
+from vipetsc.lattice.unit_loads import unit_loads
 
 MOST_DOFS = 1000  # masses of a lattice whose modes are all computed: a minute with dashpots, and 100 MB
 RIGID = 1e-12  # squared frequencies, or losses of a mode, below this fraction of the largest are none
@@ -83,24 +84,14 @@ class ModalCompliance:
     @cached_property
     def loads(self) -> np.ndarray:
         """Unit loads (dofs, pairs and points): columns that pick a relative displacement, or one of a mass."""
-        chain = self.chain
-        d = chain.cell.dofs
-        pairs = self.pairs
-        loads = np.zeros((chain.cells * d, pairs + len(self.points)))
-        for j, (site, pair) in enumerate(zip(chain.sites, chain.contact_pairs, strict=True)):
-            resonator_cell = (site + pair.next_cell) % chain.cells
-            loads[resonator_cell * d + pair.resonator, j] = 1
-            # The ground does not move.
-            if pair.host >= 0:
-                loads[site * d + pair.host, j] = -1
-        for j, place in enumerate(self.springs, len(chain.sites)):
+        loads = unit_loads(self.chain, self.chain.resonator_cells, self.points, range(self.chain.cells))
+        elongations = np.zeros((len(loads), len(self.springs)))
+        for column, place in zip(elongations.T, self.springs, strict=True):
             if place.end >= 0:
-                loads[place.end, j] = 1
+                column[place.end] = 1
             if place.start >= 0:
-                loads[place.start, j] = -1
-        for j, (cell, mass) in enumerate(self.points, pairs):
-            loads[cell * d + mass, j] = 1
-        return loads
+                column[place.start] = -1
+        return np.insert(loads, [len(self.chain.sites)], elongations, axis=1)
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Compliance (omega, pair, pair) in m/N at frequencies ``omegas`` in rad/s, on or below the real axis."""

@@ -20,7 +20,10 @@ from scipy.sparse.linalg import LinearOperator, gmres
 from vipetsc.case import Model
 from vipetsc.case.kinds import lesser_clearances
 from vipetsc.lattice import ToneBurst, WaveCompliance, bloch
-from vipetsc.studies.response import DECAY, SiteResponses, fastest_wave, in_contact, self_response, unit_phase
+from vipetsc.lattice.direct_compliance import DirectCompliance
+from vipetsc.studies.response import SiteResponses, fastest_wave, in_contact, self_response, unit_phase
+from vipetsc.studies.spectral_line import SpectralLine
+from vipetsc.studies.wave_losses import SentPowers, WaveLosses
 
 WIDTH = 14  # of the burst's line, half of what is followed about a frequency
 WIDEST = 0.45  # of the drive's frequency, the largest half width: the followed line reaches neither 0 nor 2 Om
@@ -34,13 +37,15 @@ CLOSE = 1e-3  # largest change of c over the linear wave at which the iteration 
 
 
 class Composed(NamedTuple):
-    """Energies in J at the end under an amplitude: ``into`` (band) other than the drive's, ``dissipated``.
+    """Energies in J at the end under an amplitude: ``into`` (band) other than the drive's, ``dissipated`` in contacts.
 
-    ``z`` (site) is the largest at every site; ``change`` the last iteration's, over the linear wave.
+    In a lattice with dashpots ``into`` has the change of the drive's band as well. ``absorbed`` is what absorbing ends
+    have taken. ``z`` (site) is the largest at every site; ``change`` the last iteration's, over the linear wave.
     """
 
     into: np.ndarray
     dissipated: float
+    absorbed: float
     z: np.ndarray
     change: float
 
@@ -74,24 +79,23 @@ class Network:
         self.om = drive.frequency
         self.clearance = lesser_clearances(model.gaps, chain.clearances)
 
-        length = 2 * model.end
         half = min(WIDTH * 2 * np.pi / drive.duration, WIDEST * drive.frequency)
-        most = int(np.ceil(half * length / (2 * np.pi)))
-        self.offset = 2 * np.pi * np.arange(-most, most + 1) / length
-        self.time = np.arange(len(self.offset)) * length / len(self.offset)
-        self.decay = DECAY / length
-        self.during = self.time <= model.end  # the second half is padding for what the transform would fold back
+        self.line = SpectralLine(half=half, length=2 * model.end)
+        self.offset = self.line.offset
+        self.time = self.line.time
+        self.during = self.time <= model.end
+        most = self.line.most
 
         # The burst's envelope of a drive of 1 N, or of 1 m of a wall: sin is -i exp(i Om t), under a Hann window.
         force = drive.window_amplitude / abs(drive.amplitude) * (1 - np.cos(self.om * self.time / drive.cycles))
-        pulse = self._forward(np.where(self.time < drive.duration, -1j * force, 0))
+        pulse = self.line.forward(np.where(self.time < drive.duration, -1j * force, 0))
         response, g = self._responses(self.om)
         sites = len(chain.sites)
         self.linear = np.zeros((sites, len(self.time)), complex)
         # A wall acts through springs, on several masses if they are tied to it.
-        for number, acting in enumerate(model.drives, sites):
-            gain = acting.stiffness or 1.0
-            self.linear += self._backward(response[:, :, number].T * (gain * pulse))
+        driving = np.array([(acting.stiffness or 1.0) * pulse for acting in model.drives])
+        for number, spectrum in enumerate(driving, sites):
+            self.linear += self.line.backward(response[:, :, number].T * spectrum)
 
         inside = self._propagates(self.om)
         radiated = 1j * g.imag  # the part of g that leaves as waves
@@ -115,6 +119,7 @@ class Network:
             sent = response[:, :, :sites] / g.T[:, None]
             self.received3 = np.where(inside, received.T - eye[:, :, None], 0)
             self.between3 = np.where(inside, sent.T - eye[:, :, None], 0)
+        self.losses = self._losses(driving)
 
     def compose(self, amplitude: float, sites: SiteResponses) -> Composed:
         """The energies at the end under ``amplitude`` (N, of a wall m), from the response of each site alone."""
@@ -145,19 +150,42 @@ class Network:
                 c3 = c3 + 0.5 * (self._solve(self.between3, -1.0 * on, sent, c3) - c3)
             if change < CLOSE and i >= LEAST:
                 break
-        return self._energies(Arriving(c, c3, on), sites, change)
+        return self._energies(Arriving(c, c3, on), sites, change, amplitude)
 
     def _responses(self, middle: float) -> tuple[np.ndarray, np.ndarray]:
         """Response of w at the sites to forces at the sites and of the drives (frequency, site, force); of one alone.
 
         The second (site, frequency) is that of a site in an infinite lattice to a pair of forces at itself.
         """
-        omega = middle + self.offset - 1j * self.decay
-        driven = tuple((drive.cell, drive.mass) for drive in self.model.drives)
-        response = WaveCompliance(self.model.chain, points=driven).response(omega)
+        omega = middle + self.offset - 1j * self.line.decay
+        response = self._compliance().response(omega)
         pairs = self.model.chain.contact_pairs
         alone = {pair: self_response(self.cell, omega, pair) for pair in {*pairs}}
         return response, np.array([alone[pair] for pair in pairs])
+
+    def _compliance(self) -> WaveCompliance | DirectCompliance:
+        """The compliance of the sites, with the driven masses as points."""
+        chain = self.model.chain
+        driven = tuple((drive.cell, drive.mass) for drive in self.model.drives)
+        if chain.is_damped:
+            return DirectCompliance(chain, driven)
+        return WaveCompliance(chain, points=driven)
+
+    def _losses(self, driving: np.ndarray) -> WaveLosses | None:
+        """What dashpots take from waves; ``driving`` (drive, offset) are the spectra of the drives."""
+        compliance = self._compliance()
+        driven = fastest_wave(self.cell, self.om, self.model.chain.contact_pairs[0])
+        if isinstance(compliance, WaveCompliance) or driven is None:
+            return None
+        return WaveLosses(
+            model=self.model,
+            line=self.line,
+            compliance=compliance,
+            middle=self.om,
+            driving=driving,
+            driven=driven,
+            third=self.third,
+        )
 
     def _powers(self, omega: float) -> np.ndarray:
         """Power (site, 1) in W/m^2 of the wave at ``omega`` in rad/s over the |w|^2 of each site's pair."""
@@ -172,17 +200,9 @@ class Network:
         high = frequency.max(axis=0)
         return np.asarray(((omega[:, None] >= low) & (omega[:, None] <= high)).any(axis=1))
 
-    def _forward(self, a: np.ndarray) -> np.ndarray:
-        """Spectrum (..., offset) of an envelope (..., time)."""
-        return np.asarray(np.fft.fftshift(np.fft.fft(a * np.exp(-self.decay * self.time)), axes=-1))
-
-    def _backward(self, spectrum: np.ndarray) -> np.ndarray:
-        """Envelope (..., time) of a spectrum (..., offset)."""
-        return np.asarray(np.fft.ifft(np.fft.ifftshift(spectrum, axes=-1)) * np.exp(self.decay * self.time))
-
     def _sent(self, between: np.ndarray, source: np.ndarray) -> np.ndarray:
         """Waves (site, time) that arrive at every site from ``source`` (site, time) while the run goes on."""
-        arriving = self._backward(np.einsum("jkt,jt->kt", between, self._forward(source)))
+        arriving = self.line.backward(np.einsum("jkt,jt->kt", between, self.line.forward(source)))
         return np.where(self.during, arriving, 0)
 
     def _solve(self, between: np.ndarray, factor: np.ndarray, right: np.ndarray, guess: np.ndarray) -> np.ndarray:
@@ -203,8 +223,8 @@ class Network:
         """z (site, time)."""
         return np.asarray((np.abs(c) + np.abs(c3)) / self.clearance[:, None])
 
-    def _energies(self, waves: Arriving, sites: SiteResponses, change: float) -> Composed:
-        """The energies at the end, of ``waves`` that arrive at the sites."""
+    def _energies(self, waves: Arriving, sites: SiteResponses, change: float, amplitude: float) -> Composed:
+        """The energies at the end, of ``waves`` that arrive at the sites under ``amplitude``."""
         c = waves.first
         z = self._over_clearance(c, waves.third)
         step = float(self.time[1])
@@ -218,37 +238,55 @@ class Network:
         dissipated = float((power * lost).sum()) * step
         bands = emitted.sum(axis=(1, 2)) * step
 
+        passed = 1.0
+        gain = np.zeros_like(power)
         if self.third:
             absorbed = self._absorbed(emitted.sum(axis=0), waves.on, sites) * step
             total = float(bands.sum())
             if total:
-                bands = bands * (1 - absorbed / total)
+                passed = 1 - absorbed / total
             dissipated = dissipated + absorbed
-            gain = self._third_gain(waves, state.third) * step
-            bands[self.third.band] = max(bands[self.third.band] + gain, 0.0)
-        return Composed(bands, dissipated, np.abs(c).max(axis=1) / self.clearance, change)
+            gain = self._third_gain(waves, state.third)
 
-    def _third_gain(self, waves: Arriving, third: np.ndarray) -> float:
-        """Sum over time of the power in W by which third harmonics give more together than each site alone."""
+        largest = np.abs(c).max(axis=1) / self.clearance
+        if self.losses:
+            sent = SentPowers(
+                bands=emitted * passed,
+                spectrum=burst.spectrum,
+                third=gain,
+                given=power * lost + emitted.sum(axis=0) + gain,
+                force=state.fundamental * c * waves.on,
+            )
+            end = self.losses.at_end(sent, amplitude)
+            return Composed(into=end.remaining, dissipated=dissipated, absorbed=end.absorbed, z=largest, change=change)
+
+        bands = bands * passed
+        if self.third:
+            bands[self.third.band] = max(bands[self.third.band] + float(gain.sum()) * step, 0.0)
+        return Composed(into=bands, dissipated=dissipated, absorbed=0.0, z=largest, change=change)
+
+    def _third_gain(self, waves: Arriving, third: np.ndarray) -> np.ndarray:
+        """Power (site, time) in W by which third harmonics of the sites give more together than each alone."""
         c = waves.first
         alone = third * np.abs(c) * unit_phase(c) ** 3 * waves.on
-        rate = 1j * (3 * self.om + self.offset - 1j * self.decay)
-        apart = self._backward(rate * self.g3 * self._forward(alone))
+        rate = 1j * (3 * self.om + self.offset - 1j * self.line.decay)
+        apart = self.line.backward(rate * self.g3 * self.line.forward(alone))
         force = alone - waves.on * waves.third / self.centre
-        together = self._backward(rate * np.einsum("jkt,jt->kt", self.response3, self._forward(force)))
-        return 0.5 * float(((force * together.conj()).real - (alone * apart.conj()).real).sum())
+        together = self.line.backward(rate * np.einsum("jkt,jt->kt", self.response3, self.line.forward(force)))
+        return np.asarray(0.5 * ((force * together.conj()).real - (alone * apart.conj()).real))
 
     def _absorbed(self, emitted: np.ndarray, on: np.ndarray, sites: SiteResponses) -> float:
         """Sum over time of the power in W that sites in contact take from what others have ``emitted`` (site, time)."""
         assert self.third
+        rate = self.losses.rate(self.third) if self.losses else 0.0
         cells = np.array(self.model.chain.sites)
         total = 0.0
         for order in (np.argsort(cells), np.argsort(-cells)):  # waves that go up, and those that go down
             passing = np.zeros(len(self.time))
             last = order[0]
             for k in order:
-                late = self.time - abs(cells[k] - cells[last]) / self.third.speed
-                passing = np.interp(late, self.time, passing, left=0.0)
+                lag = abs(cells[k] - cells[last]) / self.third.speed
+                passing = np.interp(self.time - lag, self.time, passing, left=0.0) * np.exp(-rate * lag)
                 last = k
 
                 z = np.sqrt(np.maximum(passing, 0) / self.power3[k]) / self.clearance[k]

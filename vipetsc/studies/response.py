@@ -42,10 +42,11 @@ def self_response(cell: UnitCell, omega: np.ndarray, pair: Pair) -> np.ndarray:
 class TravellingWave(NamedTuple):
     """The fastest wave at a frequency: its ``band`` from 0, |v_g| ``speed`` in cells/s, power over |w|^2 in W/m^2.
 
-    w is the relative displacement of a pair of masses.
+    w is the relative displacement of a pair of masses; ``wavenumber`` is in rad per cell.
     """
 
     band: int
+    wavenumber: float
     speed: float
     power_per_area: float
 
@@ -61,7 +62,9 @@ def fastest_wave(cell: UnitCell, omega: float, pair: Pair) -> TravellingWave | N
     # Bloch's factor of the next cell; the ground does not move.
     resonator = vector[pair.resonator] * (np.exp(1j * kappa) if pair.next_cell else 1.0)
     relative = abs(resonator - (vector[pair.host] if pair.host >= 0 else 0.0))
-    return TravellingWave(number - 1, speed, speed * omega**2 / (2 * max(relative, TINY) ** 2))
+    return TravellingWave(
+        band=number - 1, wavenumber=kappa, speed=speed, power_per_area=speed * omega**2 / (2 * max(relative, TINY) ** 2)
+    )
 
 
 def in_contact(z: np.ndarray, release: np.ndarray) -> np.ndarray:
@@ -199,11 +202,15 @@ class ContactState(NamedTuple):
 
 
 class BurstState(NamedTuple):
-    """Values for a whole burst, over its largest z: factors of loss and of bands (band, ...), and release."""
+    """Values for a whole burst, over its largest z: factors of loss and of bands (band, ...), and release.
+
+    ``spectrum`` (..., band, bin) are the fractions of the energy in a band that each bin of the wavenumber gets.
+    """
 
     lost: np.ndarray
     into: np.ndarray
     release: np.ndarray
+    spectrum: np.ndarray
 
 
 class SiteResponse(NamedTuple):
@@ -212,7 +219,8 @@ class SiteResponse(NamedTuple):
     ``fundamental`` is f1/c and ``third`` f3 (c*/|c|)^3/|c| in N/m (complex). ``lost`` and ``into`` (band, x) are powers
     over that of a travelling wave of the same |c|: what is dissipated, and what goes to every band but its own, scaled
     to sum to what the driven wave loses. Of bursts whose largest z is exp(``peaks``): ``factor`` (loss and bands, run),
-    by which the sum over a burst is that of the run, and ``release`` (run), z at which contact ends.
+    by which the sum over a burst is that of the run, ``release`` (run), z at which contact ends, and ``spectrum``
+    (band, bin, run): see ``BurstState``; of lattices without dashpots it has no bin.
     """
 
     x: np.ndarray
@@ -223,6 +231,7 @@ class SiteResponse(NamedTuple):
     peaks: np.ndarray
     factor: np.ndarray
     release: np.ndarray
+    spectrum: np.ndarray
 
     @classmethod
     def of(cls, records: list[Record], cell: UnitCell, drive: float, largest: float, pair: Pair) -> Self:
@@ -233,6 +242,7 @@ class SiteResponse(NamedTuple):
         sums = np.array([record["sums"] for record in records])
         peaks = np.log([record["z"] for record in records])
         release = np.array([record["release"] for record in records])
+        spectrum = np.stack([_fractions(record.get("spectrum", [[]] * cell.dofs)) for record in records], axis=-1)
         wave = fastest_wave(cell, drive, pair)
         squares = sums[:, 0]  # |c|^2, by run
         total = sums.sum(axis=0)
@@ -247,6 +257,7 @@ class SiteResponse(NamedTuple):
                 peaks=peaks,
                 factor=np.ones((1 + cell.dofs, len(peaks))),
                 release=release,
+                spectrum=spectrum,
             )
 
         # Bins that no sample fell into lie between others that have some.
@@ -273,6 +284,7 @@ class SiteResponse(NamedTuple):
             peaks=peaks,
             factor=factor,
             release=release,
+            spectrum=spectrum,
         )
 
     def at(self, z: np.ndarray) -> ContactState:
@@ -293,7 +305,12 @@ class SiteResponse(NamedTuple):
         """Factors and release of bursts with these ``largest`` z (site)."""
         x = np.log(np.maximum(largest, 1e-9))
         factors = np.array([np.interp(x, self.peaks, row) for row in self.factor])
-        return BurstState(lost=factors[0], into=factors[1:], release=np.interp(x, self.peaks, self.release))
+        spectrum = np.zeros((*np.shape(x), *self.spectrum.shape[:-1]))
+        for band, of_bin in np.ndindex(self.spectrum.shape[:-1]):
+            spectrum[..., band, of_bin] = np.interp(x, self.peaks, self.spectrum[band, of_bin])
+        return BurstState(
+            lost=factors[0], into=factors[1:], release=np.interp(x, self.peaks, self.release), spectrum=spectrum
+        )
 
 
 class SiteResponses(NamedTuple):
@@ -327,4 +344,12 @@ class SiteResponses(NamedTuple):
             lost=np.array([state.lost for state in states]),
             into=np.stack([state.into for state in states], axis=1),
             release=np.array([state.release for state in states]),
+            spectrum=np.array([state.spectrum for state in states]),
         )
+
+
+def _fractions(energies: list[list[float]]) -> np.ndarray:
+    """The ``energies`` (band, bin) over their sums, of bands that have any."""
+    values = np.array(energies)
+    sums = values.sum(axis=1, keepdims=True)
+    return np.divide(values, sums, out=np.zeros_like(values), where=sums > 0)

@@ -75,7 +75,7 @@ class Ring:
         contacts = self._contacts() if with_site else NO_SITES
         case = self.case.varied(
             without=("output",),
-            lattice={"cells": setting.cells, "ends": "periodic"},
+            lattice={"cells": setting.cells, "ends": "periodic", "absorbing": None},
             # Where the case moves a wall, a force sends a wave of the same form.
             drive={"cell": 1, "amplitude": amplitude, "end": None},
             contacts=contacts,

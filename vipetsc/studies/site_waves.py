@@ -40,7 +40,7 @@ NODES_A_CELL = 1  # nodes of the wavenumber over the cells of the ring, in which
 AROUND = 4  # samples before the first contact and after the last in which the force is not zero
 
 
-class Sent(NamedTuple):
+class SentWave(NamedTuple):
     """The wave that unit forces send in one direction: amplitudes ``by_site`` and ``by_drive`` in m/N.
 
     ``factor`` is that to the next cell, ``flux`` in W/m^2 that past the site of a wave of 1 m in its cell.
@@ -93,7 +93,7 @@ class SiteWaves:
             self.leaving_drive[node, band] = leaving
             self.arriving[node, band] = leaving * forward.factor**setting.distance
 
-    def _sent(self, omega: float, up: complex, drive_mass: int) -> tuple[Sent, Sent]:
+    def _sent(self, omega: float, up: complex, drive_mass: int) -> tuple[SentWave, SentWave]:
         """What is sent forward and backward at ``omega`` by waves near to the factor ``up`` of one to higher cells."""
         waves = damped_waves(self.cell, omega)
         half = len(waves.factor) // 2
@@ -112,7 +112,7 @@ class SiteWaves:
             if not self.pair.next_cell:
                 flux = flux / abs(factor)
             outwards = factor if wave == higher else 1 / factor
-            directions.append(Sent(by_site=site[wave], by_drive=drive[wave], factor=outwards, flux=flux))
+            directions.append(SentWave(by_site=site[wave], by_drive=drive[wave], factor=outwards, flux=flux))
         if self.setting.towards < 0:
             directions.reverse()
         return directions[0], directions[1]
@@ -144,6 +144,13 @@ class SiteWaves:
     def energies(self, force: np.ndarray | None = None) -> np.ndarray:
         """Energies (band, direction) in J past the site, of the waves of ``amplitudes``."""
         return np.asarray((self.weight * self.flux * np.abs(self.amplitudes(force)) ** 2).sum(axis=1).T)
+
+    def sent_by_bins(self, force: np.ndarray, bins: int) -> np.ndarray:
+        """Energies (band, bin) in J that the contact's ``force`` (time) in N sends out, by bins of the wavenumber."""
+        amplitudes = self.sends * spectrum_of(force, self.setting.interval, self.frequency)
+        energies = (self.weight * self.flux * np.abs(amplitudes) ** 2).sum(axis=0)
+        of_bin = np.arange(len(energies)) * bins // len(energies)
+        return np.array([np.bincount(of_bin, column, bins) for column in energies.T])
 
     def late(self, since: float) -> float:
         """Energy in J of the drive's band that arrives later than ``since`` s after it was sent."""

@@ -19,6 +19,7 @@ SUMMARY = {
     "rms_upper": "rms error of the upper bands (decades)",
     "rms_other": "rms error of all bands except the driven one (decades)",
     "worst_dissipated": "largest error of the dissipated fraction",
+    "worst_dashpots": "largest error of the fraction that dashpots take",
     "cpu_seconds": "CPU time without the simulations (s)",
 }
 
@@ -61,7 +62,8 @@ def prediction_table(data: xr.Dataset) -> str:
     """Predicted and simulated fractions of the energy at every amplitude, and their differences."""
     # Without ``predict.simulate`` nothing is simulated.
     kinds = [kind for kind in ("predicted", "simulated") if f"{kind}/other" in data]
-    columns = [(kind, quantity) for quantity in ("upper", "other", "dissipated") for kind in kinds]
+    quantities = [name for name in ("upper", "other", "dissipated", "dashpots") if f"predicted/{name}" in data]
+    columns = [(kind, quantity) for quantity in quantities for kind in kinds]
 
     unit = data["amplitude"].attrs["units"]
     lines = [f"   amplitude ({unit})  " + "  ".join(f"{kind} {quantity}" for kind, quantity in columns)]
