@@ -11,12 +11,52 @@ import pytest
 
 from tests.conftest import on_two
 from tests.models import CLEARANCE, four_band_contact
+from vipetsc.case import NnmCase
 from vipetsc.lattice import Chain
 from vipetsc.lattice.cell import four_band
 from vipetsc.modes.balance.stops import Stops
+from vipetsc.modes.branches.lattices import LatticeMethod
+from vipetsc.modes.branches.losses import with_lattice_loss
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
+from vipetsc.modes.point import Point
 
 COMM = MPI.COMM_WORLD
+
+
+@pytest.mark.parallel([2, 3])
+def test_losses_have_the_same_bits():
+    """What dashpots and contacts take from an orbit does not depend on how the lattice is cut."""
+    table = {
+        "lattice": {"preset": "four-band", "cells": 18, "damping": {"mass": 0.1}},
+        "contacts": {"sites": [6, 9, 10], "restitution": 0.9},
+        "nnm": {"system": "chain", "start_frequency": [1600.0], "forced": [9, 1]},
+    }
+    case = NnmCase.from_table(table)
+
+    def losses(comm):
+        """Loss and force of an orbit in which all sites touch, whether or not it is periodic."""
+        method = LatticeMethod(case, comm)
+        x = 1e-2 * np.random.default_rng(3).standard_normal(method.system.dofs)
+        point = Point(
+            tangent=np.empty(0),
+            index=0,
+            step=0.0,
+            next_step=0.0,
+            kind="regular",
+            x=x,
+            period=2 * np.pi / 1600,
+            energy=1.0,
+            residual=0.0,
+            episodes=0,
+            closed=0.0,
+            newton=0,
+        )
+        lossy = with_lattice_loss(method.lattice, method.dissipation, point)
+        return lossy.loss, lossy.force
+
+    together = losses(COMM)
+    assert together == losses(MPI.COMM_SELF)
+    assert together[0] > 0
 
 
 @pytest.mark.parallel([2, 3])

@@ -90,14 +90,6 @@ def test_a_cell_of_ones_own_needs_clearances_and_a_stiffness():
         NnmCase.from_table({"lattice": lattice, "contacts": {"clearance": 0.1}})
 
 
-def test_a_restitution_is_warned_of_where_losses_are_not_computed():
-    """Losses are computed by shooting with matrices: for a long chain a restitution below 1 is treated as 1."""
-    table = {"contacts": {"restitution": 0.7, "sites": 1}, "nnm": {"system": "chain", "start_frequency": [1600.0]}}
-    (warning,) = NnmCase.from_table(table).warnings()
-    assert warning.startswith("contacts.restitution = 0.7 is treated as 1")
-    assert NnmCase.from_table({"contacts": {"restitution": 0.7}}).warnings() == []
-
-
 @pytest.mark.parametrize("nnm", [{}, {"system": "chain"}, {"system": "condensed", "start_frequency": [1600.0]}])
 @pytest.mark.parametrize(
     ("table", "key"),

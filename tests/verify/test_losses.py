@@ -9,6 +9,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_matrix
 
 from tests.rigs import TWO_MASSES
 from tests.unlike_lattices import TABLE, independent_lattice
@@ -17,6 +18,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.modes.branches.condensed import CondensedMethod, state_of
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.losses import with_loss
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.continuation.arclength import Continuation
@@ -88,6 +90,64 @@ def test_free_decay_takes_the_loss(shot):
     # First order in the loss, which is a small part of the energy.
     assert point.loss < 1e-2 * point.energy
     assert lost == pytest.approx(point.loss, rel=1e-2)
+
+
+CHAIN: dict[str, Any] = {
+    "name": "chain",
+    "lattice": {
+        "cells": 14,
+        "cell": {
+            "masses": [4e-3, 2e-3],
+            "springs": [
+                {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True},
+                {"start": 1, "end": 2, "stiffness": 5e3},
+            ],
+        },
+        "damping": {"mass": 1.0, "stiffness": 1e-6},
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("law", "stiffness", "side", "omega"), [("hertz", 1e7, "both", 4500.0), ("bilinear", 1e5, "plus", 1600.0)]
+)
+def test_lattices_without_matrices_lose_what_orbits_lose(law, stiffness, side, omega):
+    """Dashpots and contacts of a breather by the propagator's steps, and by the flow with dense matrices."""
+    contacts = {"law": law, "stiffness": stiffness, "sites": [7, 9], "clearance": [1e-4, 1.3e-4], "side": side}
+    nnm = {"system": "chain", "tolerance": 1e-12, "forced": [6, 1]}
+
+    def case(shooting: str) -> NnmCase:
+        changes = {"contacts": contacts | {"restitution": 0.9}, "nnm": nnm | {"shooting": shooting, "modes": [1]}}
+        return NnmCase.from_table(CHAIN | changes)
+
+    method = LatticeMethod(case("krylov"), MPI.COMM_SELF)
+    breather = method.lattice.breather(omega)
+    assert breather.episodes >= 1
+    point = method.assess(method.lattice, breather)
+    dense = ShootingMethod(case("dense"), MPI.COMM_SELF)
+    expected = with_loss(dense.shooting, dense.dissipation, breather)
+    by_contacts = with_loss(dense.shooting, dense.dissipation._replace(damping=csr_matrix((28, 28))), breather)
+
+    assert 0.1 < by_contacts.loss / expected.loss < 0.95
+    assert point.loss == pytest.approx(expected.loss, rel=2e-7)
+    assert point.force == pytest.approx(expected.force, rel=2e-7)
+
+    # Three periods as one: a site touches several times in the arc.
+    thrice = replace(breather, period=3 * breather.period)
+    expected = with_loss(dense.shooting, dense.dissipation, thrice)
+    assert method.assess(method.lattice, thrice).loss == pytest.approx(expected.loss, rel=2e-7)
+
+
+def test_a_linear_mode_of_a_lattice_without_matrices_has_its_damping_ratio():
+    """The loss of a harmonic motion is that of Rayleigh damping, and the force acts on its amplitude."""
+    nnm = {"system": "chain", "shooting": "krylov", "modes": [5], "forced": [4, 2], "start_energy": 1e-9}
+    contacts = {"law": "hertz", "stiffness": 1e7, "sites": [7], "clearance": 1e-3}
+    method = LatticeMethod(NnmCase.from_table(CHAIN | {"contacts": contacts, "nnm": nnm}), MPI.COMM_SELF)
+    point = method.assess(method.lattice, method.start(method.lattice, 4))
+
+    omega = 2 * np.pi / point.period
+    assert point.damping_ratio == pytest.approx((1.0 / omega + 1e-6 * omega) / 2, rel=1e-11)
+    assert point.force == pytest.approx(point.loss / (np.pi * abs(point.x[3 * 2 + 1])), rel=1e-11)
 
 
 @pytest.mark.slow

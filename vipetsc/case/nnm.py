@@ -102,16 +102,6 @@ class NnmCase(CaseFile):
         """Whether the branches are drawn, ``output.figures``."""
         return self.output.figures
 
-    def warnings(self) -> list[str]:
-        """Sentences about keys of the case that normal modes ignore."""
-        restitution = self.contacts.restitution
-        if restitution == 1 or not self.krylov:
-            return []
-        return [
-            f"contacts.restitution = {restitution:g} is treated as 1: losses are computed with nnm.shooting = "
-            '"dense" or nnm.system = "condensed"'
-        ]
-
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> list[Problem]:
         """Problems between keys."""

@@ -194,9 +194,6 @@ def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iter
         remedy = "moves variations by exact linear steps, which springs that are not linear do not have; omit it, or"
         yield Problem(f"nnm.{key}", getattr(nnm, key), f'{remedy} system = "condensed"')
         return
-    if krylov and cell.is_damped:
-        remedy = 'not yet: losses along orbits are computed with nnm.shooting = "dense", or system = "condensed"'
-        yield Problem("lattice", "damped", remedy)
     if krylov:
         for key in ("compare", "switch", "orbits_at", "flow", "jacobian"):
             if getattr(nnm, key) != NnmTable.model_fields[key].default:

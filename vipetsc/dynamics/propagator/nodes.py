@@ -39,6 +39,13 @@ def _lay_out(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return position, slope
 
 
+@lru_cache
+def at_end() -> np.ndarray:
+    """Weights (node,) that extrapolate what is smooth in z from its values at the nodes to a substep's end, z = 1."""
+    z, _ = _gauss(NODES)
+    return np.array([np.prod([(1 - a) / (b - a) for a in z if a != b]) for b in z])
+
+
 def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss's nodes and weights on [0, 1]."""
     nodes, weights = leggauss(count)

@@ -11,6 +11,7 @@ never the matrix.
 """
 
 import copy
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.clusters import expand_free_motion
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.propagator.nodes import NODES
+from vipetsc.dynamics.propagator.nodes import NODES, at_end
 from vipetsc.dynamics.propagator.stencil import Halo, exchange
 from vipetsc.dynamics.propagator.step_choice import refusal
 from vipetsc.dynamics.propagator.substeps import create_tape
@@ -48,6 +49,25 @@ class _Moving(NamedTuple):
     variations: Variations
     halo: Halo
     petsc_objects: list
+
+
+class ClosedSubsteps(NamedTuple):
+    """Substeps (row,) of an orbit in which contacts were closed, in the order of time at each site.
+
+    ``site`` counts the lattice's sites from 0, ``side`` is 1 or -1; ``onset`` marks those with which a contact begins.
+    They end at ``end`` in s. ``first_rate`` and ``last_rate`` are w' in m/s at both ends; ``w`` and ``rate`` (row,
+    node) are w in m and w' in m/s at the nodes, whose ``weights`` (row, node) in s integrate over the substep.
+    """
+
+    site: np.ndarray
+    side: np.ndarray
+    onset: np.ndarray
+    end: np.ndarray
+    first_rate: np.ndarray
+    last_rate: np.ndarray
+    w: np.ndarray
+    rate: np.ndarray
+    weights: np.ndarray
 
 
 def no_samples(model: Model, layout: Layout, number: int) -> Samples:
@@ -79,16 +99,17 @@ class TangentPropagator(Propagator):
 
     ``cells`` are arrays (2 dof, owned cell), displacements before velocities. A contact that dissipates must be open
     at the beginning: the approach velocity w'_minus with which it began is not part of the state. An engine is for one
-    orbit: ``place``, then ``run``, then ``move`` any number of times.
+    orbit: ``place``, then ``run``, then ``move`` any number of times. The tape of a cluster has so many ``rows``; an
+    engine without any runs the orbit alone.
     """
 
-    def __init__(self, model: Model, layout: Layout) -> None:
+    def __init__(self, model: Model, layout: Layout, rows: int = MOST_ROWS) -> None:
         super().__init__(model, layout)
         self._model = model
         clusters = self._forces.clusters
         # Clusters with a drive that acts are solved in every step; without one only those whose sites may touch.
         clusters.drives.rows["duration"] = 0.0
-        self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), MOST_ROWS))
+        self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), rows))
         self._linear: _Linearisation | None = None
         self._moving: _Moving | None = None
 
@@ -134,18 +155,26 @@ class TangentPropagator(Propagator):
         clusters.history["onset"] = -np.inf
         clusters.history["duration"] = 1.0
 
-    def run(self, samples: int) -> np.ndarray:
+    def run(self, samples: int, look: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
         """Advance to the sample of that number, counted from the start; returns the cells there.
 
-        Raises StalledError on all ranks, also where the orbit needs more substeps in contact than the tape has rows.
+        ``look`` sees the cells of every sample on the way. Raises StalledError on all ranks, also where the orbit needs
+        more substeps in contact than the tape has rows.
         """
         layout = self._layout
-        result = self.fill(no_samples(self._model, layout, samples + 1))
-        needed = layout.comm.allreduce(int(self._forces.clusters.tape.used.max(initial=0)), max)
-        if result.stalled or needed > MOST_ROWS:
-            raise StalledError(result.stalled or f"an orbit needs {needed} substeps in contact, of {MOST_ROWS}")
-        cells = self._components[self.steps % 2][: 2 * layout.dofs * layout.owned]
-        return cells.reshape(2 * layout.dofs, layout.owned).copy()
+        tape = self._forces.clusters.tape
+        for number in range(1, samples + 1) if look else [samples]:
+            # Nothing is stored: the engine goes to the sample before the one that would be.
+            result = self.fill(no_samples(self._model, layout, number + 1))
+            needed = layout.comm.allreduce(int(tape.used.max(initial=0)), max)
+            room = tape.rows.shape[1]
+            if result.stalled or needed > room:
+                raise StalledError(result.stalled or f"an orbit needs {needed} substeps in contact, of {room}")
+            cells = self._components[self.steps % 2][: 2 * layout.dofs * layout.owned]
+            cells = cells.reshape(2 * layout.dofs, layout.owned).copy()
+            if look:
+                look(cells)
+        return cells
 
     def contacts(self) -> tuple[np.ndarray, int]:
         """Begin and end (substep, 2) in s of the substeps in which a site was closed, and the number of contacts.
@@ -169,6 +198,30 @@ class TangentPropagator(Propagator):
                 of_site = is_open[rows["site"] == site]
                 episodes += int(np.sum(of_site & ~np.append(False, of_site[:-1])))
         return np.concatenate(spans), episodes
+
+    def closed_substeps(self) -> list[ClosedSubsteps]:
+        """The substeps in which contacts were closed, of each cluster that this rank logs."""
+        clusters = self._forces.clusters
+        tables = clusters.nodes
+        interval = self.series.interval
+        substeps = []
+        for c in np.flatnonzero(self._forces.logs):
+            rows = clusters.tape.rows[c, : clusters.tape.used[c]]
+            w, rate = clusters.tape.motion[c, : len(rows)].swapaxes(0, 1)
+            length = rows["length"] * interval
+            of_cluster = ClosedSubsteps(
+                site=np.array(self._forces.sites(int(c)), int)[rows["site"]] - 1,
+                side=np.sign(rows["mode"]),
+                onset=rows["onset"] > 0,
+                end=rows["begin"] + rows["position"] * interval + length,
+                first_rate=rows["rate"],
+                last_rate=rate @ at_end(),
+                w=w,
+                rate=rate,
+                weights=tables.weight[rows["kind"]] * length[:, None],
+            )
+            substeps.append(of_cluster)
+        return substeps
 
     def _open_rows(self, c: int, rows: np.ndarray, is_held: np.ndarray) -> np.ndarray:
         """Which ``rows`` (row,) of the tape of cluster ``c`` are of an open site, as those that ``is_held`` may be."""

@@ -8,6 +8,7 @@ from vipetsc.case import NnmCase
 from vipetsc.case.names import distinct
 from vipetsc.io.branch_kinds import ORBITS
 from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.losses import dissipation_of, with_lattice_loss
 from vipetsc.modes.branches.orbits import NnmMethod, map_of, start_energy
 from vipetsc.modes.branches.stored_states import stored_states
 from vipetsc.modes.lattice.floquet import with_multipliers
@@ -31,6 +32,7 @@ class LatticeMethod(NnmMethod):
         options = case.nnm
         chain = case.chain()
         self.system = System.from_chain(chain, elastic_stops(case), dense=False)
+        self.dissipation = dissipation_of(case)
         shooting_map = map_of(options, self.system)
         self.lattice = LatticeShooting(self.system, chain, shooting_map, comm, options.tolerance, options.max_newton)
 
@@ -54,7 +56,9 @@ class LatticeMethod(NnmMethod):
         return linear_start(self.lattice, job, start_energy(self.options, self.system, job))
 
     def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:
-        """The point with its largest multipliers if ``nnm.multipliers`` asks for them."""
+        """The point with its loss, if anything dissipates, and the multipliers that ``nnm.multipliers`` asks for."""
+        if self.dissipation.acts:
+            point = with_lattice_loss(self.lattice, self.dissipation, point)
         wanted = self.options.multipliers
         if not wanted:
             return point

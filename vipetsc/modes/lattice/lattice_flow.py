@@ -10,7 +10,7 @@ States are blocks (2 dof, owned cell), displacements in m before velocities in m
 ``dynamics.layout``; ``scatter`` and ``gather`` go from and to the order of ``modes.system``, cell by cell.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from mpi4py import MPI
@@ -22,7 +22,7 @@ from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.step_choice import LARGEST_OMEGA_H
-from vipetsc.dynamics.propagator.tangent import TangentPropagator
+from vipetsc.dynamics.propagator.tangent import MOST_ROWS, TangentPropagator
 from vipetsc.lattice import Chain, Drive, ToneBurst
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.problem import FlowError
@@ -84,27 +84,45 @@ class LatticeFlow:
 
     def arc(self, start: np.ndarray, duration: float) -> LatticeArc:
         """The orbit from the block ``start`` over ``duration`` seconds; raises FlowError on all ranks."""
-        samples = max(int(np.ceil(self._omega * duration / LARGEST_OMEGA_H)), 1)
-        model = self._model(duration, samples)
+        engine, end = self._run(start, duration, self.steps(duration))
+        intervals, episodes = engine.contacts()
+        closed = _union(np.concatenate(self.comm.allgather(intervals)))
+        return LatticeArc(duration, start, end, self.comm.allreduce(episodes), closed, engine)
+
+    def steps(self, duration: float, largest: float = LARGEST_OMEGA_H) -> int:
+        """The steps of an arc of ``duration`` seconds, each at most ``largest`` radians of the fastest motion."""
+        return max(int(np.ceil(self._omega * duration / largest)), 1)
+
+    def watch(self, start: np.ndarray, duration: float, steps: int, look: Callable[[np.ndarray], None]) -> None:
+        """Let ``look`` see the block at the start of an arc and after each of so many ``steps``; all ranks call it.
+
+        Raises FlowError on all ranks.
+        """
+        look(start)
+        engine, _ = self._run(start, duration, steps, look)
+        engine.destroy()
+
+    def _run(
+        self, start: np.ndarray, duration: float, steps: int, look: Callable[[np.ndarray], None] | None = None
+    ) -> tuple[TangentPropagator, np.ndarray]:
+        """The engine that has run an orbit in so many ``steps``, on a tape unless they are looked at, and its end."""
+        model = self._model(duration, steps)
         why = TangentPropagator.refusal(model)
         if why:
             raise FlowError(why)
 
-        engine = TangentPropagator(model, self.layout)
+        engine = TangentPropagator(model, self.layout, 0 if look else MOST_ROWS)
         largest = np.abs(start).max(axis=1, initial=0.0) if start.size else np.zeros(len(start))
         # The same scale on all ranks, or substeps and with them the bits would depend on their number.
         self.comm.Allreduce(MPI.IN_PLACE, largest, MPI.MAX)
         u, v = np.split(largest, 2)
         try:
             engine.place(start, max(float(v.max()), SLOWEST * self._omega * float(u.max())))
-            end = engine.run(samples)
+            end = engine.run(steps, look)
         except StalledError as error:  # of all ranks; anything else may be of one alone
             engine.destroy()
             raise FlowError(f"the orbit of {duration:.6g} s stops: {error}") from error
-
-        intervals, episodes = engine.contacts()
-        closed = _union(np.concatenate(self.comm.allgather(intervals)))
-        return LatticeArc(duration, start, end, self.comm.allreduce(episodes), closed, engine)
+        return engine, end
 
     def scatter(self, state: np.ndarray) -> np.ndarray:
         """The rank's block of a ``state`` (..., 2n) of the whole lattice."""

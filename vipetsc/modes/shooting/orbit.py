@@ -41,15 +41,20 @@ def sample_orbit(problem: ShotOrbits, point: Point, samples: int = 400) -> tuple
     for _ in range(round(problem.map.fraction * samples)):
         states.append(problem.flow.arc(states[-1], point.period / samples, point.period).end)
     u, v = np.hsplit(np.array(states), 2)
+    return whole_period(u, problem.map, samples, 1), whole_period(v, problem.map, samples, -1)
 
-    if problem.map.quarter:  # to the centre: odd about it
-        u = np.vstack([u, -u[-2::-1]])
-        v = np.vstack([v, v[-2::-1]])
-    if len(u) < samples:  # to a rest (or from centre to centre): mirror image about it
-        sign = -1 if problem.map.start == problem.map.end == "centre" else 1
-        u = np.vstack([u, sign * u[-2::-1]])
-        v = np.vstack([v, -sign * v[-2::-1]])
-    return u[:samples], v[:samples]
+
+def whole_period(part: np.ndarray, shooting_map: ShootingMap, samples: int, parity: int) -> np.ndarray:
+    """Values (samples, ...) at uniform times of a period, from those of an arc, its start and its end included.
+
+    ``parity`` is 1 of displacements, which are even about a rest and odd about the centre, and -1 of velocities.
+    """
+    if shooting_map.quarter:  # to the centre
+        part = np.concatenate([part, -parity * part[-2::-1]])
+    if len(part) < samples:  # to a rest (or from centre to centre): mirror image about it
+        sign = -1 if shooting_map.start == shooting_map.end == "centre" else 1
+        part = np.concatenate([part, parity * sign * part[-2::-1]])
+    return part[:samples]
 
 
 def resonance(problem: ShotOrbits, point: Point, samples: int = 1024) -> int:
