@@ -114,7 +114,7 @@ def test_modes_near_a_frequency_are_those_of_the_lattice_with_all_their_copies(e
 
 @pytest.mark.parallel(2)
 def test_modes_need_no_direct_solver_for_several_ranks(monkeypatch):
-    monkeypatch.setattr(eigen, "DIRECT", (("petsc",), ()))
+    monkeypatch.setattr(eigen, "ON_SEVERAL", ())
     chain = Chain(four_band("calibrated"), 60, "fixed")
     matrices = LatticeMatrices(chain, COMM)
     modes = modes_near(matrices, 4, 2034.0)

@@ -19,9 +19,14 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     lattice = f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {describe_ends(case)}"
     if case.lattice.preset:
         lattice += f", reading {case.lattice.reading}"
-    bands = pass_bands(cell)
-    band_list = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)
-    gap_list = ", ".join(f"{low:.2f}-{high:.2f}" for low, high in gaps(bands))
+    band_list = "none: only contacts join the masses"
+    gap_list = ""
+    if cell.springs:
+        bands = pass_bands(cell)
+        band_list = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands) + " rad/s"
+        gap_list = "none"
+        if between := gaps(bands):
+            gap_list = ", ".join(f"{low:.2f}-{high:.2f}" for low, high in between) + " rad/s"
     # Each of a million sites may have its own law: a list shows only the first ones.
     laws = model.used_laws[:8]
     clearances = first_few(describe_stops(model.gaps, chain.clearances))
@@ -29,8 +34,8 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     return [
         ("case", case.name),
         ("lattice", lattice),
-        ("pass bands", f"{band_list} rad/s" if cell.springs else "none: only contacts join the masses"),
-        ("gaps", f"{gap_list} rad/s" if gap_list else ("none" if cell.springs else "")),
+        ("pass bands", band_list),
+        ("gaps", gap_list),
         ("loss", describe_losses(case)),
         ("contact", "; ".join(dict.fromkeys(map(str, laws)))),
         ("sites", first_few([cell + 1 for cell in chain.sites])),

@@ -76,7 +76,9 @@ def draw_pictures(
                 # A lattice without sites has no impacts: no matter to warn of.
                 echo(comm, f"  {sentence}")
         # Rank 0 reads the time, so that all ranks use the same one even if their file systems differ.
-        newest = None if afresh else on_root(comm, lambda: newest_result(folders))
+        newest = None
+        if not afresh:
+            newest = on_root(comm, lambda: newest_result(folders))
         drawn = on_every_rank(comm, draw_part)
     # ``gather`` gives None on all ranks but the first.
     return sorted(path for paths in comm.gather(drawn) or [] for path in paths)

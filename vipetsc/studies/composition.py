@@ -141,7 +141,9 @@ class Network:
             # The last c is near the next: GMRES begins with it.
             arriving = self._solve(self.between, self.radiated * state.fundamental * on, linear, c)
             change = float(np.abs(arriving - c).max()) / size
-            step = 1.0 if i < FULL_STEPS else 0.5
+            step = 1.0
+            if i >= FULL_STEPS:
+                step = 0.5
             c = c + step * (arriving - c)
 
             if self.third:
@@ -299,4 +301,6 @@ class Network:
 def _of_sites(values: np.ndarray) -> np.ndarray:
     """The ``values`` (site,) as factors of arrays (site, time): one number where all sites have the same."""
     # A product with a number and one with equal numbers in an array differ by rounding.
-    return values[0] if np.all(values == values[0]) else values[:, None]
+    if np.all(values == values[0]):
+        return values[0]
+    return values[:, None]

@@ -131,13 +131,14 @@ class Results:
             return
 
         statistics = record["statistics"]
-        work = statistics["work"]
         row = {
             "contact_episodes": statistics["episodes"],
             "ledger_error": statistics["ledger_error"],
-            "work": work,
-            "dissipated_fraction": statistics["dissipated"] / work if work else np.nan,
+            "work": statistics["work"],
+            "dissipated_fraction": np.nan,
         }
+        if statistics["work"]:
+            row["dissipated_fraction"] = statistics["dissipated"] / statistics["work"]
         # Scaled members have no measures of their own: they get those of their linear run at the end.
         self._put(number, row | record.get("measures", {}))
         # An amplitude sweep goes below the onset on purpose.

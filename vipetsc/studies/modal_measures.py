@@ -41,15 +41,20 @@ def modal_energies(run: xr.Dataset, record: VelocityRecord, measures: Collection
         return {}
 
     names = parts.parts.names
-    kind = "of the lattice" if parts.modes.exact else f"of a ring of {parts.modes.cells} cells"
+    kind = f"of a ring of {parts.modes.cells} cells"
+    if parts.modes.exact:
+        kind = "of the lattice"
     record.attributes["bands/modal_energy"] = {"parts": list(names), "modes": kind}
     values: dict[str, Any] = {"bands/part": np.arange(1, len(names) + 1)}
     if "displacement" in run and "transfers" in measures:
         values |= _history(run, record, parts)
     else:
-        # Runs that keep no displacement keep the last one.
-        last = run["displacement"][-1:] if "displacement" in run else run["end/displacement"].expand_dims("time")
-        energy = parts.energies(last.values, np.asarray(record.velocity[-1:]), np.zeros(1, int))
+        if "displacement" in run:
+            last = run["displacement"][-1:].values
+        else:
+            # Runs that keep no displacement keep the last one, without a dimension for time.
+            last = run["end/displacement"].values[None]
+        energy = parts.energies(last, np.asarray(record.velocity[-1:]), np.zeros(1, int))
         values["bands/instant"] = time[-1:]
         values["bands/modal_energy"] = energy.sum(axis=1)
 
@@ -65,6 +70,8 @@ def _modal_parts(run: xr.Dataset, record: VelocityRecord) -> ModalParts | None:
     """The modes by part of the frequency axis; None, and why in the ``record``, where they cannot be measured."""
     chain = record.model.chain
     reason = ""
+
+    # From what is missing in the file to what the physics does not have.
     if "displacement" not in run and "end/displacement" not in run:
         reason = "the displacement was not recorded"
     elif len(record.cells) < chain.cells:
@@ -76,6 +83,7 @@ def _modal_parts(run: xr.Dataset, record: VelocityRecord) -> ModalParts | None:
             return ModalParts.of(chain)
         except ValueError as error:
             reason = str(error)
+
     record.left_out.append(f"upper_share_at_end, bands/modal_energy: {reason}")
     return None
 

@@ -101,27 +101,32 @@ class ObjectiveRuns:
             records[condition, sample] = self.recorded.records[case_id(run)]
             reason = self._failure(run)
             if reason:
-                at = "" if condition is None else f"{condition:g} {self.plan.amplitude_unit}: "
+                if condition is not None:
+                    reason = f"{condition:g} {self.plan.amplitude_unit}: {reason}"
                 return Judgement(
-                    losses=[np.nan] * len(options.objective),
-                    constraints=[np.nan] * len(constraints),
-                    reason=at + reason,
+                    losses=[np.nan] * len(options.objective), constraints=[np.nan] * len(constraints), reason=reason
                 )
 
         losses = []
         for objective in options.objective:
-            sign = -1 if objective.goal == "maximise" else 1
-            by_amplitude = [sign * mean for mean in _means(objective, design, records)]
-            # Losses are small for good designs, so the worst is the largest.
-            losses.append(max(by_amplitude) if objective.over == "worst" else float(np.mean(by_amplitude)))
+            by_amplitude = _means(objective, design, records)
+            if objective.goal == "maximise":
+                by_amplitude = [-mean for mean in by_amplitude]
+            if objective.over == "worst":
+                # Losses are small for good designs, so the worst is the largest.
+                losses.append(max(by_amplitude))
+            else:
+                losses.append(float(np.mean(by_amplitude)))
 
         bounded = []
         excess = 0.0
         for constraint in constraints:
             means = _means(constraint, design, records)
-            # The worst is the one that is farthest outside the bounds.
-            worst = max(means, key=constraint.excess)
-            value = worst if constraint.over == "worst" else float(np.mean(means))
+            if constraint.over == "worst":
+                # The worst is the one that is farthest outside the bounds.
+                value = max(means, key=constraint.excess)
+            else:
+                value = float(np.mean(means))
             bounded.append(value)
             excess += constraint.excess(value)
         return Judgement(losses, bounded, excess)
@@ -218,7 +223,9 @@ def _analysed(run: xr.Dataset, tables: Sequence[MeasuredTable]) -> dict[str, Any
         else:
             values[table.name] = float(value)
     warnings = json.loads(analysis.attrs["warnings"])
-    return values | ({"warnings": warnings} if warnings else {})
+    if warnings:
+        values["warnings"] = warnings
+    return values
 
 
 def _part_of(parts: Sequence[str], band: int) -> int:
@@ -241,7 +248,9 @@ def _energy_beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray)
     sites = np.array(chain.sites)
     farthest = sites[np.argmax(np.abs(sites - model.drive_cell))]
     cells = np.arange(chain.cells)
-    beyond = cells > farthest if farthest >= model.drive_cell else cells < farthest
+    beyond = cells > farthest
+    if farthest < model.drive_cell:
+        beyond = cells < farthest
 
     u = displacement.ravel()
     v = velocity.ravel()

@@ -80,8 +80,12 @@ def _counts(search: OptimumSearch) -> dict[str, int]:
     """The numbers of runs and of cases whose frequency responses were followed, for all designs."""
     options = search.plan.options
     kinds = {case_id(run): isinstance(run, NfrcCase) for design in search.designs for run in design.runs}
-    counts = {"runs": len(kinds) - sum(kinds.values())} if options.measures_runs else {}
-    return counts | ({"responses": sum(kinds.values())} if options.measures_responses else {})
+    counts = {}
+    if options.measures_runs:
+        counts["runs"] = len(kinds) - sum(kinds.values())
+    if options.measures_responses:
+        counts["responses"] = sum(kinds.values())
+    return counts
 
 
 def _design_values(search: OptimumSearch) -> dict[str, Any]:

@@ -109,7 +109,9 @@ class TaskPool:
                 break
             if number == block_end:
                 # One rank draws for its team, whose ranks must work on the same job.
-                number = self.team.bcast(drawn.draw(block) if leads else None)
+                if leads:
+                    number = drawn.draw(block)
+                number = self.team.bcast(number)
                 block_end = min(number + block, len(jobs))
             if number >= len(jobs):
                 break
@@ -124,7 +126,7 @@ class TaskPool:
             if leads and last.ending == Ending.DONE:
                 done += 1
             # Every rank asks for the count, which moves the bar of rank 0 also when another team has ended a job.
-            count = ended.draw(1 if leads else 0)
+            count = ended.draw(int(leads))
             if progress:
                 progress.update(count + 1)
 
@@ -171,8 +173,12 @@ class TaskPool:
 
     def _judge(self, error: Exception) -> JobEnd:
         """Whether an ``error`` is a failure of its job alone or ends all jobs, and how it is reported."""
+        is_failure = isinstance(error, self.failures) and not is_disk_full(error)
         text = str(error)
-        named = text if isinstance(error, RuntimeError) else f"{type(error).__name__}: {text}"
-        if isinstance(error, self.failures) and not is_disk_full(error):
-            return JobEnd(Ending.FAILED, named)
-        return JobEnd(Ending.FATAL, text if isinstance(error, OSError) else named)
+        # Errors of this program are sentences; of others the type says what they are about.
+        is_sentence = isinstance(error, RuntimeError) or (isinstance(error, OSError) and not is_failure)
+        if not is_sentence:
+            text = f"{type(error).__name__}: {text}"
+        if is_failure:
+            return JobEnd(Ending.FAILED, text)
+        return JobEnd(Ending.FATAL, text)

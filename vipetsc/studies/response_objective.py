@@ -49,7 +49,7 @@ def _record(case: NfrcCase, branches: Sequence[Branch[Any]], tables: Sequence[Me
         low, high = table.part or case.nfrc.range
         of_curves: list[float] = []
         for curve in case.every_curve():
-            # Isolated states are as possible as those of the curve beside which they lie.
+            # Isolated states are as possible as those of the curve near which they lie.
             parts = [_part(b, of) for b in branches if b.name.partition(ISOLA)[0] == curve.name]
             if table.below:
                 of_curves.append(widest_gap(parts, table.below, low, high))

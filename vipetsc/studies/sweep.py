@@ -144,8 +144,12 @@ def _in_memory(plan: Sweep, comm: MPI.Comm, stop: StopRequest | None, progress: 
         discard(folder)
         return ensemble
 
-    held = on_every_rank(comm, lambda: read() if comm.rank == 0 else None)
-    return replace(result, folder=None, held=held)
+    def read_on_root() -> "xr.Dataset | None":
+        if comm.rank > 0:
+            return None
+        return read()
+
+    return replace(result, folder=None, held=on_every_rank(comm, read_on_root))
 
 
 def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, progress: bool) -> SweepResult:
@@ -161,7 +165,11 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     def look() -> tuple[dict[str, NeededRun], dict[str, LinearRun | str]]:
         survey = _survey(plan, folder)
         surveys.append(survey)
-        return survey.needed, dict(survey.results.linear) if len(survey.missing) else {}
+        linear: dict[str, LinearRun | str] = {}
+        # Of a whole sweep nobody needs the linear runs, which other ranks would get in a message.
+        if len(survey.missing):
+            linear |= survey.results.linear
+        return survey.needed, linear
 
     # Linear runs first: members that nothing touches are scaled from them, and they show what the others cost.
     needed, runs.linear = on_root(comm, look)
@@ -178,7 +186,9 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
 
     def put_together() -> tuple[np.ndarray, list[str]]:
         survey = surveys[0]
-        results = Results(plan, folder) if needed or order else survey.results
+        results = survey.results
+        if needed or order:
+            results = Results(plan, folder)
         status, warnings = conclude(results, afresh=bool(order))
         return status, [*dict.fromkeys([*survey.results.damaged, *survey.lost, *warnings])]
 
@@ -192,7 +202,10 @@ def _join_linear_runs(runs: SweepRuns, comm: MPI.Comm) -> None:
     """Give every rank the linear runs of all, each with all measures that any rank took of it."""
     for from_rank in comm.allgather(runs.linear):
         for name, run in from_rank.items():
-            runs.linear[name] = run if isinstance(run, str) else run.joined(runs.linear.get(name))
+            # A text is the reason why it did not come out.
+            if not isinstance(run, str):
+                run = run.joined(runs.linear.get(name))
+            runs.linear[name] = run
 
 
 class NeededRun(NamedTuple):

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -113,16 +113,19 @@ class SweepRuns:
         site = leading_cell(case)
         name = linear_name(case)
         linear = self._linear_of(case, name, site)
-        modules = case.plugins.modules if case.plugins else []
+        modules: list[str] = []
+        if case.plugins:
+            modules = case.plugins.modules
         scales = not self.plan.options.fields and can_be_scaled(modules)
-        quiet = scales and bool((linear.reached(case) < MARGIN).all())
-        if quiet:
+        if scales and bool((linear.reached(case) < MARGIN).all()):
+            status = SCALED
             record = _scaled(case, linear, name, site)
         else:
+            status = COMPLETE
             opening = partial(self._opening, case, name)
             record = self._simulate(case, self.folder / self.ids[number], linear.arrival_at(site), opening)
         record |= {"rtol": case.time.rtol, "cpu_seconds": round(time.process_time() - begin, 4)}
-        on_root(self.recorded.team, lambda: self._append(number, SCALED if quiet else COMPLETE, record))
+        on_root(self.recorded.team, lambda: self._append(number, status, record))
 
     def _linear_of(self, case: Case, name: str, site: int) -> LinearRun:
         """The linear run ``name`` of ``case``, simulated if it is missing, with measures for the first ``site``.
@@ -130,9 +133,11 @@ class SweepRuns:
         It has none where members keep their fields: they are measured themselves.
         """
         linear = self.linear.get(name)
-        fields = self.plan.options.fields
-        if not isinstance(linear, LinearRun) or (not fields and site not in linear.measures):
-            self.make_linear(case, () if fields else (site,))
+        sites = [site]
+        if self.plan.options.fields:
+            sites = []
+        if not isinstance(linear, LinearRun) or not linear.measures.keys() >= {*sites}:
+            self.make_linear(case, sites)
             linear = self.linear[name]
         assert isinstance(linear, LinearRun)
         return linear
@@ -167,15 +172,22 @@ class SweepRuns:
                 write_text(marker, text)
 
         on_root(self.recorded.team, begin)
-        memory = RunMemory(self.recorded.team)
-        everything = _with_everything(case, [*FIELDS] if fields else ["velocity"])
         # Measures need all samples and cells, also those that the member does not keep.
-        simulated = case if fields and all_kept else everything
-        output = RunFolder(folder, self.recorded.team) if fields else memory
+        memory = RunMemory(self.recorded.team)
+        output: RunMemory | RunFolder = memory
+        simulated = _with_everything(case, ["velocity"])
+        if fields:
+            output = RunFolder(folder, self.recorded.team)
+            simulated = _with_everything(case, [*FIELDS])
+            if all_kept:
+                simulated = case
         result = self.recorded.simulate(simulated, output, opening)
 
         def measure() -> Record:
-            with open_run(folder / "run.h5") if memory.dataset is None else memory.dataset as run:
+            run = memory.dataset
+            if run is None:
+                run = open_run(folder / "run.h5")
+            with run:
                 analysis = analyse(run, self.measures, arrival)
                 if fields and not all_kept:
                     write_netcdf(folder / "run.h5", thinned(run, case).assign_attrs(case=case.to_toml()))
@@ -220,8 +232,13 @@ def _with_everything(case: Case, fields: list[str]) -> Case:
 
 def measures_of(plan: Sweep) -> set[str]:
     """Measures that ``analyse`` takes of a member: those that its pictures show if its fields are kept."""
-    asked = WHOLE if plan.options.fields else ANALYSED
-    return {"motion"} | {measure for name in plan.options.measures if name in asked for measure in asked[name]}
+    asked: Mapping[str, Sequence[str]] = ANALYSED
+    if plan.options.fields:
+        asked = WHOLE
+    measures = {"motion"}
+    for name in plan.options.measures:
+        measures |= {*asked.get(name, ())}
+    return measures
 
 
 def keeps_all(case: Case) -> bool:
@@ -246,5 +263,7 @@ def thinned(run: xr.Dataset, case: Case) -> xr.Dataset:
     fields = {}
     for name in output.fields:
         field = run[name].isel(time=slice(None, None, output.stride))
-        fields[name] = field.rename(time="field_time") if output.stride > 1 else field
+        if output.stride > 1:
+            field = field.rename(time="field_time")
+        fields[name] = field
     return run.drop_vars(output.fields).assign(fields)

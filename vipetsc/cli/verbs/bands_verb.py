@@ -18,6 +18,7 @@ from vipetsc.io.folder import origin
 from vipetsc.io.lock import locked
 from vipetsc.io.names import path_named
 from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands
+from vipetsc.lattice.bands import Band
 from vipetsc.lattice.damped import damped_bloch, decay_length
 from vipetsc.parallel import StopRequest, on_root
 
@@ -69,8 +70,10 @@ def write_bands(case: Case, folder: Path, as_json: bool) -> str:
 
 def bands_table(cell: UnitCell) -> dict[str, Any]:
     """Bands of a cell with edges and largest group velocity, and gaps; neither of a cell without springs."""
+    edges: tuple[Band, ...] = ()
+    if cell.springs:
+        edges = pass_bands(cell)
     rows = []
-    edges = pass_bands(cell) if cell.springs else []
     for band in edges:
         kappa, frequency, speed = max_group_velocity(cell, band.number)
         fastest = {"wavenumber": kappa, "frequency": frequency, "group_velocity": speed}
@@ -105,13 +108,16 @@ def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
         kappa = max_group_velocity(cell, band.number)[0]
         point = damped_bloch(cell, kappa)
         rate = point.rate[band.number - 1]
+        decay_time = np.inf
+        if rate.real:
+            # The complex rate has the decay in its negative real part.
+            decay_time = float(-1 / rate.real)
         rows.append({
             "band": band.number,
             "wavenumber": kappa,
             "damping_ratio": float(point.ratio[band.number - 1]),
             "frequency": float(rate.imag),
-            # The complex rate has the decay in its negative real part.
-            "decay_time": float(-1 / rate.real) if rate.real else np.inf,
+            "decay_time": decay_time,
         })  # fmt: skip
     return {"damping": rows, "decay_length": {"frequency": frequency, "cells": decay_length(cell, frequency)}}
 

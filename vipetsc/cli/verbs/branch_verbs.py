@@ -21,7 +21,7 @@ from vipetsc.cli.tables import first_few, table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import BRANCHES
 from vipetsc.parallel import on_root
-from vipetsc.wording import counted
+from vipetsc.wording import counted, with_unit
 
 if TYPE_CHECKING:
     from vipetsc.modes.branches.branch import Branch
@@ -88,7 +88,7 @@ def nnm_rows(case: NnmCase, ranks: int) -> Rows:
     laws = dict.fromkeys(f"{law.law}, {law.stiffness:.6g} N/m^{law.onset_exponent:g}" for law in case.laws())
     return [
         ("nnm", f"{case.nnm.system} system, modes {first_few(case.nnm.modes)}, {low:g} to {high:g} J"),
-        ("nnm contact", first_few(list(laws)) if laws else "none"),
+        ("nnm contact", first_few(list(laws))),
     ]
 
 
@@ -100,9 +100,10 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
         amplitude_unit = "of the clearance"
     else:
         excitation = f"a force on mass {case.drive.mass} of cell {case.drive.cell}"
+        amplitude_unit = "N"
         if case.drive.end:
             excitation = f"the motion of the {case.drive.end} wall"
-        amplitude_unit = "m" if case.drive.end else "N"
+            amplitude_unit = "m"
         if case.drive.more:
             excitation += f", and {len(case.drive.more)} more in the ratios of the amplitudes"
 
@@ -119,7 +120,9 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
 
     low, high = options.range
     curves = counted(len(case.every_curve()), "curve")
-    parity = "odd only" if options.symmetric else "even and odd"
+    parity = "even and odd"
+    if options.symmetric:
+        parity = "odd only"
 
     lattice = dict(lattice_rows(case))
     if options.infinite:
@@ -154,11 +157,11 @@ def _isola_rows(case: NfrcCase) -> Rows:
 
 def _family_rows(case: NfrcCase) -> Rows:
     """The keys that vary in the family, and their values."""
-    table = case.table or {}
-    return [
-        (f"{key}{f' ({unit})' if (unit := unit_of(key, table)) else ''}", first_few([f"{value}" for value in values]))
-        for key, values in (case.nfrc.family or {}).items()
-    ]
+    rows = []
+    for key, values in (case.nfrc.family or {}).items():
+        unit = unit_of(key, case.table or {})
+        rows.append((with_unit(key, unit), first_few([f"{value}" for value in values])))
+    return rows
 
 
 def branch_log() -> Callable[["Branch", "Point"], None]:
@@ -232,8 +235,10 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
     parameter = parameter_values(curve)
     for kind, heading in SPECIAL_POINTS.items():
         at = parameter[curve.is_kind(kind)]
-        if at.size or kind == "fold":
-            rows.append((heading, ", ".join(f"{value:.6g}" for value in at) + f" {unit}" if at.size else "none"))
+        if at.size:
+            rows.append((heading, ", ".join(f"{value:.6g}" for value in at) + f" {unit}"))
+        elif kind == "fold":
+            rows.append((heading, "none"))
 
     jumps = []
     for direction, path in (("up", sweep_up(curve)), ("down", sweep_down(curve))):

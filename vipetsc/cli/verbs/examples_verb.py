@@ -43,7 +43,10 @@ def examples(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> 
         echo(comm, "vipetsc examples NAME copies a case file, with the files that it names, into the current folder")
         return DONE
 
-    chosen = on_root(comm, lambda: _chosen(shipped, list(shipped) if options.all else options.name))
+    names = options.name
+    if options.all:
+        names = list(shipped)
+    chosen = on_root(comm, lambda: _chosen(shipped, names))
     echo_paths(comm, on_root(comm, lambda: copy_examples(chosen, options.out or Path(), force=options.force)))
     return DONE
 
@@ -82,8 +85,10 @@ def _chosen(shipped: dict[str, Example], names: list[str]) -> list[Example]:
         if stem in shipped:
             chosen.append(shipped[stem])
             continue
+        remedy = "`vipetsc examples` lists them"
         near = difflib.get_close_matches(stem, shipped, n=3, cutoff=0.5)
-        remedy = f"did you mean {' or '.join(near)}?" if near else "`vipetsc examples` lists them"
+        if near:
+            remedy = f"did you mean {' or '.join(near)}?"
         problems.append(Problem("NAME", name, f"no such case file; {remedy}"))
     if problems:
         raise CaseError(problems, "examples")

@@ -34,23 +34,32 @@ def export(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 def existing_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
     """The folders that those of ``paths`` that exist are or lie in."""
     # Missing paths are left to the verb, which refuses them with a reason; there is no folder to lock.
-    return on_root(comm, lambda: [path if path.is_dir() else path.parent for path in paths if path.exists()])
+    return on_root(comm, lambda: [_folder_of(path) for path in paths if path.exists()])
+
+
+def _folder_of(path: Path) -> Path:
+    """The folder that ``path`` is, or the one of the file that it is."""
+    if path.is_dir():
+        return path
+    return path.parent
 
 
 def write_exports(path: Path) -> list[Path]:
     """Export what ``path`` is or holds; returns the files. Raises FolderError for one that cannot be read."""
     from vipetsc.io.export import write_curves, write_xdmf
 
-    folder = path if path.is_dir() else path.parent
-    branches = sorted(path.glob("branch-*.h5")) if path.is_dir() else []
+    folder = _folder_of(path)
+    sources = [path]
+    if path.is_dir():
+        # A folder of branches is the one kind with several files of curves.
+        sources = sorted(path.glob("branch-*.h5")) or [path]
     written = []
     try:
         if (folder / "run.h5").exists():
             mesh = write_xdmf(folder)
             if mesh:
                 written.append(mesh)
-        # A folder of branches is the one kind with several files of curves.
-        for source in branches or [path]:
+        for source in sources:
             written += write_curves(source)
     # OSError: a file that was cut off or is no HDF5. TypeError: another program's, of types that no table can hold.
     except (OSError, TypeError, ValueError) as error:

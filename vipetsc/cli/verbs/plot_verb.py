@@ -92,16 +92,19 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
     from vipetsc.cli.verbs.verb_list import study_verbs
 
     # Verbs that leave the same kind of folder share their pictures.
-    known = {verb.pictures.source: verb.pictures for verb in study_verbs() if verb.pictures}
-    files = {pictures.file for pictures in known.values()}
-    folders = [path.parent if path.name in files else path for path in paths]
-    for pictures in known.values():
+    by_source = {verb.pictures.source: verb.pictures for verb in study_verbs() if verb.pictures}
+    files = {pictures.file for pictures in by_source.values()}
+    folders = list(paths)
+    for i, path in enumerate(paths):
+        if path.name in files:
+            folders[i] = path.parent
+    for pictures in by_source.values():
         if pictures.are_of(folders):
             return pictures, folders
 
     if len(folders) > 1:
         raise FolderError(f"{' '.join(map(str, paths))}: only sweeps and folders of branches can be drawn on one page")
-    return known["run"], folders
+    return by_source["run"], folders
 
 
 def film(
@@ -135,8 +138,10 @@ def film(
     if "mp4" in formats and not has_ffmpeg:
         raise FolderError(f"--format mp4: {movie.REMEDY}")
     if not formats:
-        formats = {*MOVIE_FORMATS} if has_ffmpeg else {"gif"}
-        missing = "" if has_ffmpeg else f"no MP4: {movie.REMEDY}"
+        formats = {*MOVIE_FORMATS}
+        if not has_ffmpeg:
+            formats = {"gif"}
+            missing = f"no MP4: {movie.REMEDY}"
 
     with rc_style(), ExitStack() as stack:
         run = stack.enter_context(open_run(folder / "run.h5"))

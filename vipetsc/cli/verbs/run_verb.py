@@ -20,6 +20,7 @@ from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
 from vipetsc.io.folder import RUN, FolderError
 from vipetsc.lattice import waves_at
 from vipetsc.parallel import on_root
+from vipetsc.wording import counted
 
 if TYPE_CHECKING:
     from vipetsc.dynamics import Result
@@ -44,7 +45,9 @@ def load(options: argparse.Namespace) -> Case:
 def _sweep_of(options: argparse.Namespace) -> Sweep:
     """The sweep whose file or folder is given; raises CaseError."""
     path = Path(options.case or "the case of a sweep")
-    return Sweep.load(path / "case.toml" if path.is_dir() else path)
+    if path.is_dir():
+        path = path / "case.toml"
+    return Sweep.load(path)
 
 
 def simulate_and_measure(case: Case, work: Work) -> Outcome:
@@ -72,8 +75,10 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     has_two_samples = result.statistics["samples"] > 1
     has_fields = bool(case.output.fields) and has_two_samples
     if has_fields or (case.output.points and has_two_samples):
-        # The linear run of its sweep has the time at which the wave arrives at the sites of a member.
-        sweep = Path(work.options.case) if work.options.member else None
+        sweep = None
+        if work.options.member:
+            # The linear run of its sweep has the time at which the wave arrives at the sites of a member.
+            sweep = Path(work.options.case)
         on_root(work.comm, lambda: is_measured(work.folder) or measure_run(work.folder, sweep))
         on_root(work.comm, lambda: has_xdmf(work.folder) or write_xdmf(work.folder))
         measured, unsettled = on_root(work.comm, lambda: measures_of_points(case, work.folder))
@@ -94,22 +99,18 @@ def run_rows(case: Case, ranks: int) -> Rows:
     chain = model.chain
     cost = estimate(case, ranks)
 
-    # Where nothing is driven, they are of the motion that the lattice begins with.
-    omega = case.wave_frequency if chain.cell.springs else None
-    waves = [
-        f"band {band}, kappa = {kappa / np.pi:.4f} pi, v_g = {speed:.2f} cells/s"
-        for band, kappa, speed in waves_at(chain.cell, omega or 0.0)
-    ]
-    drive_end = max(drive.waveform.duration for drive in model.drives)
-    drive_words = f"{drive_end:.6g} s" if drive_end < np.inf else "no end"
-    noun = "burst" if all(drive.kind == DEFAULT for _, drive in case.drive.every) else "drive"
+    begins_with = ""
+    if case.initial:
+        begins_with = case.initial.describe()
 
     # Doubles: fields at every stride-th sample; at all samples, the losses of each site, perhaps its force,
     # and three quantities of each point. The rest is small.
     columns = len(recorded_cells(case.output, chain.cells)) * chain.cell.dofs * len(case.output.fields)
-    every_sample = len(chain.sites) * (2 if case.output.forces else 1) + 3 * len(case.output.points or [])
+    every_sample = len(chain.sites) * (1 + bool(case.output.forces)) + 3 * len(case.output.points or [])
     size = 8 * (columns * -(-model.samples // case.output.stride) + every_sample * model.samples)
-    writer = "parallel" if written_together(model, case.output, ranks) else "gather"
+    writer = "gather"
+    if written_together(model, case.output, ranks):
+        writer = "parallel"
     free = shutil.disk_usage(".").free
 
     # Ranks on one machine divide its memory among them.
@@ -119,25 +120,58 @@ def run_rows(case: Case, ranks: int) -> Rows:
     if needed > available:
         memory += f", but only {available / 1e9:.3g} GB are available"
 
-    time = f"about {duration(cost.seconds)} on {ranks} rank{'s' if ranks > 1 else ''}"
+    engine = cost.engine
+    if cost.note:
+        engine += f": {cost.note}"
+    time = f"about {duration(cost.seconds)} on {counted(ranks, 'rank')}"
     if cost.episodes:
         time += f", {duration(cost.contacts)} of this for about {float(f'{cost.episodes:.1g}'):g} contacts"
 
     return [
         *lattice_rows(case),
-        ("begins with", case.initial.describe() if case.initial else ""),
-        *(("drive", drive.describe() if drive.amplitude else "none") for _, drive in case.drive.every),
-        ("waves at Om", ("; ".join(waves) or "none: the frequency is in a gap") if omega else ""),
-        (f"{noun}, end", f"{drive_words}, {model.end:.6g} s") if model.is_driven else ("end", f"{model.end:.6g} s"),
+        ("begins with", begins_with),
+        *_drive_rows(case),
         ("samples", f"{model.samples}, every {model.sample_interval:g} s"),
         ("points", ", ".join(f"{p.name} (cell {p.cell}, mass {p.mass})" for p in case.output.points or [])),
         ("tolerances", f"rtol {model.rtol:g}, atol {model.atol[0]:.3g} m and {model.atol[1]:.3g} m/s"),
-        ("engine", f"{cost.engine}: {cost.note}" if cost.note else cost.engine),
+        ("engine", engine),
         ("disk", f"{size / 2**20:.4g} MiB ({writer}), twice that during the run; {free / 2**30:.4g} GiB free here"),
         ("memory", memory),
         ("time", time),
         ("faster", cost.faster),
     ]
+
+
+def _drive_rows(case: Case) -> Rows:
+    """The drives, the waves at their frequency, and the times at which the drives and the run end."""
+    model = case.model()
+    rows: Rows = []
+    for _, drive in case.drive.every:
+        words = "none"
+        if drive.amplitude:
+            words = drive.describe()
+        rows.append(("drive", words))
+
+    # Where nothing is driven, the waves are those of the motion that the lattice begins with.
+    omega = case.wave_frequency
+    if omega and model.chain.cell.springs:
+        waves = [
+            f"band {band}, kappa = {kappa / np.pi:.4f} pi, v_g = {speed:.2f} cells/s"
+            for band, kappa, speed in waves_at(model.chain.cell, omega)
+        ]
+        rows.append(("waves at Om", "; ".join(waves) or "none: the frequency is in a gap"))
+
+    run_end = f"{model.end:.6g} s"
+    if not model.is_driven:
+        return [*rows, ("end", run_end)]
+    noun = "drive"
+    if all(drive.kind == DEFAULT for _, drive in case.drive.every):
+        noun = "burst"
+    drive_end = "no end"
+    last = max(drive.waveform.duration for drive in model.drives)
+    if last < np.inf:
+        drive_end = f"{last:.6g} s"
+    return [*rows, (f"{noun}, end", f"{drive_end}, {run_end}")]
 
 
 def run_table(result: "Result", faster: str = "") -> str:
@@ -157,10 +191,14 @@ def run_table(result: "Result", faster: str = "") -> str:
             energy += f" in contacts and {100 * damped / work:.4g} % in dashpots"
         energy += f", ledger closes to {numbers['ledger_error']:.2g} of the work"
 
+    restitution = ""
     rebounds = [*dict.fromkeys(np.ravel(numbers.get("effective_restitution", [])).tolist())]
-    restitution = f"{first_few([f'{e:.3f}' for e in rebounds])} (effective)" if rebounds else ""
+    if rebounds:
+        restitution = f"{first_few([f'{e:.3f}' for e in rebounds])} (effective)"
     limits = [f"{name} {numbers[name]}" for name in ("grazes", "floored", "clipped", "pulled") if numbers[name]]
-    note = numbers.get("engine_note")
+    engine = ""
+    if note := numbers.get("engine_note"):
+        engine = f"{numbers['engine']}: {note}"
     time = f"{numbers['wall_seconds']:.2f} s wall, {numbers['cpu_seconds']:.2f} s CPU of all ranks"
     if compiled := numbers.get("compile_seconds"):
         time += f"; {compiled:.1f} s of this for compiling kernels, once"
@@ -173,7 +211,7 @@ def run_table(result: "Result", faster: str = "") -> str:
         ("steps", steps),
         ("time", time),
         ("folder", str(result.folder)),
-        ("engine", f"{numbers['engine']}: {note}" if note else ""),
+        ("engine", engine),
         ("faster", faster),
     ]
     return f"{result.sentence}\n{table(rows)}"
@@ -193,13 +231,16 @@ def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
             if name in MEASURES or name not in analysis:
                 continue  # of no point, or not measured
             item = analysis[name]
-            unit = "" if item.attrs["units"] == "1" else item.attrs["units"]
             if np.isnan(item.values).all():
                 rows.append((name, "no value"))
                 continue
-            values = ", ".join(f"{value:.5g}" for value in np.atleast_1d(item.values))
-            parts = f" ({', '.join(np.atleast_1d(item.attrs['parts']))})" if "parts" in item.attrs else ""
-            rows.append((name, f"{values} {unit}".rstrip() + parts))
+
+            text = ", ".join(f"{value:.5g}" for value in np.atleast_1d(item.values))
+            if item.attrs["units"] != "1":
+                text += f" {item.attrs['units']}"
+            if "parts" in item.attrs:
+                text += f" ({', '.join(np.atleast_1d(item.attrs['parts']))})"
+            rows.append((name, text))
         warnings = json.loads(analysis.attrs["warnings"])
     return table(rows), [warning for warning in warnings if warning.startswith(UNSETTLED)]
 

@@ -34,7 +34,9 @@ def sweep_rows(plan: Sweep, ranks: int) -> Rows:
     tried = plan.tried()
     impossible = sum(member.case is None for member in tried)
     counts = " x ".join(map(str, plan.shape))
-    of = "them" if len(tried) == plan.count else len(tried)
+    of = str(len(tried))
+    if len(tried) == plan.count:
+        of = "them"
     return [("sweep", f"{plan.count} members ({counts}), {impossible} of {of} impossible")]
 
 

@@ -168,9 +168,9 @@ class BranchMonitor:
         times = repetitions(self._problem, point)
         twice = self._repeats and times > 1
         self._repeats = times > 1
-        return (
-            f"left its branch: the orbit of point {point.index} is another one passed {times} times" if twice else None
-        )
+        if not twice:
+            return None
+        return f"left its branch: the orbit of point {point.index} is another one passed {times} times"
 
     def _retraces(self, point: Point, track: np.ndarray, here: np.ndarray) -> str | None:
         """A sentence if the branch, which is ``here`` now, lies on its earlier ``track``; else None."""
@@ -186,7 +186,9 @@ class BranchMonitor:
         if distance[i] >= SAME_PLACE * size or abs(along) <= SAME_DIRECTION:
             return None
         where = f"point {point.index} lies on the step after point {i + 1}"
-        return f"retraces itself: {where}, backwards" if along < 0 else f"closed on itself: {where}"
+        if along < 0:
+            return f"retraces itself: {where}, backwards"
+        return f"closed on itself: {where}"
 
 
 def sampled(problem: Shooting, points: list[Point]) -> Variables:
@@ -219,8 +221,11 @@ def compare(reference: Shooting, points: list[Point], flow: Flow) -> Variables:
     frequency = np.full(len(chosen), np.nan)
     for i, point in enumerate(chosen):
         frame = problem.relative_frame(point.x, point.period)
+        held = int(np.abs(point.x).argmax())
+        if contacts:
+            held = contacts[0].resonator
         row = np.zeros(len(frame.xi))
-        row[contacts[0].resonator if contacts else int(np.abs(point.x).argmax())] = 1.0
+        row[held] = 1.0
         # begin off the orbit, or a flow whose residual passes there would not move at all
         attempt = frame.solve(frame.xi + OFF * (1 - row), row, row @ frame.xi)
         if attempt.converged:

@@ -35,7 +35,9 @@ class CondensedLayout:
 
         # Points of one branch differ in their number of harmonics, but all have odd ones alone or none does.
         odd = all(p.order % 2 and len(p.x) <= p.order // 2 * places + places for p in points)
-        orders = np.arange(count) * 2 + 1 if odd else np.arange(count)
+        orders = np.arange(count)
+        if odd:
+            orders = 2 * orders + 1
         elongations = branch.column("elongations").reshape(len(points), places)
         axes = "point", "place", "order"
         kept_text = "number of the last harmonic"
@@ -75,7 +77,9 @@ class CondensedLayout:
         points = []
         for i, fields in enumerate(quantities(data)):
             order = int(data["harmonics_kept"].values[i])
-            count = (order + 1) // 2 if odd else order + 1
+            count = order + 1
+            if odd:
+                count = (order + 1) // 2
 
             # The first point of a branch that has gone no further has no tangent.
             tangent_period = data["tangent_period"].values[i]

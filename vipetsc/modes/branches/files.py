@@ -79,8 +79,10 @@ def read_branch(path: Path) -> Branch[Any]:
         data = file.load()
     about = data.attrs
     points = layout.points(data)
-    # Files of responses have the next step at each point, and none for the branch.
-    next_step = about["next_step"] if "next_step" in about else float(data["next_step"].values[-1])
+    next_step = about.get("next_step")
+    if next_step is None:
+        # Files of responses have the next step at each point, and none for the branch.
+        next_step = float(data["next_step"].values[-1])
     return Branch(
         name=str(about["name"]),
         case=str(about["case"]),

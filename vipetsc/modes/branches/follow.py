@@ -45,11 +45,14 @@ def claim_branches(
 
     def difference(earlier: str) -> str | None:
         # The whole case need not be the same: a branch that has used up its points is resumed with more of them.
-        same = type(case).from_toml(earlier).physics() == case.physics()
-        return None if same else f"--resume needs {case.kept_by_resume}"
+        if type(case).from_toml(earlier).physics() == case.physics():
+            return None
+        return f"--resume needs {case.kept_by_resume}"
 
-    further = difference if resume else None
-    return claimed(comm, folder, BRANCHES, case.to_toml(), force=force, resume=resume, difference=further)
+    text = case.to_toml()
+    if not resume:
+        return claimed(comm, folder, BRANCHES, text, force=force)
+    return claimed(comm, folder, BRANCHES, text, force=force, resume=True, difference=difference)
 
 
 def method_of(case: BranchCase) -> type[Method[Any]]:
@@ -58,7 +61,9 @@ def method_of(case: BranchCase) -> type[Method[Any]]:
         return ResponseMethod
     if case.krylov:
         return LatticeMethod
-    return CondensedMethod if case.condensed else ShootingMethod
+    if case.condensed:
+        return CondensedMethod
+    return ShootingMethod
 
 
 def follow_all(
@@ -83,7 +88,9 @@ def follow_all(
     if method_of(case).shared:
         together = follower(comm)
         branches = [branch for job in jobs for branch in together.follow(job)]
-        return branches if comm.rank == 0 else []
+        if comm.rank > 0:
+            return []
+        return branches
 
     # Neighbours in the list fall to different ranks; no rank waits for another until all are followed.
     followed: dict[int, list[Branch[Any]]] = {}
@@ -162,11 +169,14 @@ class Follower:
         problem = method.problem(job)
         interruptions: tuple[type[Exception], ...] = (StoppedError, *method.failures)
         try:
-            start = branch.regular()[-1] if branch.points else method.start(problem, job)
-            # A branch that is resumed has its lower part already, or it would have no points.
             *before, direction = method.directions()
-            if before and not branch.points:
-                self._follow_down(branch, problem, start)
+            if branch.points:
+                # A branch that is resumed has its lower part already, or it would have no points.
+                start = branch.regular()[-1]
+            else:
+                start = method.start(problem, job)
+                if before:
+                    self._follow_down(branch, problem, start)
             self.grow(branch, problem, start, method.rule, direction)
         except interruptions:
             if method.finishes_failed and branch.points:
@@ -177,8 +187,10 @@ class Follower:
     def _follow_down(self, branch: Branch[Any], problem: PeriodicProblem[Any], start: Any) -> None:
         """Begin a branch with its part below the start, from the far end on."""
         down = self._begun(f"{branch.name}-down")
+        if down.points:
+            start = down.regular()[-1]
         if not down.complete:
-            self.grow(down, problem, down.regular()[-1] if down.points else start, self.method.rule, -1)
+            self.grow(down, problem, start, self.method.rule, direction=-1)
         # The part was followed away from the start: in the order of the branch its tangents are reversed.
         for p in reversed(down.points):
             branch.points.append(replace(p, tangent=-p.tangent, energy_tangent=-p.energy_tangent))
@@ -207,7 +219,9 @@ class Follower:
         # The monitor compares with all earlier points; a resumed branch has to be judged as one that never stopped.
         for point in regular:
             check(point)
-        before = regular[-2] if len(regular) > 1 else None
+        before = None
+        if len(regular) > 1:
+            before = regular[-2]
         last = continuation.point
         finding = None
         saved = time.monotonic()
@@ -268,7 +282,7 @@ class Follower:
         return fresh
 
     def _further(self, branch: Branch[Any]) -> list[Branch[Any]]:
-        """The branches that cross ``branch`` or lie beside it, as far as they are asked for."""
+        """The branches that cross ``branch``, and isolated ones near it, as far as they are asked for."""
         branches: list[Branch[Any]] = []
         for crossing in self.method.further(branch, branches):
             other = self._begun(crossing.name)
@@ -278,8 +292,9 @@ class Follower:
         return branches
 
     def _cross(self, branch: Branch[Any], crossing: CrossingBranch) -> None:
-        """Follow a ``branch`` that crosses another one or lies beside it."""
+        """Follow a ``branch`` that crosses another one, or an isolated one near it."""
         sys.audit("vipetsc.switch", branch.name)
-        problem, first = crossing.start()
-        begin = branch.regular()[-1] if branch.points else first
+        problem, begin = crossing.start()
+        if branch.points:
+            begin = branch.regular()[-1]
         self.grow(branch, problem, begin, crossing.rule)

@@ -12,7 +12,9 @@ RESPONSE_KINDS = ("regular", "fold", "neimark-sacker", "period-doubling", "branc
 
 def kinds_of(branch_kind: str) -> tuple[str, ...]:
     """Kinds of points on a branch of that kind, in the order of their codes."""
-    return RESPONSE_KINDS if branch_kind == RESPONSES else KINDS
+    if branch_kind == RESPONSES:
+        return RESPONSE_KINDS
+    return KINDS
 
 
 def stored_kinds(data: xr.Dataset) -> list[str]:

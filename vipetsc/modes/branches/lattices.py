@@ -43,7 +43,9 @@ class LatticeMethod(NnmMethod):
     def name(self, job: int) -> str:
         """The name of the branch of a mode, or of a start frequency."""
         frequencies = self.options.start_frequency
-        return f"breather-{distinct(frequencies)[job]}" if frequencies else self.system.branch_name(job)
+        if frequencies:
+            return f"breather-{distinct(frequencies)[job]}"
+        return self.system.branch_name(job)
 
     def problem(self, job: int) -> LatticeShooting:
         """The shooting equations of the lattice."""

@@ -190,8 +190,13 @@ def _taken(law: Contact, contacts: Iterable[_Contact]) -> float:
 
 
 def force_for(loss: float, amplitude: float) -> float:
-    """The force in N whose work makes up for a ``loss`` in J a period; the mass moves by ``amplitude`` in m."""
-    return loss / (np.pi * abs(amplitude)) if amplitude else np.inf
+    """The force in N whose work makes up for a ``loss`` in J a period; the mass moves by ``amplitude`` in m.
+
+    A force a quarter of a period ahead of the displacement does the work pi F |a| in a period; at a node none can.
+    """
+    if amplitude == 0:
+        return np.inf
+    return loss / (np.pi * abs(amplitude))
 
 
 def _moments(problem: Shooting, arc: Arc, period: float) -> list[_Moment]:
@@ -249,8 +254,11 @@ def _contacts_of_arc(problem: Shooting, arc: Arc, moments: list[_Moment], number
 
 def _speed(problem: Shooting, arc: Arc, moments: list[_Moment], time: float, row: np.ndarray) -> float:
     """|w'| in m/s of a contact at a ``time`` in the arc."""
+    state = arc.start
+    reached = 0.0
     before = [m for m in moments if m.time < time]
-    state = np.concatenate([before[-1].u, before[-1].v]) if before else arc.start
-    reached = before[-1].time if before else 0.0
+    if before:
+        state = np.concatenate([before[-1].u, before[-1].v])
+        reached = before[-1].time
     end = problem.flow.arc(state, time - reached, 2 * np.pi / problem.flow.omega).end
     return float(abs(row @ end[len(row) :]))

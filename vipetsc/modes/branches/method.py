@@ -14,7 +14,7 @@ Monitor = Callable[[S], str | None]
 
 
 class CrossingBranch(NamedTuple):
-    """A branch that crosses another one, or lies beside it.
+    """A branch that crosses another one, or an isolated one near it.
 
     ``start`` finds its problem and first point when it is followed; ``rule(problem, first, done)`` gives the steps and
     the end of one that has ``done`` regular points after its start.
@@ -30,7 +30,7 @@ class Method(ABC, Generic[S]):
 
     ``kind`` is the kind of their files. ``shared``: all ranks follow a branch together. ``failures`` end a branch and
     not the program. ``keeps_empty``: a branch without points leaves a file that says why. ``finishes_failed``: the
-    additions to the file of a whole branch are made for a branch that failed, too.
+    a branch that failed has the additions to the file of a whole branch, too.
     """
 
     kind: ClassVar[str]
@@ -92,7 +92,7 @@ class Method(ABC, Generic[S]):
         """Add the variables of a whole branch's file that are not of its points."""
 
     def further(self, branch: Branch[S], followed: Sequence[Branch[S]]) -> Iterator[CrossingBranch]:
-        """The branches that cross a branch, or lie beside it, and that the case asks for.
+        """The branches that cross a branch, and isolated ones near it, that the case asks for.
 
         ``followed`` has those that were followed so far, when the next one is asked for.
         """

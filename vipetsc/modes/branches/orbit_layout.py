@@ -44,7 +44,9 @@ class OrbitLayout:
 
     def table(self, branch: Branch[Point]) -> Table:
         """The table of a branch for CSV, with numbers in full precision."""
-        traces = ["half_trace"] if branch.dofs == 2 else [f"half_trace_{i + 1}" for i in range(_pairs(branch))]
+        traces = [f"half_trace_{i + 1}" for i in range(_pairs(branch))]
+        if branch.dofs == 2:
+            traces = ["half_trace"]
         names = ["energy", "frequency", "period", *(f"x{i + 1}" for i in range(branch.dofs)), *traces]
         losses = loss_columns(branch)
         names += ["multiplier_max", "slope", *losses, "contacts", "region", "kind"]
@@ -60,9 +62,11 @@ class OrbitLayout:
         traces = data["half_trace"].values + 1j * data["half_trace_imaginary"].values
         tangents = np.column_stack([data["tangent"].values, data["tangent_period"].values])
         points = []
-        # Half-traces are real but where two pairs have met: their array keeps its type through a file.
         for fields, x, tangent, c in zip(quantities(data), data["initial"].values, tangents, traces, strict=True):
-            points.append(Point(**fields, x=x, tangent=tangent, half_traces=c if np.any(c.imag != 0) else c.real))
+            # Half-traces are real but where two pairs have met: their array keeps its type through a file.
+            if not np.any(c.imag != 0):
+                c = c.real
+            points.append(Point(**fields, x=x, tangent=tangent, half_traces=c))
         return points
 
     def dofs(self, data: xr.Dataset) -> int:
@@ -72,4 +76,6 @@ class OrbitLayout:
 
 def _pairs(branch: Branch[Point]) -> int:
     """Number of half-traces of an orbit; a whole lattice's orbit has none."""
-    return len(branch.points[0].half_traces) if branch.points else branch.dofs - 1
+    if not branch.points:
+        return branch.dofs - 1
+    return len(branch.points[0].half_traces)

@@ -83,15 +83,19 @@ def map_of(options: NnmTable, system: System) -> ShootingMap:
     if options.map != "auto":
         return MAPS[options.map]
     # The quarter map assumes u(t + T/2) = -u(t), which holds for forces that change sign with the displacement.
-    return MAPS["quarter" if system.odd else "half"]
+    if system.odd:
+        return MAPS["quarter"]
+    return MAPS["half"]
 
 
 def start_energy(options: NnmTable, system: System, mode: int) -> float:
     """Energy in J of the first point of the branch of ``mode`` (from 0): well below the first touch."""
     if options.start_energy != "auto":
         return options.start_energy
-    graze = system.grazing_energy(mode)
-    energy = graze / BELOW_TOUCH if math.isfinite(graze) else ANY_ENERGY
+    energy = ANY_ENERGY
+    touching = system.grazing_energy(mode)
+    if math.isfinite(touching):
+        energy = touching / BELOW_TOUCH
     return max(energy, options.energy[0] * ABOVE_LOWEST)
 
 
@@ -131,7 +135,9 @@ class ShootingMethod(NnmMethod):
 
     def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:
         """The point with its loss, if anything dissipates."""
-        return with_loss(self.shooting, self.dissipation, point) if self.dissipation.acts else point
+        if not self.dissipation.acts:
+            return point
+        return with_loss(self.shooting, self.dissipation, point)
 
     def monitor(self, problem: PeriodicProblem[Point]) -> Monitor[Point]:
         """The check of every new point: whether the branch retraces itself, stands still or is another one."""

@@ -62,8 +62,10 @@ def assign_regions(energy: np.ndarray, slope: np.ndarray, episodes: np.ndarray, 
     region = np.ones(len(energy), np.int8)
     touched = np.nonzero(episodes > 0)[0]
     if not touched.size:
-        smooth = np.nanmax(np.abs(slope) * energy, initial=0.0) > LINEAR
-        return region * (0 if smooth else 1)
+        is_nonlinear = np.nanmax(np.abs(slope) * energy, initial=0.0) > LINEAR
+        if is_nonlinear:
+            region[:] = 0
+        return region
     region[touched[0] :] = 2
 
     peak = _peak(energy, slope, touched[0])
@@ -90,14 +92,18 @@ def _peak(energy: np.ndarray, slope: np.ndarray, first: int) -> int | None:
 
     None where the slope changes its sign after it, or too few points follow for an exponent.
     """
+    start = first
     folds = np.nonzero(np.diff(np.sign(np.diff(energy[first:]))) != 0)[0]
-    # A second difference belongs to three points: two further on, the fold is passed.
-    start = first + (folds[-1] + 2 if folds.size else 0)
+    if folds.size:
+        # A second difference belongs to three points: two further on, the fold is passed.
+        start += folds[-1] + 2
     tail = slope[start:]
     if len(tail) < FEWEST or not np.all(np.isfinite(tail) & (tail > 0)):
         return None
     peak = start + int(np.argmax(tail))
-    return peak if len(energy) - peak >= FEWEST else None
+    if len(energy) - peak < FEWEST:
+        return None
+    return peak
 
 
 def fit_slope(energy: np.ndarray, slope: np.ndarray, region: np.ndarray) -> dict[str, dict[str, float]]:
@@ -131,6 +137,11 @@ def fit_slope(energy: np.ndarray, slope: np.ndarray, region: np.ndarray) -> dict
 
 def _last_peak(slope: np.ndarray) -> int:
     """The place of the largest slope after the last that is not positive."""
+    begin = 0
     backwards = np.nonzero(~(slope > 0))[0]
-    begin = int(backwards[-1]) + 1 if backwards.size else 0
-    return begin + (int(np.argmax(slope[begin:])) if slope[begin:].size else 0)
+    if backwards.size:
+        begin = int(backwards[-1]) + 1
+    # None may follow: the largest of nothing is not defined.
+    if begin == len(slope):
+        return begin
+    return begin + int(np.argmax(slope[begin:]))

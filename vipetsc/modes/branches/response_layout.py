@@ -16,7 +16,9 @@ from vipetsc.spectra.responses import LAYOUT, OUTPUTS, Stored
 
 def outputs_of(branch: Branch[Response]) -> dict[str, Stored]:
     """The outputs that the states of a curve have."""
-    present = branch.points[0].measured.outputs if branch.points else {}
+    if not branch.points:
+        return {}
+    present = branch.points[0].measured.outputs
     return {name: stored for name, stored in OUTPUTS.items() if name in present}
 
 
@@ -28,14 +30,17 @@ def measure(branch: Branch[Response], stored: str) -> np.ndarray:
         return np.array([p.measured.harmonics.real for p in branch.points])
     if stored == "harmonics_imaginary":
         return np.array([p.measured.harmonics.imag for p in branch.points])
-    field = "fractions" if stored == "share" else stored
-    return np.array([getattr(p.measured, field) for p in branch.points])
+    if stored == "share":
+        return np.array([p.measured.fractions for p in branch.points])
+    return np.array([getattr(p.measured, stored) for p in branch.points])
 
 
 def parameter_values(branch: Branch[Response]) -> np.ndarray:
     """The value (point,) of the parameter that varies along a curve."""
     over = str(branch.about["over"])
-    return measure(branch, over if over in LAYOUT else "parameter")
+    if over in LAYOUT:
+        return measure(branch, over)
+    return measure(branch, "parameter")  # a key of the case
 
 
 class ResponseLayout:
@@ -56,8 +61,8 @@ class ResponseLayout:
             "xi": variable(("point", "unknown"), xi, "1", "unknowns"),
             "tangent": variable(("point", "unknown"), branch.column("tangent"), "1", "unit tangent"),
             "next_step": variable("point", branch.column("next_step"), "1", "arclength of the next step"),
-            "up": variable("up", np.arange(len(up)), "1", "place on the way up"),
-            "down": variable("down", np.arange(len(down)), "1", "place on the way down"),
+            "up": variable("up", np.arange(len(up)), "1", "place in the sweep up"),
+            "down": variable("down", np.arange(len(down)), "1", "place in the sweep down"),
             "up_point": variable("up", up, "1", passed),
             "down_point": variable("down", down, "1", "points visited as the parameter decreases slowly"),
         }
@@ -78,6 +83,7 @@ class ResponseLayout:
         for name, stored in (LAYOUT | outputs_of(branch)).items():
             if "order" in stored.dimensions:
                 continue
+
             values = measure(branch, name).reshape(count, -1)
             if name in OUTPUTS and stored.dimensions not in ("", "site"):
                 labels = branch.extra[stored.dimensions].values
@@ -86,6 +92,7 @@ class ResponseLayout:
                 columns[name] = values[:, 0].tolist()
             else:
                 columns |= {f"{name}_{i}": column.tolist() for i, column in enumerate(values.T, 1)}
+
         columns["kind"] = [p.kind for p in branch.points]
         rows = [[str(value) for value in row] for row in zip(*columns.values(), strict=True)]
         return Table(list(columns), rows)
@@ -94,9 +101,8 @@ class ResponseLayout:
         """The states of a file."""
         points = []
         # Numbers are not stored: a fold has that of the regular point after it.
-        regular = -1
+        index = 0
         for i, kind in enumerate(stored_kinds(data)):
-            regular += kind == "regular"
             row = {name: data[name].values[i] for name in LAYOUT if name in data}
 
             measures = Measures(
@@ -118,12 +124,13 @@ class ResponseLayout:
                 Response(
                     xi=data["xi"].values[i],
                     tangent=data["tangent"].values[i],
-                    index=regular if kind == "regular" else regular + 1,
+                    index=index,
                     next_step=float(data["next_step"].values[i]),
                     kind=kind,
                     measures=measures,
                 )
             )
+            index += kind == "regular"
         return points
 
     def dofs(self, data: xr.Dataset) -> int:
@@ -138,8 +145,10 @@ def sweep_up(branch: Branch[Response]) -> list[int]:
 
 def sweep_down(branch: Branch[Response]) -> list[int]:
     """States that a slow fall of the parameter passes, from the last of the sweep up."""
-    way_up = sweep_up(branch)
-    return swept(_sweep(branch, -1), way_up[-1]) if way_up else []
+    passed = sweep_up(branch)
+    if not passed:
+        return []
+    return swept(_sweep(branch, -1), passed[-1])
 
 
 def _sweep(branch: Branch[Response], sign: int) -> ParameterSweep:
@@ -148,9 +157,11 @@ def _sweep(branch: Branch[Response], sign: int) -> ParameterSweep:
     stable = measure(branch, "unstable") == 0
     fold = branch.is_kind("fold")
     parameter = sign * parameter_values(branch)
-    # Without contacts the first spring that is not linear stands for the state.
-    size = measure(branch, "largest" if branch.dofs else "largest_elongation")[:, 0]
-    return ParameterSweep(parameter, size=size, stable=with_stable_folds(stable, fold))
+    # The first contact stands for the state; without contacts the first spring that is not linear.
+    name = "largest_elongation"
+    if branch.dofs:
+        name = "largest"
+    return ParameterSweep(parameter, size=measure(branch, name)[:, 0], stable=with_stable_folds(stable, fold))
 
 
 def _complex(real: np.ndarray, imaginary: np.ndarray) -> np.ndarray:

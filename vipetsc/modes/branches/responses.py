@@ -29,7 +29,7 @@ from vipetsc.modes.response.steps import TurningSteps, first_state
 from vipetsc.modes.response.swept import swept_states
 from vipetsc.spectra.measures import JOINT
 
-# Between the name of a curve and the number of an isolated one beside it.
+# Between the name of a curve and the number of an isolated one near it.
 ISOLA = "-isola-"
 
 
@@ -54,9 +54,10 @@ class ResponseMethod(Method[Response]):
         return list(range(len(case.every_curve())))
 
     def new_branch(self, name: str) -> Branch[Response]:
-        """A curve without states, or an isolated one beside it."""
+        """A curve without states, or an isolated one near it."""
         base, isola, number = name.partition(ISOLA)
         curve = next(curve for curve in self.curves if curve.name == base)
+
         about: dict[str, Any] = {"over": curve.case.nfrc.over, "restitution": curve.restitution}
         if curve.case.nfrc.varies_key:
             about["unit"] = unit_of(curve.case.nfrc.over, curve.case.model_dump(by_alias=True, exclude_none=True))
@@ -64,6 +65,7 @@ class ResponseMethod(Method[Response]):
             about["isola"] = number
         if curve.values:
             about["family"] = curve.values
+
         return Branch(
             name=name,
             case=curve.case.to_toml(),
@@ -99,12 +101,12 @@ class ResponseMethod(Method[Response]):
         return TurningSteps(problem, max(self.case.nfrc.points - 1 - done, 0))
 
     def further(self, branch: Branch[Response], followed: Sequence[Branch[Response]]) -> Iterator[CrossingBranch]:
-        """The isolated curves that are found beside a curve, in both directions where they are not closed."""
+        """The isolated curves that are found near a curve, in both directions where they are not closed."""
         if not (self.case.nfrc.isolas and branch.complete):
             return
         states = self.problem(next(job for job in self.jobs(self.case) if self.name(job) == branch.name))
 
-        def known() -> list[list[Response]]:
+        def curves_so_far() -> list[list[Response]]:
             return [branch.points, *(other.points for other in followed)]
 
         search = self.case.nfrc.isola_search
@@ -119,8 +121,8 @@ class ResponseMethod(Method[Response]):
         number = 0
         for p, candidates in zip(places.tolist(), of_places, strict=True):
             if "amplitudes" in search:
-                candidates += over_amplitudes(states, known(), p)
-            for xi in unknown_states(states, known, candidates):
+                candidates += over_amplitudes(states, curves_so_far(), p)
+            for xi in unknown_states(states, curves_so_far, candidates):
                 number += 1
                 start = Response(xi=xi, next_step=states.options.first_step)
                 first = replace(start, tangent=states.first_tangent(start, 1))
@@ -157,6 +159,7 @@ def _axes(case: NfrcCase) -> Variables:
         "way": variable("way", np.array(WAYS), "1", "destination of the energy"),
         "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
     }
+
     if not chain.is_linear:
         labels = [f"{place.cell + 1}.{place.number + 1}" for place in nonlinear_places(chain)]
         text = "cell in which a nonlinear spring begins (0: left wall), and its number there, both from 1"

@@ -60,7 +60,7 @@ def _states_across(sweep: ParameterSweep, i: int, passed: set[int]) -> list[int]
     p = sweep.parameter
     ahead = []
     for j in range(len(p) - 1):
-        low, high = (j, j + 1) if p[j] <= p[j + 1] else (j + 1, j)
+        low, high = sorted((j, j + 1), key=p.__getitem__)
         passes = p[low] <= p[i] < p[high]
         if passes and sweep.stable[low] and sweep.stable[high] and not {low, high} & passed:
             ahead.append(high)

@@ -190,7 +190,9 @@ class Continuation(Generic[S]):
         self.point = self.passed = start
         if not start.tangent.size:
             self.point = replace(start, tangent=problem.first_tangent(start, direction))
-        self.step = self.rule.first_step if step is None else step
+        self.step = self.rule.first_step
+        if step is not None:
+            self.step = step
         self.ending = "not finished"
         self.finished = False
 
@@ -243,4 +245,6 @@ def _rule(problem: Any, control: Any) -> Any:
 
     Such a section is only given with a problem whose points are orbits, which types cannot say: hence Any.
     """
-    return GuardedSteps(problem, control) if isinstance(control, NnmTable) else control
+    if isinstance(control, NnmTable):
+        return GuardedSteps(problem, control)
+    return control

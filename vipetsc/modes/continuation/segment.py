@@ -126,8 +126,9 @@ class Segment(Generic[S]):
 
         # Nearer ends give better guesses, and a Newton step that left the segment may stay in its half.
         first, second = self.split()
-        inside = first if kind.test(first.left) * kind.test(first.right) < 0 else second
-        return inside.root(kind, halvings - 1)
+        if kind.test(first.left) * kind.test(first.right) < 0:
+            return first.root(kind, halvings - 1)
+        return second.root(kind, halvings - 1)
 
     def _find(self, kind: SpecialKind[S], seek: bool) -> S:
         """The point where a test vanishes, by the kind's own equations if it has some and ``seek``, or bracketed."""
@@ -152,8 +153,10 @@ class Segment(Generic[S]):
 
     def split(self, arclength: float | None = None) -> "tuple[Segment[S], Segment[S]]":
         """The parts before and after an arclength, or about the middle; raises ArithmeticError if there is none."""
-        places = self.length * MIDDLES if arclength is None else [arclength]
-        for place in places:
+        places = self.length * MIDDLES
+        if arclength is not None:
+            places = np.array([arclength])
+        for place in places.tolist():
             with suppress(ArithmeticError):
                 middle = self.at(place)
                 return self.between(self.left, middle, self.begin), self.between(middle, self.right, self.begin + place)
@@ -165,6 +168,10 @@ def _turn(*values: tuple[float, float]) -> float | None:
     (x0, z), (x1, a), (x2, b) = values
     bend = ((b - a) / (x2 - x1) - (z - a) / (x0 - x1)) / (x2 - x0)
     slope = (b - a) / (x2 - x1) - bend * (x2 - x1)
-    at = -slope / (2 * bend) if bend else x1
+    if bend == 0:
+        return None
+    at = -slope / (2 * bend)
     top = a + slope * at / 2
-    return at if x1 < at < x2 and top * np.sign(a) < NEAR * min(abs(a), abs(b)) else None
+    if x1 < at < x2 and top * np.sign(a) < NEAR * min(abs(a), abs(b)):
+        return at
+    return None

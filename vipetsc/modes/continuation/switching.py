@@ -46,8 +46,13 @@ def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooti
     astray, parts of it are tried. The tolerance is what the map's rounding at the special point allows. Raises
     ContinuationError if no map has a second null direction, or no orbit off the old branch is found.
     """
+    # An orbit over a quarter of its period has two symmetries, and a crossing branch may lack either.
+    names: tuple[str, ...] = (old.map.name,)
+    if old.map.quarter:
+        names = ("quarter", "half", "half-centre")
+
     singular: list[str] = []
-    for name in ("quarter", "half", "half-centre") if old.map.quarter else (old.map.name,):
+    for name in names:
         crossing = _crossing(old, point, name, singular)
         if crossing is not None:
             return crossing.problem, _first_point(crossing, point, amplitude)
@@ -102,7 +107,9 @@ def _first_point(crossing: Crossing, point: Point, amplitude: float) -> Point:
 
 def _re_expressed(old: Shooting, point: Point, new: Shooting) -> tuple[np.ndarray, float]:
     """Initial values and period of a special point's orbit for another map; the period is doubled where it doubles."""
-    period = (2 if point.kind == "period-doubling" else 1) * point.period
+    period = point.period
+    if point.kind == "period-doubling":
+        period *= 2
     if old.map.start == new.map.start:
         return point.x, period
     return old.end(old.arc(point.x, point.period))[old.system.dofs :], period  # the centre of a quarter-period orbit

@@ -73,7 +73,10 @@ def with_multipliers(
 
     If SLEPc fails, the point has no multipliers, ``multiplier`` is NaN, and the log says why.
     """
-    count = MULTIPLIERS if wanted is True else int(wanted)
+    # ``True`` asks for multipliers without a number.
+    count = int(wanted)
+    if wanted is True:
+        count = MULTIPLIERS
     try:
         largest = largest_multipliers(flow, system, odd, u, point.period, count)
     except (PETSc.Error, np.linalg.LinAlgError) as error:
@@ -97,7 +100,12 @@ def largest_multipliers(
     comm = flow.comm
     start = np.append(u, 0 * u)
     omega = 2 * np.pi / period
-    arc = flow.arc(flow.scatter(start), period / (2 if odd else 1))
+    duration = period
+    sign = 1
+    if odd:
+        duration = period / 2
+        sign = -1
+    arc = flow.arc(flow.scatter(start), duration)
     scale = flow.scatter(np.sqrt(np.append(omega**2 * system.masses, system.masses)))
 
     # The direction of the motion itself, by its acceleration: it starts at rest.
@@ -106,7 +114,7 @@ def largest_multipliers(
     noise = NOISE * np.random.default_rng(1).standard_normal(len(start))
     seed = flow.scatter(noise + np.tile(system.contact_rows.sum(axis=0), 2))
 
-    monodromy = Monodromy(arc, scale, -1 if odd else 1)
+    monodromy = Monodromy(arc, scale, sign)
     try:
         basis = _krylov_basis(monodromy, phase, seed, wanted, comm)
         if not len(basis):
@@ -116,7 +124,9 @@ def largest_multipliers(
         arc.engine.destroy()
 
     order = np.argsort(-np.abs(values), kind="stable")[:wanted]
-    largest = values[order] ** 2 if odd else values[order]
+    largest = values[order]
+    if odd:
+        largest = largest**2
     return np.stack([largest, residuals[order].astype(complex)], axis=-1)
 
 
