@@ -1,4 +1,4 @@
-"""Modules of users, which register parts (``vipetsc.register``): how they are located, imported and told apart.
+"""Modules of users, which register parts (``vipetsc.register``): how they are located, imported and distinguished.
 
 A module is named by a file ending in ``.py``, by an entry point of the group ``vipetsc.plugins``, or as Python imports
 it, in this order, as pytest takes the name behind ``-p``. What is installed is imported only where a case names it.
@@ -89,7 +89,9 @@ def located(name: str, folder: Path) -> str:
         return name
     path = (folder / name).resolve()
     here = Path(path.name).resolve()
-    return str(here if here.is_file() and not path.is_file() else path)
+    if here.is_file() and not path.is_file():
+        return str(here)
+    return str(path)
 
 
 def load(name: str) -> Plugin:
@@ -108,10 +110,15 @@ def load(name: str) -> Plugin:
 def _imported(name: str) -> Plugin:
     """The module ``name``, imported."""
     earlier = _every_module()
-    entry = None if is_file(name) else next(iter(metadata.entry_points(group=GROUP, name=name)), None)
     try:
-        installed = entry.module if entry else name
-        module = _from_file(Path(name)) if is_file(name) else importlib.import_module(installed)
+        if is_file(name):
+            module = _from_file(Path(name))
+        else:
+            entry = next(iter(metadata.entry_points(group=GROUP, name=name)), None)
+            installed = name
+            if entry:
+                installed = entry.module
+            module = importlib.import_module(installed)
     except PluginError:
         raise
     # SystemExit: a script that ends its process, imported by mistake.

@@ -22,8 +22,11 @@ ALLOCATIONS = 10_000  # of objects that may hold others, between two searches fo
 
 def launched_rank() -> int | None:
     """The rank of this process in its job; None if it was not launched as one of several."""
-    ranks = [os.environ[name] for name in RANKS if os.environ.get(name, "").isdigit()]
-    return int(ranks[0]) if ranks else None
+    for name in RANKS:
+        rank = os.environ.get(name, "")
+        if rank.isdigit():
+            return int(rank)
+    return None
 
 
 @contextmanager
@@ -32,7 +35,9 @@ def quick_start_alone() -> Iterator[None]:
 
     What the environment already says stays as it is.
     """
-    added = {} if launched_rank() is not None else {name: ALONE[name] for name in ALONE if name not in os.environ}
+    added: dict[str, str] = {}
+    if launched_rank() is None:
+        added = {name: value for name, value in ALONE.items() if name not in os.environ}
     os.environ.update(added)
     try:
         yield
@@ -98,8 +103,9 @@ class CompileClock:
     @property
     def seconds(self) -> float:
         """Time in s until now."""
-        running = time.monotonic() - self._begin if self._depth else 0.0
-        return self._seconds + running
+        if self._depth == 0:
+            return self._seconds
+        return self._seconds + time.monotonic() - self._begin
 
     def start(self) -> None:
         """Begin to compile a kernel; one that it calls may begin meanwhile."""
@@ -109,7 +115,8 @@ class CompileClock:
 
     def stop(self) -> None:
         """End what was begun last."""
-        self._seconds = self.seconds if self._depth == 1 else self._seconds
+        if self._depth == 1:
+            self._seconds = self.seconds
         self._depth -= 1
 
 

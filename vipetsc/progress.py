@@ -57,9 +57,10 @@ class Progress:
             self._leave_out_compiling()
             self._bar.update(done - self._bar.n)
         elif self._show and now - self._last >= LINE_EVERY:
+            left = float("inf")
             worked = self._worked()
-            rate = (done - self._first) / worked if worked > 0 else 0.0
-            left = (self._total - done) / rate if rate > 0 else float("inf")
+            if worked > 0 and done > self._first:
+                left = (self._total - done) * worked / (done - self._first)
             say(f"{self._position()}, {left:.0f} s left")
             self._last = now
 
@@ -83,7 +84,9 @@ class Progress:
 
     def _position(self) -> str:
         """How much of the total is done."""
-        percent = 100 * self._done / self._total if self._total else 100.0
+        percent = 100.0
+        if self._total:
+            percent = 100 * self._done / self._total
         return f"{percent:3.0f} %  {self._done:.4g} of {self._total:.4g} {self._unit}"
 
 

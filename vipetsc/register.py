@@ -154,6 +154,7 @@ def elastic_law(
         raise ValueError(f"the law {name!r} begins with the power {onset_exponent}; at least 1 is needed")
     for function in (force, slope, energy):
         _check_arguments(function, ("x", "k", *taken), f"of the law {name!r}")
+
     part = LawPart(
         force=force,
         slope=slope,
@@ -276,7 +277,9 @@ def reserve(kind: str, names: Iterable[str]) -> None:
 def file_digest(file: str) -> str:
     """SHA-256 of a source ``file``; empty where there is none, as of what is typed in."""
     path = Path(file)
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+    if not path.is_file():
+        return ""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _origin(name: str, function: Callable[..., Any]) -> dict[str, Any]:

@@ -62,11 +62,14 @@ def _is_running(process: int) -> bool:
 
 def unwritten(path: Path, error: Exception) -> OSError:
     """An OSError with the number of ``error``, from Python or from HDF5, that names the file that was not written."""
-    number = getattr(error, "errno", None)
-    in_text = re.search(r"errno = (\d+)", str(error))  # HDF5 says it in its message alone
-    if not number:
-        number = int(in_text[1]) if in_text else 0
-    reason = os.strerror(number) if number else str(error)
+    number = getattr(error, "errno", None) or 0
+    in_text = re.search(r"errno = (\d+)", str(error))
+    if not number and in_text:
+        # HDF5 says it in its message alone.
+        number = int(in_text[1])
+    reason = str(error)
+    if number:
+        reason = os.strerror(number)
     return OSError(
         number, f"{path} could not be written: {reason}; after the cause is removed, the same command continues"
     )
@@ -109,7 +112,8 @@ def load_arrays(path: Path, wanted: Collection[str] | None = None, copy: bool = 
     """
     try:
         record = npy.open_memmap(path, mode="r", max_header_size=2**32)  # type: ignore[call-arg]
-        names = record.dtype.names if wanted is None else wanted
-        return {name: np.array(record[name], copy=copy) for name in names}
+        if wanted is None:
+            wanted = record.dtype.names or ()
+        return {name: np.array(record[name], copy=copy) for name in wanted}
     except (OSError, ValueError) as error:
         raise OSError(f"{path} cannot be read: {error}") from error

@@ -12,6 +12,7 @@ from vipetsc.io.atomic import atomic_write, write_text
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.chunks import FORCES, MOTION
 from vipetsc.io.read import field_time, open_results, open_run
+from vipetsc.wording import with_unit
 
 MOST_FRAMES = 5000  # of a run with more samples, every n-th; a frame takes about 1 kB of the text
 MOST_ROWS = 1_000_000  # of a table
@@ -54,7 +55,9 @@ def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str]) -> 
     _child(grid, "Topology", TopologyType="2DCoRectMesh", Dimensions=mesh)
     geometry = _child(grid, "Geometry", GeometryType="ORIGIN_DXDY")
     # Cells along the slow axis, as the datasets have them; a single cell has no spacing of its own.
-    spacing = cells[1] - cells[0] if len(cells) > 1 else 1
+    spacing = 1
+    if len(cells) > 1:
+        spacing = cells[1] - cells[0]
     _child(geometry, "DataItem", _words((cells[0], 1)), Dimensions="2", Format="XML")
     _child(geometry, "DataItem", _words((spacing, 1)), Dimensions="2", Format="XML")
 
@@ -94,14 +97,17 @@ def write_curves(path: Path) -> list[Path]:
     Variables over the same dimensions are one table, with a row a point, their coordinates first, units in the head.
     That of the designs of a search has a column for each variable, objective and constraint, that of a frequency
     response one for each named mass, contact and wall.
-    Of a run with ``analysis.h5`` beside it there is a table of its numbers, ``analysis-measures.csv``, and where they
-    were recorded ``run-points.csv`` and ``run-forces.csv``, with a column for each point and site. Fields and maps,
-    over other dimensions than the axes of a sweep, are left out. Raises as ``open_results``.
+    Of a run with ``analysis.h5`` in the same folder there is a table of its numbers, ``analysis-measures.csv``, and
+    where they were recorded ``run-points.csv`` and ``run-forces.csv``, with a column for each point and site. Fields
+    and maps, over other dimensions than the axes of a sweep, are left out. Raises as ``open_results``.
     """
     written = []
     with open_results(path) as data:
         source = Path(data.encoding.get("source", path / "ensemble.h5"))
-        axes = data["status"].dims if "status" in data else ()
+        # Of a sweep: a status of each member.
+        axes: tuple[Any, ...] = ()
+        if "status" in data:
+            axes = data["status"].dims
         groups: dict[tuple[str, ...], list[str]] = {}
         for name, item in data.data_vars.items():
             if len(item.dims) == 1 or (axes and item.dims == axes):
@@ -112,14 +118,16 @@ def write_curves(path: Path) -> list[Path]:
                 continue
             table = data[names].assign(_columns_of_designs(data, dims) | _columns_of_responses(data, dims))
             foreign = [name for name, item in table.coords.items() if not set(item.dims) <= set(dims)]
-            over = "members" if dims == axes else "-".join(dims)
+            over = "-".join(dims)
+            if dims == axes:
+                over = "members"
             stem = f"{source.stem}-{over}".replace("/", "-")
             path_of_table = source.parent / "curves" / f"{stem}.csv"
             written.append(_write_table(path_of_table, table.drop_vars(foreign)))
         written += _write_wide(data, source)
 
-    # The numbers of a run are in the file beside it.
-    measured = source if source.name == ANALYSIS else source.with_name(ANALYSIS)
+    # The numbers of a run are in another file of its folder.
+    measured = source.with_name(ANALYSIS)
     if source.name in ("run.h5", ANALYSIS) and measured.exists():
         with open_results(measured) as analysis:
             numbers = _numbers(analysis)
@@ -134,7 +142,9 @@ def _columns_of_designs(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr
     for name, label in OF_DESIGNS.items():
         if name not in data or data[name].dims != (*dims, label):
             continue
-        units = data["unit"].values if label == "variable" else ["1"] * data.sizes[label]
+        units = ["1"] * data.sizes[label]
+        if label == "variable":
+            units = data["unit"].values.tolist()
         for text, unit, values in zip(data[label].values, units, data[name].values.T, strict=True):
             columns[str(text)] = xr.DataArray(values, dims=dims, attrs={"units": unit})
     return columns
@@ -192,8 +202,10 @@ def _write_table(path: Path, table: xr.Dataset) -> Path:
     frame = table.to_dataframe().reset_index()
     heads = []
     for name in frame.columns:
-        unit = table[name].attrs.get("units", "1") if name in table.variables else "1"
-        heads.append(name if unit in ("1", "") else f"{name} ({unit})")
+        unit = "1"
+        if name in table.variables:
+            unit = table[name].attrs.get("units", "1")
+        heads.append(with_unit(name, unit))
     frame.columns = heads
     return _write_frame(path, frame)
 

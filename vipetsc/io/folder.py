@@ -158,7 +158,10 @@ def _claim(
             raise FolderError(f"{path}: {problem}")
     else:
         discard(aside)
-        folder = aside if filled else path
+        folder = path
+        if filled:
+            # Until the new results are complete, the old ones stay where they are.
+            folder = aside
         folder.mkdir(exist_ok=True)
 
     if not going_on or _text_of(folder / kind.marker) != text:
@@ -200,14 +203,18 @@ def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference |
             differing.append(f"{key} = {values[0]} there, {values[1]} here")
     if not differing:
         return None
-    more = f"; and {len(differing) - MOST_NAMED} more" if len(differing) > MOST_NAMED else ""
-    return f"contains another {kind.noun}: {'; '.join(differing[:MOST_NAMED])}{more}; {remedy}"
+    shown = "; ".join(differing[:MOST_NAMED])
+    if len(differing) > MOST_NAMED:
+        shown += f"; and {len(differing) - MOST_NAMED} more"
+    return f"contains another {kind.noun}: {shown}; {remedy}"
 
 
 def _shown(value: Any) -> str:
     """A value as a message shows it; of one long word, such as a hash, its beginning."""
     text = str(value)
-    return f"{text[:16]}..." if len(text) > 60 and " " not in text else shorten(text, 60)
+    if len(text) > 60 and " " not in text:
+        return f"{text[:16]}..."
+    return shorten(text, 60)
 
 
 def _text_of(path: Path) -> str:

@@ -48,9 +48,10 @@ def kept_arrays(kind: str, content: Iterable[bytes], compute: Callable[[], Array
 
 def cache_folder() -> Path:
     """The folder of the user's cache, which need not exist."""
-    # The standard ignores a path that is not absolute.
-    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    parent = named if named.is_absolute() else Path(os.path.expanduser("~/.cache"))
+    parent = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if not parent.is_absolute():
+        # The standard has such a path ignored.
+        parent = Path(os.path.expanduser("~/.cache"))
     return parent / "vipetsc"
 
 
@@ -65,7 +66,9 @@ def _read(path: Path) -> dict[str, np.ndarray] | None:
     # A damaged header gives numpy's ValueError, EOFError or SyntaxError, a lost name KeyError.
     except (OSError, ValueError, EOFError, SyntaxError, KeyError):
         return None
-    return arrays if np.array_equal(checksum, _checksum(arrays)) else None
+    if not np.array_equal(checksum, _checksum(arrays)):
+        return None
+    return arrays
 
 
 def _checksum(arrays: Arrays) -> np.ndarray:

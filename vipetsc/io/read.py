@@ -73,13 +73,17 @@ def open_results(path: str | Path) -> xr.Dataset:
 
 def field_time(run: xr.Dataset) -> np.ndarray:
     """Times (t) in s of the fields: ``time``, or every n-th of it."""
-    return run["field_time" if "field_time" in run else "time"].values
+    if "field_time" in run:
+        return run["field_time"].values
+    return run["time"].values
 
 
 def field_interval(run: xr.Dataset) -> float:
     """Sampling interval of the fields in s; NaN for a single sample."""
     time = field_time(run)
-    return float(time[1] - time[0]) if len(time) > 1 else np.nan
+    if len(time) < 2:
+        return np.nan
+    return float(time[1] - time[0])
 
 
 def leading_site(run: xr.Dataset) -> int | None:
@@ -138,9 +142,10 @@ def over_samples(ensemble: xr.Dataset) -> xr.Dataset:
 
 def outdated(folder: Path) -> str:
     """Message about a sweep of an earlier version, which has a folder for every member; empty for one of this."""
+    if not (folder / "linear").is_dir():
+        return ""
     remedy = "repeat the sweep with --force, or in another folder with --out"
-    text = f"{folder}: contains a sweep of an earlier version, with a folder for each member; {remedy}"
-    return text if (folder / "linear").is_dir() else ""
+    return f"{folder}: contains a sweep of an earlier version, with a folder for each member; {remedy}"
 
 
 def select(data: Selectable, **wanted: Any) -> Selectable:
@@ -163,9 +168,11 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
         dimension = str(data[name].dims[0])
         matches[dimension] = matches.get(dimension, np.array(True)) & match
         if not matches[dimension].any():
+            sought = f"{name} = {value!r}"
             others = [n for n in wanted if n != name and n in data.coords and data[n].dims == data[name].dims]
-            with_others = f" at the given {', '.join(others)}" if others else ""
-            raise KeyError(f"no member has {name} = {value!r}{with_others}; the values are {list(coordinate)}")
+            if others:
+                sought += f" at the given {', '.join(others)}"
+            raise KeyError(f"no member has {sought}; the values are {list(coordinate)}")
 
     return data.isel({dimension: int(np.argmax(match)) for dimension, match in matches.items()})
 

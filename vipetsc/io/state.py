@@ -44,7 +44,9 @@ class State(NamedTuple):
                 origin = {"orbit": row + 1, "period": float(file["states/period"][row])}
             elif u.ndim == 3:
                 times = file[str(u.dims[0])].values
-                interval = float(times[1] - times[0]) if len(times) > 1 else np.inf
+                interval = np.inf
+                if len(times) > 1:
+                    interval = float(times[1] - times[0])
                 row = _row(times, time, 0.5 * interval, f"{path} has samples in s")
                 origin = {"time": float(times[row]), "case": file.attrs.get("case")}
             if u.ndim == 3:  # read one state, not all

@@ -110,7 +110,12 @@ class RunFolder:
         Raises OSError on all ranks if one cannot write.
         """
         path = self._chunk(self.count, self.comm.rank)
-        on_every_rank(self.comm, lambda: None if chunk is None else save_arrays(path, chunk))
+
+        def save() -> None:
+            if chunk is not None:
+                save_arrays(path, chunk)
+
+        on_every_rank(self.comm, save)
         self.count += 1
 
     def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
@@ -214,7 +219,9 @@ class RunFolder:
 
     def _write(self, path: Path, contents: _Contents) -> None:
         """Write a file of the run to ``path``, together with the other writers."""
-        together = {"driver": "mpio", "comm": self.comm} if self.recording.together else {}
+        together: dict[str, Any] = {}
+        if self.recording.together:
+            together = {"driver": "mpio", "comm": self.comm}
         log = contents.log
         columns = chunks.log_columns(log.rows, log.first)
         sizes = {**contents.small.sizes, "episode": log.total}
@@ -224,7 +231,9 @@ class RunFolder:
             large = {}
             for name in (*columns, *self.recording.of_sites, *self.recording.fields):
                 description = chunks.described(name, contents.small)
-                dtype = columns[name].dtype if name in columns else float
+                dtype = np.dtype(float)
+                if name in columns:
+                    dtype = columns[name].dtype
                 about = description.attributes | chunks.coordinates(name)
                 shape = [sizes[dim] for dim in description.dims]
                 large[name] = add_variable(file, name, description.dims, shape, dtype, about)

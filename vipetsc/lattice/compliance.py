@@ -183,7 +183,7 @@ class WaveCompliance:
         u = solution.unknowns[0, :, 0]
         amplitudes = np.array([u[-half:], u[size : size + half]])
         if wave is not None:
-            row = 0 if wave.direction > 0 else 1
+            row = int(wave.direction < 0)
             amplitudes[row, wave.channel] += self._transmitted(wave, amplitude, waves)
 
         unit_flux = np.empty((2, half))
@@ -195,15 +195,15 @@ class WaveCompliance:
 
     def _transmitted(self, wave: IncidentWave, amplitude: complex, waves: BlochWaves) -> complex:
         """Amplitude behind the last loaded cell, scaled as ``waves``, of an incident ``wave`` of ``amplitude`` in m."""
-        half = waves.factor.shape[1] // 2
-        channel = wave.channel if wave.direction > 0 else wave.channel + half
+        channel = wave.channel
+        steps = self.cells[-1] + 1 - wave.origin
+        if wave.direction < 0:
+            # Waves to lower cells come after those to higher ones.
+            channel += waves.factor.shape[1] // 2
+            steps = self.cells[0] - wave.origin
         state = waves.state[0, :, channel]
         shape = cell_between(self.chain.cell, waves, state, wave.factor * state)
         scale = wave.shape[self.chain.cell.host] / shape[self.chain.cell.host]
-
-        steps = self.cells[0] - wave.origin
-        if wave.direction > 0:
-            steps = self.cells[-1] + 1 - wave.origin
         return complex(amplitude * scale * wave.factor**steps)
 
     def _stretches(self) -> list[Stretch]:
@@ -307,13 +307,16 @@ class WaveCompliance:
         """Position of a ``cell`` in a ``stretch``, from 1; up to 0 in one without a beginning; None outside."""
         cells = self.cells
         if stretch.left is None:
-            return 1 - (cells[0] - cell) if cell < cells[0] else None
+            if cell >= cells[0]:
+                return None
+            return 1 - (cells[0] - cell)
 
         place = cell - cells[stretch.left]
         if not self.infinite:
             place %= self.chain.cells
-        inside = place > 0 and (stretch.right is None or place <= stretch.length)
-        return place if inside else None
+        if place > 0 and (stretch.right is None or place <= stretch.length):
+            return place
+        return None
 
 
 def _relative_motion(pair: Pair, shape: np.ndarray, factor: complex) -> complex:
@@ -336,7 +339,9 @@ def _right_half(omegas: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
 def _propagating_channel(factor: np.ndarray, direction: int, wavenumber: float) -> int:
     """Number of the wave of ``factor`` (2r,) in a ``direction`` that does not decay, with ``wavenumber`` in (0, pi)."""
     half = len(factor) // 2
-    channels = range(half) if direction > 0 else range(half, 2 * half)
+    channels = range(half)
+    if direction < 0:
+        channels = range(half, 2 * half)
 
     def mismatch(n: int) -> float:
         return float(abs(abs(np.angle(factor[n])) - wavenumber) + abs(1 - abs(factor[n])))

@@ -65,7 +65,9 @@ def registered_factor(name: str) -> DissipationPart | None:
 def least_restitution(factor: str) -> float:
     """The smallest restitution that the dissipation ``factor`` of that name takes."""
     registered = registered_factor(factor)
-    return registered.least_restitution if registered else LEAST_RESTITUTION.get(factor, 0.0)
+    if registered:
+        return registered.least_restitution
+    return LEAST_RESTITUTION.get(factor, 0.0)
 
 
 def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
@@ -111,8 +113,9 @@ class Contact:
 
     def __str__(self) -> str:
         about = f"restitution {self.restitution:g}, effective {self.effective_restitution:.3f}"
-        named = "" if self.factor == "paper" else f" ({self.factor})"
-        return f"{self.law}, {self.stiffness:.6g} N/m^{self.onset_exponent:g}, {about}{named}"
+        if self.factor != "paper":
+            about += f" ({self.factor})"
+        return f"{self.law}, {self.stiffness:.6g} N/m^{self.onset_exponent:g}, {about}"
 
     @property
     def onset_exponent(self) -> float:
@@ -140,14 +143,16 @@ class Contact:
 
     def elastic_slope(self, x: ArrayLike) -> np.ndarray:
         """df/dx in N/m at the indentation ``x`` in m; for x <= 0 that of a contact that has just closed."""
-        x, n = np.maximum(x, 0.0), self.onset_exponent
+        x = np.maximum(x, 0.0)
+        n = self.onset_exponent
         if self.law not in LAWS:
             return self._registered_values("slope", x)
         return n * self.stiffness * x ** (n - 1)
 
     def elastic_energy(self, x: ArrayLike) -> np.ndarray:
         """The integral of f in J from 0 to the indentation ``x`` in m; zero for x <= 0."""
-        x, n = np.maximum(x, 0.0), self.onset_exponent
+        x = np.maximum(x, 0.0)
+        n = self.onset_exponent
         if self.law not in LAWS:
             return self._registered_values("energy", x)
         return self.stiffness * x ** (n + 1) / (n + 1)

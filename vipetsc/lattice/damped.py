@@ -142,4 +142,6 @@ def decay_length(cell: UnitCell, omega: float) -> float:
     """Cells in which the wave of ``omega`` (rad/s) that goes farthest decays by 1/e; inf without damping."""
     growth = np.abs(np.log(np.abs(damped_waves(cell, omega).factor)))
     slowest = growth.min()
-    return float(1 / slowest) if slowest > NEUTRAL else np.inf
+    if slowest <= NEUTRAL:
+        return np.inf
+    return float(1 / slowest)

@@ -47,7 +47,9 @@ class ToneBurst:
     @property
     def duration(self) -> float:
         """Length of the burst in s; 0 of none."""
-        return 2 * np.pi * self.cycles / self.frequency if self.amplitude else 0.0
+        if not self.amplitude:
+            return 0.0
+        return 2 * np.pi * self.cycles / self.frequency
 
     @property
     def settled(self) -> float:
@@ -62,7 +64,9 @@ class ToneBurst:
     @property
     def window_amplitude(self) -> float:
         """The factor in N before 1 - cos."""
-        return self.amplitude if self.envelope == "paper" else self.amplitude / 2
+        if self.envelope == "paper":
+            return self.amplitude
+        return self.amplitude / 2
 
     @property
     def peak(self) -> float:
@@ -134,7 +138,9 @@ class Pieces:
         table = table.copy()
         for name in COEFFICIENTS:
             table[name] *= amplitude
-        length = duration if np.isfinite(duration) else table["start"][-1]
+        length = duration
+        if not np.isfinite(duration):
+            length = table["start"][-1]
         return cls(
             amplitude=amplitude,
             frequency=frequency,
@@ -147,7 +153,9 @@ class Pieces:
     @property
     def settled(self) -> float:
         """Time in s from which on the force is at rest or repeats itself: the end, or that of the ramp without one."""
-        return self.duration if np.isfinite(self.duration) else float(self.table["start"][-1])
+        if np.isfinite(self.duration):
+            return self.duration
+        return float(self.table["start"][-1])
 
     @property
     def breaks(self) -> np.ndarray:
@@ -280,7 +288,9 @@ def ramped(
     no sine, but a step. ``ramp`` is at most half the duration.
     """
     ends = np.isfinite(duration)
-    starts = [0.0, ramp, duration - ramp] if ends else [0.0, ramp]
+    starts = [0.0, ramp]
+    if ends:
+        starts.append(duration - ramp)
     table = _table(starts)
     rise = SMOOTH / ramp ** np.arange(6)
     _set(table[0], rise)
@@ -290,7 +300,7 @@ def ramped(
 
     if sweep is not None:
         lowest = frequency - sweep / 2
-        rate = sweep / duration if ends else 0.0
+        rate = sweep / duration  # 0 of a sine that does not end
         x = table["start"]
         # Each piece goes on with the phase and the frequency that the sweep has reached.
         table["phase"] = x * (lowest + 0.5 * rate * x)
@@ -317,12 +327,17 @@ def spline(amplitude: float, times: ArrayLike, values: ArrayLike, frequency: flo
     times = np.asarray(times, float)
     values = np.asarray(values, float)
     hold &= bool(values[-1] != 0)
-    table = _table(times if hold else times[:-1])
+    starts = times[:-1]
+    duration = float(times[-1])
+    if hold:
+        starts = times
+        duration = np.inf
+    table = _table(starts)
     for k, column in enumerate(scipy.interpolate.CubicSpline(times, values).c[::-1]):
         table[COEFFICIENTS[k]][: len(times) - 1] = column
     if hold:
         table["c0"][-1] = values[-1]
-    return Pieces.of(amplitude, frequency, np.inf if hold else float(times[-1]), table)
+    return Pieces.of(amplitude, frequency, duration, table)
 
 
 def main_frequency(times: ArrayLike, values: ArrayLike) -> float:

@@ -57,14 +57,19 @@ def condensed(section: EndSection, omegas: np.ndarray) -> np.ndarray:
     """Z (omega, dof, dof) in N/m of a ``section`` at ``omegas`` in rad/s, on its innermost cell."""
     chain, cells, end = section
     d = chain.cell.dofs
-    first = chain.cells - cells if end == "right" else 0
+    # From the outermost cell inwards; ``outwards`` is the block of a row that couples it to the cell farther out.
+    first = 0
+    outwards = 0
+    order = range(cells)
+    if end == "right":
+        first = chain.cells - cells
+        outwards = 2
+        order = order[::-1]
     stiffness = _blocks(chain.stiffness_rows(first, first + cells), first, d)
     damping = _blocks(chain.damping_rows(first, first + cells), first, d)
     masses = chain.masses()[first * d : (first + cells) * d].reshape(cells, d)
 
     w = omegas[:, None, None]
-    outwards = 2 if end == "right" else 0
-    order = range(cells)[::-1] if end == "right" else range(cells)
     outer: np.ndarray | None = None
     for n in order:
         z = stiffness[1, n] + 1j * w * damping[1, n] - w**2 * np.diag(masses[n])

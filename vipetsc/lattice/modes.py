@@ -193,7 +193,10 @@ def mode_shape(chain: Chain, number: int) -> np.ndarray:
 
     Of the two modes of a wave on a ring, the one that is largest at cell 1 has the lower number.
     """
-    shape = _ring_shape(chain, number) if chain.ends == "periodic" else _standing_shape(chain, number)
+    if chain.ends == "periodic":
+        shape = _ring_shape(chain, number)
+    else:
+        shape = _standing_shape(chain, number)
     return np.asarray(shape / shape.flat[np.argmax(np.abs(shape))])
 
 
@@ -205,7 +208,9 @@ def _ring_shape(chain: Chain, number: int) -> np.ndarray:
     wave = bloch(chain.cell, kappa).vectors[:, place % chain.cell.dofs]
     # Turned so that its largest mass is largest at the first cell.
     turned = wave / wave[np.argmax(np.abs(wave))] * np.exp(1j * kappa * np.arange(chain.cells))[:, None]
-    return turned.imag if kappa > 0 else turned.real
+    if kappa > 0:
+        return turned.imag
+    return turned.real
 
 
 def _standing_shape(chain: Chain, number: int) -> np.ndarray:
@@ -311,8 +316,10 @@ def _wavenumbers(vectors: np.ndarray, chain: Chain) -> np.ndarray:
     sums[1:] += shapes[:-1]
     sums[:-1] += shapes[1:]
 
-    # The cells at the ends have a neighbour less.
-    inside = slice(1, -1) if chain.cells > 2 else slice(None)
+    inside = slice(None)
+    if chain.cells > 2:
+        # The cells at the ends have a neighbour less.
+        inside = slice(1, -1)
     products = np.einsum("xdn,xdn->n", shapes[inside], sums[inside])
     norms = np.einsum("xdn,xdn->n", shapes[inside], shapes[inside])
     # A mode may be at rest in the one cell between two others.

@@ -125,7 +125,13 @@ def beyond_end(chain: Chain, end: str, omega: np.ndarray) -> np.ndarray:
     damping = reference.damping_rows(0, 3).toarray()[rows]
     masses = np.diag(reference.masses()[rows])
     before, same, after = (stiffness[:, i * d : i * d + d] + 1j * w * damping[:, i * d : i * d + d] for i in range(3))
-    outwards, inwards = (after, before) if end == "right" else (before, after)
+    outwards = before
+    inwards = after
+    last = slice(0, d)
+    if end == "right":
+        outwards = after
+        inwards = before
+        last = slice(2 * d, 3 * d)
 
     bulk = same - w**2 * masses
     surface = bulk
@@ -146,7 +152,6 @@ def beyond_end(chain: Chain, end: str, omega: np.ndarray) -> np.ndarray:
     if chain.ends == "free":
         # A free end has no spring to the next cell: what a wall spring would add to the last cell.
         alone = Chain(chain.cell, 3, "free")
-        last = slice(2 * d, 3 * d) if end == "right" else slice(0, d)
         cut = reference.stiffness_matrix().toarray()[last, last] - alone.stiffness_matrix().toarray()[last, last]
         lost = reference.damping_rows(0, 3).toarray()[last, last] - alone.damping_rows(0, 3).toarray()[last, last]
         added = added + cut + 1j * w * lost

@@ -23,6 +23,7 @@ from vipetsc.lattice.ends import End, EndSection, Side, amplitudes_back, condens
 from vipetsc.lattice.waves import NEUTRAL
 
 NEAR = 32  # cells up to which the waves that the other end sends back are in phase with those of the drive
+OTHER_END: dict[End, End] = {"left": "right", "right": "left"}
 LOBES = (-8, -2, 0, 2, 8)  # detunings, in widths of a waveform's spectrum, between which it is smooth
 # Quadrature: nodes of a panel, error of an integral, and halvings of a panel at most.
 NODES = 8
@@ -72,13 +73,16 @@ class Source:
         """
         new = [omega for omega in omegas.tolist() if (omega, end, absorbs) not in self._sent]
         if new:
-            other: End = "left" if end == "right" else "right"
-            walls = condensed(EndSection(self._uniform, 1, other), np.array(new))
+            walls = condensed(EndSection(self._uniform, 1, OTHER_END[end]), np.array(new))
             force = 2 / np.pi * np.abs(self.waveform.spectrum(np.array(new))) ** 2
             for omega, wall, size in zip(new, walls, force, strict=True):
                 energy = self._energy_of_a_unit(omega, end, None if absorbs else wall)
                 self._sent[omega, end, absorbs] = size * energy
         return np.array([self._sent[omega, end, absorbs] for omega in omegas.tolist()])
+
+    def _cells_beyond(self, end: End) -> int:
+        """Number of cells between the driven one and an ``end``."""
+        return {"left": self.place, "right": self.cells - 1 - self.place}[end]
 
     def _waves_at(self, omega: float) -> Waves:
         if omega not in self._waves:
@@ -100,8 +104,8 @@ class Source:
             return np.asarray(flux * np.abs(ahead) ** 2)
 
         # Cells from the driven one to the one next to the last at the other end.
-        distance = (self.place if end == "right" else self.cells - 1 - self.place) - 1
-        other: End = "left" if end == "right" else "right"
+        other = OTHER_END[end]
+        distance = self._cells_beyond(other) - 1
         at_wall = behind * side.step[side.back] ** -distance
         image = side.step[side.towards] ** distance * (amplitudes_back(wall, waves, other) @ at_wall)
         if distance < NEAR:
@@ -111,8 +115,7 @@ class Source:
     def _densities(self, omegas: np.ndarray, section: EndSection, absorbs: bool) -> np.ndarray:
         """Energies (2, omega) in J s/rad that arrive at a ``section`` and that come back from it."""
         end = section.end
-        last = self.place if end == "left" else self.cells - 1 - self.place
-        distance = max(last - section.cells, 0)
+        distance = max(self._cells_beyond(end) - section.cells, 0)
         sent = self.sent(omegas, end, absorbs)
         (sends,) = np.nonzero(sent.any(axis=1))
 

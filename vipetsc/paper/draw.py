@@ -46,9 +46,10 @@ def draw_paper(
     spent = comm.allreduce(time.process_time() - begin)
     if drawn:
         drawn_anew = len(undrawn) == sum(len(entry["pictures"]) for entry in record["figures"].values())
-        # The cost of pictures from earlier calls counts unless all were drawn again.
-        earlier = 0.0 if drawn_anew else record["cpu"]["figures"]
-        record["cpu"]["figures"] = spent + earlier
+        if not drawn_anew:
+            # The cost of pictures from earlier calls counts, too.
+            spent += record["cpu"]["figures"]
+        record["cpu"]["figures"] = spent
     on_root(comm, lambda: write_record(root, record))
     return tuple(drawn)
 

@@ -25,6 +25,7 @@ from vipetsc.paper.report import ReportContents, write_report
 from vipetsc.paper.steps import duration, make_steps, noted
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.backbone import is_related, relate_folders
+from vipetsc.wording import counted
 
 Announce = Callable[[str], None]
 
@@ -174,7 +175,7 @@ def plan_table(plan: Plan, root: Path, ranks: int) -> str:
         left = step.left(root) / ranks
         total += left
         lines.append(f"{step.name:<26}{step.state(root):<10}{duration(left):>9}  {' '.join(plan.claims_of(step))}")
-    all_steps = f"all steps on {ranks} {'rank' if ranks == 1 else 'ranks'}"
+    all_steps = f"all steps on {counted(ranks, 'rank')}"
     lines += [f"{all_steps:<36}{duration(total):>9}", ""]
 
     width = max([len("paper"), *(len(figure.label) for figure in plan.figures)]) + 2

@@ -115,7 +115,10 @@ class PaperStep:
     def parts(self) -> dict[int, float]:
         """Parts that single ranks compute, by number with CPU times in s: branches by mode, the search; else none."""
         if isinstance(self.case, NnmCase):
-            return {mode: self.cost * (IN_PHASE if mode == 1 else 1) for mode in self.case.nnm.modes}
+            costs = dict.fromkeys(self.case.nnm.modes, self.cost)
+            if 1 in costs:
+                costs[1] *= IN_PHASE
+            return costs
         if isinstance(self.case, DesignCase):
             return {1: self.cost}
         return {}
@@ -150,11 +153,15 @@ class PaperStep:
         if not (folder / "case.toml").exists():
             return MISSING
         if not self._is_case_of(folder):
-            # Results of this case may be under computation, to replace those of the other.
-            return BEGUN if self._is_case_of(folder / NEW) else STALE
+            if self._is_case_of(folder / NEW):
+                # Results of this case are under computation, to replace those of the other.
+                return BEGUN
+            return STALE
         if outdated(folder):
             return STALE
-        return DONE if all(map(self._is_complete, self.results(root))) else BEGUN
+        if all(map(self._is_complete, self.results(root))):
+            return DONE
+        return BEGUN
 
     def _is_case_of(self, folder: Path) -> bool:
         """Whether a ``folder`` is there for results of this case."""

@@ -97,8 +97,11 @@ def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str,
         if not uri:
             uri = "data:image/webp;base64," + base64.b64encode(small(image.convert("RGB"))).decode()
 
+        content = b"[]"
         shown = path.with_suffix(".json")
-        axes = zlib.compress(shown.read_bytes() if shown.exists() else b"[]", 9)
+        if shown.exists():
+            content = shown.read_bytes()
+        axes = zlib.compress(content, 9)
         return image.width, image.height, key, uri, base64.b64encode(axes).decode()
 
 

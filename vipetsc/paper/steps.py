@@ -126,8 +126,11 @@ def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: boo
 
     def write() -> None:
         record = read_record(root)
-        before = {} if afresh else record["cpu"]["steps"]
-        record["cpu"]["steps"] |= {name: before.get(name, 0.0) + seconds for name, seconds in spent.items()}
+        steps = record["cpu"]["steps"]
+        for name, seconds in spent.items():
+            if not afresh:
+                seconds += steps.get(name, 0.0)
+            steps[name] = seconds
         write_record(root, record)
 
     on_root(comm, write)

@@ -163,7 +163,9 @@ def _fewest_steps(part: _Cosines, most: int, stride: int) -> int:
     high = 2 * part.high
     steps = fft.next_fast_len(max(3 * width, 1), real=True)
     if steps >= most:
-        return most if stride == 1 else min(fft.next_fast_len(-(-most // stride), real=True), most)
+        if stride == 1:
+            return most
+        return min(fft.next_fast_len(-(-most // stride), real=True), most)
 
     while steps < min(high, most):
         # The cosines from low to high must not turn back within their range, nor fall on those up to ``width``.

@@ -37,8 +37,10 @@ def doubt(points: float, r2: float) -> str:
         return f"too few points ({points:g})"
     if np.isnan(r2):
         return "no fit"
-    # Below zero a constant fits better.
-    return "" if r2 >= 0 else f"adjusted R² {r2:.2g}"
+    if r2 < 0:
+        # A constant fits better.
+        return f"adjusted R² {r2:.2g}"
+    return ""
 
 
 def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:

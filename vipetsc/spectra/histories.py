@@ -64,7 +64,9 @@ def steady_amplitude(time: np.ndarray, values: np.ndarray, drive: SteadyDrive, p
     """
     window = periods * drive.period
     end = min(drive.stop, float(time[-1]))
-    interval = float(time[1] - time[0]) if len(time) > 1 else np.inf
+    interval = np.inf
+    if len(time) > 1:
+        interval = float(time[1] - time[0])
     harmonics = min(HARMONICS, int(RESOLVED * np.pi / (interval * drive.frequency)))
     # Rounding of the times must not lose a window.
     if harmonics < 1 or end - WINDOWS * window < drive.start * (1 - 1e-12) - 1e-12 * window:
@@ -94,7 +96,9 @@ def _phasor(time: np.ndarray, values: np.ndarray, frequency: float, harmonics: i
 def transmission(source: np.ndarray, receiver: np.ndarray) -> float:
     """The rms of the ``receiver`` (t,) over that of the ``source`` (t,); NaN where the source does not move."""
     source_rms = rms(source)
-    return rms(receiver) / source_rms if source_rms else np.nan
+    if source_rms == 0:
+        return np.nan
+    return rms(receiver) / source_rms
 
 
 def transmission_by_part(

@@ -70,7 +70,9 @@ class RunRecord:
     def drift(self, point: str) -> float | None:
         """The largest drift of the steady amplitudes at a ``point``."""
         steady = self.steady(point)
-        return None if steady is None else float(np.max([amplitude.drift for amplitude in steady.values()]))
+        if steady is None:
+            return None
+        return float(np.max([amplitude.drift for amplitude in steady.values()]))
 
     def settled(self, point: str, quantity: str) -> float | None:
         """The steady amplitude of a ``quantity`` at a ``point``, NaN and a warning where it has not settled."""
@@ -125,7 +127,10 @@ class RunMeasure(NamedTuple):
         """The measure of these ``points``: its name, text and function without them."""
         if self.over == "run":
             return self
-        place = f"at {points[0]}" if self.over == "point" else f"of {points[1]} over that of {points[0]}"
+        if self.over == "point":
+            place = f"at {points[0]}"
+        else:
+            place = f"of {points[1]} over that of {points[0]}"
         of = self.of
         assert of is not None
         return self._replace(
@@ -231,20 +236,26 @@ def _contact_episodes(record: RunRecord) -> int | None:
 
 
 def _work(record: RunRecord) -> float | None:
-    return float(record.run["energy/work"][-1]) if "energy/work" in record.run else None
+    if "energy/work" not in record.run:
+        return None
+    return float(record.run["energy/work"][-1])
 
 
 def _dissipated_fraction(record: RunRecord) -> float | None:
     work = _work(record)
     if work is None or "energy/dissipated" not in record.run:
         return None
-    return float(record.run["energy/dissipated"][-1]) / work if work else np.nan
+    if work == 0:
+        return np.nan
+    return float(record.run["energy/dissipated"][-1]) / work
 
 
 def _largest_force(record: RunRecord) -> float | None:
     if not record.run.sizes.get("site") or "impacts/force" not in record.run:
         return None
-    return float(record.run["impacts/force"].max()) if record.run.sizes["episode"] else 0.0
+    if record.run.sizes["episode"] == 0:
+        return 0.0
+    return float(record.run["impacts/force"].max())
 
 
 def _velocities(record: RunRecord, source: str, receiver: str) -> tuple[np.ndarray, np.ndarray]:
@@ -269,7 +280,9 @@ def _steady_transmission(record: RunRecord, source: str, receiver: str) -> float
     of_receiver = record.settled(receiver, "velocity")
     if of_source is None or of_receiver is None:
         return None
-    return of_receiver / of_source if of_source else np.nan
+    if of_source == 0:
+        return np.nan
+    return of_receiver / of_source
 
 
 def _of_points(kind: str, quantity: str) -> RunMeasure:

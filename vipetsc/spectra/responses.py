@@ -89,7 +89,9 @@ def largest_response(parts: list[CurvePart], low: float, high: float) -> float:
         if len(y) > 2:
             middle = int(np.argmax(y[1:-1])) + 1
             largest = max(largest, _vertex(s[middle - 1 : middle + 2], y[middle - 1 : middle + 2]))
-    return float(largest) if np.isfinite(largest) else np.nan
+    if not np.isfinite(largest):
+        return np.nan
+    return float(largest)
 
 
 def _at_ends(part: CurvePart, low: float, high: float) -> list[float]:

@@ -147,10 +147,10 @@ def _drive_rows(case: Case) -> Rows:
     model = case.model()
     rows: Rows = []
     for _, drive in case.drive.every:
-        words = "none"
+        text = "none"
         if drive.amplitude:
-            words = drive.describe()
-        rows.append(("drive", words))
+            text = drive.describe()
+        rows.append(("drive", text))
 
     # Where nothing is driven, the waves are those of the motion that the lattice begins with.
     omega = case.wave_frequency

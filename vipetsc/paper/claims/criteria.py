@@ -113,9 +113,9 @@ def verdict(criteria: Sequence[Criterion], value: Mapping[str, SupportsFloat | N
     names = [c.quantity for c in missed]
     if not missed:
         return HOLDS, names
-    if len(missed) == len(criteria):
-        return FAILS if failed else UNMEASURED, names
-    if any(c.decisive for c in failed):
+    if not failed and len(missed) == len(criteria):
+        return UNMEASURED, names
+    if len(missed) == len(criteria) or any(c.decisive for c in failed):
         return FAILS, names
     return IN_PART, names
 
@@ -127,12 +127,14 @@ def _criteria(rows: Sequence[Sequence[Any]]) -> tuple[Criterion, ...]:
         for quantity, comparison, threshold, unit, source, *decisive in rows:
             if quantity.endswith("*") != bool(law):
                 continue
+            if isinstance(threshold, list):
+                # TOML has no tuples, and a frozen criterion shall not hold a list.
+                threshold = tuple(threshold)
             criteria.append(
                 Criterion(
                     quantity=quantity.replace("*", f", {law}"),
                     comparison=comparison,
-                    # TOML has no tuples, and a frozen criterion shall not hold a list.
-                    threshold=tuple(threshold) if isinstance(threshold, list) else threshold,
+                    threshold=threshold,
                     unit=unit,
                     source=source,
                     decisive=bool(decisive),

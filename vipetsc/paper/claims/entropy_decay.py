@@ -6,6 +6,7 @@ import xarray as xr
 from vipetsc.paper.claims.criteria import ABRUPT, HIGH, PEAK, QUIET, SEVERAL, STRAIGHT, STRAIGHT_EVERYWHERE
 from vipetsc.paper.claims.evidence import EXCITED, AmplitudeCurve, Evidence, Measurement, MissingEvidence
 from vipetsc.spectra import FEWEST, doubt, normalised
+from vipetsc.wording import counted
 
 # Steps with sites that are spread, and with sites in neighbouring cells.
 SPREAD, NEIGHBOURS = "scattering", "scattering-neighbours"
@@ -68,10 +69,16 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     in_place = np.mean([PEAK[0] <= c.peak_amplitude <= PEAK[1] for c in spread])
     several = [c for c in spread if c.sites >= SEVERAL]
     # Where the peak lies above, the value belongs to the rise and not to the decay.
-    behind = [c.interpolate(HIGH) if c.peak_amplitude < HIGH else np.nan for c in several]
-    highest = np.max(behind) if behind else None
+    behind = [c.interpolate(HIGH) for c in several if c.peak_amplitude < HIGH]
+    highest = floor = None
+    if several:
+        highest = np.nan
+        if len(behind) == len(several):
+            highest = np.max(behind)
+    if quiet.size:
+        floor = quiet.max()
     result.value |= {
-        "floor of the normalised entropy": quiet.max() if quiet.size else None,
+        "floor of the normalised entropy": floor,
         "fraction of configurations with an abrupt rise": abrupt,
         f"fraction of configurations with the peak at {PEAK[0]:g} to {PEAK[1]:g} N": in_place,
         f"normalised entropy at {HIGH:g} N behind the peak, {SEVERAL} sites or more": highest,
@@ -105,15 +112,22 @@ def _list_fits(result: Measurement, configurations: list[EntropyDecay], sites: s
     fit = f"adjusted R^2 >= {STRAIGHT:g} over {FEWEST} points or more"
     result.value[f"fraction of configurations of {sites} sites with {fit}"] = straight
     for c in configurations:
-        name = f"{c.sites} {'site' if c.sites == 1 else 'sites'}, {kind}"
+        # Numbers that cannot be relied on stand as missing.
+        r2 = exponent = half_width = None
+        name = f"{counted(c.sites, 'site')}, {kind}"
         doubts = doubt(c.points, c.r2)
-        result.value[f"adjusted R^2 (log-log), {name}"] = c.r2 if c.points >= FEWEST else None
-        result.value[f"exponent, {name}"] = None if doubts else c.exponent
-        result.value[f"peak (N), {name}"] = c.peak_amplitude
-        result.uncertainty[f"exponent's 95 % interval (+/-), {name}"] = None if doubts else c.half_width
-        result.uncertainty[f"points of the fit, {name}"] = c.points
+        if c.points >= FEWEST:
+            r2 = c.r2
         if doubts:
             result.reasons.append(f"no power law with {name}: {doubts}")
+        else:
+            exponent = c.exponent
+            half_width = c.half_width
+        result.value[f"adjusted R^2 (log-log), {name}"] = r2
+        result.value[f"exponent, {name}"] = exponent
+        result.value[f"peak (N), {name}"] = c.peak_amplitude
+        result.uncertainty[f"exponent's 95 % interval (+/-), {name}"] = half_width
+        result.uncertainty[f"points of the fit, {name}"] = c.points
 
 
 def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -133,12 +147,15 @@ def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
     primary = by_average["energy_weighted"]
 
     fit = f"fraction of curves with adjusted R^2 >= {STRAIGHT_EVERYWHERE:g} over {FEWEST} points or more"
+    median = None
     finite = [c.r2 for c in primary if np.isfinite(c.r2) and c.points >= FEWEST]
+    if finite:
+        median = np.median(finite)
     result.value |= {
         "fraction of curves that rise, peak and fall by half": np.mean([c.falls for c in primary]),
         fit: straight["energy_weighted"],
         f"{fit}, log-log line alone": np.mean([c.reaches(c.r2, STRAIGHT_EVERYWHERE) for c in primary]),
-        "median adjusted R^2 (log-log)": np.median(finite) if finite else None,
+        "median adjusted R^2 (log-log)": median,
         "curves": len(primary),
     }
     result.uncertainty |= {f"{fit}, {average} mean": straight[average] for average in AVERAGES[1:]}
@@ -165,7 +182,10 @@ def error_bars(evidence: Evidence, reading: str, result: Measurement) -> None:
             raise MissingEvidence(f"{SPREAD} has no amplitude of {HIGH:g} N or more")
         # Where the peak is no lower than that, nothing lies behind it to compare with.
         at_peak = error.value[(error.amplitude == c.peak_amplitude) & (error.amplitude < HIGH)]
-        over_peak.append(high.mean() / at_peak[0] if at_peak.size else np.nan)
+        ratio = np.nan
+        if at_peak.size:
+            ratio = high.mean() / at_peak[0]
+        over_peak.append(ratio)
         if error.untouched.any():
             over_quiet.append(high.mean() / error.value[error.untouched].mean())
 

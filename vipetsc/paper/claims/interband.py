@@ -57,7 +57,9 @@ def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
 def _on_grid(values: np.ndarray) -> np.ndarray:
     """Indices of the multiples of ``GRID`` among ``values``; of all of them if there are fewer than two."""
     multiples = np.nonzero(np.abs(values / GRID - np.round(values / GRID)) < 1e-6)[0]
-    return multiples if multiples.size > 1 else np.arange(len(values))
+    if multiples.size < 2:
+        return np.arange(len(values))
+    return multiples
 
 
 def _transfer(
@@ -225,6 +227,7 @@ def one_site(evidence: Evidence, reading: str, result: Measurement) -> None:
         many = _transfer(evidence, reading, law, sites=5, cycles=30)
         short = _transfer(evidence, reading, law, sites=5, cycles=15)
         single = _transfer(evidence, reading, law, sites=1, cycles=30)
+
         common, i, j = np.intersect1d(many.amplitude, short.amplitude, return_indices=True)
         correlation = np.nan
         if len(common) > 2:

@@ -44,7 +44,9 @@ def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any
         result.reasons.append(str(missing))
     except (KeyError, OSError, ValueError) as error:  # files of another version, or cut off
         message = " ".join(str(error).split()).replace(f"{evidence.root}/", "")
-        file = evidence.files[-1] if evidence.files else "a file"
+        file = "a file"
+        if evidence.files:
+            file = evidence.files[-1]
         result.reasons.append(f"{file} cannot be used: {message}")
     else:
         # A claim whose measurement broke off has no verdict on the numbers that it has.

@@ -13,6 +13,7 @@ from vipetsc.modes.system import System
 from vipetsc.paper.claims.criteria import FEWEST_FOLDS, HERTZ_LIMIT, LAWS, SAME_EXPONENT, SAME_MOTION
 from vipetsc.paper.claims.evidence import AnalysedMember, Evidence, Measurement, MissingEvidence
 from vipetsc.studies.backbone import BRANCH, log_slope
+from vipetsc.wording import counted
 
 # Steps of the paper's plan.
 INTERBAND = "interband"
@@ -30,7 +31,9 @@ TRUE = {
 def branches(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C15: slope, folds and stability over regions I-IV of the out-of-phase branch (Fig. 11)."""
     for law in LAWS:
-        step = f"nnm-{law}" if reading == "printed" else f"nnm-{law}-{reading}"
+        step = f"nnm-{law}"
+        if reading != "printed":
+            step += f"-{reading}"
         branch = evidence.open(step, BRANCH)
         case = NnmCase.from_toml(branch.attrs["case"])
         if case.lattice.reading != reading or case.contacts.law != law:
@@ -51,6 +54,9 @@ def _add_out_of_phase(branch: xr.Dataset, case: NnmCase, law: str, result: Measu
     last = np.nonzero(regular)[0][-1]
     folds = int(np.sum((kind == KINDS.index("fold-energy")) & (region == 2)))
     fit = json.loads(branch.attrs["fits"]).get("III", {})
+    energy_of_contact = None
+    if first.size:
+        energy_of_contact = energy[first[-1]]
     result.value |= {
         f"regions, {law}": len(set(region[region > 0].tolist())),
         f"largest |d ln f / d ln E| in region I, {law}": _largest(steepness[first]),
@@ -59,7 +65,7 @@ def _add_out_of_phase(branch: xr.Dataset, case: NnmCase, law: str, result: Measu
         f"adjusted R^2 of the slope in region III, {law}": fit.get("adjusted_r2"),
         f"exponent of the slope in region III, {law}": fit.get("exponent"),
         f"last frequency (Hz), {law}": frequency[last],
-        f"energy at the end of region I (J), {law}": energy[first[-1]] if first.size else None,
+        f"energy at the end of region I (J), {law}": energy_of_contact,
     }
     result.uncertainty[f"points in region III, {law}"] = fit.get("points", 0)
     result.uncertainty[f"energy of the last point (J), {law}"] = energy[last]
@@ -73,8 +79,10 @@ def _add_out_of_phase(branch: xr.Dataset, case: NnmCase, law: str, result: Measu
         distance = abs(steepness[last] - HERTZ_LIMIT)
         result.value["last d ln f / d ln E's distance from the 3/2 law's .1, hertz"] = distance
     if folds < FEWEST_FOLDS:
-        modulus = f" at {case.contacts.modulus / 1e6:g} MPa" if case.contacts.modulus else ""
-        result.reasons.append(f"the {law} branch{modulus} has {folds} energy folds at grazing")
+        of_branch = f"the {law} branch"
+        if case.contacts.modulus:
+            of_branch += f" at {case.contacts.modulus / 1e6:g} MPa"
+        result.reasons.append(f"{of_branch} has {folds} energy folds at grazing")
 
 
 def _add_in_phase(branch: xr.Dataset, law: str, result: Measurement) -> None:
@@ -110,7 +118,7 @@ def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None
         main = name.endswith(MAIN)
         label = law
         if not main:
-            label = f"{law}, {sites} {'site' if sites == '1' else 'sites'}, {cycles} cycles"
+            label = f"{law}, {counted(sites, 'site')}, {cycles} cycles"
         about = {k.removeprefix(f"{name}/"): v for k, v in relation.attrs.items() if k.startswith(f"{name}/")}
         difference = abs(about["exponent"] - about["slope_exponent"])
         fitted = relation[f"{name}/fitted"].values.astype(bool)
