@@ -41,6 +41,7 @@ def main() -> None:
 def row(table: dict, noise: float, seeds: int, folder: Path) -> str:
     """What comes out with one ``noise`` over so many ``seeds``."""
     truth = [*table["contacts"]["clearance"], table["contacts"]["restitution"]]
+
     inside = []
     errors = []
     for seed in range(seeds):

@@ -31,6 +31,7 @@ def _texts(figure: Figure) -> Iterator[str]:
             boxes.append((text.get_text(), box))
             if min(box.x0, box.y0) < -1 or box.x1 > figure.bbox.width + 1 or box.y1 > figure.bbox.height + 1:
                 yield f"outside the page: {text.get_text()!r}"
+
     for (first, a), (second, b) in combinations(boxes, 2):
         width = min(a.x1, b.x1) - max(a.x0, b.x0)
         height = min(a.y1, b.y1) - max(a.y0, b.y0)

@@ -73,14 +73,17 @@ def rate_of(states: SteadyStates, omega: float, amplitude: float):
         beyond.append((start, end, spring))
 
     def rate(t: float, y: np.ndarray) -> np.ndarray:
-        u, v = y[:n], y[n:]
+        u = y[:n]
+        v = y[n:]
         force = drive * np.cos(omega * t) - stiffness @ u - damping @ v
+
         for host, resonator, stops in joins:
             w = u[resonator] - (0.0 if host is None else u[host])
             push = stops.law.elastic_force(w - stops.plus) - stops.law.elastic_force(-w - stops.minus) - stops.load
             force[resonator] -= push
             if host is not None:
                 force[host] += push
+
         for start, end, spring in beyond:
             z = (0.0 if end is None else u[end]) - (0.0 if start is None else u[start])
             pull = spring.quadratic * z**2 + spring.cubic * z**3

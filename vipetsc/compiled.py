@@ -186,7 +186,7 @@ def kernel_sources(package: Path, file: Path) -> set[Path]:
 
 @cache
 def _tables(package: Path) -> frozenset[Path]:
-    """The tables of numbers in ``package``, which stand beside its modules; other folders hold what users read."""
+    """The tables of numbers in ``package``, which stand next to its modules; other folders hold what users read."""
     return frozenset(table for table in package.rglob("*.csv") if (table.parent / "__init__.py").exists())
 
 

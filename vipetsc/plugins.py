@@ -110,6 +110,7 @@ def load(name: str) -> Plugin:
 def _imported(name: str) -> Plugin:
     """The module ``name``, imported."""
     earlier = _every_module()
+    entry: metadata.EntryPoint | None = None
     try:
         if is_file(name):
             module = _from_file(Path(name))

@@ -115,6 +115,7 @@ def page(tmp_path_factory):
             axes.set(title="5 sites", xlabel="Amplitude (N)", ylabel=label)
         picture = save(figure, folder / "fig99-panels.png")
         save(figure, folder / "fig99-panels.json")
+
     contents = ReportContents(
         note="",
         claims=[],

@@ -57,6 +57,7 @@ def test_a_run_that_another_program_writes_is_one(in_process, tmp_path, verb):
     case.write_text(RUN)
     out = tmp_path / "out"
     assert in_process("run", case, "--out", out, "--set", "output.figures=false").returncode == 0
+
     script = f"import h5py; file = h5py.File({str(out / 'run.h5')!r}, 'a'); print('open', flush=True); input()"
     command = [sys.executable, "-c", script]
     with subprocess.Popen(
@@ -65,6 +66,7 @@ def test_a_run_that_another_program_writes_is_one(in_process, tmp_path, verb):
         assert other.stdout.readline() == "open\n"
         ended = in_process(verb, out)
         other.communicate("\n", timeout=60)
+
     assert ended.returncode == 2
     assert "run.h5 cannot be opened as a run: another program has it open for writing" in ended.stderr
     assert "is not a run" not in ended.stderr

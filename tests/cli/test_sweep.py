@@ -75,7 +75,7 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
     assert visible == {"case.toml", "members.jsonl", "ensemble.h5", "index.json"}
 
     second = in_process("sweep", case, "--out", out)
-    assert re.search(r"made now +0 in", second.stdout)
+    assert re.search(r"computed now +0 in", second.stdout)
     changed = in_process("sweep", case, "--out", out, "--set", "drive.cycles=6")
     assert changed.returncode == 2
     assert "contains another sweep: drive.cycles = 5 there, 6 here; replace it with --force" in changed.stderr

@@ -48,6 +48,7 @@ def ensemble_of(*axes: dict[str, list], drive: dict[str, Any] | None = None, par
         for path, values in axis.items():
             about = {"long_name": path, "units": "1"}
             coords[path.rpartition(".")[2]] = xr.Variable(dim, coordinate(values), about)
+
     shape = [len(next(iter(axis.values()))) for axis in axes]
     number = np.arange(prod(shape)).reshape(shape)
     about = {"units": "1", "long_name": "inter-band energy transfer"}
@@ -59,9 +60,10 @@ def ensemble_of(*axes: dict[str, list], drive: dict[str, Any] | None = None, par
         "ibtet": (dims, 0.01 * (number + 1.0), about),
     }
     if parts:
-        shares = np.stack([10.0**-part * (number + 1.0) for part in range(parts)], axis=-1)
+        fractions = np.stack([10.0**-part * (number + 1.0) for part in range(parts)], axis=-1)
         names = ["below", *(f"band {part}" for part in range(1, parts))]
-        data["bands/share"] = ((*dims, "part"), shares, {"units": "1", "long_name": "share", "parts": names})
+        data["bands/share"] = ((*dims, "part"), fractions, {"units": "1", "long_name": "fraction", "parts": names})
+
     case = tomli_w.dumps({"name": "tried", "drive": drive or {}, "sweep": {}})
     return xr.Dataset(data, coords, {"case": case})
 

@@ -110,6 +110,7 @@ def test_names_are_keys_of_the_case():
         },
         contacts={"clearance": {"first": 1e-4, "last": 1e-4}},
     )
+
     values = {"contacts.clearance.first": 2e-4, "contacts.clearance.last": 3e-4, "contacts.restitution": 0.5}
     values["lattice.cell.masses[2]"] = 3e-3
     ids = []
@@ -143,12 +144,14 @@ def test_a_search_of_mixed_kinds_finds_the_best_of_each():
     space = SearchSpace({}, kinds)
     steps = np.array([variable.step for variable in kinds])
     search = CmaEs(space.to_unit(space.begin()), steps, np.eye(3), 0.3, seed=1, population=None)
+
     best = np.inf, None
     for _ in range(60):
         values = [space.from_unit(point) for point in search.ask()]
         losses = [np.log10(x / 2) ** 2 + 0.05 * (n - 21) ** 2 + kinds[2].choices[int(c) - 1] for x, n, c in values]
         search.tell(np.array(losses)[:, None])
         best = min(best, (min(losses), values[int(np.argmin(losses))]), key=lambda pair: pair[0])
+
     assert best[1][1:].tolist() == [21, 3]
     assert best[1][0] == pytest.approx(2.0, rel=0.05)
 
@@ -216,6 +219,7 @@ def test_keys_with_dots_are_found_and_changed():
     ):
         assert put(table, path, value) == []
         assert value_at(table, path) == value
+
     assert table == {
         "profiles": {"springs[1].stiffness": [4.0], "masses[1]": [1.0, 5.0]},
         "list": [{"a": 6}],

@@ -48,6 +48,7 @@ def write_sweep(folder: Path) -> None:
     dims = ("restitution", "amplitude")
     number = np.arange(len(RESTITUTIONS) * len(AMPLITUDES)).reshape(len(RESTITUTIONS), -1)
     episodes = np.tile(np.where(AMPLITUDES < ONSET, 0.0, 4.0), (len(RESTITUTIONS), 1))
+
     data = {
         "status": (dims, np.zeros_like(number, np.int8)),
         "ibtet": (dims, np.stack([transfer_of(restitution) for restitution in RESTITUTIONS])),
@@ -58,6 +59,7 @@ def write_sweep(folder: Path) -> None:
         "restitution": ("restitution", RESTITUTIONS, {"long_name": "contacts.restitution", "units": "1"}),
         "amplitude": ("amplitude", AMPLITUDES, {"long_name": "drive.amplitude", "units": "N"}),
     }
+
     case = Sweep.from_table(SWEEP).to_toml()
     write_netcdf(folder / "ensemble.h5", xr.Dataset(data, coords, {"case": case}))
 
@@ -96,6 +98,7 @@ def member_of(folder: str, amplitude: float, restitution: float) -> MemberRun:
             f"drive.amplitude={amplitude}",
         ]
     )
+
     spectrum = xr.DataArray(
         np.outer(np.arange(1.0, 6.0), np.ones(9)),
         {"wavenumber": np.linspace(0, np.pi, 5), "frequency": np.linspace(0, 3000.0, 9)},

@@ -58,6 +58,7 @@ def chain_table(path, **record: Any) -> dict[str, Any]:
         {"quantity": "dashpot", "bounds": [0.1, 50.0]},
     ]
     records = [{"file": str(path), "time": "ms", "time_factor": 1e-3, "sensors": sensors} | record]
+
     return {
         "name": "chain",
         "lattice": {"cells": 4, "cell": CHAIN},

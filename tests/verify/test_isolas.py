@@ -106,12 +106,14 @@ def test_a_motion_on_it_stays_up_to_its_end_and_falls_beyond(curves, place, stay
     stable = [point for point in isola.points if point.measured.unstable == 0 and point.kind == "regular"]
     upper = measure(isola, "frequency").max()
     begin = min(stable, key=lambda point: abs(point.measured.frequency - upper * 0.99))
+
     omega = upper * (1 + place)
     periods = 150
     rate = rate_of(states, omega, 0.18)
     end = 2 * np.pi / omega * periods
     late = np.linspace(0.97 * end, end, 400)
     motion = solve_ivp(rate, (0, end), state_of(states, begin), "LSODA", t_eval=late, rtol=1e-7, atol=1e-9)
+
     largest = np.abs(motion.y[0]).max()
     assert (largest > 1.3) == stays
     if not stays:

@@ -124,6 +124,7 @@ def searched(tmp_path_factory):
             {"measure": "band_transmission/base-tip", "band": 2, "at_most": 100.0, "amplitudes": [5.0]},
         ],
     }
+
     folder = tmp_path_factory.mktemp("search")
     plan = OptimiseCase.from_table(table)
     return plan, folder, run_search(plan, folder, MPI.COMM_SELF)

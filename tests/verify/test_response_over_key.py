@@ -118,6 +118,8 @@ def test_a_curve_ends_on_its_range_where_no_case_lies_beyond(key, low, high, tmp
     (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
     assert curve.ending == f"reached the end of nfrc.range, {high:g}"
     assert parameter_values(curve)[[0, -1]].tolist() == [low, high]
+
+    # At its upper end nothing dissipates: the state there is that of the elastic contact.
     if key == "contacts.restitution":
         alone = NfrcCase.from_table(
             table

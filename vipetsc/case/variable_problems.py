@@ -91,7 +91,7 @@ def _tried(key: str, row: VariableRow, table: Table) -> Iterator[Problem]:
 def _is_about(key: str, path: str, is_entry: bool) -> bool:
     """Whether the problem of a ``key`` is about what stands at ``path``; entries of a list may only exclude each other.
 
-    A key that is unknown may be one on the way to it.
+    A key that is unknown may be a part of its path.
     """
     return key == path or (not is_entry and path.startswith((f"{key}.", f"{key}[")))
 

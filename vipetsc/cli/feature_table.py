@@ -1,4 +1,4 @@
-"""Which verb accepts which feature of a case: a table made by checking a small case for each pair of them.
+"""Which verb accepts which feature of a case: a table that follows from checking a small case for each pair of them.
 
 A verb accepts a feature if its case with this feature is valid, and if the checks that follow the reading of the case
 (of an engine, of linear modes) accept it too. Otherwise the message that refuses it stands in the table.

@@ -64,7 +64,7 @@ class _CheckedFile(io.RawIOBase):
             try:
                 return os.write(self.descriptor, data)
             except BlockingIOError:
-                # The reader of a pipe made it one that does not wait: wait here.
+                # The reader of a pipe has set it not to wait: wait here.
                 select.select([], [self.descriptor], [])
             except OSError as error:
                 self.error = error

@@ -22,7 +22,7 @@ LANDED_W = 1e-10
 # ... and on g = 0 when |g| is within this.
 LANDED_G = 1e-9
 # A site at rest in contact has opened or closed when it is this fraction of its scale away from D: the many landings
-# that made it rest are over, and it lands at D again.
+# by which it came to rest are over, and it lands at D again.
 MOVED_W = 100 * LANDED_W
 
 # The largest force in a step is sampled at the ends of so many intervals, then narrowed by golden sections.

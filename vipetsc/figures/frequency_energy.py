@@ -185,7 +185,7 @@ def _label_tongue(axes: Axes, branch: xr.Dataset, order: int) -> None:
     k = branch["resonance"].values
 
     # Tongues are expected in the order of k. Folds with this k that come after a fold with a higher one are no
-    # tips of this tongue: they lie on the way from one tongue to the next.
+    # tips of this tongue: they lie between one tongue and the next.
     higher = np.nonzero(k > order)[0]
     end = higher[0] if higher.size else len(k)
     tongue = branch.isel(point=(k == order) & (np.arange(len(k)) < end))

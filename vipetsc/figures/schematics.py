@@ -199,7 +199,7 @@ def _draw_pair(axes: Axes, layout: CellLayout, pair: Pair) -> None:
     """Draw the contact of a ``pair``: within the cell, with a mass of the next cell, or with the ground."""
     x, y = layout.centre[pair.resonator]
     if pair.host < 0:
-        # A post on the ground in the way of the mass, below what is tied to the mass.
+        # A post on the ground that stops the mass, below what is tied to the mass.
         edge = x + layout.half[pair.resonator] + GAP
         axes.add_patch(Rectangle((edge, y - 2 * HALF), 0.12, 2 * HALF - 0.1, fc=style.VERMILION, lw=0, zorder=3))
         draw_wall(axes, (edge - 0.3, y - 2 * HALF - 0.2), 0.72, 0.2)

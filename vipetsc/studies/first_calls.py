@@ -22,7 +22,7 @@ RUN: dict[str, Any] = {
     "contacts": {"sites": [6, 12], "clearance": 1e-4},
     "time": {"end": 0.08},
 }
-# A mode of the cell, with the other two flows beside it; a breather of a lattice, shot without dense matrices.
+# A mode of the cell, also by the other two flows; a breather of a lattice, shot without dense matrices.
 CELL: dict[str, Any] = {
     "lattice": {"preset": "four-band", "reading": "printed"},
     "contacts": {"law": "bilinear", "modulus": 1e8},

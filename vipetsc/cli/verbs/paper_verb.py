@@ -31,7 +31,10 @@ def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
     for note in result.notes:
         echo(comm, f"vipetsc: {note}", sys.stderr)
     echo(comm, claims_table(result.claims))
-    echo(comm, f"  {len(result.new_steps)} steps made, {len(result.drawn)} pictures drawn\n  {folder / 'report.html'}")
+    echo(
+        comm,
+        f"  {len(result.new_steps)} steps computed, {len(result.drawn)} pictures drawn\n  {folder / 'report.html'}",
+    )
     return DONE if result.complete else FAILED
 
 

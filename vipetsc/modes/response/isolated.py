@@ -1,10 +1,10 @@
 """States of isolated curves, which no curve from the beginning of the range meets: where one can begin.
 
 At one amplitude an isolated curve (an isola) hangs together with the others by states at other amplitudes: with the
-amplitude it grows, and in general merges with its neighbour. From each known state at a value p of the parameter the
-states over the amplitude are therefore followed at this p, up and down. Where such a line passes the amplitude of the
-curve again it has found a state of it, known or not. Cf. T. Detroux et al., Mech. Syst. Signal Process. 60-61 (2015)
-799, and R. J. Kuether et al., J. Sound Vib. 351 (2015) 299, who continue folds over the amplitude.
+amplitude it grows, and in general merges with its neighbour. From each state found so far at a value p of the parameter
+the states over the amplitude are therefore followed at this p, up and down. Where such a line passes the amplitude of
+the curve again it has found a state of it, a new one or not. Cf. T. Detroux et al., Mech. Syst. Signal Process. 60-61
+(2015) 799, and R. J. Kuether et al., J. Sound Vib. 351 (2015) 299, who continue folds over the amplitude.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -36,14 +36,14 @@ def places_of(states: Equations, count: int) -> np.ndarray:
 
 
 def unknown_states(
-    states: Equations, known: Callable[[], Curves], candidates: Sequence[np.ndarray]
+    states: Equations, curves_so_far: Callable[[], Curves], candidates: Sequence[np.ndarray]
 ) -> Iterator[np.ndarray]:
-    """Unknowns of those of the ``candidates`` that lie on none of the ``known`` curves.
+    """Unknowns of those of the ``candidates`` that lie on none of the ``curves_so_far``.
 
     The curves are asked for before each state, since curves may be added between two states.
     """
     for xi in candidates:
-        if not _is_among(xi, states_on(states, known(), float(xi[-1]))):
+        if not _is_among(xi, states_on(states, curves_so_far(), float(xi[-1]))):
             yield xi
 
 

@@ -126,9 +126,10 @@ def _closed(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
     """Scaled harmonics of a state at ``omega`` of a lattice in which stops touch at rest.
 
     Such a stop is touched at every amplitude. The forces of all contacts are therefore multiplied by a weight s^4, a
-    dashpot of 1 - s times the impedance of the lattice lies beside each, and the state is followed from s = 0, where it
-    is the linear one, to s = 1. The curve cannot come back to s = 0, where there is no other state, and the dashpots
-    keep it from resonances. The power gives stiff contacts, which act at small weights already, a long way.
+    dashpot of 1 - s times the impedance of the lattice lies parallel to each, and the state is followed from s = 0,
+    where it is the linear one, to s = 1. The curve cannot come back to s = 0, where there is no other state, and the
+    dashpots keep it from resonances. The power gives stiff contacts, which act at small weights already, a long part of
+    the path.
     """
     impedance = 1 / (omega * np.abs(np.diag(states.compliance.at(np.array([omega]))[0])))
     update = {"over": "amplitude", "range": [amplitude, 2 * amplitude], "fixed": [omega]}
