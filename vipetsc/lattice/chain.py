@@ -272,7 +272,7 @@ def _largest_response(cell: UnitCell, cells: int, ends: Ends, driven: int, omega
     dynamic = chain.stiffness_matrix() - diags(chain.masses() * omega**2)
     force = np.zeros(cells * cell.dofs, complex)
     force[driven] = 1.0
-    # Eliminated column by column in SciPy's own order, a ring loses all digits: waves grow on their way along it.
+    # Eliminated column by column in SciPy's own order, a ring loses all digits: waves grow as they run along it.
     order = "MMD_AT_PLUS_A" if ends == "periodic" else "COLAMD"
     return float(np.abs(scipy.sparse.linalg.spsolve(dynamic.tocsc(), force, permc_spec=order)).max())
 
