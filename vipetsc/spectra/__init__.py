@@ -3,19 +3,20 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from vipetsc.spectra.band_energies import Parts, front_arrival, ibtet, part_energies
 from vipetsc.spectra.directions import band_envelopes, by_direction, wave_energies
 from vipetsc.spectra.fits import FEWEST, PowerLaw, doubt, normalised, power_law
 from vipetsc.spectra.fourier import TAPER, Dispersion, dispersion, kinetic_energy, ridge, taper, wavenumber_content
 from vipetsc.spectra.pooling import block_means, block_sums, blocks
 
 if TYPE_CHECKING:
+    from vipetsc.spectra.band_energies import PartEnergies, Parts, front_arrival, ibtet, part_energies
     from vipetsc.spectra.entropies import Entropy, averages, entropy, local_entropy
     from vipetsc.spectra.modal_energies import ModalParts, upper_share
     from vipetsc.spectra.wavelet import BINS, Nodes, filter_bank, inverse, padded_length, partition, transform
 
 # Their compiled kernels take half a second to load, and a case that is only checked needs the names of measures alone.
 COMPILED = {
+    "band_energies": ("PartEnergies", "Parts", "front_arrival", "ibtet", "part_energies"),
     "entropies": ("Entropy", "averages", "entropy", "local_entropy"),
     "modal_energies": ("ModalParts", "upper_share"),
     "wavelet": ("BINS", "Nodes", "filter_bank", "inverse", "padded_length", "partition", "transform"),

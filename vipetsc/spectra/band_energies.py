@@ -16,9 +16,10 @@ from scipy import fft
 from scipy.special import diric
 
 from vipetsc.lattice import Band
+from vipetsc.spectra.cosine_transform import cosine_transform
 from vipetsc.spectra.pooling import block_means, blocks
 
-COLUMNS = 64  # histories of masses that are transformed together
+COLUMNS = 32  # histories of masses that are transformed together, which fit into a cache
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ def part_energies(
         # Mass by mass: the cells of one lie together where runs in memory hold them.
         for mass, first in itertools.product(range(dofs), range(0, held.shape[1], COLUMNS)):
             together = slice(first, first + COLUMNS)
-            spectrum = _cosines(held[:, together, mass])
+            spectrum = cosine_transform(held[:, together, mass])
             spectrum[[0, -1]] *= 0.5
             for number, (energy, part) in enumerate(zip(energies, parts, strict=True)):
                 filtered = _folded(spectrum[part.low : part.high + 1], part.low, steps[number])
@@ -127,17 +128,6 @@ def part_energies(
 
     total = [_at_samples(energy, part, last) for energy, part in zip(energies, parts, strict=True)]
     return PartEnergies(np.array(total), maps)
-
-
-def _cosines(columns: np.ndarray) -> np.ndarray:
-    """``fft.dct(columns, 1, axis=0)``, two columns a transform: faster where the length has large factors."""
-    nt, count = columns.shape
-    mirrored = np.zeros((2 * nt - 2, count + count % 2))
-    mirrored[:nt, :count] = columns
-    mirrored[nt:] = mirrored[nt - 2 : 0 : -1]
-    # Neighbouring columns as real and imaginary parts: the transforms of both are real, since both are even.
-    pairs = fft.fft(mirrored.view(complex), axis=0, overwrite_x=True)[:nt]
-    return pairs.view(float)[:, :count]
 
 
 class _Cosines(NamedTuple):
@@ -177,8 +167,8 @@ def _fewest_steps(part: _Cosines, most: int, stride: int) -> int:
 
 
 def _folded(amplitudes: np.ndarray, low: int, steps: int) -> np.ndarray:
-    """Twice the sum (t', ...) of the cosines ``low``, ... with ``amplitudes`` (k, ...), at ``steps`` + 1 even times."""
-    folded = np.zeros((steps + 1, *amplitudes.shape[1:]))
+    """Twice the sum (t', n) of the cosines ``low``, ... with ``amplitudes`` (k, n), at ``steps`` + 1 even times."""
+    folded = np.zeros((steps + 1, amplitudes.shape[1]))
     end = low + len(amplitudes)
     for start in range(low - low % steps, end, steps):
         piece = amplitudes[max(start - low, 0) : start + steps - low]
@@ -188,7 +178,7 @@ def _folded(amplitudes: np.ndarray, low: int, steps: int) -> np.ndarray:
             first = steps - first - len(piece) + 1
         folded[first : first + len(piece)] += piece
     folded[[0, -1]] *= 2.0
-    return fft.dct(folded, type=1, axis=0, overwrite_x=True)
+    return cosine_transform(folded)
 
 
 def _at_samples(energy: np.ndarray, part: _Cosines, last: int) -> np.ndarray:
@@ -202,7 +192,7 @@ def _at_samples(energy: np.ndarray, part: _Cosines, last: int) -> np.ndarray:
 
     waves, amplitudes = _waves_of_energy(energy, part)
     spread = np.bincount(_looks_like(waves, last), amplitudes, last + 1)
-    return np.maximum(_folded(spread, 0, last), 0.0)
+    return np.maximum(_folded(spread[:, None], 0, last)[:, 0], 0.0)
 
 
 def _waves_of_energy(energy: np.ndarray, part: _Cosines) -> tuple[np.ndarray, np.ndarray]:
