@@ -154,6 +154,27 @@ def test_a_site_below_the_drive_is_met_forward(tmp_path):
     np.testing.assert_allclose(up, down, atol=1e-6)
 
 
+def test_a_wave_sent_by_a_moved_wall_has_the_same_law(tmp_path):
+    """The fractions are those of a force; the wall's amplitude at the onset is that of the first contact of a run."""
+    wall = law_case(drive={"end": "left"}, law=COARSE | {"distance": 20})
+    mass = wall.model().drive_mass + 1
+    force = law_case(drive={"cell": 1, "mass": mass}, law=COARSE | {"distance": 20})
+    runs = make_runs(tmp_path / "wall", wall)
+    moved = shares(runs, 1.3)
+    np.testing.assert_array_equal(moved, shares(make_runs(tmp_path / "force", force), 1.3))
+
+    del runs.jittered  # what ``shares`` put in its place
+    data = runs.dataset({1.0: np.nan, 1.3: np.nan})
+    assert data["amplitude"].attrs["units"] == "m"
+    onset = float(data["amplitude"][0])
+    contacts = {"sites": [21], "clearance": wall.law.clearance, "restitution": 1.0}
+    for factor in (0.9999, 1.0001):
+        drive = {"cycles": 8, "band": 2, "at": "max-group-velocity", "end": "left", "amplitude": onset * factor}
+        table = {"lattice": {"cells": 80}, "contacts": contacts, "drive": drive, "time": {"end": runs.setting.end}}
+        run = run_of(Case.from_table(table))
+        assert (run.sizes["episode"] > 0) == (factor > 1)
+
+
 @pytest.fixture(scope="module")
 def refined(tmp_path_factory):
     """The case, the law and the folder of a law refined to one per cent at its onset."""

@@ -88,7 +88,6 @@ class LawCase(Case):
         "touching stops": "the law is one of amplitude over clearance, which has no value without a clearance",
         "initial motion": "the law's fractions are of the work of the drive, in a lattice that starts at rest",
         "many drives": "the law is that of one wave",
-        "moved wall": "the runs of a law have a ring of cells, in which there is no wall",
         "other waveforms": "the law is that of a wave of one frequency that ends, which a burst is",
     }
     waveforms = ("burst",)

@@ -35,9 +35,7 @@ class PredictCase(LawCase):
 
     verb = section = "predict"
     refuses: ClassVar[Mapping[str, str]] = {
-        feature: reason
-        for feature, reason in LawCase.refuses.items()
-        if feature not in ("moved wall", "absorbing ends")
+        feature: reason for feature, reason in LawCase.refuses.items() if feature != "absorbing ends"
     }
 
     def warnings(self) -> list[str]:

@@ -35,6 +35,7 @@ from mpi4py import MPI
 import numpy as np
 import xarray as xr
 
+from vipetsc.case.amplitude import amplitude_unit
 from vipetsc.case.law import LawCase
 from vipetsc.io.folder import LAW, claimed, provenance
 from vipetsc.io.netcdf import tabulated, write_netcdf
@@ -153,7 +154,8 @@ class ScatteringRuns:
         """The wave at the site, from the ``motion`` under 1 N without the site."""
         w = motion.displacement[:, 0]
         rate = motion.velocity[:, 0]
-        return {
+        of_wall = {"wall_peak": self.ring.wall_peak()} if self.case.drive.end else {}
+        return of_wall | {
             "peak": self.ring.peak_of(motion),
             "time": motion.time.tolist(),
             "envelope": np.hypot(w, rate / self.case.model().drive.frequency).tolist(),
@@ -263,6 +265,9 @@ class ScatteringRuns:
         linear = self.records[LINEAR]
         points = sorted(errors)
         outcomes = [self.outcomes(z) for z in points]
+        peak = self.peak
+        if "wall_peak" in linear:
+            peak = linear["wall_peak"]
 
         values: dict[str, Any] = {
             "z": points,
@@ -270,7 +275,7 @@ class ScatteringRuns:
             "direction": ["forward", "backward"],
             "time": linear["time"],
             "envelope": linear["envelope"],
-            "amplitude": [self.amplitude(z) for z in points],
+            "amplitude": [self.ring.amplitude(z, peak) for z in points],
             "interpolation_error": [errors[z] for z in points],
         }
         of_points = [name for name in POINT_LAYOUT if name not in DAMPED or self.cell.is_damped]
@@ -279,6 +284,8 @@ class ScatteringRuns:
         for name in of_points:
             values[f"{name}_scatter"] = np.array([deviation[name] for _, deviation in outcomes])
         data = xr.Dataset(tabulated(LAYOUT, values), attrs=provenance(self.recorded.comm) | self._about())
+
+        data["amplitude"].attrs["units"] = amplitude_unit(self.case)
 
         law = ScatteringLaw.of(data)
         efficiency = law.efficiency()

@@ -6,7 +6,9 @@ t_e = d/v + s T_b (s = ``law.settle``): at d/v + T_b the slow waves' end has pas
 contacts to die away. No wave returns along the ring: what the drive sends in the other direction reaches the site from
 behind after (N - d)/V, what leaves the site is back N/V after the wave's arrival there, so N >= d + V t_e makes the
 ring infinite. The drive works as without a site if the burst is over before a wave is back from it (d >= V T_b/2). The
-drive is in the midst of the lattice, not at a wall. ``LawCase.one_site`` chooses N, d and t_e.
+drive is in the midst of the lattice, not at a wall: where the case moves one, a force on the mass beside it sends the
+wave, which has the same form at a site as that of the wall if it is narrow in frequency. How far the wall moves for it
+follows from a run in which it does. ``LawCase.one_site`` chooses N, d and t_e.
 """
 
 from collections.abc import Mapping
@@ -62,6 +64,21 @@ class Ring:
         first = max(cell - beside, 1)
         last = min(cell + self.kind.pair.next_cell + beside, self.setting.cells)
         return self._run(amplitude, with_site, {"window": [first, last]})
+
+    def wall_peak(self) -> float:
+        """Largest w in m of the linear wave at the site's distance from the case's wall, which moves by 1 m."""
+        setting = self.setting
+        cell = setting.distance + 1 if self.case.drive.end == "left" else setting.cells - setting.distance
+        case = self.case.varied(
+            without=("output",),
+            lattice={"cells": setting.cells, "absorbing": None},
+            drive={"cell": None, "mass": None, "amplitude": 1.0},
+            contacts=NO_SITES,
+            time={"end": setting.end, "sample_interval": setting.interval},
+            output={"window": [cell, cell + self.kind.pair.next_cell]},
+        )
+        run = self.recorded.run_in_memory(case)[0]
+        return self.peak_of(PairMotion.between(run, [0], [self.kind.pair]))
 
     def _contacts(self) -> dict[str, Any]:
         """The changes of ``[contacts]`` that leave one site of the kind."""

@@ -38,7 +38,7 @@ LAYOUT = {
     "direction": ("direction", "1", "forward: from the drive to the site and beyond; backward"),
     "time": ("time", "s", "time"),
     "envelope": ("time", "m/N", "sqrt(w^2 + (w'/Om)^2) of the linear wave at the site under 1 N"),
-    "amplitude": ("z", "N", "amplitude of the drive"),
+    "amplitude": ("z", "N", "amplitude of the drive; in m of a moved wall"),
     "episodes": ("z", "1", "contact episodes"),
     "near": (
         "z",
