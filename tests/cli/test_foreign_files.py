@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.faults.scenarios import SCENARIOS, prepare, words_of
+from tests.faults.scenarios import PLAIN, SCENARIOS, prepare, words_of
 from vipetsc.cli.verbs.verb_list import VERBS
 from vipetsc.io.errors import ResultFileError, UnreadableFileError
 
@@ -46,7 +46,7 @@ def test_pictures_of_a_foreign_file_are_refused(in_process, tmp_path, name, cont
 def test_a_search_in_whose_place_a_foreign_file_lies_is_made_again(in_process, tmp_path):
     scenario = SCENARIOS["design"]
     out = tmp_path / "out"
-    words = words_of(scenario.words, prepare(scenario, tmp_path), out)
+    words = words_of(f"{scenario.words} {PLAIN}", prepare(scenario, tmp_path), out)
     assert in_process(*words).returncode == 0
 
     for contents in ("numbers", "link to itself"):

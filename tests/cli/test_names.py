@@ -85,6 +85,7 @@ def test_an_ascii_locale_takes_names_in_utf_8(by_shell, tmp_path, verb):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize("verb", ["run", "sweep", "law", "nnm", "bands", "plot", "export"])
 def test_a_folder_may_have_bytes_that_are_no_text(in_process, monkeypatch, tmp_path, verb):
     scenario = SCENARIOS[verb]

@@ -18,7 +18,7 @@ range = [0.97, 1.01]
 harmonics = 5
 """
 
-pytestmark = pytest.mark.parallel(1)
+pytestmark = [pytest.mark.parallel(1), pytest.mark.usefixtures("plain_pictures")]
 
 
 # A curve is named by its restitution and by what it keeps, here the frequency in rad/s.

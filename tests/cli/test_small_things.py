@@ -26,6 +26,7 @@ def test_pictures_are_no_part_of_a_case_that_simulates_nothing(kind):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(("verb", "text"), [("nnm", BRANCHES), ("design", DESIGN)])
 def test_branches_and_searches_need_not_be_drawn(in_process, tmp_path, verb, text):
     case = tmp_path / "case.toml"

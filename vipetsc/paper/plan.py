@@ -210,7 +210,9 @@ class PaperStep:
         if isinstance(self.case, NnmCase):
             return int(_branch_statistics(self.results(root))["failed"])
         if isinstance(self.case, Sweep):
-            return int((open_ensemble(self.folder(root))["status"] == FAILED).sum())
+            # To read all measures takes much longer, and a call with nothing to do does it for every sweep.
+            with open_netcdf(self.folder(root) / "ensemble.h5", "sweep's ensemble", ("status",)) as ensemble:
+                return int((ensemble["status"] == FAILED).sum())
         return 0
 
     def statistics(self, root: Path) -> dict[str, Any]:
