@@ -277,6 +277,19 @@ def test_bad_values_of_a_condensed_case_are_refused(change, key):
         chain_case(change)
 
 
+@pytest.mark.parametrize(
+    ("nnm", "message"),
+    [
+        ({"start_frequency": [1600.0], "start_sites": [2]}, "site numbers from 1 to 1"),
+        ({"start_sites": [1]}, "begin at a start_frequency"),
+    ],
+)
+def test_start_sites_of_a_shot_lattice_are_there_and_begin_breathers(nnm, message):
+    lattice = {"preset": "four-band", "cells": 14}
+    with pytest.raises(CaseError, match=message):
+        NnmCase.from_table({"lattice": lattice, "contacts": {"sites": [6]}, "nnm": {"system": "chain"} | nnm})
+
+
 @pytest.mark.parametrize("system", ["reduced", 'chain"\nshooting = "dense'])
 def test_branches_shot_with_dense_matrices_have_no_start_frequency(system):
     with pytest.raises(CaseError, match=r"nnm.start_frequency"):

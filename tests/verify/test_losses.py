@@ -194,6 +194,34 @@ def test_harmonics_of_all_orders_count_in_the_loss():
     assert motion.force == pytest.approx(orbit.force, rel=1e-4)
 
 
+@pytest.mark.parametrize("method", ["shooting", "condensed"])
+def test_dashpots_of_a_system_of_ones_own_take_what_those_of_a_lattice_take(method):
+    """The two masses as a lattice with damping and as masses with dashpots: one branch, one loss, one force."""
+    nnm = {"method": method, "modes": [1], "points": 14, "largest_step": 0.3, "first_step": 0.1, "start_energy": 0.7}
+    nnm |= {"tolerance": 1e-11, "truncation": 1e-5}
+    contacts = TWO_MASSES["contacts"]
+    lattice = {"name": "rig", "lattice": TWO_MASSES["lattice"], "contacts": contacts}
+    own = {
+        "masses": [1.0, 1.0],
+        "springs": [{"start": start, "end": end, "stiffness": 1.5} for start, end in ((0, 1), (1, 2), (0, 2))],
+        "dashpots": [{"start": 0, "end": end, "damping": 0.06} for end in (1, 2)],
+        "contacts": [{"host": 0, "resonator": 1, "clearance": contacts["clearance"]}],
+    }
+    of_system = {key: contacts[key] for key in ("law", "stiffness", "restitution", "side")}
+    cases = [
+        lattice | {"nnm": nnm | {"system": "chain", "forced": [2, 1]}},
+        {"name": "own", "contacts": of_system, "nnm": nnm | {"system": "own", "own": own, "forced": [2]}},
+    ]
+    first, second = (follow_all(NnmCase.from_table(table), None, MPI.COMM_SELF)[0] for table in cases)
+
+    assert first.points[-1].episodes == 1
+    assert first.points[0].damping_ratio == pytest.approx(0.06 / (2 * 2 * np.pi * first.points[0].frequency), rel=1e-9)
+    for of_lattice, of_own in zip(first.points, second.points, strict=True):
+        assert of_own.energy == pytest.approx(of_lattice.energy, rel=1e-9)
+        assert of_own.loss == pytest.approx(of_lattice.loss, rel=1e-9)
+        assert of_own.force == pytest.approx(of_lattice.force, rel=1e-9)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("damping", [0.02, 0.005])
 def test_the_force_holds_a_steady_state_in_quadrature(damping):

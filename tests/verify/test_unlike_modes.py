@@ -14,7 +14,7 @@ from tests.condensed_branches import condensed_branch
 from tests.models import CLEARANCE, four_band_contact
 from tests.unlike_lattices import independent_lattice, unlike_case
 from vipetsc.case.nnm_table import NnmTable
-from vipetsc.lattice import Contact, WaveCompliance
+from vipetsc.lattice import Chain, Contact, WaveCompliance
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
@@ -185,3 +185,22 @@ def test_bloch_waves_and_all_modes_give_the_same_breather_on_one_side(one_sided)
     assert first.energy == pytest.approx(shot.energy, rel=1e-5)
     u = np.concatenate(list(state_of(by_modes, second, chain.cell.dofs).values()))
     assert min(np.abs(u - shot.x).max(), np.abs(u + shot.x).max()) < 1e-4 * np.abs(u).max()
+
+
+def test_a_breather_begins_at_the_site_that_is_asked_for():
+    """At a linear stop that is twice as far the breather is twice as large, and the other way it is its negative."""
+    sites = (4, 13)
+    chain = Chain(breather_chain().cell, 18, "fixed", sites, (CLEARANCE, 2 * CLEARANCE))
+    stops = [Stops.both(four_band_contact("bilinear"), clearance) for clearance in chain.clearances]
+    system = System.from_chain(chain, stops, dense=False)
+    problem = LatticeShooting(system, chain, MAPS["quarter"], MPI.COMM_SELF, 1e-12, 12)
+
+    near = problem.breather(1600.0, [1])
+    far = problem.breather(1600.0, [2])
+    opposite = problem.breather(1600.0, [-2])
+
+    assert np.abs(far.x).argmax() // chain.cell.dofs == sites[1]
+    assert np.abs(near.x).argmax() // chain.cell.dofs == sites[0]
+    assert system.contact_rows[1] @ far.x == pytest.approx(2 * (system.contact_rows[0] @ near.x), rel=1e-6)
+    assert far.energy == pytest.approx(4 * near.energy, rel=1e-6)
+    assert opposite.x == pytest.approx(-far.x, abs=1e-9 * np.abs(far.x).max())

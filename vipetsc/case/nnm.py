@@ -24,6 +24,7 @@ from vipetsc.case.nnm_checks import (
     check_reduced,
     check_shooting,
     check_size,
+    check_start_sites,
 )
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.case.resolve import (
@@ -146,6 +147,7 @@ class NnmCase(CaseFile):
             chain = build_chain(lattice, contacts).without_dashpots()
             return [*problems, *check_condensed(nnm, contacts, chain, valid)]
         problems += check_shooting(nnm, lattice, cell)
+        problems += check_start_sites(nnm, len(sites))
         problems += check_size(nnm, lattice, cell)
         problems += check_stiffness(contacts, bool(sites), valid)
         rigid = int(lattice.ends != "fixed")  # nothing holds it

@@ -39,6 +39,7 @@ def check_options(nnm: NnmTable) -> Iterator[Problem]:
     masses = len(nnm.custom.masses)
     pairs = [(f"springs[{i}]", s.start, s.end) for i, s in enumerate(nnm.custom.springs, 1)]
     pairs += [(f"smooth[{i}]", s.start, s.end) for i, s in enumerate(nnm.custom.smooth, 1)]
+    pairs += [(f"dashpots[{i}]", d.start, d.end) for i, d in enumerate(nnm.custom.dashpots, 1)]
     pairs += [(f"contacts[{i}]", p.host, p.resonator) for i, p in enumerate(nnm.custom.contacts, 1)]
     for key, start, end in pairs:
         if start == end or max(start, end) > masses:
@@ -136,9 +137,9 @@ def check_method(nnm: NnmTable) -> Iterator[Problem]:
         method = "shot"
         foreign = ("compare", "switch")
     elif nnm.system == "chain":
-        # A start frequency begins a branch of localised motions of a chain: it is not foreign here.
-        method = "condensed"
-        foreign = ("start_sites",)
+        # A start frequency begins a branch of localised motions of a chain, at sites: neither is foreign here.
+        method = "that begin at a start_frequency"
+        foreign = () if nnm.start_frequency else ("start_sites",)
     else:
         method = "condensed"
         foreign = ("start_frequency", "start_sites")
@@ -155,9 +156,7 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
         yield Problem("nnm.start_frequency", [], "give frequencies in rad/s, between the pass bands or above them")
 
     count = len(chain.sites) + len(nonlinear_places(chain))
-    outside = [number for number in nnm.start_sites if not 1 <= abs(number) <= count]
-    if outside:
-        yield Problem("nnm.start_sites", outside, f"give site numbers from 1 to {count}, with a sign")
+    yield from check_start_sites(nnm, count)
 
     cell = chain.cell
     masses = cell.dofs * chain.cells
@@ -182,6 +181,13 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
     if inside:
         edges = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)
         yield Problem("nnm.start_frequency", inside, f"lies in a pass band ({edges} rad/s); motions there radiate")
+
+
+def check_start_sites(nnm: NnmTable, count: int) -> Iterator[Problem]:
+    """The problem of motions that begin at other places than the ``count`` that there are."""
+    outside = [number for number in nnm.start_sites if not 1 <= abs(number) <= count]
+    if outside:
+        yield Problem("nnm.start_sites", outside, f"give site numbers from 1 to {count}, with a sign")
 
 
 def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iterator[Problem]:

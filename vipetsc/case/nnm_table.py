@@ -29,6 +29,14 @@ class SmoothSpringTable(Section):
     quadratic: Finite = 0.0
 
 
+class DashpotTable(Section):
+    """A dashpot of ``damping`` in N s/m between two masses, as in ``LinearSpringTable``."""
+
+    start: Annotated[int, Field(ge=0)]
+    end: Annotated[int, Field(ge=1)]
+    damping: Positive
+
+
 class PairTable(Section):
     """A contact between ``host`` (0 is the ground) and ``resonator`` (1-based) with its ``clearance`` in m.
 
@@ -42,11 +50,12 @@ class PairTable(Section):
 
 
 class SystemTable(Section):
-    """The section [nnm.own]: masses in kg, linear and smooth springs, contact pairs (law: ``[contacts]``)."""
+    """The section [nnm.own]: masses in kg, linear and smooth springs, dashpots, contact pairs (law: ``[contacts]``)."""
 
     masses: list[Positive] = Field(min_length=1)
     springs: list[LinearSpringTable] = Field(min_length=1)
     smooth: list[SmoothSpringTable] = Field([])
+    dashpots: list[DashpotTable] = Field([])
     contacts: list[PairTable] = Field([])
 
 

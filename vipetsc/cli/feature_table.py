@@ -196,7 +196,11 @@ RUBBER = {"plugins": {"modules": [str(files("vipetsc") / "examples" / "own_law.p
     law="rubber-stop", parameters={"b": 1e7}
 )
 FEATURES: tuple[Feature, ...] = (
-    Feature("dashpots", _lattice(damping={"mass": 1.0})),
+    Feature(
+        "dashpots",
+        _lattice(damping={"mass": 1.0}),
+        {"nnm": {"own": {"dashpots": [{"start": 0, "end": 2, "damping": 0.1}]}}},
+    ),
     Feature("loss by bands", _lattice(damping={"loss": {"1": 0.01}})),
     Feature(
         "smooth springs",

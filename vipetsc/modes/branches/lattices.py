@@ -54,7 +54,7 @@ class LatticeMethod(NnmMethod):
     def start(self, problem: PeriodicProblem[Point], job: int) -> Point:
         """The orbit of a linear mode at a small energy, or a breather of a start frequency."""
         if self.options.start_frequency:
-            return self.lattice.breather(self.options.start_frequency[job])
+            return self.lattice.breather(self.options.start_frequency[job], self.options.start_sites or [1])
         return linear_start(self.lattice, job, start_energy(self.options, self.system, job))
 
     def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:

@@ -35,6 +35,7 @@ from vipetsc.modes.point import Point
 from vipetsc.modes.shooting.flow import Arc
 from vipetsc.modes.shooting.orbit import whole_period
 from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.system import elongation_rows
 
 # Nodes of Gauss's rule in a piece of an arc, which is at most this part of a radian of the fastest linear mode. A stiff
 # contact may be one piece: 12 nodes err by 1e-4 of its loss, 24 by 1e-12.
@@ -68,6 +69,13 @@ def dissipation_of(case: NnmCase) -> Dissipation:
         chain = case.damped_chain
         damping = chain.damping_rows(0, chain.cells)
         damping.eliminate_zeros()
+    elif case.nnm.custom is not None:
+        # The table counts masses from 1, and 0 is the ground.
+        dashpots = case.nnm.custom.dashpots
+        ends = [(dashpot.start - 1 if dashpot.start else None, dashpot.end - 1) for dashpot in dashpots]
+        rows = elongation_rows(ends, len(case.nnm.custom.masses))
+        rates = np.array([dashpot.damping for dashpot in dashpots])
+        damping = csr_matrix(rows.T @ (rates[:, None] * rows))
     return Dissipation(damping=damping, laws=case.laws(), forced=case.forced_mass())
 
 

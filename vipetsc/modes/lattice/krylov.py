@@ -6,6 +6,7 @@ lattice, whose size is bounded from below for a breather between the bands, and 
 rank: GMRES needs few products, and no preconditioner (options of PETSc begin with ``nnm_``).
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Protocol
@@ -196,22 +197,27 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
         null = self.newton.null_vector(frame, frame.xi, row / np.linalg.norm(row))
         return frame.chart.to_changes(frame.xi, null)
 
-    def breather(self, omega: float) -> Point:
-        """The orbit of a frequency ``omega`` in rad/s, between the bands, in which the first site touches.
+    def breather(self, omega: float, sites: Sequence[int] = (1,)) -> Point:
+        """The orbit of a frequency ``omega`` in rad/s, between the bands, in which ``sites`` touch.
 
-        The guess is a describing function, as for condensed motions. Raises ContinuationError if there is none,
-        StartError if Newton's method does not converge from there.
+        These are numbers from 1, negative of sites that move the other way. The guess are describing functions, as for
+        condensed motions. Raises ContinuationError if there is none, StartError if Newton's method does not converge
+        from there.
         """
         system = self.system
-        row = system.contact_rows[0]
-        pair = system.contacts[0]
         # Displacements by a force of 1 N, in m. Of a lattice that nothing holds a little inertia replaces the walls.
-        moved = splu((system.stiffness - omega**2 * diags(system.masses)).tocsc()).solve(row)
-        pressed = splu((system.stiffness + STATIC * omega**2 * diags(system.masses)).tocsc()).solve(row)
-        g = PlaceCompliance(static=float(row @ pressed), dynamic=float(row @ moved))
-        mean, amplitude = describing_motion(SiteForces([pair.stops]), 0, g, omega)
+        dynamic = splu((system.stiffness - omega**2 * diags(system.masses)).tocsc())
+        static = splu((system.stiffness + STATIC * omega**2 * diags(system.masses)).tocsc())
+        x = np.zeros(system.dofs)
+        for number in sites:
+            row = system.contact_rows[abs(number) - 1]
+            stops = system.contacts[abs(number) - 1].stops
+            moved = dynamic.solve(row)
+            pressed = static.solve(row)
+            g = PlaceCompliance(static=float(row @ pressed), dynamic=float(row @ moved))
+            mean, amplitude = describing_motion(SiteForces([stops]), 0, g, omega)
+            x += moved * (np.sign(number) * amplitude / g.dynamic) + pressed * (mean / g.static)
 
-        x = moved * (amplitude / g.dynamic) + pressed * (mean / g.static)
         frame = self.frame_at("relative", x, 2 * np.pi / omega, np.empty(0))
         keep_period = np.append(np.zeros(system.dofs), 1.0)
         attempt = frame.solve(frame.xi, keep_period, 1.0)
