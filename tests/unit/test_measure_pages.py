@@ -17,8 +17,9 @@ from tests.readable import complaints
 from vipetsc.case import Case
 from vipetsc.case.keys import unit_of
 from vipetsc.case.sweep import coordinate
-from vipetsc.figures.measure_pages import MOST_PAGES, Measure, Roles, measure_pages, measures_of, reason_without_page
+from vipetsc.figures.measure_pages import MOST_PAGES, Measure, measure_pages, measures_of, reason_without_page
 from vipetsc.figures.measure_panels import cell_edges, log_ticks
+from vipetsc.figures.measure_roles import Roles
 from vipetsc.figures.style import rc_style, save
 from vipetsc.figures.sweep_members import Labels
 from vipetsc.figures.swept_axes import SweptAxis, even_scale

@@ -27,9 +27,9 @@ def draw_losses(axes: Axes, branch: xr.Dataset) -> None:
     if "force" not in branch or not np.isfinite(branch["force"].values).any():
         return
 
-    beside = axes.twinx()
-    beside.plot(energy, branch["force"].values, color=style.VERMILION, lw=1.0, ls="--", marker=marker)
-    beside.set(yscale="log", ylabel="force in resonance (N)")
+    of_forces = axes.twinx()
+    of_forces.plot(energy, branch["force"].values, color=style.VERMILION, lw=1.0, ls="--", marker=marker)
+    of_forces.set(yscale="log", ylabel="force in resonance (N)")
     # One legend for both axes.
     axes.plot([], [], color=style.VERMILION, lw=1.0, ls="--", label="force")
     axes.legend(fontsize=5.5)

@@ -15,10 +15,11 @@ from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
 from vipetsc.figures.panels import band_of, percentile_norm
 from vipetsc.figures.style import Drawing
-from vipetsc.figures.sweep_members import AMPLITUDE, Sweeps, counted, grouped, in_pi, reading_of, suffix, table
+from vipetsc.figures.sweep_members import AMPLITUDE, Sweeps, grouped, in_pi, reading_of, suffix, table
 from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import select
 from vipetsc.spectra import doubt, normalised
+from vipetsc.wording import counted
 
 AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "joint"}
 COLOURS = {"energy_weighted": style.BLUE, "masked": style.VERMILION, "joint": style.GREEN}

@@ -48,20 +48,25 @@ def residual_correlations(identified: xr.Dataset) -> Figure:
         chosen = identified["data/channel"].values == number
         residuals = identified["data/measured"].values[chosen] - identified["data/model"].values[chosen]
         residuals = residuals - residuals.mean()
-        power = residuals @ residuals
         lags = np.arange(1, min(MOST_LAGS, len(residuals) // 2) + 1)
-        values = [residuals[lag:] @ residuals[:-lag] / power if power else 0.0 for lag in lags]
+        values = np.array([residuals[lag:] @ residuals[:-lag] for lag in lags])
+        power = residuals @ residuals
+        if power:
+            values = values / power
+
+        # Of white noise 95 % of the values lie between these bounds.
         bound = 1.96 / np.sqrt(len(residuals))
         panel.axhspan(-bound, bound, color=style.PALE, lw=0)
         panel.vlines(lags, 0, values, color=style.BLUE, lw=0.8)
         panel.set(xlabel="lag (samples)", title=str(identified["channel"].values[number]))
+
     axes[0].set_ylabel("autocorrelation of residuals")
     panels.label_panels(axes)
     return figure
 
 
 def misfit_profiles(identified: xr.Dataset) -> Figure:
-    """Draw the misfit with each parameter held at values around the best one, and all others fitted."""
+    """Draw the misfit with each parameter held at values near the best one, and all others fitted."""
     count = identified.sizes["parameter"]
     columns = min(count, 4)
     rows = -(-count // columns)
@@ -88,12 +93,14 @@ def _draw_profile(axes: Axes, parameter: xr.Dataset) -> None:
     places = 100 * (parameter["profile/value"].values / value - 1)
     axes.plot(places, parameter["profile/cost"].values, "o-", color=style.BLUE, ms=3, lw=0.8)
     if np.isfinite(error) and error > 0:
-        around = np.linspace(places.min(), places.max(), 100)
-        parabola = (around * value / (100 * error)) ** 2
-        axes.plot(around, parabola, color=style.GREY, lw=0.7, ls=style.DASHED)
+        dense = np.linspace(places.min(), places.max(), 100)
+        parabola = (dense * value / (100 * error)) ** 2
+        axes.plot(dense, parabola, color=style.GREY, lw=0.7, ls=style.DASHED)
     axes.axvline(0.0, color=style.BLACK, lw=0.6)
-    unit = parameter["unit"].item()
-    axes.set(xlabel=f"% from {value:.4g}{'' if unit == '1' else f' {unit}'}", ylabel="misfit - least")
+    label = f"% from {value:.4g}"
+    if parameter["unit"].item() != "1":
+        label += f" {parameter['unit'].item()}"
+    axes.set(xlabel=label, ylabel="misfit - least")
 
 
 def parameter_correlation(identified: xr.Dataset) -> Figure:
@@ -103,7 +110,9 @@ def parameter_correlation(identified: xr.Dataset) -> Figure:
     figure = style.new_figure(style.PAGE, 3.2)
     matrix, directions = figure.subplots(1, 2)
     shown = matrix.imshow(identified["correlation"].values, vmin=-1, vmax=1, cmap="RdBu_r")
-    size = 6 if count <= MOST_NAMES else 4
+    size = 6
+    if count > MOST_NAMES:
+        size = 4
     matrix.set_xticks(np.arange(count), names, rotation=90, fontsize=size)
     matrix.set_yticks(np.arange(count), names, fontsize=size)
     matrix.set_title("Correlation of the errors")

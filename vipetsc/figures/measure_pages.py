@@ -4,7 +4,6 @@ A measure is any variable of ``ensemble.h5`` over all axes of its sweep, perhaps
 Numbers are positions on an axis; words, lists and numbers with two values are curves; samples of disorder are a band.
 """
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
@@ -24,17 +23,15 @@ from vipetsc.figures.measure_panels import (
     draw_maps,
     draw_samples,
 )
+from vipetsc.figures.measure_roles import MOST_CURVES, PART, Roles
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import in_file_name, table
 from vipetsc.figures.swept_axes import SweptAxis, SweptKey, joined
 from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import over_samples
+from vipetsc.wording import with_unit
 
-MOST_CURVES = 6
-MOST_PANELS = 16
 MOST_PAGES = 12  # of a measure; a longer study is cut through its largest value
-LEAST_ON_A_MAP = 3  # values of a number that is an axis of a map
-PART = "part"  # the dimension of parts of the frequency axis
 BAND = "band"  # how those begin that are pass bands
 LONGEST_STEM = 150  # letters: file systems take 255, and figures of a report have prefixes
 
@@ -54,49 +51,6 @@ ON_REQUEST = {
     "rms_acceleration",
     "steady_drift",
 }
-
-
-class Roles(NamedTuple):
-    """What the axes of a measure are in its pictures: positions ``x`` (and ``y`` of a map), curves, panels, pages."""
-
-    x: SweptAxis
-    y: SweptAxis | None
-    curves: tuple[SweptAxis, ...]
-    panels: tuple[SweptAxis, ...]
-    pages: tuple[SweptAxis, ...]
-
-    @property
-    def labels(self) -> list[str]:
-        """The labels of the axes of numbers: pages with the same ones can have common axes."""
-        return [axis.label if axis.is_number else "" for axis in (self.x, self.y) if axis]
-
-    @classmethod
-    def of(cls, axes: Sequence[SweptAxis]) -> Self:
-        """Return the roles of ``axes``, of which there is at least one."""
-        longest_first = sorted(axes, key=lambda axis: -axis.size)
-        numbers = [axis for axis in longest_first if axis.is_number]
-        of_a_map = [axis for axis in numbers if axis.size >= LEAST_ON_A_MAP]
-        x = (numbers or longest_first)[0]
-        y = of_a_map[1] if len(of_a_map) > 1 else None
-
-        taken = {x.dimension} | ({y.dimension} if y else set())
-        others = [axis for axis in axes if axis.dimension not in taken]
-        # The last axes of a case vary fastest: what they compare stands closest together.
-        # Bands differ by orders of magnitude: members are compared band by band.
-        keys = [axis for axis in others if axis.dimension != PART]
-        curves = () if y else _last_of(keys or others, MOST_CURVES)
-        taken |= {axis.dimension for axis in curves}
-        others = [axis for axis in others if axis.dimension not in taken]
-        panels = _last_of(others, MOST_PANELS)
-        return cls(x, y, curves, panels, pages=tuple(others[: len(others) - len(panels)]))
-
-
-def _last_of(axes: Sequence[SweptAxis], most: int) -> tuple[SweptAxis, ...]:
-    """Return the last of the ``axes`` that have ``most`` combinations or fewer."""
-    count = 0
-    while count < len(axes) and math.prod(axis.size for axis in axes[-count - 1 :]) <= most:
-        count += 1
-    return tuple(axes[len(axes) - count :])
 
 
 class Measure(NamedTuple):
@@ -134,12 +88,17 @@ class Measure(NamedTuple):
         values, *ends = (item.isel(place).isel(first) for item in (values, *ends))
 
         unit = str(values.attrs.get("units", "1"))
+        if unit == "1":
+            unit = ""  # as texts have it
+        band = None
+        if ends:
+            band = (ends[0], ends[1])
         return cls(
             name=name,
-            unit="" if unit == "1" else unit,
+            unit=unit,
             text=str(values.attrs.get("long_name", "")),
             values=values.where(np.isfinite),
-            band=(ends[0], ends[1]) if ends else None,
+            band=band,
             samples=_seeds(ensemble).size,
             axes=tuple(axes),
             failed=means["contact_episodes"].isel(first, missing_dims="ignore").isnull(),
@@ -148,7 +107,7 @@ class Measure(NamedTuple):
     @property
     def label(self) -> str:
         """The name of the measure with its unit."""
-        return f"{self.name} ({self.unit})" if self.unit else self.name
+        return with_unit(self.name, self.unit)
 
     def at(self, place: Mapping[str, int]) -> Self:
         """Return the measure at the indices ``place`` of its dimensions, without these."""
@@ -283,7 +242,9 @@ def _pages_over_keys(measure: Measure, heading: str, stem: str, others: Sequence
     for number, place in enumerate(places, 1):
         page = measure.at(place)
         if np.isfinite(page.values).any():
-            page_stem = f"{stem}-{number}" if dimensions else stem
+            page_stem = stem
+            if dimensions:
+                page_stem += f"-{number}"
             yield Drawing(page_stem, partial(_page, page, roles, [heading, cut + measure.place_text(place)], common))
 
 
@@ -317,32 +278,27 @@ def _samples_page(ensemble: xr.Dataset, measure: Measure, heading: str) -> Figur
 
 def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAxes | None) -> Figure:
     """Draw a measure in the panels of a page, its largest value marked, on axes ``common`` to several pages."""
-    heading, *further = title
-    over = joined([axis.label for axis in (roles.x, roles.y) if axis])
-    compared = joined([key.label for axis in (*roles.panels, *roles.curves) for key in axis.keys])
-    lines = [heading, f"over {over}" + (f", for each {compared}" if compared else ""), *further]
     best = measure.largest()
-    # Of the bands the driven one has most.
+    # Of the bands the driven one has most: to mark its largest value would say nothing.
     marks_largest = all(axis.dimension != PART for axis in measure.axes)
+    lines = _lines_above(measure, roles, title)
     if marks_largest:
         largest = f"{float(measure.values.isel(best)):.4g} {measure.unit}".strip()
-        lines.append(f"largest (ring): {largest} at {measure.place_text(best)}")
-    if measure.samples:
-        lines.append(f"means over {measure.samples} samples" + ("" if roles.y else "; bands: 5 to 95 % of the samples"))
-    failed = int(measure.failed.sum())
-    if failed:
-        lines.append(f"{failed} of {measure.failed.size} members failed and are left out")
-
-    without_value = int((measure.values.isnull() & ~measure.failed).sum())
-    if without_value:
-        lines.append(f"{without_value} of {measure.values.size} values are missing")
+        lines.insert(1 + len(title), f"largest (ring): {largest} at {measure.place_text(best)}")
 
     panels = _by_place(measure, roles.panels)
-    page = MeasurePage(measure.label, lines, list(_by_place(measure, roles.curves)) if roles.curves else [])
-    page.lay_out(list(panels), columns=roles.panels[-1].size if len(roles.panels) > 1 else 0)
+    legend: list[str] = []
+    if roles.curves:
+        legend = list(_by_place(measure, roles.curves))
+    columns = 0
+    if len(roles.panels) > 1:
+        columns = roles.panels[-1].size
+    page = MeasurePage(measure.label, lines, legend)
+    page.lay_out(list(panels), columns=columns)
 
-    of_panels = {axis.dimension: best[axis.dimension] for axis in roles.panels}
-    marked = measure.place_text(of_panels) if marks_largest else None
+    marked = None
+    if marks_largest:
+        marked = measure.place_text({axis.dimension: best[axis.dimension] for axis in roles.panels})
     if roles.y:
         fields = [panel.values.transpose(roles.y.dimension, roles.x.dimension).values for panel in panels.values()]
         ring = None
@@ -351,9 +307,34 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAx
         return draw_maps(page, roles.x, roles.y, fields, ring, common)
 
     for axes, (text, panel) in zip(page.panels, panels.items(), strict=True):
-        largest_point = (best[roles.x.dimension], float(measure.values.isel(best))) if text == marked else None
+        largest_point = None
+        if text == marked:
+            largest_point = (best[roles.x.dimension], float(measure.values.isel(best)))
         draw_curves(axes, roles.x, _curves(panel, roles.curves), largest_point)
     return page.finish_curves(roles.x, measure.values.values, common)
+
+
+def _lines_above(measure: Measure, roles: Roles, title: Sequence[str]) -> list[str]:
+    """Return the lines above the panels: the ``title``, what varies on the page, and what values are left out."""
+    heading, *further = title
+    over = f"over {joined([axis.label for axis in (roles.x, roles.y) if axis])}"
+    compared = joined([key.label for axis in (*roles.panels, *roles.curves) for key in axis.keys])
+    if compared:
+        over += f", for each {compared}"
+    lines = [heading, over, *further]
+
+    if measure.samples:
+        means = f"means over {measure.samples} samples"
+        if roles.y is None:
+            means += "; bands: 5 to 95 % of the samples"
+        lines.append(means)
+    failed = int(measure.failed.sum())
+    if failed:
+        lines.append(f"{failed} of {measure.failed.size} members failed and are left out")
+    without_value = int((measure.values.isnull() & ~measure.failed).sum())
+    if without_value:
+        lines.append(f"{without_value} of {measure.values.size} values are missing")
+    return lines
 
 
 def _by_place(measure: Measure, axes: Sequence[SweptAxis]) -> dict[str, Measure]:
@@ -366,7 +347,9 @@ def _by_place(measure: Measure, axes: Sequence[SweptAxis]) -> dict[str, Measure]
 def _curves(panel: Measure, compared: Sequence[SweptAxis]) -> list[Curve]:
     """Return the curves of a panel, one for each combination of what is ``compared`` in it."""
     are_bands = [axis.dimension for axis in compared] == [PART]
-    colours = _band_colours(compared[0]) if are_bands else [""] * MOST_CURVES
+    colours = [""] * MOST_CURVES
+    if are_bands:
+        colours = _band_colours(compared[0])
     curves = []
     for number, (label, one) in enumerate(_by_place(panel, compared).items()):
         ends = one.band and (one.band[0].values, one.band[1].values)

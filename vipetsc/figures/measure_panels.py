@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import Locator, LogLocator, MaxNLocator, NullLocator
 
 from vipetsc.figures import style
 from vipetsc.figures.log_ticks import has_room, label_log_axis, log_ticks
@@ -80,10 +80,15 @@ class MeasurePage:
         if not 0 < columns <= MOST_COLUMNS:
             columns = -(-count // -(-count // MOST_COLUMNS))
         rows = -(-count // columns)
-        self.width = SINGLE if count == 1 else style.PAGE
+        self.width = style.PAGE
+        if count == 1:
+            self.width = SINGLE
 
         heading = [part for line in self.title if line for part in wrap(line, int(LETTERS * self.width))]
-        height = 0.15 * len(heading) + (2.4 if rows == 1 else 0.3 + 1.75 * rows)
+        height = 2.4
+        if rows > 1:
+            height = 0.3 + 1.75 * rows
+        height += 0.15 * len(heading)
         strip = self._legend_height()
         self.figure = style.new_figure(self.width, height + strip)
         self.body = self.figure
@@ -137,6 +142,8 @@ class MeasurePage:
             values = common.values
         finite = values[np.isfinite(values)]
         first = self.panels[0]
+
+        # The axes of all panels are shared: scales and limits of the first are those of all.
         if common and x.is_number:
             first.update_datalim([(common.x.min(), finite.min()), (common.x.max(), finite.max())])
             first.autoscale_view()
@@ -145,6 +152,7 @@ class MeasurePage:
             label_log_axis(first.yaxis, float(finite.min()), float(finite.max()), USED * PANEL_HEIGHT)
         elif 0 <= finite.min() < 0.5 * finite.max():
             first.set_ylim(bottom=0)
+
         self.label_axes(x, self.label)
         self.write_legend()
         return self.figure
@@ -161,9 +169,14 @@ def draw_curves(axes: Axes, x: SweptAxis, curves: Sequence[Curve], ring: tuple[i
     """Draw ``curves`` over ``x``, points alone over categories, and a ``ring`` at an index and value."""
     order = np.argsort(x.positions, kind="stable")
     for curve in curves:
-        shift = 0.0 if x.is_number else 0.12 * (curve.number - 0.5 * (len(curves) - 1))
+        shift = 0.0
+        line = "-"
+        if not x.is_number:
+            # Points over one category stand side by side, and no line joins categories.
+            shift = 0.12 * (curve.number - 0.5 * (len(curves) - 1))
+            line = ""
         positions = x.positions[order] + shift
-        axes.plot(positions, curve.values[order], label=curve.label, **curve.look | {"ls": "-" if x.is_number else ""})
+        axes.plot(positions, curve.values[order], label=curve.label, **curve.look | {"ls": line})
         if curve.band:
             _draw_band(axes, x, positions, *(end[order] for end in curve.band), colour=curve.look["color"])
         if ring and curve.values[ring[0]] == ring[1]:
@@ -205,7 +218,9 @@ def draw_maps(
     """
     x_order = np.argsort(x.positions, kind="stable")
     y_order = np.argsort(y.positions, kind="stable")
-    norm = _norm(common.values if common else np.stack(fields))
+    norm = _norm(np.stack(fields))
+    if common:
+        norm = _norm(common.values)
     for axes, unordered in zip(page.panels, fields, strict=True):
         values = unordered[np.ix_(y_order, x_order)]
         axes.set(xscale=x.scale, yscale=y.scale, facecolor=style.PALE)
@@ -237,7 +252,9 @@ def _norm(values: np.ndarray) -> Normalize:
     high = float(finite.max())
     if low > 0 and high > LOG_RATIO * low:
         return LogNorm(low, high)
-    return Normalize(low, high if high > low else low + 1)
+    if high == low:
+        high = low + 1  # a field of one value still has a scale
+    return Normalize(low, high)
 
 
 def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, norm: Normalize, most: int) -> None:
@@ -245,7 +262,9 @@ def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray,
     finite = values[np.isfinite(values)]
     if len(finite) < 4 or np.ptp(finite) == 0:
         return
-    locator = LogLocator(numticks=most) if isinstance(norm, LogNorm) else MaxNLocator(most)
+    locator: Locator = MaxNLocator(most)
+    if isinstance(norm, LogNorm):
+        locator = LogLocator(numticks=most)
     levels = [level for level in locator.tick_values(norm.vmin, norm.vmax) if finite.min() < level < finite.max()]
     if not levels:
         return
@@ -269,12 +288,12 @@ def draw_samples(page: MeasurePage, seeds: np.ndarray, series: Sequence[Curve]) 
 
 def cell_edges(positions: np.ndarray, scale: str) -> np.ndarray:
     """Return the edges of the cells of a map about rising ``positions``, halfway between them on the ``scale``."""
-    on_scale = np.log(positions) if scale == "log" else positions
-    middles = 0.5 * (on_scale[1:] + on_scale[:-1])
-    first = 2 * on_scale[0] - middles[0]
-    last = 2 * on_scale[-1] - middles[-1]
-    edges = np.concatenate([[first], middles, [last]])
-    return np.exp(edges) if scale == "log" else edges
+    if scale == "log":
+        return np.exp(cell_edges(np.log(positions), "linear"))
+    middles = 0.5 * (positions[1:] + positions[:-1])
+    first = 2 * positions[0] - middles[0]
+    last = 2 * positions[-1] - middles[-1]
+    return np.concatenate([[first], middles, [last]])
 
 
 def label_positions(axis: Axis, swept: SweptAxis, length: float) -> None:
@@ -285,13 +304,17 @@ def label_positions(axis: Axis, swept: SweptAxis, length: float) -> None:
     positions = swept.positions
     texts = swept.value_texts
     if not swept.is_number:
-        is_long = axis.axis_name == "x" and not has_room(positions, texts, USED * length, is_horizontal=True)
-        axis.set_ticks(positions, texts, **({"rotation": 25, "ha": "right"} if is_long else {}))
+        look: dict[str, Any] = {}
+        if axis.axis_name == "x" and not has_room(positions, texts, USED * length, is_horizontal=True):
+            look = {"rotation": 25, "ha": "right"}
+        axis.set_ticks(positions, texts, **look)
         if axis.axis_name == "x":
             axis.axes.set_xlim(-0.5, len(positions) - 0.5)
         return
 
-    on_scale = np.log(positions) if swept.scale == "log" else positions
+    on_scale = positions
+    if swept.scale == "log":
+        on_scale = np.log(positions)
     number = swept.first_number
     if (
         number

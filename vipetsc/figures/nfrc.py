@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.figures import panels, style
 from vipetsc.io.netcdf import open_netcdf
+from vipetsc.wording import with_unit
 
 # Label, colour, and the line by which they differ in grey.
 ENERGIES = {
@@ -58,7 +59,9 @@ def response_page(
     curves: Sequence[xr.Dataset], rows: Sequence[Callable[[Axes, xr.Dataset], None]], height: float
 ) -> Figure:
     """Return a page of ``height`` in with a column for each of ``curves``, whose panels ``rows`` draw."""
-    width = style.COLUMN if len(curves) == 1 else style.PAGE
+    width = style.COLUMN
+    if len(curves) > 1:
+        width = style.PAGE
     figure = style.new_figure(width, height)
     columns = figure.subplots(len(rows), len(curves), sharex="col", squeeze=False).T
 
@@ -80,18 +83,21 @@ def parameter_label(branch: xr.Dataset) -> str:
         return "frequency (rad/s)"
     case = NfrcCase.of(branch)
     if case.nfrc.varies_key:
-        unit = str(branch["parameter"].attrs["units"])
-        return f"{case.nfrc.over} ({unit})" if unit not in ("", "1") else case.nfrc.over
+        return with_unit(case.nfrc.over, str(branch["parameter"].attrs["units"]))
     if case.nfrc.source == "wave":
         return "amplitude of the wave / clearance"
-    return "amplitude of the wall (m)" if case.drive.end else "amplitude (N)"
+    if case.drive.end:
+        return "amplitude of the wall (m)"
+    return "amplitude (N)"
 
 
 def parameter_of(branch: xr.Dataset) -> np.ndarray:
     """Return the parameter (point,) that varies along a curve."""
     over = str(branch.attrs["over"])
-    # Over a key of the case its values are a variable of their own.
-    values: np.ndarray = branch[over if over in branch else "parameter"].values
+    if over not in branch:
+        # The values of a key of the case are a variable of their own.
+        over = "parameter"
+    values: np.ndarray = branch[over].values
     return values
 
 
@@ -124,13 +130,19 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
     relative = largest / np.where(clearance > 0, clearance, 1.0)  # (point, site)
     # Along a curve over a key of the case they may not stay what they are at its beginning.
     if "parameter" in branch or not np.all(clearance > 0):
-        label = "largest |w| (mm)" if branch.sizes["site"] else "largest elongation (mm)"
+        label = "largest elongation (mm)"
+        if branch.sizes["site"]:
+            label = "largest |w| (mm)"
         relative = 1e3 * largest
     size = relative[:, 0]
 
-    others = "other sites" if branch.sizes["site"] else "other springs"
-    for number, other in enumerate(relative.T[1:]):
-        axes.plot(parameter, other, color=style.GREY, lw=0.6, label=None if number else others)
+    # One entry of the legend stands for all of them.
+    others: str | None = "other springs"
+    if branch.sizes["site"]:
+        others = "other sites"
+    for other in relative.T[1:]:
+        axes.plot(parameter, other, color=style.GREY, lw=0.6, label=others)
+        others = None
 
     # Sweeps lie beneath the branch, the one down narrower, so that both are seen where they coincide.
     for name, colour, width in (("up", style.GREEN, 6.0), ("down", style.PURPLE, 3.0)):
@@ -139,7 +151,9 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
             look = {"color": colour, "lw": width, "alpha": 0.35, "solid_capstyle": "butt"}
             axes.plot(parameter[points], size[points], label=f"sweep {name}", **look)
 
-    stable_label = "stable" if stable.any() else None
+    stable_label = None
+    if stable.any():
+        stable_label = "stable"
     axes.plot(parameter, np.where(stable, size, np.nan), color=style.BLACK, lw=1.3, label=stable_label)
     if not stable.all():
         # With the stable points next to them, so that the dashed line meets the full one.
@@ -160,7 +174,9 @@ def draw_special(axes: Axes, branch: xr.Dataset, values: np.ndarray, labelled: b
         (places,) = np.nonzero(branch["kind"].values == code)
         if places.size:
             look = {"ms": size, "mfc": "white", "mec": style.VERMILION, "ls": "none", "marker": marker}
-            axes.plot(parameter[places], values[places], label=label if labelled else None, **look)
+            if labelled:
+                look["label"] = label
+            axes.plot(parameter[places], values[places], **look)
 
 
 def _draw_phase(axes: Axes, branch: xr.Dataset) -> None:

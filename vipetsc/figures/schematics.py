@@ -17,9 +17,9 @@ from vipetsc.figures import style
 from vipetsc.figures.lattice_strip import draw_lattice, draw_wall
 from vipetsc.figures.panels import band_diagram, note
 from vipetsc.figures.style import with_prefix
-from vipetsc.figures.sweep_members import counted
 from vipetsc.lattice import Spring, UnitCell
 from vipetsc.lattice.chain import Pair
+from vipetsc.wording import counted
 
 # Lengths in units of the drawing.
 PITCH = 2.0  # distance between neighbouring masses

@@ -1,5 +1,6 @@
 """Sources of the pictures of sweeps: ensembles, members with their fields, and the names of both."""
 
+import re
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -12,6 +13,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from vipetsc.case import Case, Model, Sweep
+from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import style
 from vipetsc.figures.panels import ROMAN, recorded_sites
 from vipetsc.figures.style import Drawing
@@ -20,6 +22,7 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes, curves, field_time, open_run, over_samples, whole_members
 from vipetsc.lattice import waves_at
 from vipetsc.lattice.chain import cells_between
+from vipetsc.wording import counted
 
 AMPLITUDE = "amplitude"
 SITES = "contacts.sites"
@@ -158,7 +161,10 @@ class AmplitudeSeries(NamedTuple):
             tag = "abc"[column]
             if rows > 1:
                 tag += f".{ROMAN[row]}"
-            panel.set_title(f"({tag})" if row else f"({tag}) {self.headings[column]}")
+            title = f"({tag})"
+            if row == 0:
+                title += f" {self.headings[column]}"
+            panel.set_title(title)
         return figure, grid
 
     def snapshot_times(self) -> np.ndarray:
@@ -170,7 +176,8 @@ class AmplitudeSeries(NamedTuple):
         chain = member.model.chain
         sites = recorded_sites(member.run)
         delay = cells_between(sites - 1, member.model.drive_cell, chain.cells, chain.ends) / self.wave.speed
-        first, last = delay.min(), delay.max()
+        first = delay.min()
+        last = delay.max()
         burst = member.model.drive.duration
         end = field_time(member.run)[-1]
         times = np.array([0.5 * burst + 0.5 * first, 0.5 * burst + first, burst + last, 0.95 * end])
@@ -228,7 +235,9 @@ def series_of(sweeps: Sweeps, *needs: str) -> Iterator[AmplitudeSeries]:
 
 def _series_title(member: xr.Dataset, ensemble: xr.Dataset, case: Case, wave: DrivenWave) -> str:
     """Return the reading, whatever else varies, the number of sites and the driven wavenumber of a series."""
-    parts = [f"{case.lattice.reading.capitalize()} reading"] if case.lattice.preset else []
+    parts = []
+    if case.lattice.preset:
+        parts.append(f"{case.lattice.reading.capitalize()} reading")
     for axis in SweptAxis.all_of(ensemble):
         if axis.dimension not in (AMPLITUDE, "reading", "wavenumber", "sites"):
             parts.append(axis.texts[_place(member["number"].item(), ensemble)[axis.dimension]])
@@ -259,7 +268,9 @@ def _triples(ensemble: xr.Dataset) -> list[list[_MemberFolder]]:
 def _in_words(member: xr.Dataset, name: str, joint: str) -> str:
     """Return the value of a swept key; a number after the key's name."""
     value = member[name].item()
-    return value if isinstance(value, str) else f"{name}{joint}{value:g}"
+    if isinstance(value, str):
+        return value
+    return f"{name}{joint}{value:g}"
 
 
 def table(ensemble: xr.Dataset) -> dict[str, Any]:
@@ -278,9 +289,15 @@ def grouped(items: Iterable[T], key: Callable[[T], str]) -> dict[str, list[T]]:
 def reading_of(ensemble: xr.Dataset) -> str:
     """Return the reading of all members of a sweep that does not vary it; empty for a cell that has none."""
     for _, number in curves(ensemble):
-        lattice = Sweep.of(ensemble).case(number).lattice
-        return lattice.reading if lattice.preset else ""
+        return reading_of_case(Sweep.of(ensemble).case(number))
     return ""
+
+
+def reading_of_case(case: Case) -> str:
+    """Return the reading of the preset of ``case``; empty for a cell that the case gives itself."""
+    if not case.lattice.preset:
+        return ""
+    return case.lattice.reading
 
 
 def suffix(member: xr.Dataset, ensemble: xr.Dataset, named: bool, dims: Collection[str] | None = None) -> str:
@@ -312,11 +329,6 @@ def _in_file_name(member: xr.Dataset, name: str) -> str:
     return in_file_name(_in_words(member, name, "-"))
 
 
-def counted(number: int, noun: str) -> str:
-    """Return a number with its noun: ``1 site``, ``5 sites``."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
 def sites_of(case: Case) -> list[int]:
     """Return the cells of the contact sites, from 1."""
     sites = case.contacts.sites
@@ -339,13 +351,16 @@ class Labels(NamedTuple):
     def of(cls, case: Case, varied: str = "") -> Self:
         """Return the names of ``case``, with further keys that are ``varied`` and their values."""
         sites = len(sites_of(case))
-        law = case.contacts.law if sites else ""
-        reading = case.lattice.reading if case.lattice.preset else ""
-        unit = "m" if case.drive.end else case.drive.record.unit
+        reading = reading_of_case(case)
+        law = ""
+        if sites:
+            law = case.contacts.law
         # A lattice that begins in motion may have no drive.
-        amplitude = f"{case.drive.amplitude:.4g} {unit}" if case.drive.amplitude else ""
-        has_cycles = amplitude and "cycles" in case.drive.record.keys
-        cycles = f"{case.drive.cycles:g} {'cycle' if case.drive.cycles == 1 else 'cycles'}" if has_cycles else ""
+        amplitude = cycles = ""
+        if case.drive.amplitude:
+            amplitude = f"{case.drive.amplitude:.4g} {drive_unit(case.drive)}"
+            if "cycles" in case.drive.record.keys:
+                cycles = counted(case.drive.cycles, "cycle")
         configuration = phrase(counted(sites, "site"), cycles, varied)
         page_stem = in_file_name(phrase(reading, configuration).replace(", ", "-").replace(" ", "-"))
         return cls(
@@ -366,4 +381,4 @@ def phrase(*parts: str) -> str:
 
 def in_file_name(text: str) -> str:
     """Return ``text`` in characters that every file system takes."""
-    return "".join(c if (c.isascii() and c.isalnum()) or c in "-._" else "-" for c in text.replace("π", "pi"))
+    return re.sub(r"[^A-Za-z0-9._-]", "-", text.replace("π", "pi"))

@@ -10,6 +10,7 @@ import xarray as xr
 
 from vipetsc.case.keys import unit_of
 from vipetsc.io.read import axes as axes_of
+from vipetsc.wording import with_unit
 
 FEW_TOGETHER = 6  # values of keys that vary together and stand as categories
 FRACTION_LIMIT = 36  # largest denominator of a wavenumber over pi that is written as a fraction
@@ -29,7 +30,7 @@ class SweptKey(NamedTuple):
     @property
     def label(self) -> str:
         """The path with the unit in brackets."""
-        return f"{self.path} ({self.unit})" if self.unit else self.path
+        return with_unit(self.path, self.unit)
 
     @property
     def is_number(self) -> bool:
@@ -129,12 +130,16 @@ class SweptAxis(NamedTuple):
     def positions(self) -> np.ndarray:
         """The numbers along the axis, or the numbers of its categories from 0."""
         number = self.first_number
-        return np.arange(self.size, dtype=float) if number is None else number.values.astype(float)
+        if number is None:
+            return np.arange(self.size, dtype=float)
+        return number.values.astype(float)
 
     @property
     def scale(self) -> str:
         """The scale on which the positions lie more evenly, "linear" or "log"."""
-        return even_scale(self.positions) if self.is_number else "linear"
+        if not self.is_number:
+            return "linear"
+        return even_scale(self.positions)
 
     @classmethod
     def all_of(cls, ensemble: xr.Dataset) -> list[Self]:
@@ -163,7 +168,9 @@ def even_scale(values: np.ndarray) -> str:
         return "linear"
     linear = np.diff(ordered)
     logarithmic = np.diff(np.log(ordered))
-    return "log" if _unevenness(logarithmic) < _unevenness(linear) else "linear"
+    if _unevenness(logarithmic) < _unevenness(linear):
+        return "log"
+    return "linear"
 
 
 def _unevenness(steps: np.ndarray) -> float:
@@ -176,9 +183,12 @@ def in_pi(wavenumber: float) -> str:
     near = Fraction(multiple).limit_denominator(FRACTION_LIMIT)
     if abs(float(near) - multiple) > 1e-6:
         return f"{multiple:.3f}π"
-    numerator = "" if near.numerator == 1 else near.numerator
-    denominator = f"/{near.denominator}" if near.denominator > 1 else ""
-    return f"{numerator}π{denominator}"
+    text = "π"
+    if near.numerator != 1:
+        text = f"{near.numerator}π"
+    if near.denominator > 1:
+        text += f"/{near.denominator}"
+    return text
 
 
 def joined(parts: Sequence[str]) -> str:

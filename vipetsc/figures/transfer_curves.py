@@ -24,6 +24,7 @@ from vipetsc.figures.sweep_members import (
     Sweeps,
     grouped,
     phrase,
+    reading_of_case,
     sites_of,
     transfer_members,
     varied_at,
@@ -60,21 +61,27 @@ def transfer_curves(sweeps: Sweeps) -> Iterator[TransferCurve]:
             data = row.sortby(AMPLITUDE)
             transfer = data["ibtet"].values
             if sites_of(case) and np.isfinite(transfer).sum() >= FEWEST:
+                floor = np.nan
                 untouched = transfer[data["contact_episodes"].values == 0]
-                floor = untouched.mean() if untouched.size else np.nan
+                if untouched.size:
+                    floor = untouched.mean()
                 yield TransferCurve(case, data.assign(floor=floor, peak=int(np.nanargmax(transfer))))
 
 
 def columns_of_laws(shown: Sequence[TransferCurve], ylabel: str, panel: Callable[[Axes, TransferCurve], str]) -> Figure:
     """Draw a page of one configuration: a column a law, drawn by ``panel``, which returns the column's title."""
     shown = sorted(shown, key=lambda curve: curve.case.contacts.law, reverse=True)
-    width = style.PAGE if len(shown) > 1 else 4.3
+    width = 4.3
+    if len(shown) > 1:
+        width = style.PAGE
     varied = str(shown[0].data.get("varied", ""))
     figure = style.new_figure(width, 2.9, Labels.of(shown[0].case, varied).page)
     grid = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     for tag, axes, curve in zip(ascii_lowercase, grid, shown, strict=False):
         title = panel(axes, curve)
-        axes.set_title(f"({tag}) {title}" if len(shown) > 1 else title)
+        if len(shown) > 1:
+            title = f"({tag}) {title}"
+        axes.set_title(title)
     grid[0].set_ylabel(ylabel)
     return figure
 
@@ -111,7 +118,10 @@ def _page(reading: str, page_curves: Sequence[TransferCurve], points: Sequence[T
     laws = sorted({curve.case.contacts.law for curve in page_curves}, reverse=True)
     kinds = list(dict.fromkeys(Labels.of(curve.case).configuration for curve in page_curves))
     looks = {kind: _Look(kind, f"C{i}", MARKERS[i % len(MARKERS)]) for i, kind in enumerate(kinds)}
-    figure = style.new_figure(style.PAGE if len(laws) > 1 else style.COLUMN, 4.6)
+    width = style.COLUMN
+    if len(laws) > 1:
+        width = style.PAGE
+    figure = style.new_figure(width, 4.6)
     grid = figure.subplots(2, len(laws), sharey="row", squeeze=False)
     figure.supxlabel("Amplitude of the drive (N)")
     figure.supylabel("Inter-band transfer (1)")
@@ -316,8 +326,7 @@ def _regimes(folders: Sequence[Path], files: Files, labels: Labels, curve: Trans
     (site,) = sites_of(case)
     columns = -(-len(motions) // 2)
     window = f"{PERIODS} periods of the drive about the largest $|w|$"
-    reading = case.lattice.reading if case.lattice.preset else ""
-    heading = f"{phrase(labels.law, reading, labels.configuration, f'cell {site}')}; {window}"
+    heading = f"{phrase(labels.law, reading_of_case(case), labels.configuration, f'cell {site}')}; {window}"
     figure = style.new_figure(style.PAGE, 3.4, heading)
     left, right = figure.subfigures(1, 2, width_ratios=(1, 0.62 * columns))
     transfer = left.subplots()

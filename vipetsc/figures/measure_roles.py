@@ -1,0 +1,66 @@
+"""What the axes of a measure are in its pictures: positions, curves of a panel, panels of a page, pages."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+from vipetsc.figures.swept_axes import SweptAxis
+
+MOST_CURVES = 6  # of a panel: as many as there are markers
+MOST_PANELS = 16  # of a page
+LEAST_ON_A_MAP = 3  # values of a number that is an axis of a map
+PART = "part"  # the dimension of parts of the frequency axis
+
+
+class Roles(NamedTuple):
+    """What the axes of a measure are in its pictures: positions ``x`` (and ``y`` of a map), curves, panels, pages."""
+
+    x: SweptAxis
+    y: SweptAxis | None
+    curves: tuple[SweptAxis, ...]
+    panels: tuple[SweptAxis, ...]
+    pages: tuple[SweptAxis, ...]
+
+    @property
+    def labels(self) -> list[str]:
+        """The labels of the axes of numbers: pages with the same ones can have common axes."""
+        labels = []
+        for axis in (self.x, self.y):
+            if axis is not None and axis.is_number:
+                labels.append(axis.label)
+            elif axis is not None:
+                labels.append("")
+        return labels
+
+    @classmethod
+    def of(cls, axes: Sequence[SweptAxis]) -> Self:
+        """Return the roles of ``axes``, of which there is at least one."""
+        longest_first = sorted(axes, key=lambda axis: -axis.size)
+        numbers = [axis for axis in longest_first if axis.is_number]
+        of_a_map = [axis for axis in numbers if axis.size >= LEAST_ON_A_MAP]
+        x = (numbers or longest_first)[0]
+        y = None
+        taken = {x.dimension}
+        if len(of_a_map) > 1:
+            y = of_a_map[1]
+            taken.add(y.dimension)
+
+        others = [axis for axis in axes if axis.dimension not in taken]
+        # The last axes of a case vary fastest: what they compare stands closest together.
+        # Bands differ by orders of magnitude: members are compared band by band.
+        keys = [axis for axis in others if axis.dimension != PART]
+        curves: tuple[SweptAxis, ...] = ()
+        if y is None:
+            curves = _last_of(keys or others, MOST_CURVES)
+        taken |= {axis.dimension for axis in curves}
+        others = [axis for axis in others if axis.dimension not in taken]
+        panels = _last_of(others, MOST_PANELS)
+        return cls(x, y, curves, panels, pages=tuple(others[: len(others) - len(panels)]))
+
+
+def _last_of(axes: Sequence[SweptAxis], most: int) -> tuple[SweptAxis, ...]:
+    """Return the last of the ``axes`` that have ``most`` combinations or fewer."""
+    count = 0
+    while count < len(axes) and math.prod(axis.size for axis in axes[-count - 1 :]) <= most:
+        count += 1
+    return tuple(axes[len(axes) - count :])
