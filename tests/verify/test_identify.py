@@ -9,7 +9,7 @@ from tests.conftest import run_of
 from tests.identified import identify_table, lattice_table, measured_table
 from vipetsc.case import Case
 from vipetsc.case.identify import IdentifyCase
-from vipetsc.identification.growing_windows import Precision
+from vipetsc.identification.precision import Precision
 from vipetsc.identification.uncertainty import errors_with_sensor, quantile, uncertainty_of
 from vipetsc.identification.whiteness import ljung_box
 from vipetsc.io.netcdf import open_netcdf

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 FOLDER = re.compile(r"[^\s./\\-][^/\\]*")
-LARGEST = 1e50
+LARGEST = 1e50  # products of a few larger numbers overflow, and those of a few below its inverse vanish
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
 Table = dict[str, Any]  # a parsed TOML table
 Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid

@@ -11,6 +11,7 @@ from vipetsc.case.sought import SoughtParameter, differs_by_side
 from vipetsc.identification.initial_state import NARROW, WIDTH
 from vipetsc.identification.misfit import Misfit
 from vipetsc.identification.motion import MotionError
+from vipetsc.identification.precision import FINAL, GROWING, TOLERANCE, Precision
 
 # While windows grow, what the data do not tell yet stays: a deviation of one of a coordinate weighs as one datum that
 # misses by its noise. The last fit has no such rows.
@@ -22,7 +23,6 @@ LEAST_NOISE = 1e-9
 # Clearances that are tried, over the motion without the stop: out of reach, where the lattice may not have touched,
 # just within it, where derivatives begin, and further in.
 OF_REACH = (1.02, 0.98, 0.8, 0.6, 0.4)
-TOLERANCE = 1e-12
 # Least weight of the prior over the size of the Jacobian. Where a clearance is not reached, a column is zero; without
 # full rank, SciPy makes every step as long as the trust region is, and does not converge.
 RIDGE = 1e-10
@@ -53,22 +53,6 @@ class Window(NamedTuple):
     impacts: int
     misfit: float
     coordinates: np.ndarray
-
-
-class Precision(NamedTuple):
-    """How a fit ends: after so many ``steps`` (None: those of the case), or where cost or coordinates change less.
-
-    ``cost`` and ``step`` are relative changes. ``has_prior`` holds the coordinates near those at which the fit begins.
-    """
-
-    steps: int | None = None
-    cost: float = TOLERANCE
-    step: float = TOLERANCE
-    has_prior: bool = False
-
-
-GROWING = Precision(cost=1e-2, step=1e-3, has_prior=True)
-FINAL = Precision()
 
 
 class Fit(NamedTuple):
@@ -102,8 +86,10 @@ class GrowingWindows:
         self.keep = keep
         self._solved = [np.array(z) for z in solved]
         self._solutions = 0
-        options = misfit.plan.options
         self.last = [float(record.times[-1]) for record in misfit.records]
+
+        # The noise that no sensor states is a fraction of the signal at first; later it follows from the residuals.
+        options = misfit.plan.options
         self._is_given = []
         for number, table in enumerate(options.records):
             given = np.array([sensor.noise is not None for sensor in table.sensors])
@@ -112,6 +98,8 @@ class GrowingWindows:
             self._is_given.append(given)
             misfit.noise[number] = np.array(noise)
         self._sizes = [np.sqrt(np.mean(record.values**2, axis=0)) for record in misfit.records]
+
+        # Initial states have no bounds, only a prior.
         bounds = [(p.to_coordinate(p.low), p.to_coordinate(p.high)) for p in misfit.plan.parameters]
         bounds += [(-np.inf, np.inf)] * (misfit.size - misfit.count)
         self.low, self.high = np.array(bounds).T
@@ -133,9 +121,10 @@ class GrowingWindows:
     def _pass(self, z: np.ndarray, windows: list[Window]) -> Fit:
         """Fit all parameters over growing windows, then over all data with the noise that they show."""
         z = self._fit_contacts(z, windows)
-        for _ in range(REWEIGHTINGS if not all(map(all, self._is_given)) else 0):
-            self._estimate_noise(z)
-            z = self.solve(z, self.last, self._every())
+        if not all(map(all, self._is_given)):
+            for _ in range(REWEIGHTINGS):
+                self._estimate_noise(z)
+                z = self.solve(z, self.last, self._every())
         windows.append(self._window(z, self.last))
         return Fit(z, self.deviance(z), windows, self.misfit.noise.copy())
 
@@ -165,7 +154,8 @@ class GrowingWindows:
             if parameter.acts_without_contact or is_own:
                 active.append(number)
         for number, state in self.misfit.states.items():
-            active += state.indices if silent[number] else ()
+            if silent[number]:
+                active += state.indices
         if not any(silent) or not active:
             return z
 
@@ -192,12 +182,15 @@ class GrowingWindows:
             precision = FINAL if is_last else GROWING
             fitted = self.solve(z, ends, self._every(), precision)
             window = self._window(fitted, ends)
-            other = self._other_contacts(fitted, ends) if window.misfit > 1 or is_last else None
+            other = None
+            if window.misfit > 1 or is_last:
+                # Otherwise the noise explains the misfit, and there is nothing to look for.
+                other = self._other_contacts(fitted, ends)
             if other is not None:
                 fitted = self.solve(other, ends, self._every(), precision)
                 window = self._window(fitted, ends)
 
-            # A misfit that rises shows that the window has grown past the reach of the last fit: it is made shorter.
+            # A misfit that rises shows that the window has grown past the reach of the last fit: it is shortened.
             shorter = [(a + b) / 2 for a, b in zip(begin, ends, strict=True)]
             grown = max((b - a) / (c - a0) for a, b, c, a0 in zip(begin, ends, self.last, self._first(), strict=True))
             if window.misfit > RISE * least and grown > SHORTEST:
@@ -224,8 +217,10 @@ class GrowingWindows:
         """The longest first windows in s of the records, with enough data for the initial states that are estimated."""
         lengths = []
         for number, record in enumerate(self.misfit.records):
+            unknowns = self.misfit.count
             state = self.misfit.states.get(number)
-            unknowns = self.misfit.count + (len(state.indices) if state else 0)
+            if state:
+                unknowns += len(state.indices)
             fraction = min(max(FIRST, DATA_EACH * unknowns / record.values.size), 1.0)
             lengths.append(fraction * float(record.times[-1] - record.times[0]))
         return lengths
@@ -284,7 +279,9 @@ class GrowingWindows:
             return np.nan
         base = self.misfit.plan.base
         gaps = np.array(base.model().gaps or [(gap, gap) for gap in base.model().chain.clearances])
-        sides = [0, 1] if parameter.quantity == "clearance" and not differs_by_side(base) else SIDES[parameter.quantity]
+        sides = SIDES[parameter.quantity]
+        if parameter.quantity == "clearance" and not differs_by_side(base):
+            sides = [0, 1]  # it is that of both
         # A stop on one side only has no other side; NaN of any stop that is met is that of all.
         towards = [reached[i, side] for i in parameter.members for side in sides if np.isfinite(gaps[i, side])]
         return float(np.max(towards, initial=0.0))
@@ -299,11 +296,14 @@ class GrowingWindows:
         for number, parameter in enumerate(self.misfit.plan.parameters):
             if parameter.quantity not in SIDES:
                 continue
-            for moved in self._clearances_tried(z if best is None else best, ends, number):
+            for moved in self._clearances_tried(z, ends, number):
                 cost = self.cost(moved, ends)
                 if cost < least:
                     best = moved
                     least = cost
+            # The next clearance is tried together with what has lowered the misfit so far.
+            if best is not None:
+                z = best
         return best
 
     def _clearances_tried(self, z: np.ndarray, ends: Sequence[float], number: int) -> list[np.ndarray]:
@@ -318,7 +318,7 @@ class GrowingWindows:
 
         tried = []
         for fraction in OF_REACH:
-            # Not of a stop that is met even at its upper bound: then the motion without it is not known.
+            # Not of a stop that is met even at its upper bound: the motion without it cannot be had.
             if parameter.low <= fraction * beyond <= parameter.high:
                 moved = z.copy()
                 moved[number] = parameter.to_coordinate(fraction * beyond)

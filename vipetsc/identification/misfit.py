@@ -140,6 +140,10 @@ class Misfit:
         """
         table = self.plan.options.records[number]
         model = self.plan.record_case(self.case(z), number).model()
+        if watched is None:
+            watched = self.watched[number]
+
+        # Derivatives of the equations of motion, as differences between two models for each parameter.
         inner, estimated = self.columns(number, active)
         lower, upper, widths = self._models(z, number, inner)
         coefficients = MotionCoefficients.of(model)
@@ -149,7 +153,7 @@ class Misfit:
             coefficients,
             slopes,
             times=self.times(z, number, end)[::stride],
-            watched=self.watched[number] if watched is None else watched,
+            watched=watched,
             touches=table.contact,
             begin=self._begin(z, number, model, (lower, upper, widths), estimated),
         )
@@ -159,11 +163,14 @@ class Misfit:
         z: np.ndarray,
         number: int,
         model: Model,
-        around: tuple[list[Model], list[Model], np.ndarray],
+        neighbours: tuple[list[Model], list[Model], np.ndarray],
         estimated: Sequence[int],
     ) -> MotionBegin | None:
-        """The beginning of the motion of record ``number``; None for rest."""
-        lower, upper, widths = around
+        """The beginning of the motion of record ``number``; None for rest.
+
+        ``neighbours`` are the lower and upper models of each parameter's difference, and its width.
+        """
+        lower, upper, widths = neighbours
         state = self.states.get(number)
         if state is not None:
             matrix = state.matrix
@@ -188,7 +195,9 @@ class Misfit:
         depend on the offset.
         """
         offset = self.plan.options.records[number].offset
-        return float(self.records[number].times[0]) - (offset[1] if isinstance(offset, list) else offset)
+        if isinstance(offset, list):
+            offset = offset[1]
+        return float(self.records[number].times[0]) - offset
 
     def times(self, z: np.ndarray, number: int, end: float) -> np.ndarray:
         """The samples' times in s since the beginning of the drive, up to the record's time ``end``."""
@@ -207,6 +216,7 @@ class Misfit:
         motion = response.motion
         inner, estimated = self.columns(number, active)
         column_of = {p: 1 + column for column, p in enumerate(inner + estimated)}
+
         values = np.zeros(motion.shape[:2])
         slopes = np.zeros((*values.shape, len(active)))
         for k, sensor in enumerate(table.sensors):
@@ -216,9 +226,11 @@ class Misfit:
                 row = ROWS[sensor.quantity]
                 values[:, k] = motion[:, k, row, 0]
                 rate = motion[:, k, row + 1, 0]
+
             is_of_amplitude = sensor.drive in (None, 1) and "amplitude" not in table.drive
             for column, p in enumerate(active):
                 if self._is(p, "offset"):
+                    # A later beginning of the drive shifts the whole motion.
                     parameter = self.plan.parameters[p]
                     is_own = parameter.members == (number,)
                     slopes[:, k, column] = -rate * parameter.slope(z[p]) * is_own

@@ -9,7 +9,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from vipetsc.identification.growing_windows import GrowingWindows, Precision
+from vipetsc.identification.growing_windows import GrowingWindows
+from vipetsc.identification.precision import Precision
 from vipetsc.identification.uncertainty import uncertainty_of
 
 # Distance in standard errors of the outermost values of a profile.
@@ -47,14 +48,15 @@ class MisfitProfile(NamedTuple):
 
 def profile_around(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitProfile:
     """The profiles with ``count`` places a parameter about the fit ``z`` (coordinate,), within the bounds."""
-    known = uncertainty_of(windows.misfit.whole_jacobian(z, windows.last))
+    uncertainty = uncertainty_of(windows.misfit.whole_jacobian(z, windows.last))
+    errors = uncertainty.errors
     sought = range(windows.misfit.count)
-    reach = np.where(known.determined, REACH * known.errors, np.inf)
+    reach = np.where(uncertainty.determined, REACH * errors, np.inf)
     low = np.maximum(z - reach, windows.low)[sought]
     high = np.minimum(z + reach, windows.high)[sought]
     # The covariance says where the others go, as long as the problem is nearly linear.
-    along = (known.correlation * known.errors / known.errors[:, None])[sought]
-    along = np.where(known.determined[sought, None], along, 0.0)
+    along = (uncertainty.correlation * errors / errors[:, None])[sought]
+    along = np.where(uncertainty.determined[sought, None], along, 0.0)
     return MisfitProfile(np.linspace(low, high, count, axis=1), along)
 
 
@@ -84,12 +86,17 @@ def _follow(
     while abs(value - z[number]) > SAME:
         step = fraction * (value - z[number])
         begin = np.clip(z + slope * step, windows.low, windows.high)
-        begin[number] = value if fraction == 1 else z[number] + step
+        # The last step ends on the value itself, not on a sum that is rounded.
+        begin[number] = value
+        if fraction < 1:
+            begin[number] = z[number] + step
         if _contacts(windows, begin) != contacts and fraction > SMALLEST_STEP:
             fraction /= 2
             continue
 
-        fitted = windows.solve(begin, windows.last, others, PRECISION) if others else begin
+        fitted = begin
+        if others:
+            fitted = windows.solve(begin, windows.last, others, PRECISION)
         slope = (fitted - z) / (fitted[number] - z[number])
         z = fitted
         contacts = _contacts(windows, z)

@@ -25,8 +25,9 @@ from scipy.ndimage import uniform_filter1d
 from vipetsc.compiled import njit
 from vipetsc.spectra.wavelet import padded_length, transform_filters
 
+# The paper's: wavenumbers of the nodes, and centre wavenumber of the wavelets.
 NODES = 60
-KC = 12.0  # centre wavenumber of the wavelets
+KC = 12.0
 CHUNK = 8  # snapshots that are transformed together
 GROUP = 8  # nodes that are filtered together
 STRONGEST = 8  # snapshots in which the largest weight is sought, those of most energy over as many cells

@@ -40,11 +40,11 @@ def identified_values(
 ) -> dict[str, Any]:
     """All values by name in ``LAYOUT``; ``fits`` are the records of the starts, ``profile`` coordinates and costs."""
     jacobian = windows.misfit.whole_jacobian(z, windows.last)
-    known = uncertainty_of(marginal_jacobian(jacobian, windows.misfit.count))
-    values = _parameter_values(windows, z, known)
+    uncertainty = uncertainty_of(marginal_jacobian(jacobian, windows.misfit.count))
+    values = _parameter_values(windows, z, uncertainty)
     values |= _sensor_values(windows, z, uncertainty_of(jacobian))
     values |= _window_values(windows, fits[best])
-    values |= _start_values(windows, fits, best, known.errors)
+    values |= _start_values(windows, fits, best, uncertainty.errors)
     values |= _channel_values(windows, z)
     values |= _state_values(windows, z, jacobian)
 
@@ -59,7 +59,7 @@ def identified_values(
     }
 
 
-def _parameter_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty) -> dict[str, Any]:
+def _parameter_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncertainty) -> dict[str, Any]:
     """Parameters with their uncertainty, and what is not determined."""
     misfit = windows.misfit
     parameters = misfit.plan.parameters
@@ -68,9 +68,9 @@ def _parameter_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty
     # A group whose stops are all out of reach is at least as wide as the largest motion towards any.
     at_least = np.array([windows.beyond(parameter, reached) for parameter in parameters])
 
-    is_known = known.determined & np.isnan(at_least)
+    determined = uncertainty.determined & np.isnan(at_least)
     slopes = np.array([parameter.slope(x) for parameter, x in zip(parameters, z, strict=True)])
-    width = quantile(misfit.plan.options.confidence) * known.errors
+    width = quantile(misfit.plan.options.confidence) * uncertainty.errors
     low = [parameter.from_coordinate(x) for parameter, x in zip(parameters, z - width, strict=True)]
     high = [parameter.from_coordinate(x) for parameter, x in zip(parameters, z + width, strict=True)]
     return {
@@ -80,31 +80,35 @@ def _parameter_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty
         "low": [parameter.low for parameter in parameters],
         "high": [parameter.high for parameter in parameters],
         "value": misfit.values(z),
-        "standard_error": np.where(is_known, slopes * known.errors, np.nan),
-        "interval_low": np.where(is_known, low, np.nan),
-        "interval_high": np.where(is_known, high, np.nan),
-        "determined": is_known.astype(int),
+        "standard_error": np.where(determined, slopes * uncertainty.errors, np.nan),
+        "interval_low": np.where(determined, low, np.nan),
+        "interval_high": np.where(determined, high, np.nan),
+        "determined": determined.astype(int),
         "at_least": at_least,
-        "relative_error": known.errors,
-        "correlation": known.correlation,
+        "relative_error": uncertainty.errors,
+        "correlation": uncertainty.correlation,
         "direction": np.arange(1, len(z) + 1),
-        "singular": known.singular,
-        "vector": known.directions,
+        "singular": uncertainty.singular,
+        "vector": uncertainty.directions,
     }
 
 
-def _sensor_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty) -> dict[str, Any]:
+def _sensor_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncertainty) -> dict[str, Any]:
     """The mass at which one more sensor of the first record with contact would lower each error most.
 
-    ``known`` is the uncertainty of all coordinates: the sensor tells of an initial state that is estimated, too.
+    The ``uncertainty`` is that of all coordinates: the sensor also measures an initial state that is estimated.
     """
     misfit = windows.misfit
     plan = misfit.plan
     tables = plan.options.records
     record = next((number for number, table in enumerate(tables) if table.contact), 0)
+    # It measures what the first sensor of motion does, with the mean of their noise.
     sensors = [number for number, sensor in enumerate(tables[record].sensors) if sensor.quantity != "force"]
-    quantity = tables[record].sensors[sensors[0]].quantity if sensors else "velocity"
-    noise = float(np.mean([misfit.noise[record][number] for number in sensors])) if sensors else 1.0
+    quantity = "velocity"
+    noise = 1.0
+    if sensors:
+        quantity = tables[record].sensors[sensors[0]].quantity
+        noise = float(np.mean([misfit.noise[record][number] for number in sensors]))
 
     dofs = plan.base.lattice.unit_cell().dofs
     count = plan.base.lattice.cells * dofs
@@ -116,7 +120,7 @@ def _sensor_values(windows: GrowingWindows, z: np.ndarray, known: Uncertainty) -
     response = misfit.respond(z, record, windows.last[record], range(misfit.size), candidates, stride)
     slopes = np.zeros((*response.motion.shape[:2], len(z)))
     slopes[:, :, inner + estimated] = np.sqrt(stride) * response.motion[:, :, ROWS[quantity], 1:]
-    errors = errors_with_sensor(known, slopes, noise)[:, : misfit.count]
+    errors = errors_with_sensor(uncertainty, slopes, noise)[:, : misfit.count]
     chosen = errors.argmin(axis=0)
     return {
         "sensor/cell": candidates[chosen] // dofs + 1,

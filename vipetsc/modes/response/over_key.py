@@ -84,8 +84,9 @@ class StatesOverKey(SteadyEquations):
     def jacobian(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
         """The derivative (n, n + 1) of the ``residual``.
 
-        Beyond the range that of the tangent's own slope is left out, which is small as what is beyond. Residual and
-        unknowns are over the same clearance, so that the derivative by the motion does not depend on it.
+        Beyond the range the tangent of the ``residual`` changes with the motion, too; the derivative leaves that out,
+        which vanishes with the distance to the range. Residual and unknowns are over the same clearance, so that the
+        derivative by the motion does not depend on it.
         """
         states, inner = self._at(xi)
         return np.column_stack([states.jacobian(inner, shift)[:, :-1], self._slope(xi, shift)])

@@ -98,25 +98,25 @@ class StabilityChanges:
         The pair's exponent is followed from the state at which it grows; if that fails, the number decides.
         """
         states = self.states
-        known: dict[bytes, complex] = {}
+        exponents: dict[bytes, complex] = {}
 
         def distance(point: Response) -> float:
             """Re lambda over Om beyond the line; the guess is the exponent of the state found last."""
             key = point.xi.tobytes()
-            if key not in known:
-                known[key] = states.pair_near(point.xi, [*known.values()][-1])
-            return known[key].real - states.least_growth(point.xi)
+            if key not in exponents:
+                exponents[key] = states.pair_near(point.xi, [*exponents.values()][-1])
+            return exponents[key].real - states.least_growth(point.xi)
 
         def changed(point: Response) -> float:
             return 0.5 - (states.stability(point.xi).unstable != unstable)
 
         def finish(point: Response, left: Response, right: Response) -> Response:
-            return self._measured(point, fewer, known.get(point.xi.tobytes()))
+            return self._measured(point, fewer, exponents.get(point.xi.tobytes()))
 
         stable, growing = sorted((self.left, self.right), key=lambda point: states.stability(point.xi).unstable)
         # Of the pairs that grow at one end the slowest is nearest to the line.
         with suppress(ArithmeticError, IndexError):
-            known[growing.xi.tobytes()] = states.growing_pairs(growing.xi)[0]
+            exponents[growing.xi.tobytes()] = states.growing_pairs(growing.xi)[0]
             if distance(stable) < 0:
                 return SpecialKind(NEIMARK_SACKER, distance, finish=finish)
         return SpecialKind(NEIMARK_SACKER, changed, finish=finish)

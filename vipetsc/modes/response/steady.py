@@ -59,10 +59,13 @@ class SteadyStates(SteadyEquations):
         self.options = options
         self.restitution = restitution
         self.wave = options.source == "wave"
-        self.forces = forces_of(case, restitution) if forces is None else forces
+        if forces is None:
+            forces = forces_of(case, restitution)
+        if compliance is None:
+            compliance = compliance_of(case)
+        self.forces = forces
         self.points, self.weights = driven_points(case)
-        self.compliance = compliance_of(case) if compliance is None else compliance
-
+        self.compliance = compliance
         self.outputs = ResponseOutputs(case, self.compliance, self.forces.contacts)
 
         # Latest linear motions by frequency, and the latest determinant: neighbours on a curve over the amplitude.
@@ -101,7 +104,9 @@ class SteadyStates(SteadyEquations):
             )
             return self.options.fixed[0] * largest
         omega = self.case.frequency
-        amplitude = self.options.range[1] if over_amplitude else self.options.fixed[0]
+        amplitude = self.options.fixed[0]
+        if over_amplitude:
+            amplitude = self.options.range[1]
         return float(amplitude * np.abs(self.linear_motion(omega).harmonics).max())
 
     def _scale(self, clearance: float) -> float:
@@ -140,7 +145,9 @@ class SteadyStates(SteadyEquations):
         series = self.balance.series(x, omega)
 
         unstable, fastest = perturbations or self._perturbations(xi, series)
-        rate = complex(np.nan, np.nan) if fastest is None else fastest
+        rate = complex(np.nan, np.nan)
+        if fastest is not None:
+            rate = fastest
         forces = series.forces[:, : z.shape[1]]
         sites = len(self.forces.contacts)
         return Measures(
@@ -188,8 +195,10 @@ class SteadyStates(SteadyEquations):
         """The perturbations of a state with these forces that grow."""
         # The count is cheaper than the zeros themselves, and most states are stable.
         unstable = self.stability(xi).unstable
+        if not unstable:
+            return Perturbations(unstable, 0j)
         omega, _ = self.drive(xi[-1])
-        return Perturbations(unstable, self.hill(omega).fastest(series) if unstable else 0j)
+        return Perturbations(unstable, self.hill(omega).fastest(series))
 
     def determinant(self, xi: np.ndarray, exponent: complex) -> float:
         """Hill's determinant of a state at lambda/Om = ``exponent``, where it is real."""
@@ -260,4 +269,6 @@ class SteadyStates(SteadyEquations):
                 if np.any(forces[:, k]):
                     powers[2] += self.compliance.outgoing(k * omega, forces[:, k]).sum()
         powers[3] = loss * (omega / (2 * np.pi))
-        return powers / given if given > 0 else np.full(4, np.nan)
+        if not given > 0:
+            return np.full(4, np.nan)
+        return powers / given
