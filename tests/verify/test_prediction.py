@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.interpolate import CubicSpline
 
-from tests.conftest import simulated
-from tests.one_site import prediction_case
+from tests.conftest import simulated, with_sections
+from tests.one_site import PREDICTION, prediction_case
 from vipetsc.case import Case, CaseError
+from vipetsc.case.kinds import NO_SITES
 from vipetsc.case.predict import PredictCase
 from vipetsc.io.records import read_records
 from vipetsc.studies.composition import Network
@@ -19,6 +21,14 @@ from vipetsc.studies.prediction import composed, predict
 from vipetsc.studies.prediction_runs import LINEAR, SITE, Records, amplitudes_of, site_points
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.response import BINS, SiteResponse, SiteResponses, in_contact
+
+CHIRP = {"waveform": "chirp", "bandwidth": 300.0, "duration": 0.09, "ramp": 0.045}
+
+
+def pulse_case(drive: dict[str, Any], **sections: dict[str, Any]) -> PredictCase:
+    """The small case with a ``drive`` of another waveform in the place of the burst, at the same frequency."""
+    wave = {key: value for key, value in PREDICTION["drive"].items() if key != "cycles"}
+    return PredictCase.from_table(with_sections(PREDICTION | {"drive": wave | drive}, sections))
 
 
 class Prediction(NamedTuple):
@@ -259,6 +269,40 @@ def test_the_wave_of_a_moved_wall_is_predicted_as_simulated(tmp_path):
     # The first contact is exact: one amplitude lies below, one above.
     assert (data["simulated/contact_episodes"].values > 0).tolist() == [False, True]
     assert 5e-4 < data.attrs["onset_amplitude"] < 2e-3
+    assert data.attrs["rms_upper"] < 0.15
+    assert data.attrs["worst_dissipated"] < 0.05
+
+
+def test_the_wave_of_a_pulse_that_is_no_burst_is_that_of_the_linear_run():
+    """The envelopes at the sites, at their main frequency, are the motion of a run without contacts."""
+    case = pulse_case(CHIRP)
+    network = Network(case.model())
+    run, _ = simulated(case.varied(contacts=NO_SITES, drive={"amplitude": 1.0}))
+    cell = case.lattice.unit_cell()
+    time = network.time[network.during]
+    for site, envelope in zip(case.model().chain.sites, network.linear, strict=True):
+        u = run["displacement"].values[:, site]
+        w = CubicSpline(run["time"].values, u[:, cell.resonator] - u[:, cell.host])(time)
+        predicted = (envelope[network.during] * np.exp(1j * network.om * time)).real
+        np.testing.assert_allclose(predicted, w, atol=0.03 * np.abs(w).max())
+
+
+@pytest.mark.parametrize(
+    ("drive", "reason"),
+    [
+        (CHIRP | {"bandwidth": 900.0, "ramp": 0.01}, "in one band and within 30% of its main frequency"),
+        ({"waveform": "harmonic"}, "a wave that ends; give drive.duration"),
+    ],
+)
+def test_a_wave_without_an_amplitude_of_one_frequency_is_not_predicted(drive, reason):
+    with pytest.raises(CaseError, match=reason):
+        pulse_case(drive)
+
+
+@pytest.mark.slow
+def test_a_chirp_is_predicted_as_simulated(tmp_path):
+    data = predict(pulse_case(CHIRP, contacts={"restitution": 0.7}, predict={"amplitudes": [50.0, 120.0]}), tmp_path)
+
     assert data.attrs["rms_upper"] < 0.15
     assert data.attrs["worst_dissipated"] < 0.05
 

@@ -3,14 +3,19 @@
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 
 from vipetsc.case.case_file import Problem, Section, Valid
 from vipetsc.case.law import LawCase
 from vipetsc.case.schema import Positive
 from vipetsc.case.warnings import end_warnings, length_warnings, wave_warnings
+from vipetsc.case.waveforms import DEFAULT
+from vipetsc.lattice.packet import narrow_fraction
 
 MOST = 10_000  # amplitudes
+WIDTH = 0.3  # of the main frequency, within which the waves of a pulse lie that is no burst
+NARROW = 0.95  # of their energy, at least
 
 
 class PredictTable(Section):
@@ -35,7 +40,9 @@ class PredictCase(LawCase):
 
     verb = section = "predict"
     refuses: ClassVar[Mapping[str, str]] = {
-        feature: reason for feature, reason in LawCase.refuses.items() if feature != "absorbing ends"
+        feature: reason
+        for feature, reason in LawCase.refuses.items()
+        if feature not in ("absorbing ends", "other waveforms")
     }
 
     def warnings(self) -> list[str]:
@@ -51,6 +58,25 @@ class PredictCase(LawCase):
                 f" time.end = {model.end:.4g} s: sites that meet it several times are predicted less accurately"
             )
         return warnings
+
+    def _place_problems(self) -> list[Problem]:
+        """Problems with the wave, whose form is not that of a burst, and with the distance that it gives."""
+        return self._pulse_problems() or super()._place_problems()
+
+    def _pulse_problems(self) -> list[Problem]:
+        """Problems with a wave that goes on, or that has no amplitude of one frequency."""
+        model = self.model()
+        if not np.isfinite(model.drive.duration):
+            remedy = "a prediction is that of a wave that ends; give drive.duration"
+            return [Problem("drive.waveform", self.drive.kind, remedy)]
+        narrow = narrow_fraction(model.chain.cell, model.drive, model.drive_mass, WIDTH)
+        if self.drive.kind == DEFAULT or narrow >= NARROW:
+            return []
+        remedy = (
+            f"a site responds to the amplitude of a wave of one frequency, and less than {NARROW:.0%} of the energy of"
+            f" this one is in one band and within {WIDTH:.0%} of its main frequency; run accepts all"
+        )
+        return [Problem("drive.waveform", self.drive.kind, remedy)]
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:

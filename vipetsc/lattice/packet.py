@@ -11,6 +11,7 @@ from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.drive import Waveform
 
 WAVENUMBERS = np.linspace(0, np.pi, 8001)[1:-1]
+COARSE = 8  # of these, one in so many is enough for a sum
 
 
 @lru_cache
@@ -31,6 +32,19 @@ def packet_speeds(cell: UnitCell, burst: Waveform, mass: int, beyond: float = 1e
     order = np.argsort(speed)
     slow, fast = np.interp([beyond, 1 - beyond], np.cumsum(weight[order]) / weight.sum(), speed[order])
     return band, float(slow), float(fast)
+
+
+@lru_cache
+def narrow_fraction(cell: UnitCell, waveform: Waveform, mass: int, width: float) -> float:
+    """Fraction of the energy of waves by a force on one ``mass`` (0-based) that is in one band, and narrow.
+
+    These are the waves of the band that takes most, at frequencies within the fraction ``width`` of the main one.
+    """
+    point = bloch(cell, WAVENUMBERS[::COARSE])
+    weights = np.abs(waveform.spectrum(point.frequency) * point.vectors[:, mass]) ** 2
+    band = int(np.argmax(weights.sum(axis=0)))
+    is_near = np.abs(point.frequency[:, band] - waveform.frequency) <= width * waveform.frequency
+    return float(weights[is_near, band].sum() / weights.sum())
 
 
 class Packet(NamedTuple):

@@ -19,7 +19,7 @@ from scipy.sparse.linalg import LinearOperator, gmres
 
 from vipetsc.case import Model
 from vipetsc.case.kinds import lesser_clearances
-from vipetsc.lattice import ToneBurst, WaveCompliance, bloch
+from vipetsc.lattice import ToneBurst, WaveCompliance, Waveform, bloch
 from vipetsc.lattice.direct_compliance import DirectCompliance
 from vipetsc.studies.response import SiteResponses, fastest_wave, in_contact, self_response, unit_phase
 from vipetsc.studies.spectral_line import SpectralLine
@@ -29,6 +29,7 @@ WIDTH = 14  # of the burst's line, half of what is followed about a frequency
 WIDEST = 0.45  # of the drive's frequency, the largest half width: the followed line reaches neither 0 nor 2 Om
 WAVENUMBERS = 181  # from 0 to pi, at which the bands are sampled for their edges
 WEAK = 0.35  # over clearance: weaker waves lose as much at a site in contact as a driven wave of this amplitude
+SAMPLES_OF_PERIOD = 40  # of a waveform's highest frequency
 MOST = 60  # iterations
 LEAST = 9  # iterations
 HELD = 30  # iterations after which the sites in contact are held
@@ -73,22 +74,19 @@ class Network:
     def __init__(self, model: Model) -> None:
         chain = model.chain
         drive = model.drive
-        assert isinstance(drive, ToneBurst)
         self.model = model
         self.cell = chain.cell
         self.om = drive.frequency
         self.clearance = lesser_clearances(model.gaps, chain.clearances)
 
-        half = min(WIDTH * 2 * np.pi / drive.duration, WIDEST * drive.frequency)
+        half = min(_half_width(drive), WIDEST * drive.frequency)
         self.line = SpectralLine(half=half, length=2 * model.end)
         self.offset = self.line.offset
         self.time = self.line.time
         self.during = self.time <= model.end
         most = self.line.most
 
-        # The burst's envelope of a drive of 1 N, or of 1 m of a wall: sin is -i exp(i Om t), under a Hann window.
-        force = drive.window_amplitude / abs(drive.amplitude) * (1 - np.cos(self.om * self.time / drive.cycles))
-        pulse = self.line.forward(np.where(self.time < drive.duration, -1j * force, 0))
+        pulse = self._pulse(drive)
         response, g = self._responses(self.om)
         sites = len(chain.sites)
         self.linear = np.zeros((sites, len(self.time)), complex)
@@ -153,6 +151,20 @@ class Network:
             if change < CLOSE and i >= LEAST:
                 break
         return self._energies(Arriving(c, c3, on), sites, change, amplitude)
+
+    def _pulse(self, drive: Waveform) -> np.ndarray:
+        """Spectrum (offset,) of the envelope of a drive of 1 N, or of 1 m of a wall, about its frequency."""
+        if isinstance(drive, ToneBurst):
+            # Its sine is -i exp(i Om t), under a Hann window.
+            force = drive.window_amplitude / abs(drive.amplitude) * (1 - np.cos(self.om * self.time / drive.cycles))
+            return self.line.forward(np.where(self.time < drive.duration, -1j * force, 0))
+
+        # F = Re a exp(i Om t): at positive frequencies the transform of a is twice that of F.
+        step = 2 * np.pi / (drive.highest or self.om) / SAMPLES_OF_PERIOD
+        samples = np.arange(int(np.ceil(drive.duration / step)) + 1) * step
+        force = drive.force(samples) / abs(drive.amplitude) * np.exp(-self.line.decay * samples)
+        transform = step * np.exp(-1j * np.multiply.outer(self.om + self.offset, samples)) @ force
+        return np.asarray(2 * transform / self.time[1])
 
     def _responses(self, middle: float) -> tuple[np.ndarray, np.ndarray]:
         """Response of w at the sites to forces at the sites and of the drives (frequency, site, force); of one alone.
@@ -296,6 +308,14 @@ class Network:
                 total += float((passing * fraction).sum())
                 passing = passing * (1 - fraction) + emitted[k] / 2  # half of it in each direction
         return total
+
+
+def _half_width(drive: Waveform) -> float:
+    """Half the width in rad/s of what is followed of a ``drive`` about its frequency."""
+    half = WIDTH * 2 * np.pi / drive.duration
+    if isinstance(drive, ToneBurst):
+        return half
+    return half + max(drive.highest - drive.frequency, 0.0)
 
 
 def _of_sites(values: np.ndarray) -> np.ndarray:
