@@ -46,6 +46,7 @@ def test_a_check_loads_no_tables_no_pictures_and_no_kernels():
     assert loaded_by("validate", CASE) <= {"scipy.optimize"}
 
 
-def test_a_run_without_pictures_loads_no_pictures(tmp_path):
+def test_a_run_without_pictures_loads_no_pictures_and_its_pictures_load_no_kernels(tmp_path):
     small = ("--set", "time.end=0.01", "--set", "output.figures=false")
     assert "matplotlib" not in loaded_by("run", CASE, "--out", tmp_path / "run", *small)
+    assert "numba" not in loaded_by("plot", tmp_path / "run")

@@ -17,7 +17,8 @@ from vipetsc.case.schema import AnalysisTable
 from vipetsc.dynamics.ts import integrator
 from vipetsc.io.lock import FolderError
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.reanalysis import is_measured, measure_run, reanalyse_folders
+from vipetsc.studies.analysis_options import is_measured
+from vipetsc.studies.reanalysis import measure_run, reanalyse_folders
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from vipetsc.io.netcdf import tabulated
 from vipetsc.lattice import pass_bands
 from vipetsc.lattice.chain import cells_between
 from vipetsc.spectra.measures import MEASURES, PART, RunRecord, row_of, take
+from vipetsc.studies.analysis_options import describe_options
 from vipetsc.studies.band_measures import BANDS, band_energies
 from vipetsc.studies.modal_measures import MODAL, modal_energies
 from vipetsc.studies.run_record import record_of
@@ -158,11 +159,6 @@ def _numbers(
         if name.startswith("steady"):
             attributes[name] = {"periods": record.periods, "tolerance": record.tolerance}
     return layout, values, attributes
-
-
-def describe_options(options: AnalysisTable) -> str:
-    """The ``options`` that results depend on, as text for the attribute ``analysis`` of a file."""
-    return json.dumps(options.model_dump(exclude={"memory"}, exclude_none=True))
 
 
 def _measure(

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,21 +10,20 @@ from mpi4py import MPI
 import numpy as np
 import xarray as xr
 
-import vipetsc
 from vipetsc.case import Case, Sweep
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import FolderError, origin
-from vipetsc.io.netcdf import open_netcdf, root_attributes, write_netcdf
-from vipetsc.io.read import RUN_NEEDS, open_run, outdated
+from vipetsc.io.netcdf import open_netcdf, write_netcdf
+from vipetsc.io.read import open_run, outdated
 from vipetsc.io.records import RecordFile
 from vipetsc.parallel import on_every_rank, on_root
 from vipetsc.spectra.measures import is_measure
-from vipetsc.studies.analysis import FULL, analyse, describe_options
+from vipetsc.studies.analysis import FULL, analyse
+from vipetsc.studies.analysis_options import options_of
 from vipetsc.studies.ensemble import MISSING, Results
 from vipetsc.studies.linear_run import leading_cell, measured, read_linear
 from vipetsc.studies.sweep import conclude
 from vipetsc.studies.sweep_runs import keeps_all, measures_of
-from vipetsc.studies.velocity_record import options_of
 
 
 class MeasurableRun(NamedTuple):
@@ -150,19 +148,3 @@ def numbers_of(analysis: xr.Dataset) -> dict[str, float | list[float]]:
         if is_measure(name) and is_number and analysis[name].ndim < 2:
             numbers[name] = analysis[name].values.tolist()
     return numbers
-
-
-def is_measured(folder: Path) -> bool:
-    """Whether ``folder/analysis.h5`` was measured by this version from ``run.h5`` as it is; raises as ``open_run``."""
-    run = root_attributes(folder / "run.h5", "run", RUN_NEEDS)
-    expected = {
-        "case": run["case"],
-        "status": run.get("status"),
-        "vipetsc_version": vipetsc.__version__,
-        "analysis": describe_options(options_of(run["case"], folder)),
-    }
-    # One that is not there or was cut off raises OSError.
-    with suppress(OSError):
-        analysis = root_attributes(folder / "analysis.h5", "analysis")
-        return all(analysis.get(key) == value for key, value in expected.items())
-    return False

@@ -1,8 +1,5 @@
 """Input of the measures: the velocity that a run kept, in memory or in its file, and numbers of its case."""
 
-import tomllib
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,19 +8,9 @@ from numpy.typing import ArrayLike
 
 from vipetsc import spectra
 from vipetsc.case import Case
-from vipetsc.case.case_file import read_toml
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.read import field_interval, field_time, leading_site
 from vipetsc.lattice import pass_bands
-
-
-def options_of(case: str, folder: Path | None = None, overrides: Iterable[str] = ()) -> AnalysisTable:
-    """Options ``[analysis]`` of a ``case`` (TOML), or of the case in the run's ``folder``, with ``overrides``."""
-    table = tomllib.loads(case)
-    if folder and (folder / "case.toml").exists():
-        # The user may have changed [analysis] there since the run.
-        table = read_toml(folder / "case.toml")
-    return Case.from_table(table, overrides).analysis or AnalysisTable.model_validate({})
 
 
 class VelocityRecord:

@@ -55,8 +55,9 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     from vipetsc.dynamics import simulate
     from vipetsc.dynamics.cost import estimate
     from vipetsc.io.export import has_xdmf, write_xdmf
+    from vipetsc.studies.analysis_options import is_measured
     from vipetsc.studies.linear_history import opening_of
-    from vipetsc.studies.reanalysis import is_measured, measure_run
+    from vipetsc.studies.reanalysis import measure_run
 
     opening = None
     if work.options.member:
@@ -247,7 +248,7 @@ def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
 
 def measure_where_missing(folders: Sequence[Path]) -> None:
     """Check that a folder holds a finished run, and measure it if its measures are missing or older than the run."""
-    from vipetsc.studies.reanalysis import is_measured, measure_run
+    from vipetsc.studies.analysis_options import is_measured
 
     (folder,) = folders
     run = folder / "run.h5"
@@ -262,6 +263,8 @@ def measure_where_missing(folders: Sequence[Path]) -> None:
     except (OSError, ValueError, KeyError) as error:
         raise FolderError(f"{run}: is not a run of vipetsc ({error})") from None
     if not measured:
+        from vipetsc.studies.reanalysis import measure_run
+
         measure_run(folder)
 
 

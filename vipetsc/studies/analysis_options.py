@@ -1,0 +1,44 @@
+"""The options ``[analysis]`` of a run, and whether it was measured with them; known without loading any measure."""
+
+import json
+import tomllib
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+import vipetsc
+from vipetsc.case import Case
+from vipetsc.case.case_file import read_toml
+from vipetsc.case.schema import AnalysisTable
+from vipetsc.io.netcdf import root_attributes
+from vipetsc.io.read import RUN_NEEDS
+
+
+def options_of(case: str, folder: Path | None = None, overrides: Iterable[str] = ()) -> AnalysisTable:
+    """Options ``[analysis]`` of a ``case`` (TOML), or of the case in the run's ``folder``, with ``overrides``."""
+    table = tomllib.loads(case)
+    if folder and (folder / "case.toml").exists():
+        # The user may have changed [analysis] there since the run.
+        table = read_toml(folder / "case.toml")
+    return Case.from_table(table, overrides).analysis or AnalysisTable.model_validate({})
+
+
+def describe_options(options: AnalysisTable) -> str:
+    """The ``options`` that results depend on, as text for the attribute ``analysis`` of a file."""
+    return json.dumps(options.model_dump(exclude={"memory"}, exclude_none=True))
+
+
+def is_measured(folder: Path) -> bool:
+    """Whether ``folder/analysis.h5`` was measured by this version from ``run.h5`` as it is; raises as ``open_run``."""
+    run = root_attributes(folder / "run.h5", "run", RUN_NEEDS)
+    expected = {
+        "case": run["case"],
+        "status": run.get("status"),
+        "vipetsc_version": vipetsc.__version__,
+        "analysis": describe_options(options_of(run["case"], folder)),
+    }
+    # One that is not there or was cut off raises OSError.
+    with suppress(OSError):
+        analysis = root_attributes(folder / "analysis.h5", "analysis")
+        return all(analysis.get(key) == value for key, value in expected.items())
+    return False
