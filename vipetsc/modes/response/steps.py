@@ -17,8 +17,12 @@ CORRECTION = 0.1
 # A step grows by this factor at most, and not where the curve turns by half of what is allowed.
 MOST_GROWTH = 1.6
 LEAST_ANGLE = 1e-9  # rad, for the quotient
-# States on growing amplitudes to the beginning of a range.
-MOST_RAMP = 10_000
+# States on growing amplitudes to the beginning of a range (those of examples have 40 to 180), and the arclength that
+# they may need for with short steps.
+MOST_RAMP = 300
+LONGEST_RAMP = 30.0
+# States on growing weights of the contacts' forces.
+MOST_WEIGHTS = 10_000
 
 
 class TurningSteps:
@@ -81,8 +85,8 @@ class TurningSteps:
 def first_state(states: SteadyStates | StatesOverKey, is_ramp: bool = False) -> Response:
     """The state at the beginning of the range, by growing amplitudes from one that touches no contact.
 
-    ``is_ramp``: it is the beginning of such growing amplitudes itself. Raises ContinuationError where amplitudes cannot
-    grow so far.
+    Where these do not lead there, and where stops touch at rest, by growing weights of the contacts' forces.
+    ``is_ramp``: it is the beginning of growing amplitudes itself. Raises ContinuationError where neither leads there.
     """
     if isinstance(states, StatesOverKey):
         low, _ = states.options.range
@@ -94,9 +98,9 @@ def first_state(states: SteadyStates | StatesOverKey, is_ramp: bool = False) -> 
     linear = states.linear_motion(omega).harmonics
     guess = states.balance.pack(amplitude * linear) / states.clearance
     if any(0 in (stops.plus, stops.minus) for stops in states.forces.contacts):
-        guess = _closed(states, omega, amplitude)
+        guess = _by_weights(states, omega, amplitude)
     elif _touches(states, amplitude * linear[:, 1]) and not is_ramp:
-        guess = _ramp(states, omega, amplitude)
+        guess = _by_amplitudes(states, omega, amplitude)
 
     return _begun(states, np.append(guess, low))
 
@@ -122,14 +126,13 @@ def _touches(states: SteadyStates, linear: np.ndarray) -> bool:
     return False
 
 
-def _closed(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
-    """Scaled harmonics of a state at ``omega`` of a lattice in which stops touch at rest.
+def _by_weights(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
+    """Scaled harmonics of the state at ``omega`` to which growing weights of the contacts' forces lead.
 
-    Such a stop is touched at every amplitude. The forces of all contacts are therefore multiplied by a weight s^4, a
-    dashpot of 1 - s times the impedance of the lattice lies parallel to each, and the state is followed from s = 0,
-    where it is the linear one, to s = 1. The curve cannot come back to s = 0, where there is no other state, and the
-    dashpots keep it from resonances. The power gives stiff contacts, which act at small weights already, a long part of
-    the path.
+    The forces of all contacts are multiplied by a weight s^4, each has a parallel dashpot of 1 - s times the impedance
+    of the lattice, and the state is followed from s = 0, where it is the linear one, to s = 1. The curve cannot come
+    back to s = 0, where there is no other state, and the dashpots keep it from resonances. The power gives stiff
+    contacts, which act at small weights already, a long part of the path.
     """
     impedance = 1 / (omega * np.abs(np.diag(states.compliance.at(np.array([omega]))[0])))
     update = {"over": "amplitude", "range": [amplitude, 2 * amplitude], "fixed": [omega]}
@@ -149,19 +152,30 @@ def _closed(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
     weights = StatesOverKey(weighted, "weight of contacts", amplitude, options)
     linear = amplitude * states.linear_motion(omega).harmonics
     start = _begun(weights, np.append(states.balance.pack(linear) / weights.clearance, 0.0))
-    points = list(Continuation(weights, start, TurningSteps(weights, MOST_RAMP)))
+    points = list(Continuation(weights, start, TurningSteps(weights, MOST_WEIGHTS)))
     if not points or points[-1].xi[-1] * weights.parameter.scale != 1.0:
-        raise ContinuationError(f"no state with stops that touch at rest is found at amplitude {amplitude:g}")
+        remedy = "begin nfrc.range or nfrc.fixed at another value"
+        raise ContinuationError(f"no state with closed contacts is found at amplitude {amplitude:g}; {remedy}")
     return points[-1].xi[:-1] * (weights.clearance / states.clearance)
 
 
-def _ramp(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
-    """Scaled harmonics of the state at ``omega`` to which growing amplitudes lead."""
+def _by_amplitudes(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
+    """Scaled harmonics of the state at ``omega`` to which growing amplitudes lead.
+
+    With stiff contacts that have a loss, states over the amplitude may come to motions that close a contact ever more
+    slowly, as the damping factor is divided by the speed at which it closes: steps become ever shorter. They may also
+    end where one contact episode becomes two, of which the second begins without speed. Growing weights may then lead
+    to the beginning of the range.
+    """
     below = states.options.model_copy(update={"over": "amplitude", "range": [1e-3 * amplitude, amplitude]})
     ramp = SteadyStates(
         states.case.model_copy(update={"nfrc": below}), states.restitution, omega, compliance=states.compliance
     )
-    points = list(Continuation(ramp, first_state(ramp, is_ramp=True), TurningSteps(ramp, MOST_RAMP)))
+    most = max(MOST_RAMP, int(LONGEST_RAMP / states.options.largest_step))
+    try:
+        points = list(Continuation(ramp, first_state(ramp, is_ramp=True), TurningSteps(ramp, most)))
+    except ContinuationError:
+        points = []
     if not points or not np.isclose(points[-1].xi[-1] * ramp.parameter.scale, amplitude):
-        raise ContinuationError(f"increasing amplitudes do not reach {amplitude:g}: lower nfrc.range or nfrc.fixed")
+        return _by_weights(states, omega, amplitude)
     return points[-1].xi[:-1] * (ramp.clearance / states.clearance)

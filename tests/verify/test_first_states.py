@@ -1,0 +1,103 @@
+"""States of ``nfrc`` at which a range begins in contact: by growing amplitudes, and where these do not lead there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.independent_lattice import ScipyLattice, Stop
+from tests.steady_states import motion_at, refined
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.modes.response import steps
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import first_state
+
+CLEARANCE = 1e-4
+RESTITUTION = 0.7
+PHASE = 1.5  # rad, without contact
+ROW = {
+    "masses": [4e-3, 2e-3],
+    "springs": [{"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 5e3}],
+}
+
+
+def states_from(omega: float, touches: float, **nfrc: Any) -> SteadyStates:
+    """Three cells with a stiff lossy stop in the second one, from so many times the amplitude that ``touches`` on."""
+
+    def states(low: float) -> SteadyStates:
+        case = NfrcCase.from_table(
+            {
+                "name": "x",
+                "lattice": {"cells": 3, "cell": ROW},
+                "contacts": {"stiffness": 1e7, "sites": [2], "clearance": CLEARANCE, "restitution": RESTITUTION},
+                "drive": {"frequency": omega, "cell": 1, "amplitude": 1.0, "cycles": 3},
+                "nfrc": {"source": "force", "infinite": False, "harmonics": 21, "range": [low, 1e4]} | nfrc,
+            }
+        )
+        return SteadyStates(case, RESTITUTION, omega)
+
+    return states(touches * states(1e-3).parameter.scale)
+
+
+def after_a_period(states: SteadyStates, omega: float, amplitude: float, start: np.ndarray) -> np.ndarray:
+    """The state (2, n) a period after that at the phase ``PHASE``, ``start`` (2, n), by SciPy alone."""
+    chain = states.case.model().chain
+    n = len(chain.masses())
+    stops = tuple(Stop(3, 2, CLEARANCE, 1e7, 1.5, RESTITUTION, side) for side in (1, -1))
+    push = np.zeros(n)
+    push[0] = amplitude
+    lattice = ScipyLattice(
+        chain.masses(), chain.stiffness_matrix().toarray(), np.zeros((n, n)), stops, lambda t: push * np.cos(omega * t)
+    )
+    times = (PHASE + np.array([0.0, 2 * np.pi])) / omega
+    motion, impacts = lattice.motion(times, *start, start=float(times[0]))
+    assert impacts == 2
+    return motion[:2, -1]
+
+
+@pytest.fixture
+def by_weights(monkeypatch) -> list[Any]:
+    """What states by growing weights have been asked for, one entry for each."""
+    asked: list[Any] = []
+    lead = steps._by_weights
+
+    def recorded(*given: Any) -> np.ndarray:
+        asked.append(given)
+        return lead(*given)
+
+    monkeypatch.setattr(steps, "_by_weights", recorded)
+    return asked
+
+
+@pytest.mark.slow
+def test_a_range_begins_where_growing_amplitudes_do_not_lead(by_weights):
+    """They end at 2.4 times the amplitude that touches, where an episode becomes two; the state at 3 times returns."""
+    omega = 1000.0
+    few = states_from(omega, 3.0)
+    first = first_state(few)
+    assert len(by_weights) == 1
+
+    many = states_from(omega, 3.0, harmonics=101)
+    xi = refined(few, many, first.xi)
+    _, amplitude = many.drive(xi[-1])
+    start = np.stack([part.ravel() for part in motion_at(many, xi, np.arange(3), PHASE)])
+    end = after_a_period(many, omega, amplitude, start)
+    change = np.abs(end - start).max(axis=1) / np.abs(start).max(axis=1)
+    assert (change < 3e-4).all(), change
+
+
+@pytest.mark.slow
+def test_growing_weights_lead_to_the_state_of_growing_amplitudes(monkeypatch, by_weights):
+    """Of a motion that is the only one; so does a limit of states on growing amplitudes that is too low."""
+    omega = 1700.0
+    states = states_from(omega, 1.5)
+    expected = first_state(states).xi
+    assert states.measured(expected).episodes == 2
+    assert not by_weights
+
+    monkeypatch.setattr(steps, "MOST_RAMP", 5)
+    monkeypatch.setattr(steps, "LONGEST_RAMP", 0.5)
+    assert first_state(states).xi == pytest.approx(expected, abs=1e-9)
+    assert by_weights
