@@ -16,7 +16,7 @@ from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.nodes import collocation
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
-from vipetsc.dynamics.propagator.substeps import HISTORY, SUBSTEP_STATE, Cluster, create_tape, create_trial
+from vipetsc.dynamics.propagator.substeps import HISTORY, SPRING_DOF, SUBSTEP_STATE, Cluster, create_tape, create_trial
 
 # The mass on a stop: its mass in kg, its velocity at the onset in m/s, and the stop's (k/m)^1/2 in rad/s.
 MASS = 0.02
@@ -53,6 +53,7 @@ def mass_on_stop(damping: float = 0.0) -> Cluster:
 
     return Cluster(
         contacts=contacts,
+        springs=np.zeros(0, SPRING_DOF),
         drives=create_drives((), []),
         # A free mass: an impulse changes its velocity by 1/m, which moves it by H s/m; the table holds H times that.
         response=np.full((1, 1, 1), interval**2 / MASS),
@@ -70,6 +71,21 @@ def mass_on_stop(damping: float = 0.0) -> Cluster:
         state=np.zeros(1, SUBSTEP_STATE),
         trial=create_trial(1, 1),
         tape=create_tape(0, 0),
+    )
+
+
+def mass_on_cubic_spring(cubic: float) -> Cluster:
+    """Return the mass of ``mass_on_stop`` on a spring with the force ``cubic`` z^3 in N alone, and no stop."""
+    cluster = mass_on_stop()
+    springs = np.zeros(1, SPRING_DOF)
+    springs["law"]["cubic"] = cubic
+    springs["scale"] = 1.0
+    none = np.zeros(0, np.int64)
+    return cluster._replace(
+        contacts=cluster.contacts[:0],
+        springs=springs,
+        site_motion=cluster.site_motion[:0],
+        trial=cluster.trial._replace(closed=none, springs=np.zeros(1, np.int64)),
     )
 
 

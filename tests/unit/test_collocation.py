@@ -5,8 +5,9 @@ from math import factorial
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
+from scipy.special import ellipj
 
-from tests.unit.propagator_parts import MASS, RATE, SPEED, mass_on_stop
+from tests.unit.propagator_parts import MASS, RATE, SPEED, mass_on_cubic_spring, mass_on_stop
 from vipetsc.dynamics.propagator.collocation import (
     accumulate_moments,
     collocate,
@@ -69,6 +70,37 @@ def test_a_linear_contact_is_an_oscillator(kind):
     # The trapezoidal rule over 20000 intervals is itself good to some 1e-9 of the integral.
     assert cluster.moments[0, 1] == pytest.approx(trapezoid(force * (1 - begin - t / interval), t), rel=1e-7)
     assert cluster.energy[0] == 0.0
+
+
+def test_a_cubic_spring_moves_a_mass_as_jacobis_cosine():
+    """u = A cn(omega t, 1/2) with omega^2 = A^2 c/m exactly, of an order above 14; the estimate is no smaller."""
+    omega = 1e4
+    amplitude = 1e-3
+    cubic = MASS * (omega / amplitude) ** 2
+
+    def exact(phase: float) -> np.ndarray:
+        sn, cn, dn, _ = ellipj(phase, 0.5)
+        return amplitude * np.array([cn, -omega * sn * dn])
+
+    errors = []
+    begin = -1.5
+    for phase in (2.0, 1.0):
+        cluster = mass_on_cubic_spring(cubic)
+        u, v = exact(begin)
+        cluster.taylor[:] = [[u, v * cluster.interval]]
+        length = phase / omega / cluster.interval
+        trial = one_substep(cluster, Substep(PLAIN, length))
+        end = np.array([trial.taylor[0, 0], trial.taylor[0, 1] / cluster.interval])
+        error = np.abs(end - exact(begin + phase)) / [amplitude, amplitude * omega]
+        errors.append(error.max())
+
+        # All of the spring's work comes back, and none is booked.
+        assert cluster.energy[0] == 0.0
+        assert cluster.moments[0, 0] == pytest.approx(MASS * (end[1] - v), rel=1e-9, abs=1e-9 * MASS * abs(v))
+        allowed = cluster.rtol * np.abs(trial.v[0]).max() + cluster.atol
+        assert error_ratio(cluster, trial, length) * allowed > error[1] * amplitude * omega
+    assert errors[1] < 1e-11
+    assert np.log2(errors[0] / errors[1]) > 14
 
 
 def test_damping_takes_the_energy_that_is_booked():

@@ -79,9 +79,12 @@ def forces_and_energy(u: np.ndarray) -> tuple[np.ndarray, float]:
     return forces, energy
 
 
-@pytest.fixture(scope="module")
-def run():
-    return run_of(changed())
+@pytest.fixture(scope="module", params=["ts", "propagator"])
+def run(request):
+    """The run by each engine."""
+    run = run_of(changed(time=TABLE["time"] | {"engine": request.param}))
+    assert run.attrs["statistics"]["engine"] == request.param
+    return run
 
 
 @pytest.fixture(scope="module")
@@ -227,7 +230,7 @@ SITES = {"law": "bilinear", "stiffness": 1e5, "sites": [3], "clearance": 1e-4}
         (Case, {"drive": WALL, "initial": None}, "drive.end", "quadratic and cubic in cell 12"),
         (LawCase, {"law": {}, "initial": None}, 'lattice.profiles."springs[2].quadratic"', "depend on their amplitude"),
         (NnmCase, {"nnm": {"system": "reduced"}}, 'lattice.profiles."springs[2].quadratic"', "has no such half"),
-        (NnmCase, {"nnm": {"system": "chain", "shooting": "krylov"}}, "nnm.shooting", "exact linear steps"),
+        (NnmCase, {"nnm": {"system": "chain", "shooting": "krylov"}}, "nnm.shooting", "not through springs"),
     ],
 )
 def test_refusals(kind: type[CaseFile], sections: dict[str, Any], key: str, reason: str):

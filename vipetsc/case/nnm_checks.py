@@ -14,6 +14,7 @@ from vipetsc.lattice import Chain, UnitCell, nonlinear_places, pass_bands
 from vipetsc.lattice.modal_compliance import MOST_DOFS
 
 ONE_CONTACT = "the reduced model has one contact"
+NOT_VARIED = "not yet: variations of motions are moved through contacts, not through springs that are not linear"
 
 
 def check_options(nnm: NnmTable) -> Iterator[Problem]:
@@ -168,8 +169,7 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
         remedy = f"{count} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
         yield Problem("nnm.harmonics", nnm.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
     if nnm.multipliers and not chain.is_linear:
-        remedy = "move variations by exact linear steps, which springs that are not linear do not have; omit it"
-        yield Problem("nnm.multipliers", nnm.multipliers, remedy)
+        yield Problem("nnm.multipliers", nnm.multipliers, f"{NOT_VARIED}; omit it")
     elif nnm.multipliers and masses > MOST_OF_LATTICE:
         remedy = f"need the motion of all {masses} masses, and are found up to {MOST_OF_LATTICE}"
         yield Problem(
@@ -197,8 +197,7 @@ def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iter
     krylov = nnm.is_krylov(dofs, is_linear)
     if not is_linear and (krylov or nnm.multipliers or nnm.start_frequency):
         key = next(key for key in ("multipliers", "start_frequency", "shooting") if getattr(nnm, key))
-        remedy = "moves variations by exact linear steps, which springs that are not linear do not have; omit it, or"
-        yield Problem(f"nnm.{key}", getattr(nnm, key), f'{remedy} system = "condensed"')
+        yield Problem(f"nnm.{key}", getattr(nnm, key), f'{NOT_VARIED}; omit it, or system = "condensed"')
         return
     if krylov:
         for key in ("compare", "switch", "orbits_at", "flow", "jacobian"):

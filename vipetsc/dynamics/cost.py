@@ -15,13 +15,11 @@ import numpy as np
 from vipetsc.case import Case, Model
 from vipetsc.dynamics.engine_choice import PROPAGATOR, choose_engine
 from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.dynamics.propagator.step_choice import refusal, step_series
+from vipetsc.dynamics.propagator.step_choice import refusal, spring_cost, step_series
+from vipetsc.dynamics.ts_cost import RESOLVED, step_seconds
 from vipetsc.lattice import bloch, pass_bands, waves_at
 
-# Of ts: seconds an accepted step of 8vr and a mass in it; radians of the top band in a step, steps an episode costs.
-STEP = 3.7e-5
-MASS = 1.3e-7
-RESOLVED = 0.37
+# Steps of ts that an episode costs.
 EPISODE_STEPS = 60.0
 # Steps that end on samples, over those that are needed.
 SAMPLED_STEPS = 1.3
@@ -144,7 +142,7 @@ def estimate(case: Case, ranks: int = 1) -> Cost:
 
 def _runge_kutta_seconds(model: Model, episodes: float, ranks: int) -> Seconds:
     """CPU time of ``ts`` for ``model`` with so many contact episodes."""
-    step = STEP + MASS * model.chain.cells * model.chain.cell.dofs / ranks
+    step = step_seconds(model.chain.cells * model.chain.cell.dofs / ranks)
     if ranks > 1:
         step += EXCHANGES * EXCHANGE
     steps_per_sample = max(np.ceil(model.sample_interval * pass_bands(model.chain.cell)[-1].high / RESOLVED), 1)
@@ -156,6 +154,7 @@ def _propagator_seconds(model: Model, series: StepSeries, own_rows: OwnRows, epi
     steps = model.samples * round(model.sample_interval / series.interval)
     numbers = own_rows.numbers / ranks
     step = LINEAR_STEP + CELL * model.chain.cells / ranks + OWN_NUMBER * own_rows.cells * numbers
+    step += 1e-6 * spring_cost(model.chain, series.reach)
     if ranks > 1:
         step += LINEAR_EXCHANGE
     begin = BEGIN + MAKE_NUMBER * own_rows.tables * numbers

@@ -10,5 +10,5 @@ from vipetsc.lattice.drive import Drive, Pieces, ToneBurst, Waveform
 from vipetsc.lattice.modal_compliance import ModalCompliance
 from vipetsc.lattice.modes import Modes, linear_modes
 from vipetsc.lattice.open_compliance import OpenCompliance
-from vipetsc.lattice.spring_places import SpringPlace, nonlinear_places
+from vipetsc.lattice.spring_places import SpringPlace, nonlinear_numbers, nonlinear_places
 from vipetsc.lattice.variation import Coefficients, SpringTerms, Variation

@@ -23,34 +23,41 @@ class SpringPlace(NamedTuple):
     end: int
 
 
+def nonlinear_numbers(chain: Chain, also: Collection[int] = ()) -> np.ndarray:
+    """Cells and numbers (spring, 2), as in ``SpringPlace``, of the springs that ``nonlinear_places`` returns."""
+    terms = chain.spring_terms(-1, chain.cells)
+    is_wanted = (terms.quadratic != 0) | (terms.cubic != 0)
+    is_wanted[:, list(also)] = True
+    rows, numbers = np.nonzero(is_wanted)
+    cells = rows - 1
+
+    # Before the first cell there is a spring to the left wall, and none at all unless the ends are fixed.
+    next_cell = np.array([spring.next_cell for spring in chain.cell.springs], bool)[numbers]
+    exists = next_cell | (cells >= 0)
+    if chain.ends != "fixed":
+        exists &= cells >= 0
+    if chain.ends == "free":
+        exists &= cells + next_cell < chain.cells
+    return np.column_stack([cells, numbers])[exists]
+
+
 def nonlinear_places(chain: Chain, also: Collection[int] = ()) -> list[SpringPlace]:
     """The springs of a finite ``chain`` whose force has a quadratic or cubic part, from the left.
 
     Those with the numbers ``also`` (from 0) in the cell are among them whatever their force is.
     """
     d = chain.cell.dofs
-    is_ring = chain.ends == "periodic"
-    terms = chain.spring_terms(-1, chain.cells)
-    is_wanted = (terms.quadratic != 0) | (terms.cubic != 0)
-    is_wanted[:, list(also)] = True
-
     places = []
-    for row, number in np.argwhere(is_wanted).tolist():
-        # What begins before the first cell is the spring to the left wall.
-        cell = row - 1
+    for cell, number in nonlinear_numbers(chain, also).tolist():
         law = chain.spring(cell, number)
-        starts_inside = cell >= 0
-        ends_inside = is_ring or cell + law.next_cell < chain.cells
-        is_cut = chain.ends != "fixed" and not (starts_inside and ends_inside)
-        if is_cut or not (starts_inside or law.next_cell):
-            continue
+        ends_inside = chain.ends == "periodic" or cell + law.next_cell < chain.cells
         after = (cell + law.next_cell) % chain.cells
         places.append(
             SpringPlace(
                 law=law,
                 number=number,
                 cell=cell,
-                start=cell * d + law.start if starts_inside else -1,
+                start=cell * d + law.start if cell >= 0 else -1,
                 end=after * d + law.end if ends_inside else -1,
             )
         )

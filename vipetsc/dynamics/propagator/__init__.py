@@ -86,6 +86,16 @@ number of each cell. Let a and b >= a remain of the step after two impulses. The
 the sum over forces up to then. All are smooth in a and b: Legendre coefficients are tabulated, and forces enter by
 their moments with these polynomials, of the substeps before, and within a substep at its nodes.
 
+**11. Springs that are not linear** (``groups``, ``collocation``) have the force k z + k_2 z^2 + k_3 z^3 at their
+elongation z, of which k belongs to K. The rest is a force on the DoF z = c u, with c as for the w of a site,
+
+    F = -(k_2 z^2 + k_3 z^3),
+
+at all times and smooth: 3 and 5 hold, with Gauss's nodes in time. Where the bound sum |a_k| on z of 2 makes F smaller
+than the rounding of k z, no force acts. The samples' energies have F's potential k_2 z^3/3 + k_3 z^4/4; what F does
+comes back, and is booked nowhere. The cost of such springs grows with their number, that of ``ts`` with the number of
+masses: ``step_choice`` compares the two.
+
 **Modules**, from the lattice to the engine. ``rows``: powers of the lattice's matrix, row by row. ``series``: how many
 of them count, and how far. ``groups``: contact DoFs and their groups. ``step_choice``: the length of a step.
 ``taylor``: values of the series. ``stencil``: P on a rank's cells. ``clusters``: tables of contact DoFs. ``nodes``:

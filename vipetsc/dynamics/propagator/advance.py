@@ -38,7 +38,7 @@ from vipetsc.dynamics.propagator.collocation import (
 )
 from vipetsc.dynamics.propagator.losses import PairLosses, accumulate_losses
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN
-from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, select_active, write_on_tape
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, first_drive, select_active, write_on_tape
 from vipetsc.dynamics.propagator.taylor import ROUNDING, copy, first_onset, shift
 
 # How an advance ended: at the end of the step, on a change of modes, on one of a site that is to rest instead, or
@@ -99,12 +99,12 @@ def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
     state = cluster.state[0]
     sites = cluster.contacts
     highest = 0.0
-    for i in range(sites.size, cluster.taylor.shape[0]):
+    for i in range(first_drive(cluster), cluster.taylor.shape[0]):
         highest = max(highest, cluster.drives.rows[i].highest)
     fastest = cluster.omega_max_h + highest * cluster.interval
     radians = SEARCHED if sites.size > 0 else DRIVEN
     length = min(1.0 - state.position, state.length, radians / fastest)
-    for j in range(trial.closed.size, trial.active.size):
+    for j in range(trial.closed.size + trial.springs.size, trial.active.size):
         end = drive_end(cluster.drives, trial.active[j], state.begin, cluster.interval, state.position)
         length = min(length, end - state.position)
 
@@ -266,7 +266,7 @@ def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) 
         return False
     # A substep that was cut short, by the end of the step say, is no reason for a shorter one after it. After a landing
     # a site has another mode, for which this error says nothing.
-    if not landed and trial.closed.size > 0:
+    if not landed and trial.closed.size + trial.springs.size > 0:
         state.length = max(factor * taken, state.length if taken < state.length else 0.0)
     return True
 

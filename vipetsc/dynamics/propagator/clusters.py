@@ -40,10 +40,11 @@ NEARLY_TOUCHING = 1e-9
 class DofTables(NamedTuple):
     """The contact DoFs of a rank, cluster by cluster, and the tables by which they and the lattice move each other.
 
-    The DoFs of cluster c are ``first[c]`` to ``first[c + 1]``: its sites, ``sites[c]`` of them, and then its driven
-    masses. A DoF's rows span ``StepSeries.width`` cells. ``column`` (dof,) is the first of these among the columns of
-    the halo, ``owned`` (dof, cell) their numbers among the rank's cells, -1 for cells of other ranks. ``clearance``
-    (dof,) in m is the lesser of a site's two, inf for a driven mass.
+    The DoFs of cluster c are ``first[c]`` to ``first[c + 1]``: its sites, ``sites[c]`` of them, ``springs[c]`` springs
+    that are not linear, and then its driven masses. A DoF's rows span ``StepSeries.width`` cells. ``column`` (dof,) is
+    the first of these among the columns of the halo, ``owned`` (dof, cell) their numbers among the rank's cells, -1 for
+    cells of other ranks. ``clearance`` (dof,) in m is the displacement below which no force acts: the lesser of a
+    site's two, next to nothing for a spring, inf for a driven mass.
 
     DoFs that have equal rows share a table: ``table`` (dof,) numbers it in ``rows`` (table, mass, cell, term) and in
     ``inverse_masses`` (table, mass, cell) in 1/kg. ``factors`` (2 term,) are H^(k mod 2)/k!. With dashpots ``rows`` are
@@ -60,6 +61,7 @@ class DofTables(NamedTuple):
     inverse_masses: np.ndarray
     clearance: np.ndarray
     sites: np.ndarray
+    springs: np.ndarray
     first: np.ndarray
     ledger: np.ndarray
 
@@ -83,7 +85,7 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     numbers = groups.numbers
     all_dofs = contact_dofs(model)
     dofs = all_dofs[numbers]
-    # Cells that a form has weights for: 2 if contacts join cells, else 1.
+    # Cells that a form has weights for: 2 if forces join cells, else 1.
     span = dofs["form"].shape[1]
 
     # DoFs of equal form share a table where their cells have equal rows, those of one representative.
@@ -116,7 +118,8 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
         factors=series.factors(),
         inverse_masses=1 / masses,
         clearance=dofs["clearance"] * (1 - NEARLY_TOUCHING),
-        sites=np.add.reduceat(numbers >= 0, groups.first[:-1], dtype=np.int64) if len(numbers) else numbers[:0],
+        sites=groups.counts((numbers >= 0) & (numbers < len(model.chain.sites))),
+        springs=groups.counts(numbers >= len(model.chain.sites)),
         first=groups.first,
         ledger=ledger,
     )

@@ -36,8 +36,9 @@ from vipetsc.contact.law import contact_force
 from vipetsc.dynamics.drives import drive_force
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.series import MOST_TERMS
-from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, first_drive
 from vipetsc.dynamics.propagator.taylor import evaluate, shift
+from vipetsc.dynamics.spring_law import nonlinear_force
 
 # Sweeps beyond which a substep is cut instead: so many suffice up to h omega = 8, where the error is far from small
 # enough. Any limit of some tens serves.
@@ -69,6 +70,12 @@ def _force_on_site(contacts: np.ndarray, i: int, w: float, rate: float) -> float
 
 
 @kernel
+def _force_of_spring(cluster: Cluster, i: int, z: float) -> float:
+    """Force in N on the elongation z in m of the spring that DoF ``i`` is, beyond its linear part."""
+    return -nonlinear_force(cluster.springs[i - cluster.contacts.size].law, z)
+
+
+@kernel
 def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) -> None:
     """Put w, w', w'' of every site at the present position, where the series is ``taylor``, into ``out`` (site, 3)."""
     # A record in an array of one: compiled code can change it in place.
@@ -83,7 +90,9 @@ def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) 
         out[i, 0] = taylor[i, 0]
         out[i, 1] = taylor[i, 1] / h
         forces[i] = _force_on_site(cluster.contacts, i, out[i, 0], out[i, 1])
-    for i in range(sites, forces.size):
+    for i in range(sites, first_drive(cluster)):
+        forces[i] = _force_of_spring(cluster, i, taylor[i, 0])
+    for i in range(first_drive(cluster), forces.size):
         forces[i] = drive_force(cluster.drives, i, state.begin + state.position * h)
 
     for i in range(sites):
@@ -153,7 +162,7 @@ def _prepare_nodes(cluster: Cluster, trial: Trial, substep: Substep) -> None:
             s = substep.length * cluster.nodes.position[substep.kind, node]
             sums.free_w[a, node], slope = evaluate(cluster.taylor[i], s)
             sums.free_v[a, node] = slope / h
-            if i >= cluster.contacts.size:
+            if i >= first_drive(cluster):
                 trial.force[i, node] = drive_force(cluster.drives, i, state.begin + (state.position + s) * h)
 
     for a in range(active.size):
@@ -164,7 +173,7 @@ def _prepare_nodes(cluster: Cluster, trial: Trial, substep: Substep) -> None:
 
 
 @inlined
-def _move(contacts: np.ndarray, trial: Trial) -> float:
+def _move(cluster: Cluster, trial: Trial) -> float:
     """Move the active DoFs at the nodes by the forces there.
 
     Returns the largest change as ``_replace`` measures it, inf if a motion is not finite.
@@ -185,18 +194,21 @@ def _move(contacts: np.ndarray, trial: Trial) -> float:
                     for node in range(NODES):
                         w[node] += sums.to_w[a, b, k, node] * force
                         v[node] += sums.to_v[a, b, k, node] * force
-        change = max(change, _replace(contacts, active[a], w, v, trial))
+        change = max(change, _replace(cluster, active[a], w, v, trial))
     return change
 
 
 @kernel
-def _replace(contacts: np.ndarray, i: int, w: np.ndarray, v: np.ndarray, trial: Trial) -> float:
-    """Put the motion ``w``, ``v`` of DoF ``i`` at the nodes into ``trial``; returns the largest change of a site's.
+def _replace(cluster: Cluster, i: int, w: np.ndarray, v: np.ndarray, trial: Trial) -> float:
+    """Put the motion ``w``, ``v`` of DoF ``i`` at the nodes into ``trial``; returns the largest change.
 
-    A change of w is divided by the site's clearance, one of w' by the sum of |w'| and the contact's approach velocity.
-    It is inf if the motion is not finite, and 0 for a driven mass, whose force does not depend on its motion.
+    A change of a site's w is divided by its clearance, one of w' by the sum of |w'| and the contact's approach
+    velocity; one of a spring's elongation by its largest value and the size of waves, together. It is inf if the motion
+    is not finite, and 0 for a driven mass, whose force does not depend on its motion.
     """
+    contacts = cluster.contacts
     change = 0.0
+    largest = 0.0
     for node in range(NODES):
         # ``not ... <`` is true of NaN as well.
         if not abs(w[node]) + abs(v[node]) < np.inf:
@@ -206,8 +218,14 @@ def _replace(contacts: np.ndarray, i: int, w: np.ndarray, v: np.ndarray, trial: 
             change = max(change, abs(w[node] - trial.w[i, node]) / site.scale)
             # Never 0/0: a contact begins only at a speed above zero, or has a reference speed (``contact.law.hold``).
             change = max(change, abs(v[node] - trial.v[i, node]) / (abs(v[node]) + abs(site.approach)))
+        elif i < first_drive(cluster):
+            change = max(change, abs(w[node] - trial.w[i, node]))
+            largest = max(largest, abs(w[node]))
         trial.w[i, node] = w[node]
         trial.v[i, node] = v[node]
+    # Without motion nothing has changed.
+    if largest > 0.0:
+        change /= largest + cluster.springs[i - contacts.size].scale
     return change
 
 
@@ -223,7 +241,7 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
     _prepare_nodes(cluster, trial, substep)
     last = np.inf
     for _ in range(MOST_SWEEPS):
-        change = _move(contacts, trial)
+        change = _move(cluster, trial)
         if change < CONVERGED or (change < STAGNANT and change >= last):
             return True
         if change == np.inf:
@@ -232,9 +250,12 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
         for i in trial.closed:
             for node in range(NODES):
                 trial.force[i, node] = _force_on_site(contacts, i, trial.w[i, node], trial.v[i, node])
+        for i in trial.springs:
+            for node in range(NODES):
+                trial.force[i, node] = _force_of_spring(cluster, i, trial.w[i, node])
 
     # The shorter substep that is tried next must not begin with forces that diverged.
-    trial.force[: contacts.size] = 0.0
+    trial.force[: first_drive(cluster)] = 0.0
     return False
 
 
@@ -285,20 +306,30 @@ def error_ratio(cluster: Cluster, trial: Trial, length: float) -> float:
     of a force becomes one of the site's velocity by the first term g_ii s of the site's own response, the sum of
     H^2/mass over the site's masses. The first term of another site's response is no larger, the same sum over the
     masses that the two share; later terms bear higher powers of the length. Allowed are ``rtol`` times the approach
-    velocity plus ``atol``.
+    velocity plus ``atol``; for a spring ``rtol`` times its largest rate instead.
     """
     worst = 0.0
     for i in trial.closed:
-        last = 0.0
-        for row in range(2):
-            coefficient = 0.0
-            for node in range(NODES):
-                coefficient += cluster.nodes.tail[row, node] * trial.force[i, node]
-            last += abs(coefficient)
         allowed = cluster.rtol * abs(cluster.contacts[i].approach) + cluster.atol
-        error = SUPERCONVERGENCE * last * length * cluster.response[i, i, 0] / cluster.interval
-        worst = max(worst, error / allowed)
+        worst = max(worst, _error_of_force(cluster, trial, i, length) / allowed)
+    for i in trial.springs:
+        largest = 0.0
+        for node in range(NODES):
+            largest = max(largest, abs(trial.v[i, node]))
+        worst = max(worst, _error_of_force(cluster, trial, i, length) / (cluster.rtol * largest + cluster.atol))
     return worst
+
+
+@kernel
+def _error_of_force(cluster: Cluster, trial: Trial, i: int, length: float) -> float:
+    """Estimated error in m/s of the rate of DoF ``i`` by its own force in a substep of ``length``."""
+    last = 0.0
+    for row in range(2):
+        coefficient = 0.0
+        for node in range(NODES):
+            coefficient += cluster.nodes.tail[row, node] * trial.force[i, node]
+        last += abs(coefficient)
+    return SUPERCONVERGENCE * last * length * cluster.response[i, i, 0] / cluster.interval
 
 
 @kernel
@@ -312,6 +343,8 @@ def accumulate_moments(cluster: Cluster, trial: Trial, substep: Substep) -> None
             if i < cluster.contacts.size:
                 # The elastic part of a contact's work comes back: its energy counts only what is lost.
                 _, power = contact_force(cluster.contacts, i, trial.w[i, node], trial.v[i, node])
+            elif i < first_drive(cluster):
+                power = 0.0  # all of a spring's work comes back
             else:
                 power = trial.force[i, node] * trial.v[i, node]
             cluster.energy[i] += duration * power

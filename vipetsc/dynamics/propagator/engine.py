@@ -112,7 +112,7 @@ def take_steps(
             add_free_losses(step.free_losses, cells, halo.columns, state[rows * owned : states.rows * owned], lost)
         for c in range(0 if failed else clusters.state.size):
             may_touch = expand_free_motion(dofs, c, halo.columns, clusters.taylor)
-            for i in range(dofs.first[c] + dofs.sites[c], dofs.first[c + 1]):
+            for i in range(dofs.first[c] + dofs.sites[c] + dofs.springs[c], dofs.first[c + 1]):
                 may_touch |= begin < clusters.drives.rows[i].duration
             if not may_touch:
                 continue

@@ -43,6 +43,7 @@ from vipetsc.dynamics.propagator.stencil import HaloRegions
 from vipetsc.dynamics.propagator.substeps import (
     COUNTS,
     HISTORY,
+    SPRING_DOF,
     SUBSTEP_STATE,
     Cluster,
     create_tape,
@@ -50,6 +51,7 @@ from vipetsc.dynamics.propagator.substeps import (
     select_cluster,
 )
 from vipetsc.dynamics.site_dofs import site_records
+from vipetsc.dynamics.spring_law import SPRING_LAW
 
 # A contact's first substep as a fraction of its duration at a tolerance of 1e-6; it goes with the error as others do.
 FIRST_SUBSTEP = 0.1
@@ -154,7 +156,7 @@ class Forces:
         else:
             self.losses = create_losses(groups, self.dofs, model, layout, dashpots)
         self.clusters = _create_clusters(groups, self.dofs, model, series)
-        self.tracker = ImpactTracker(self.clusters.contacts, groups.numbers.tolist())
+        self.tracker = ImpactTracker(self.clusters.contacts, _site_numbers(groups, model).tolist())
 
         leaders = all_dofs["cell"][groups.numbers[groups.first[:-1]]]
         self.logs = (leaders >= layout.start) & (leaders < layout.stop)
@@ -180,8 +182,8 @@ class Forces:
         """The sites, counted from 1, of cluster ``c``; none of -1."""
         if c < 0:
             return []
-        numbers = self._numbers[self.dofs.first[c] : self.dofs.first[c + 1]]
-        return (numbers[numbers >= 0] + 1).tolist()
+        numbers = self._numbers[self.dofs.first[c] :][: self.dofs.sites[c]]
+        return (numbers + 1).tolist()
 
     def take_episodes(self, unfinished: bool) -> np.ndarray:
         """Episodes closed since the last call, and ``unfinished`` ones as they are, that this rank logs."""
@@ -207,7 +209,7 @@ class Forces:
         forces["history"] = self.clusters.history
         forces["cluster"] = np.repeat(self.clusters.state, np.diff(self.dofs.first))
         sites = self.tracker.checkpoint()
-        return {"forces": forces[self._is_logged], "sites": sites[self._is_logged & (self._numbers >= 0)]}
+        return {"forces": forces[self._is_logged], "sites": sites[self._is_logged & (sites["number"] >= 0)]}
 
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Go back to the ``checkpoints`` of all ranks; those that a cluster reaches go on from the same numbers."""
@@ -227,6 +229,11 @@ class Forces:
         self.clusters.state[np.searchsorted(self.dofs.first, driven, side="right") - 1] = rows["cluster"]
 
 
+def _site_numbers(groups: Groups, model: Model) -> np.ndarray:
+    """The numbers (dof,) of the sites in ``groups``, -1 for springs and drives."""
+    return np.where(groups.numbers < len(model.chain.sites), np.maximum(groups.numbers, -1), -1)
+
+
 def _create_clusters(groups: Groups, dofs: DofTables, model: Model, series: StepSeries) -> Cluster:
     """Create the record of all clusters at rest, one for each of ``groups``."""
     count = len(groups.numbers)
@@ -235,11 +242,17 @@ def _create_clusters(groups: Groups, dofs: DofTables, model: Model, series: Step
     state = np.zeros(len(groups.first) - 1, SUBSTEP_STATE)
     state["length"] = 1.0
 
+    springs = np.zeros(count, SPRING_DOF)
+    springs["scale"] = model.scale
+    for name in SPRING_LAW.names or ():
+        springs["law"][name] = contact_dofs(model)[name][groups.numbers]
+
     # The error of a substep grows with the power ORDER of its length.
     tolerance = (model.rtol / FIRST_TOLERANCE) ** (1 / ORDER)
     drives = np.where(groups.numbers < 0, -1 - groups.numbers, -1)
     return Cluster(
-        contacts=site_records(model, groups.numbers),
+        contacts=site_records(model, _site_numbers(groups, model)),
+        springs=springs,
         drives=create_drives(model.drives, drives.tolist()),
         response=create_responses(groups, dofs, model, series),
         nodes=collocation(2 * terms),

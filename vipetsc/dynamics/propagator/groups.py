@@ -1,7 +1,7 @@
 """Degrees of freedom on which forces act, and the groups of them that are solved for together.
 
-They are contact sites and driven masses. Those that feel one another within a step form a group (sec. 6 of the
-derivation in the package's docstring).
+They are contact sites, springs that are not linear, and driven masses. Those that feel one another within a step form a
+group (sec. 6 of the derivation in the package's docstring).
 """
 
 from typing import NamedTuple
@@ -9,35 +9,59 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case import Model
+from vipetsc.lattice import Chain, nonlinear_numbers
+
+# A spring's force beyond its linear part counts from this fraction of the linear part on: below, it is rounding.
+NEGLIGIBLE = float(np.finfo(float).epsneg)
 
 
 class Groups(NamedTuple):
     """Groups of ``contact_dofs``: those of group g are ``numbers[first[g] : first[g + 1]]``.
 
-    In each group the sites' numbers come first, in their own order, then -1 for the first drive, -2 for the second:
-    the sign tells drives from sites, however many sites there are.
+    In each group the sites' numbers come first, in their own order, then those of springs, which go on behind the
+    lattice's last site, then -1 for the first drive, -2 for the second.
     """
 
     numbers: np.ndarray
     first: np.ndarray
 
+    def counts(self, marked: np.ndarray) -> np.ndarray:
+        """How many DoFs of each group (group,) are ``marked`` (dof,)."""
+        before = np.append(0, np.cumsum(marked))
+        return before[self.first[1:]] - before[self.first[:-1]]
+
+
+def spans_cells(chain: Chain) -> bool:
+    """Whether forces act between masses of two cells: by contacts, or by springs that are not linear."""
+    cells, numbers = nonlinear_numbers(chain).T
+    inside = cells[[chain.cell.springs[number].next_cell for number in numbers]]
+    if chain.ends == "fixed":
+        # Springs to a wall act on one mass.
+        inside = inside[(inside >= 0) & (inside < chain.cells - 1)]
+    return chain.is_joined or inside.size > 0
+
 
 def contact_dofs(model: Model) -> np.ndarray:
-    """The DoFs on which forces act: relative displacements of the sites, then displacements of driven masses.
+    """The DoFs on which forces act: relative displacements of the sites, elongations, displacements of driven masses.
 
-    The array (dof,) can be indexed by a site's number or, from the end, by -n for the n-th drive: drives come last, in
-    reverse. ``cell`` is a DoF's first cell and ``last`` its last one, the same or the next. ``form`` (cell, mass) are
-    the weights c of the displacements in these cells: one cell if no contact of the lattice joins cells, else two.
-    ``clearance`` in m is the lesser of a site's two, inf for a driven mass.
+    The array (dof,) can be indexed by a site's number, behind the sites by that of a spring, or, from the end, by -n
+    for the n-th drive: drives come last, in reverse. ``cell`` is a DoF's first cell and ``last`` its last one, the same
+    or the next. ``form`` (cell, mass) are the weights c of the displacements in these cells: one cell if no force of
+    the lattice ``spans_cells``, else two. ``clearance`` in m is the lesser of a site's two, inf for a driven mass, and
+    of a spring with the coefficients ``quadratic`` in N/m^2 and ``cubic`` in N/m^3 the elongation below which the force
+    that these add to the linear part is rounding.
     """
     lattice = model.chain
     drives = model.drives[::-1]
     sites = np.arange(len(lattice.sites))
+    springs = nonlinear_numbers(lattice)
 
-    shape = (1 + lattice.is_joined, lattice.cell.dofs)
+    shape = (1 + spans_cells(lattice), lattice.cell.dofs)
     fields = [("cell", int), ("last", int), ("form", float, shape), ("clearance", float)]
-    dofs = np.zeros(len(sites) + len(drives), fields)
-    dofs["cell"] = [*lattice.sites, *(drive.cell for drive in drives)]
+    dofs = np.zeros(len(sites) + len(springs) + len(drives), [*fields, ("quadratic", float), ("cubic", float)])
+    first_drive = len(sites) + len(springs)
+    dofs["cell"][sites] = lattice.sites
+    dofs["cell"][first_drive:] = [drive.cell for drive in drives]
 
     # ``pairs`` is empty where all sites join the masses of the cell's own pair: one row for all.
     pairs = lattice.pairs or [(lattice.cell.host, lattice.cell.resonator, 0)]
@@ -48,14 +72,42 @@ def contact_dofs(model: Model) -> np.ndarray:
     unit = np.eye(lattice.cell.dofs + 1)[:, :-1]
     dofs["form"][sites, joins] = unit[resonator]
     dofs["form"][sites, 0] -= unit[host]
-    dofs["form"][len(sites) :, 0] = unit[[drive.mass for drive in drives]]
+    dofs["form"][first_drive:, 0] = unit[[drive.mass for drive in drives]]
     dofs["last"] = dofs["cell"]
     dofs["last"][sites] += joins
 
     # ``gaps`` is empty where the clearances of every site are equal on both sides.
-    gaps = np.min(model.gaps, axis=1) if model.gaps else lattice.clearances
-    dofs["clearance"] = [*gaps, *[np.inf] * len(drives)]
+    dofs["clearance"][sites] = np.min(model.gaps, axis=1) if model.gaps else lattice.clearances
+    dofs["clearance"][first_drive:] = np.inf
+    if len(springs):
+        _fill_springs(dofs[len(sites) : first_drive], lattice, springs)
     return dofs
+
+
+def _fill_springs(dofs: np.ndarray, lattice: Chain, springs: np.ndarray) -> None:
+    """Fill the ``dofs`` (spring,) of the ``springs`` (spring, 2), cells and numbers, whose elongations they are."""
+    cells, numbers = springs.T
+    start, end, next_cell = np.array([(s.start, s.end, s.next_cell) for s in lattice.cell.springs], np.int64)[numbers].T
+    starts_inside = cells >= 0
+    ends_inside = (cells + next_cell < lattice.cells) | (lattice.ends == "periodic")
+    joins = next_cell * (starts_inside & ends_inside)
+    dofs["cell"] = np.maximum(cells, 0)
+    dofs["last"] = dofs["cell"] + joins
+
+    # The elongation is the displacement at the end less that at the start; a wall, number -1, does not move.
+    unit = np.eye(lattice.cell.dofs + 1)[:, :-1]
+    every = np.arange(len(springs))
+    dofs["form"][every, joins] = unit[np.where(ends_inside, end, -1)]
+    dofs["form"][every, 0] -= unit[np.where(starts_inside, start, -1)]
+
+    terms = lattice.spring_terms(-1, lattice.cells)
+    quadratic = terms.quadratic[cells + 1, numbers]
+    cubic = terms.cubic[cells + 1, numbers]
+    dofs["quadratic"] = quadratic
+    dofs["cubic"] = cubic
+    # The root of |c| z^2 + |q| z = NEGLIGIBLE k.
+    least = NEGLIGIBLE * lattice.coefficients(-1, lattice.cells).stiffness[cells + 1, numbers]
+    dofs["clearance"] = 2 * least / (np.abs(quadratic) + np.sqrt(quadratic**2 + 4 * np.abs(cubic) * least))
 
 
 def group_dofs(model: Model, reach: int) -> Groups:
@@ -65,7 +117,8 @@ def group_dofs(model: Model, reach: int) -> Groups:
     """
     lattice = model.chain
     dofs = contact_dofs(model)
-    numbers = np.append(np.arange(len(lattice.sites)), np.arange(-len(model.drives), 0))
+    undriven = len(dofs) - len(model.drives)
+    numbers = np.append(np.arange(undriven), np.arange(-len(model.drives), 0))
 
     # A group ends where the next DoF begins more than ``reach`` cells beyond the last cell of all before it.
     order = np.argsort(dofs["cell"])
@@ -79,6 +132,6 @@ def group_dofs(model: Model, reach: int) -> Groups:
         group[group == group.max()] = 0
 
     first = np.append(0, np.cumsum(np.bincount(group)))
-    # By group, then sites before drives, then by their own count: the last key of lexsort counts most.
+    # By group, then drives last, then by their own count: the last key of lexsort counts most.
     by_group = np.lexsort((np.abs(numbers), numbers < 0, group))
     return Groups(numbers[by_group], first)

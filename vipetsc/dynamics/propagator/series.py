@@ -48,11 +48,13 @@ class StepSeries:
     cells around it, for an even power of time; the same rows times H say what the next, odd power takes from the
     velocities. With dashpots rows are (..., 2 term, 2 dof, cell), one for each power of time: what it takes from
     displacements (P_k, the first dof) and from H times velocities (Q_k). A chain must have at least ``width`` cells.
+    With ``spans_cells`` forces act between masses of two cells, be they no contacts of ``chain`` that join cells.
     """
 
     chain: Chain
     interval: float
     tolerance: float
+    spans_cells: bool = False
 
     @cached_property
     def bounds(self) -> Bounds:
@@ -145,8 +147,8 @@ class StepSeries:
 
     @property
     def width(self) -> int:
-        """How many cells the rows of a DoF span: its own, the reach on both sides, one more if contacts join cells."""
-        return 2 * self.reach + 1 + self.chain.is_joined
+        """How many cells the rows of a DoF span: its own, the reach on both sides, one more if forces join cells."""
+        return 2 * self.reach + 1 + (self.spans_cells or self.chain.is_joined)
 
     @cached_property
     def truncation(self) -> float:

@@ -9,9 +9,10 @@ from functools import lru_cache
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.dynamics.propagator.groups import group_dofs
+from vipetsc.dynamics.propagator.groups import group_dofs, spans_cells
 from vipetsc.dynamics.propagator.series import StepSeries
-from vipetsc.lattice import ToneBurst
+from vipetsc.dynamics.ts_cost import RESOLVED, step_seconds
+from vipetsc.lattice import Chain, ToneBurst, nonlinear_numbers
 
 # The terms (omega H)^k / k! grow before they fall, to 5.5 at this omega H, and their rounding with them.
 LARGEST_OMEGA_H = 3.2
@@ -23,6 +24,8 @@ MOST_SITES = 32
 STEP_COST = 20.0  # of a step
 CELL_COST = 0.03  # of a cell in a step
 SITE_COST = 10.0  # of a sample's contacts, for each site of a cluster
+SPRING_COST = 3.0  # of a nonlinear spring in a step
+PAIR_COST = 0.8  # of a nonlinear spring in a step for each one that it feels, itself among them
 # The series is cut off at this fraction of the run's relative tolerance, or where rounding makes it as large.
 SERIES_TOLERANCE = 1e-4
 LEAST_TOLERANCE = 1e-15
@@ -34,7 +37,6 @@ def step_series(model: Model) -> StepSeries | None:
 
     Long steps are few, but sites that feel one another within a step must be followed together.
     """
-    tolerance = max(SERIES_TOLERANCE * model.rtol, LEAST_TOLERANCE)
     bursts = [drive.waveform.highest for drive in model.drives if isinstance(drive.waveform, ToneBurst)]
     fastest = max(bursts, default=0.0)
 
@@ -45,7 +47,7 @@ def step_series(model: Model) -> StepSeries | None:
         cost = parts * (STEP_COST + CELL_COST * model.chain.cells)
         if cost >= least:
             break
-        series = StepSeries(model.chain, model.sample_interval / parts, tolerance)
+        series = _series(model, parts)
         too_long = max(series.omega_max_h, fastest * series.interval) > LARGEST_OMEGA_H
         if too_long or model.chain.cells < series.width:
             continue
@@ -53,16 +55,26 @@ def step_series(model: Model) -> StepSeries | None:
         # Every DoF of a cluster is moved by every other one: the mean size of a DoF's cluster.
         sizes = np.diff(group_dofs(model, series.reach).first)
         cost += SITE_COST * float((sizes**2).sum() / sizes.sum())
+        cost += parts * spring_cost(model.chain, series.reach)
         if cost < least:
             best = series
             least = cost
     return best
 
 
+def _series(model: Model, parts: int) -> StepSeries:
+    """The series over a step of a sample interval over ``parts``, in which springs are linear."""
+    return StepSeries(
+        chain=model.chain.linearised(),
+        interval=model.sample_interval / parts,
+        tolerance=max(SERIES_TOLERANCE * model.rtol, LEAST_TOLERANCE),
+        spans_cells=spans_cells(model.chain),
+    )
+
+
 def _no_step(model: Model) -> str:
     """Why not even the shortest step suits ``model``: too few cells for its band, or waves too fast for its series."""
-    tolerance = max(SERIES_TOLERANCE * model.rtol, LEAST_TOLERANCE)
-    series = StepSeries(model.chain, model.sample_interval / MOST_PARTS, tolerance)
+    series = _series(model, MOST_PARTS)
     step = f"a step of {series.interval:.3g} s, time.sample_interval over {MOST_PARTS},"
     if model.chain.cells < series.width:
         return f"{model.chain.cells} cells are fewer than the {series.width} cells that {step} couples"
@@ -73,20 +85,48 @@ def _no_step(model: Model) -> str:
 
 
 def refusal(model: Model) -> str | None:
-    """Why linear steps do not suit ``model``: springs that are not linear, too few cells, too many sites close by."""
-    if not model.chain.is_linear:
-        return "its steps require linear springs, but some springs have a quadratic or cubic part"
+    """Why linear steps do not suit ``model``: too few cells, too many sites close by, too many nonlinear springs."""
+    # The cheapest springs in the longest step: where all springs are nonlinear, no step need be looked for.
+    crowd = _too_many_springs(model, 1, LARGEST_OMEGA_H)
+    if crowd is not None:
+        return crowd
     series = step_series(model)
     if series is None:
         return _no_step(model)
+    crowd = _too_many_springs(model, series.reach, series.omega_max_h)
+    if crowd is not None:
+        return crowd
 
-    numbers, first = group_dofs(model, series.reach)
-    counts = np.add.reduceat(numbers >= 0, first[:-1], dtype=np.int64)
+    groups = group_dofs(model, series.reach)
+    is_site = (groups.numbers >= 0) & (groups.numbers < len(model.chain.sites))
+    counts = groups.counts(is_site)
     largest = int(counts.argmax())
     if counts[largest] <= MOST_SITES:
         return None
-    cells = sorted(model.chain.sites[i] + 1 for i in numbers[first[largest] :][: counts[largest]])
+    numbers = groups.numbers[groups.first[largest] :][: counts[largest]]
+    cells = sorted(model.chain.sites[i] + 1 for i in numbers)
     return (
         f"{len(cells)} sites between cells {cells[0]} and {cells[-1]} lie within {series.reach} cells of one"
         f" another (at most {MOST_SITES} may)"
     )
+
+
+def spring_cost(chain: Chain, reach: int) -> float:
+    """Cost in us of the nonlinear springs of ``chain`` in a step in which forces reach so many cells."""
+    cells = np.sort(nonlinear_numbers(chain)[:, 0])
+    near = np.searchsorted(cells, cells + reach, "right") - np.searchsorted(cells, cells - reach, "left")
+    return SPRING_COST * len(cells) + PAIR_COST * float(near.sum())
+
+
+def _too_many_springs(model: Model, reach: int, radians: float) -> str | None:
+    """Why the nonlinear springs of ``model`` make steps of so many ``radians`` dearer than ``ts``; None if not."""
+    chain = model.chain
+    count = len(nonlinear_numbers(chain))
+    if not count:
+        return None
+    linear = STEP_COST + CELL_COST * chain.cells
+    plain = 1e6 * step_seconds(chain.cells * chain.cell.dofs) * radians / RESOLVED
+    ratio = (linear + spring_cost(chain, reach)) / plain
+    if ratio <= 1.0:
+        return None
+    return f"the forces of {count} nonlinear springs in every step would cost {ratio:.2g} times as much as ts"

@@ -18,6 +18,7 @@ from vipetsc.dynamics.drives import Drives, drive_end
 from vipetsc.dynamics.propagator.clusters import DofTables
 from vipetsc.dynamics.propagator.nodes import NODES, Collocation
 from vipetsc.dynamics.propagator.taylor import ROUNDING
+from vipetsc.dynamics.spring_law import SPRING_LAW
 
 COUNTS = ("substeps", "rejected", "landings", "switches")
 SUBSTEP_STATE = np.dtype(
@@ -27,6 +28,9 @@ SUBSTEP_STATE = np.dtype(
 begins; the position in the step and the length of the next substep, both in units of H; counts of substeps tried,
 without their repetitions that end on a kink or a change, of those rejected, of landings begun and of switches of a
 mode."""
+
+SPRING_DOF = np.dtype([("law", SPRING_LAW), ("scale", float)])
+"""A spring that is not linear: what its force has beyond the linear part; the size in m of elongations."""
 
 HISTORY = np.dtype([(name, float) for name in ("onset", "duration", "indentation", "force", "smallest_force")])
 """A site's contact: its onset in s, its expected duration in s, and its extremes so far in m and N."""
@@ -76,13 +80,15 @@ class Sums(NamedTuple):
 class Trial(NamedTuple):
     """A substep that has been computed but not yet taken.
 
-    Forces act on the DoFs ``active``: first the sites that are not free, ``closed``, then masses whose drive is on.
+    Forces act on the DoFs ``active``: first the sites that are not free, ``closed``, then all ``springs``, then masses
+    whose drive is on.
     ``force`` in N, ``w`` in m and ``v`` in m/s (dof, node) are those at its nodes; ``taylor`` and ``site_motion`` are
     as in ``Cluster``, at its end.
     """
 
     active: np.ndarray
     closed: np.ndarray
+    springs: np.ndarray
     force: np.ndarray
     w: np.ndarray
     v: np.ndarray
@@ -106,8 +112,9 @@ class Tape(NamedTuple):
 class Cluster(NamedTuple):
     """A cluster, or all clusters of a rank one after another: constants, and what changes as it is advanced.
 
-    The DoFs of a cluster are its sites, which ``contacts`` (site,) describe, and then the driven masses in reach.
-    ``drives`` has a row for every DoF; those of sites drive nothing. ``response`` (dof, dof of the same cluster, term):
+    The DoFs of a cluster are its sites, which ``contacts`` (site,) describe, its ``springs`` (spring,) of dtype
+    ``SPRING_DOF``, and then the driven masses in reach. ``drives`` has a row for every DoF; those of sites and springs
+    drive nothing. ``response`` (dof, dof of the same cluster, term):
     term m is the coefficient of s^(2 m + 1), s the time over H, in the displacement of the first DoF after a unit
     impulse on the second one, times H; with dashpots that of s^(m + 1), m < 2 term - 1. ``interval`` is H in s;
     ``rtol`` and ``atol`` (m/s) bound the error of a substep; a contact begins with the fraction ``first_substep`` of
@@ -120,6 +127,7 @@ class Cluster(NamedTuple):
     """
 
     contacts: np.ndarray
+    springs: np.ndarray
     drives: Drives
     response: np.ndarray
     nodes: Collocation
@@ -139,7 +147,7 @@ class Cluster(NamedTuple):
 
 
 def create_trial(dofs: int, terms: int) -> Trial:
-    """Workspace for a substep of ``dofs`` DoFs, all of which are active."""
+    """Workspace for a substep of ``dofs`` DoFs, all of which are active; as it is here, all are sites."""
     sums = Sums(
         free_w=np.zeros((dofs, NODES)),
         free_v=np.zeros((dofs, NODES)),
@@ -156,6 +164,7 @@ def create_trial(dofs: int, terms: int) -> Trial:
     return Trial(
         active=np.arange(dofs),
         closed=np.arange(dofs),
+        springs=np.arange(0),
         force=np.zeros((dofs, NODES)),
         w=np.zeros((dofs, NODES)),
         v=np.zeros((dofs, NODES)),
@@ -189,8 +198,10 @@ def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
     first = dofs.first[c]
     stop = dofs.first[c + 1]
     last_site = first + dofs.sites[c]
+    last_spring = last_site + dofs.springs[c]
     return Cluster(
         contacts=clusters.contacts[first:last_site],
+        springs=clusters.springs[last_site:last_spring],
         drives=Drives(clusters.drives.rows[first:stop], clusters.drives.pieces),
         response=clusters.response[first:stop],
         nodes=clusters.nodes,
@@ -211,6 +222,12 @@ def select_cluster(clusters: Cluster, dofs: DofTables, c: int) -> Cluster:
 
 
 @kernel
+def first_drive(cluster: Cluster) -> int:
+    """The first of a cluster's DoFs that is a driven mass."""
+    return cluster.contacts.size + cluster.springs.size
+
+
+@kernel
 def select_active(cluster: Cluster) -> Trial:
     """The workspace for a substep of a cluster, of those DoFs on which forces act."""
     state = cluster.state[0]
@@ -224,13 +241,18 @@ def select_active(cluster: Cluster) -> Trial:
             closed += 1
 
     count = closed
-    for i in range(sites.size, cluster.taylor.shape[0]):
+    for i in range(sites.size, first_drive(cluster)):
+        room.active[count] = i
+        count += 1
+    drives = count
+    for i in range(first_drive(cluster), cluster.taylor.shape[0]):
         if state.position < drive_end(cluster.drives, i, state.begin, cluster.interval, state.position):
             room.active[count] = i
             count += 1
     return Trial(
         active=room.active[:count],
         closed=room.closed[:closed],
+        springs=room.active[closed:drives],
         force=room.force,
         w=room.w,
         v=room.v,

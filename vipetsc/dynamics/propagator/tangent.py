@@ -115,10 +115,12 @@ class TangentPropagator(Propagator):
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
-        """Why it does not suit ``model``: what the engine refuses, and contacts that touch at rest.
+        """Why it does not suit ``model``: what the engine refuses, nonlinear springs, contacts that touch at rest.
 
         About such a contact no motion is linear, however small; one that is pressed at rest has a slope.
         """
+        if not model.chain.is_linear:
+            return "springs have a quadratic or cubic part; variations are not supported for them"
         sites = site_records(model, np.arange(len(model.chain.sites)))
         if ((np.abs(sites["mode"]) == PERMANENT) & (sites["preload"] == 0)).any():
             return "contacts touch at rest; variations are not supported for them"

@@ -151,6 +151,7 @@ def linearise(
         trial = Trial(
             active=active,
             closed=active,
+            springs=active[:0],
             force=room.force,
             w=room.w,
             v=room.v,

@@ -1,0 +1,22 @@
+"""Nonlinear springs across the borders of ranks: the same bits on any number of them."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.conftest import on_two, small_case
+from tests.mpi.test_partition import runs_alike
+
+# 24 cells are cut after 12 on two ranks, after 8 and 16 on three: springs begin in the last cells before the cuts.
+SPRINGS = {
+    "springs[1].cubic": {"cells": [8, 12, 16], "value": 3e11},
+    "springs[4].quadratic": {"cells": [13], "value": 1e5},
+}
+
+
+@pytest.mark.parallel([2, 3])
+@pytest.mark.parametrize("damping", [*on_two({}), {"mass": 30.0}])
+@pytest.mark.parametrize("engine", [*on_two("ts"), "propagator"])
+def test_same_bits_with_springs_across_borders(folder, engine, damping):
+    lattice = {"profiles": SPRINGS, "damping": damping, "ends": "periodic"}
+    runs_alike(folder, small_case(lattice=lattice, time={"end": 0.02, "engine": engine}))

@@ -1,0 +1,141 @@
+"""Nonlinear springs at few places in the propagator: all kinds of lattices against `ts`, the ledger, stops and goes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.conftest import StopAt, assert_same_bits, datasets, simulated, small_case
+from tests.mpi.test_drives import InParts
+from vipetsc.case import Case
+from vipetsc.dynamics import simulate
+from vipetsc.dynamics.engine_choice import choose_engine
+from vipetsc.dynamics.propagator.groups import contact_dofs, group_dofs
+from vipetsc.dynamics.propagator.step_choice import refusal, step_series
+from vipetsc.dynamics.propagator.tangent import TangentPropagator
+
+pytestmark = pytest.mark.parallel(1)
+
+# Of a ring the last cell's spring goes on to the first; of fixed ends it is held by the wall.
+SPRINGS: dict[str, Any] = {
+    "springs[1].cubic": {"cells": [11, 24], "value": 3e11},
+    "springs[4].quadratic": {"cells": [5, 13], "value": 4e4},
+}
+
+
+def sprung(lattice: dict[str, Any] | None = None, **sections: Any) -> Case:
+    """The small lattice with four nonlinear springs and no contacts, under a burst."""
+    plain = {"contacts": {"sites": 0}, "drive": {"amplitude": 24.0}, "time": {"end": 0.03, "engine": "propagator"}}
+    return small_case(**plain | {"lattice": {"profiles": SPRINGS} | (lattice or {})} | sections)
+
+
+def motion(case: Case, engine: str) -> np.ndarray:
+    """Displacements by an ``engine``, with tolerances of 1e-11."""
+    run, result = simulated(case.varied(time={"engine": engine, "rtol": 1e-11}))
+    assert result.statistics["engine"] == engine
+    assert result.statistics["ledger_error"] < 1e-10
+    return run["displacement"].values
+
+
+def difference(case: Case) -> float:
+    """That of the two engines, over the largest displacement."""
+    exact = motion(case, "propagator")
+    return float(np.abs(exact - motion(case, "ts")).max() / np.abs(exact).max())
+
+
+@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
+def test_both_engines_agree(ends):
+    case = sprung(lattice={"ends": ends})
+    assert difference(case) < 1e-9
+    assert (
+        np.abs(motion(case, "propagator") - motion(sprung({"ends": ends, "profiles": None}), "propagator")).max() > 1e-6
+    )
+
+
+@pytest.mark.parametrize("quadratic", [0.0, 2e6])
+def test_the_left_wall_has_the_spring_of_the_reference_cell(quadratic):
+    """It alone is nonlinear if all cells have others: behind the first mass, with the sign of its own elongation."""
+    springs = [
+        {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True, "cubic": 1e10, "quadratic": quadratic},
+        {"start": 1, "end": 2, "stiffness": 5e3},
+    ]
+    none = {f"springs[1].{term}": [0.0] * 24 for term in ("quadratic", "cubic")}
+    cell = {"preset": None, "cell": {"masses": [4e-3, 2e-3], "springs": springs}}
+    case = sprung(lattice=cell | {"profiles": none}, drive={"amplitude": 8.0, "cell": 2, "frequency": 900.0})
+    dofs = contact_dofs(case.model())
+    assert dofs["form"].tolist() == [[[1, 0]], [[1, 0]]]
+    assert dofs["cell"].tolist() == [0, 1]
+    assert difference(case) < 1e-9
+
+
+def test_both_engines_agree_in_unlike_cells_with_dashpots_and_stops():
+    """The ledger closes to 1e-10, in ``motion``, by losses that follow from dashpots alone."""
+    lattice = {
+        "profiles": SPRINGS | {"masses[2]": {"first": 2e-3, "last": 3e-3}},
+        "damping": {"mass": 30.0, "stiffness": 1e-6},
+    }
+    contacts = {"sites": [12, 13], "clearance": 5e-5, "restitution": 0.7}
+    case = sprung(lattice=lattice, contacts=contacts)
+    run, _ = simulated(case)
+    assert len(run["impacts/site"]) > 2
+    assert difference(case) < 1e-7
+
+
+def test_a_spring_that_is_hardly_stretched_is_linear():
+    """To the last bit: its force is rounding, and no time is spent on it."""
+    weak = {"drive": {"amplitude": 1e-8}}
+    nonlinear, result = simulated(
+        sprung(lattice={"profiles": {"springs[1].cubic": SPRINGS["springs[1].cubic"]}}, **weak)
+    )
+    linear, plain = simulated(sprung(lattice={"profiles": None}, **weak))
+    assert nonlinear["displacement"].values.tobytes() == linear["displacement"].values.tobytes()
+    assert result.statistics["substeps"] == plain.statistics["substeps"]
+
+
+def test_a_run_goes_on_after_a_stop(folder):
+    case = sprung(contacts={"sites": [12], "clearance": 5e-5})
+    straight = simulate(case, folder / "straight", observers=[InParts])
+    assert simulate(case, folder / "stopped", stop=StopAt(9), observers=[InParts]).resumable
+    assert simulate(case, folder / "stopped", resume=True, observers=[InParts]).complete
+    assert_same_bits(datasets(folder / "straight/run.h5"), datasets(folder / "stopped/run.h5"))
+    assert len(datasets(folder / "straight/run.h5")["impacts/site"]) > 0
+    assert straight.complete
+
+
+def test_elongations_are_degrees_of_freedom_behind_the_sites():
+    """Groups have the sites first, then the springs, then the drive."""
+    model = sprung(contacts={"sites": [12]}).model()
+    dofs = contact_dofs(model)
+    assert dofs["cell"].tolist() == [11, 4, 10, 12, 23, 0]
+    assert dofs["last"].tolist() == [11, 4, 11, 12, 23, 0]
+    assert dofs["form"][2].tolist() == [[0, 0, 0, -1], [1, 0, 0, 0]]
+    assert dofs["form"][4].tolist() == [[0, 0, 0, -1], [0, 0, 0, 0]]
+    groups = group_dofs(model, 2)
+    assert np.split(groups.numbers, groups.first[1:-1])[-2].tolist() == [0, 2, 3]
+    # z with |c| z^2 = 2^-53 k, below which the force is rounding of k z.
+    assert dofs["clearance"][2] == pytest.approx(np.sqrt(2.0**-53 * 2e4 / 3e11))
+
+
+def test_many_springs_go_to_ts():
+    """One spring in a long lattice pays, springs in every cell do not, and the message says so."""
+    everywhere = sprung(lattice={"profiles": {"springs[1].cubic": [3e11] * 24}}).model()
+    reason = refusal(everywhere)
+    assert reason is not None
+    assert "24 nonlinear springs" in reason
+    assert "times as much as ts" in reason
+    # The springs are too many whatever the step: none is looked for.
+    step_series.cache_clear()
+    long = sprung(lattice={"cells": 2000, "profiles": {"springs[1].cubic": [3e11] * 2000}})
+    chosen = choose_engine(long, long.model())
+    assert chosen.name == "ts"
+    assert "2000 nonlinear springs" in (chosen.refused or "")
+    assert step_series.cache_info().currsize == 0
+
+    few = {"springs[1].cubic": {"cells": list(range(100, 125)), "value": 3e11}}
+    assert refusal(sprung(lattice={"cells": 2000, "profiles": few}).model()) is None
+
+
+def test_variations_are_those_of_linear_springs():
+    assert "quadratic or cubic" in (TangentPropagator.refusal(sprung().model()) or "")
