@@ -80,7 +80,7 @@ class Kernel(CPUDispatcher):
 
     @cached_property
     def entry(self) -> Any:
-        """The same function as numba compiles it, with a wrapper and machine code of its own."""
+        """The function as numba compiles it, with a wrapper and machine code of its own."""
         return self._decorator(self.py_func)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:

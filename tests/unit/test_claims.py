@@ -176,7 +176,7 @@ def test_constants_inside_of_quantities_are_those_specified():
     assert (FEWEST, constants.SEVERAL) == (4, 3)
     assert (constants.QUIET, constants.PEAK, constants.HIGH) == (0.1, (0.9, 1.8), 10.0)
     assert (constants.ABRUPT, constants.LOW) == (10**0.5, 10)
-    assert (constants.BESIDE, constants.NATIVE) == (0.02, (7, 8))
+    assert (constants.HALF_WIDTH, constants.NATIVE) == (0.02, (7, 8))
     assert (constants.PAPER_CELL, constants.GRID) == ((0.1, 0.5), 0.1)
     assert constants.COUNTED == ("band 1", "band 2", "band 3", "band 4", "gap 1", "gap 2")
     # The paper's (n - 1)/(2 (n + 1)) for the exponent n = 3/2 of Hertz's law.

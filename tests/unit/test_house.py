@@ -21,6 +21,7 @@ MOST_ARGUMENTS = 7
 COMPILED = {"njit", "jit", "cfunc", "kernel", "inlined"}
 # Words that were a dialect of this package; the field has names for what they held.
 DIALECT = {"awake", "again", "loud", "heard", "alike", "letter", "found", "own", "words", "kept", "there"}
+DIALECT |= {"told", "made", "way", "beside", "around", "known", "lot"}
 
 
 # To parse the package takes a second, and six tests look at the same trees.

@@ -18,7 +18,7 @@ from vipetsc.lattice import (
     modes,
     pass_bands,
 )
-from vipetsc.spectra import ModalParts, upper_share
+from vipetsc.spectra import ModalParts, upper_fraction
 from vipetsc.spectra.modal_energies import cluster_samples
 
 CELLS = {
@@ -178,8 +178,8 @@ def test_the_upper_share_is_that_of_the_bands_above_the_drive():
     u, v = random_fields(chain, 1)
     parts = ModalParts.of(chain).energies(u, v, [0]).sum(axis=(1, 2))
     # Bands 3 and 4 are the parts 4 and 6, with gaps between; 4 J is the work.
-    assert upper_share(chain, burst, u[0], v[0], 4.0) == pytest.approx((parts[4] + parts[6]) / 4.0)
-    assert np.isnan(upper_share(chain, replace(burst, frequency=3500.0), u[0], v[0], 4.0))
+    assert upper_fraction(chain, burst, u[0], v[0], 4.0) == pytest.approx((parts[4] + parts[6]) / 4.0)
+    assert np.isnan(upper_fraction(chain, replace(burst, frequency=3500.0), u[0], v[0], 4.0))
 
 
 TIME = np.arange(11) * 1.0

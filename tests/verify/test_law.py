@@ -21,7 +21,7 @@ from vipetsc.io.records import read_records
 from vipetsc.lattice import Chain, ToneBurst, bloch, four_band, waves_at
 from vipetsc.lattice.packet import packet_speeds
 from vipetsc.parallel import StopRequest
-from vipetsc.spectra import by_direction, upper_share, wave_energies
+from vipetsc.spectra import by_direction, upper_fraction, wave_energies
 from vipetsc.studies.one_site import ScatteringRuns, make_law
 from vipetsc.studies.pair_motion import largest_between
 from vipetsc.studies.scattering_law import POINT_LAYOUT, ScatteringLaw, ScatteringOutcome, matched_clearances
@@ -351,4 +351,4 @@ def test_matched_sites_outdo_the_papers(tmp_path):
     model = Case.of(run).model()
     u = run["displacement"].values[-1]
     v = run["velocity"].values[-1]
-    assert upper_share(model.chain, model.drive, u, v, float(run["energy/work"][-1])) > 0.45
+    assert upper_fraction(model.chain, model.drive, u, v, float(run["energy/work"][-1])) > 0.45

@@ -96,7 +96,7 @@ def test_the_power_through_springs_is_that_of_the_waves(tmp_path):
     ring = runs.ring
     setting = ring.setting
     amplitude = runs.amplitude(4.0)
-    run = ring.run_at_site(amplitude, with_site=True, beside=away + 1)
+    run = ring.run_at_site(amplitude, with_site=True, neighbours=away + 1)
     contact = runs._contact(run, amplitude)
     linear = amplitude * np.array(runs.records[LINEAR]["displacement"])
     waves = runs.site_waves

@@ -6,7 +6,7 @@ import pytest
 from tests.conftest import run_of, small_case
 from vipetsc import Case
 from vipetsc.lattice import modes
-from vipetsc.spectra import ModalParts, upper_share
+from vipetsc.spectra import ModalParts, upper_fraction
 from vipetsc.studies.analysis import analyse
 
 # Parts of the four-band lattice; those between and above them are gaps.
@@ -70,7 +70,9 @@ def test_upper_bands_of_the_built_in_run_over_its_work(builtin, time, share):
     u = run["displacement"].values[sample]
     v = run["velocity"].values[sample]
 
-    assert upper_share(model.chain, model.drive, u, v, run["energy/work"].values[-1]) == pytest.approx(share, abs=1e-4)
+    assert upper_fraction(model.chain, model.drive, u, v, run["energy/work"].values[-1]) == pytest.approx(
+        share, abs=1e-4
+    )
     assert analysis["upper_share_at_end"].item() == pytest.approx(0.3385, abs=6e-5)
 
 

@@ -61,6 +61,7 @@ def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Seque
     stiffness = []
     if contacts.stiffness:
         stiffness.append(contacts.stiffness)
+
     return {
         "clearance": clearance,
         "sites": sites,

@@ -116,6 +116,7 @@ class IdentifyCase(StudyCase):
         parameters = []
         for unknown in self.options.unknowns:
             parameters += parameters_of(unknown, self.base)
+
         for number, record in enumerate(self.options.records):
             if isinstance(record.offset, list):
                 low, high = record.offset

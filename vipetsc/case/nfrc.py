@@ -312,6 +312,8 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
         yield Problem("nfrc.source", "wave", remedy)
     if not has_waves(chain):
         yield from _no_waves(nfrc, chain)
+
+    # Of motions that do not consist of Bloch waves all modes are computed, by dense matrices.
     if not needs_modes(chain) or nfrc.infinite or nfrc.source == "wave":
         return
     dofs = chain.cells * chain.cell.dofs

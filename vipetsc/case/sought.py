@@ -156,7 +156,7 @@ def groups_of(unknown: UnknownTable, count: int) -> list[tuple[int, ...]]:
 
 
 def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float) -> SoughtParameter:
-    """One of the values of an ``unknown``."""
+    """The parameter of an ``unknown`` that has one value at the ``members``, and begins at ``start``."""
     low, high = unknown.bounds
     name: str = unknown.quantity
     if unknown.of != "all":

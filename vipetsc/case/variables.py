@@ -12,7 +12,7 @@ from vipetsc.case.value_ranges import leaves
 
 SECTIONS = ("lattice", "contacts", "drive", "initial", "time", "output")  # whose keys may vary
 Kind = Literal["log", "linear", "whole", "site", "choice"]
-Share = Annotated[float, Field(ge=0, le=1)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class VariablesTable(Section):
@@ -31,7 +31,7 @@ class VariablesTable(Section):
     clearance: Pair | None = None
     profile: Pair | None = None
     sites: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
-    restitution: Annotated[list[Share], Field(min_length=2, max_length=2)] | None = None
+    restitution: Annotated[list[Fraction], Field(min_length=2, max_length=2)] | None = None
     masses: dict[str, Pair] = Field({})
     springs: dict[str, Pair] = Field({})
     lattice: dict[str, Any] | None = None

@@ -115,7 +115,7 @@ class Misfit:
         return lower, upper, np.array(widths)
 
     def columns(self, number: int, active: Iterable[int]) -> tuple[list[int], list[int]]:
-        """Those of the ``active`` coordinates that have a column in the motion of record ``number``.
+        """The ``active`` coordinates that have a column in the motion of record ``number``.
 
         They are parameters of the equations of motion, then coordinates of its initial state.
         """

@@ -46,7 +46,7 @@ class MisfitProfile(NamedTuple):
         return np.flatnonzero(places < middle - SAME)[::-1]
 
 
-def profile_around(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitProfile:
+def profile_about(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitProfile:
     """The profiles with ``count`` places a parameter about the fit ``z`` (coordinate,), within the bounds."""
     uncertainty = uncertainty_of(windows.misfit.whole_jacobian(z, windows.last))
     errors = uncertainty.errors

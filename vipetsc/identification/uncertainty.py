@@ -13,7 +13,7 @@ SMALLEST = 1e-12
 
 
 class Uncertainty(NamedTuple):
-    """Of coordinates (parameter,): ``errors`` (parameter,), ``correlation`` (parameter, parameter).
+    """Uncertainty of coordinates (parameter,): ``errors`` (parameter,), ``correlation`` (parameter, parameter).
 
     ``singular`` (direction,) are the singular values of the Jacobian, ``directions`` (direction, parameter) its right
     singular vectors: 1/s is the standard error along one. ``determined`` (parameter,).

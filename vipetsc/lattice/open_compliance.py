@@ -33,7 +33,7 @@ NEGLIGIBLE = 1e-15
 
 @dataclass(frozen=True)
 class OpenCompliance(ModalCompliance):
-    """As ``ModalCompliance``, for a ``chain`` that goes on as its reference cell beyond its ``open_ends``."""
+    """The compliance of a ``chain`` that goes on as its reference cell beyond ``open_ends``, as ``ModalCompliance``."""
 
     open_ends: tuple[str, ...] = ("right",)
 

@@ -11,14 +11,14 @@ from vipetsc.spectra.pooling import block_means, block_sums, blocks
 if TYPE_CHECKING:
     from vipetsc.spectra.band_energies import PartEnergies, Parts, front_arrival, ibtet, part_energies
     from vipetsc.spectra.entropies import Entropy, averages, entropy, local_entropy
-    from vipetsc.spectra.modal_energies import ModalParts, upper_share
+    from vipetsc.spectra.modal_energies import ModalParts, upper_fraction
     from vipetsc.spectra.wavelet import BINS, Nodes, filter_bank, inverse, padded_length, partition, transform
 
 # Their compiled kernels take half a second to load, and a case that is only checked needs the names of measures alone.
 COMPILED = {
     "band_energies": ("PartEnergies", "Parts", "front_arrival", "ibtet", "part_energies"),
     "entropies": ("Entropy", "averages", "entropy", "local_entropy"),
-    "modal_energies": ("ModalParts", "upper_share"),
+    "modal_energies": ("ModalParts", "upper_fraction"),
     "wavelet": ("BINS", "Nodes", "filter_bank", "inverse", "padded_length", "partition", "transform"),
 }
 

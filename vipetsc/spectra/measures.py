@@ -305,8 +305,8 @@ def _of_points(kind: str, quantity: str) -> RunMeasure:
 
 
 IBTET_WHOLE = "inter-band energy transfer as in the paper: the mean includes the ends of the record"
-UPPER_SHARE = "energy of the bands above the driven one at the end, over the drive's work"
-MEAN_SHARE = "mean fraction of the energy in a pass band or gap after the wave's arrival"
+UPPER_FRACTION = "energy of the bands above the driven one at the end, over the drive's work"
+MEAN_FRACTION = "mean fraction of the energy in a pass band or gap after the wave's arrival"
 STANDARD = (
     RunMeasure("contact_episodes", "1", "contact episodes", _contact_episodes, group="statistics"),
     RunMeasure(
@@ -327,11 +327,11 @@ STANDARD = (
     RunMeasure("entropy/start", "s", "time at which averages of the entropy begin", group="entropy"),
     RunMeasure("entropy/history", "bit", "entropy of a snapshot", dimension="snapshot", group="entropy"),
     RunMeasure("entropy/snapshot", "s", "time of a snapshot", dimension="snapshot", group="entropy"),
-    RunMeasure("upper_share_at_end", "1", UPPER_SHARE, group="transfer"),
+    RunMeasure("upper_share_at_end", "1", UPPER_FRACTION, group="transfer"),
     RunMeasure(
         "bands/modal_energy", "J", "energy of the linear modes in a part at the end", dimension=PART, group="transfer"
     ),
-    RunMeasure("bands/share", "1", MEAN_SHARE, dimension=PART, group="transfer"),
+    RunMeasure("bands/share", "1", MEAN_FRACTION, dimension=PART, group="transfer"),
     RunMeasure("largest_force", "N", "largest contact force of all impacts", _largest_force, power=0.0),
     *(_of_points(kind, quantity) for kind in ("peak", "rms", "steady") for quantity in QUANTITIES),
     RunMeasure(

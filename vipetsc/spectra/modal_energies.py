@@ -113,7 +113,7 @@ def _index(edges: np.ndarray, frequency: np.ndarray) -> np.ndarray:
     return np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, len(edges) - 2)
 
 
-def upper_share(chain: Chain, drive: Waveform, displacement: np.ndarray, velocity: np.ndarray, work: float) -> float:
+def upper_fraction(chain: Chain, drive: Waveform, displacement: np.ndarray, velocity: np.ndarray, work: float) -> float:
     """Energy of the pass bands above the driven one over the drive's ``work`` in J, at one instant.
 
     Fields (cell, dof) in m and m/s are of all cells. NaN if there is no such band, or no work.

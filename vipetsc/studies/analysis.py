@@ -152,10 +152,11 @@ def _numbers(
     attributes: dict[str, dict[str, Any]] = {}
     for name in taken:
         dimension, unit, text = row_of(name)
-        layout[name] = ("bands/part" if dimension == PART else dimension, unit, text)
         if dimension == PART:
+            dimension = "bands/part"  # its name in files of a single run
             values["bands/part"] = np.arange(1, len(record.parts) + 1)
             attributes[name] = {"parts": list(record.parts)}
+        layout[name] = (dimension, unit, text)
         if name.startswith("steady"):
             attributes[name] = {"periods": record.periods, "tolerance": record.tolerance}
     return layout, values, attributes
@@ -179,6 +180,8 @@ def _measure(
             values |= band_energies(record, measures)
         if cells > 1:
             values |= _wavelets(record, measures, arrival)
+
+    # The energies of the modes at an instant need no second sample.
     if {"modal", "transfers"} & measures:
         values |= modal_energies(run, record, measures)
     if cells == 1:

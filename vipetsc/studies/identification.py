@@ -22,7 +22,7 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import Measured, MeasuredError, read_measured
 from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit import Misfit
-from vipetsc.identification.misfit_profile import SIDES, MisfitProfile, Side, profile_around, profile_costs
+from vipetsc.identification.misfit_profile import SIDES, MisfitProfile, Side, profile_about, profile_costs
 from vipetsc.identification.motion import MotionError
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import IDENTIFIED, claimed, provenance
@@ -130,6 +130,7 @@ class Identification:
         start = self.starts()[number]
         windows = self._windows(solved, keep)
         fit = windows.fit(start)
+
         return {
             "begin": start.tolist(),
             "coordinates": fit.coordinates.tolist(),
@@ -156,7 +157,7 @@ class Identification:
     def profile(self, record: Record) -> MisfitProfile:
         """The profiles to be taken of the misfit of a ``record``."""
         windows, z = self.placed(record)
-        return profile_around(windows, z, self.plan.options.profile)
+        return profile_about(windows, z, self.plan.options.profile)
 
     def profiled(self, record: Record, profile: MisfitProfile, number: int, side: Side) -> Record:
         """The costs of the profile of parameter ``number`` on one ``side`` of the fit of a ``record``."""

@@ -166,7 +166,7 @@ def measured(analysis: xr.Dataset) -> Record:
 
 
 def of_motion(names: Iterable[str]) -> list[str]:
-    """Those of the ``names`` that are measures of the group "motion", perhaps of points."""
+    """The ``names`` that are measures of the group "motion", perhaps of points."""
     return [name for name in names if is_measure(name) and group_of(name) == "motion"]
 
 

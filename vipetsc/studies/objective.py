@@ -25,7 +25,7 @@ from vipetsc.studies.analysis import analyse
 from vipetsc.studies.recorded_runs import Key, RecordedRuns
 from vipetsc.studies.response_objective import measured_responses
 
-SHARE = "band_share"
+OF_A_BAND = "band_share"
 Condition = tuple[float | None, int]  # an amplitude, or None for the frequency responses, and the number of the sample
 # The measures requested of ``analyse``, by the group of a measure.
 ANALYSED = {"entropy": "entropy", "transfer": "bands", "motion": "motion", "statistics": "statistics"}
@@ -196,9 +196,9 @@ def measured(run: xr.Dataset, statistics: dict[str, Any], tables: Sequence[Measu
         "transmitted": _energy_beyond(model, u, v) / work,
     }
 
-    values |= _analysed(run, [table for table in tables if table.measure not in values and table.measure != SHARE])
+    values |= _analysed(run, [table for table in tables if table.measure not in values and table.measure != OF_A_BAND])
     for table in tables:
-        if table.measure == SHARE and table.band:
+        if table.measure == OF_A_BAND and table.band:
             low, high = table.part or (0.0, np.inf)
             within = inside[table.band] & (frequency >= low) & (frequency < high)
             values[table.name] = float(energy[within].sum())

@@ -180,7 +180,7 @@ class ScatteringRuns:
         """A run with the site in a lattice with dashpots; energies over the amplitude's square."""
         amplitude = self.amplitude(z)
         square = amplitude**2
-        run = self.ring.run_at_site(amplitude, with_site=True, beside=NEAR)
+        run = self.ring.run_at_site(amplitude, with_site=True, neighbours=NEAR)
         motion = self.ring.motion(run)
         contact = self._contact(run, amplitude)
         linear = amplitude * np.array(self.records[LINEAR]["displacement"])
@@ -222,7 +222,9 @@ class ScatteringRuns:
         options = self.case.law
         # Narrower near the onset, so that all runs of a point touch.
         width = min(options.jitter, (z - 1) / 10)
-        spread = np.linspace(-1, 1, options.samples) if options.samples > 1 else np.zeros(1)
+        spread = np.zeros(1)
+        if options.samples > 1:
+            spread = np.linspace(-1, 1, options.samples)
         return [*dict.fromkeys((z * (1 + width * spread)).tolist())]
 
     def outcomes(self, z: float) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:

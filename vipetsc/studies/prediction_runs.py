@@ -99,8 +99,8 @@ class PredictionRuns:
         points = site_points(self.case, largest)
         kinds = range(len(self.rings))
         # The runs of all kinds together: they keep more ranks busy than those of one.
-        made = self.make([Job(SITE, z, kind) for kind in kinds for z in points], largest)
-        sites = [made[kind * len(points) : (kind + 1) * len(points)] for kind in kinds]
+        runs = self.make([Job(SITE, z, kind) for kind in kinds for z in points], largest)
+        sites = [runs[kind * len(points) : (kind + 1) * len(points)] for kind in kinds]
         members: list[Record] = []
         if self.case.predict.simulate:
             members = self.make([Job(MEMBER, amplitude) for amplitude in amplitudes.tolist()])
@@ -142,18 +142,23 @@ class PredictionRuns:
         amplitude = ring.amplitude(z, linear.peak)
         run = ring.run_at_site(amplitude, with_site=True)
         motion = ring.motion(run)
+
+        # Without a contact there is no force, whose beginning and end these are.
+        first_contact = last_contact = np.nan
         separation = run["impacts/separation"].values
+        if len(separation):
+            first_contact = float(run["impacts/onset"].min())
+            last_contact = float(np.nanmax(separation))
         touched = SiteRun(
             amplitude=amplitude,
             clearance=clearance,
             displacement=motion.displacement[:, 0],
             dissipated=run["energy/dissipated"].values,
-            last_contact=float(np.nanmax(separation)) if len(separation) else np.nan,
+            last_contact=last_contact,
         )
         record = {"z": z, "amplitude": amplitude, "largest": largest} | linear.burst.sums(touched, largest)
         if linear.waves:
-            begin = float(run["impacts/onset"].min()) if len(separation) else np.nan
-            force = linear.waves.force(motion, amplitude * linear.displacement, begin, touched.last_contact)
+            force = linear.waves.force(motion, amplitude * linear.displacement, first_contact, last_contact)
             record["spectrum"] = linear.waves.sent_by_bins(force, BINS).tolist()
         return record
 

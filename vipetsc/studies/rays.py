@@ -49,7 +49,7 @@ class Rays:
         self.bins = np.pi * (np.arange(BINS) + 0.5) / BINS
 
     def of_bands(self, site: int, spectrum: np.ndarray) -> Left:
-        """Of energy that a ``site`` (cell) sends into the bands, each (band, time).
+        """What is left (band, time) of energy that a ``site`` (cell) sends into the bands.
 
         Of that in a band the fraction ``spectrum`` (band, bin) is in each bin of the wavenumber.
         """
@@ -57,7 +57,7 @@ class Rays:
         return Left(np.einsum("bk,bkt->bt", spectrum, remaining), np.einsum("bk,bkt->bt", spectrum, absorbed))
 
     def of_wave(self, site: int, band: int, kappa: float) -> Left:
-        """Of the energy that a ``site`` (cell) sends into one wave, each (time,)."""
+        """What is left (time,) of the energy that a ``site`` (cell) sends into one wave."""
         remaining, absorbed = self._fractions(site, np.array([kappa]))
         return Left(remaining[band, 0], absorbed[band, 0])
 
@@ -66,7 +66,7 @@ class Rays:
         return float(-2 * damped_bloch(self.model.chain.cell, kappa).rate.real[band])
 
     def _fractions(self, site: int, kappas: np.ndarray) -> Left:
-        """As ``of_bands``, of waves (band, kappa, time)."""
+        """What is left (band, kappa, time) of the energy that a ``site`` (cell) sends into each wave of each band."""
         chain = self.model.chain
         point = bloch(chain.cell, kappas)
         speed = np.abs(point.group_velocity).T

@@ -6,7 +6,7 @@ t_e = d/v + s T_b (s = ``law.settle``): at d/v + T_b the slow waves' end has pas
 contacts to die away. No wave returns along the ring: what the drive sends in the other direction reaches the site from
 behind after (N - d)/V, what leaves the site is back N/V after the wave's arrival there, so N >= d + V t_e makes the
 ring infinite. The drive works as without a site if the burst is over before a wave is back from it (d >= V T_b/2). The
-drive is in the midst of the lattice, not at a wall: where the case moves one, a force on the mass beside it sends the
+drive is in the midst of the lattice, not at a wall: where the case moves one, a force on the mass next to it sends the
 wave, which has the same form at a site as that of the wall if it is narrow in frequency. How far the wall moves for it
 follows from a run in which it does. ``LawCase.one_site`` chooses N, d and t_e.
 """
@@ -55,14 +55,14 @@ class Ring:
         """A run under ``amplitude`` in N of which all cells are kept at the first and the last sample."""
         return self._run(amplitude, with_site, {"stride": self.setting.samples})
 
-    def run_at_site(self, amplitude: float, *, with_site: bool, beside: int = 0) -> xr.Dataset:
+    def run_at_site(self, amplitude: float, *, with_site: bool, neighbours: int = 0) -> xr.Dataset:
         """A run under ``amplitude`` in N of which all samples of the site's cells are kept.
 
-        So are those of as many cells ``beside`` it, on both sides.
+        So are those of as many ``neighbours`` of it on either side.
         """
         cell = self.setting.site + 1
-        first = max(cell - beside, 1)
-        last = min(cell + self.kind.pair.next_cell + beside, self.setting.cells)
+        first = max(cell - neighbours, 1)
+        last = min(cell + self.kind.pair.next_cell + neighbours, self.setting.cells)
         return self._run(amplitude, with_site, {"window": [first, last]})
 
     def wall_peak(self) -> float:

@@ -37,7 +37,7 @@ from vipetsc.studies.pair_motion import PairMotion
 from vipetsc.studies.response import DECAY, self_response
 
 NODES_A_CELL = 1  # nodes of the wavenumber over the cells of the ring, in which waves do not come round
-AROUND = 4  # samples before the first contact and after the last in which the force is not zero
+MARGIN = 4  # samples before the first contact and after the last in which the force is not zero
 
 
 class SentWave(NamedTuple):
@@ -181,7 +181,7 @@ class SiteWaves:
         spectrum = np.fft.rfft((motion.displacement[:, 0] - linear) * np.exp(-decay * time), padded) / response
         force = np.fft.irfft(spectrum, padded)[: len(time)] * np.exp(decay * time)
         # Rounding aside, all else of it is what the end of the record would need to stop the motion there.
-        touching = (time >= begin - AROUND * step) & (time <= end + AROUND * step)
+        touching = (time >= begin - MARGIN * step) & (time <= end + MARGIN * step)
         return np.where(touching, force, 0.0)
 
 

@@ -98,7 +98,7 @@ class HarmonicBalance:
         self._series: tuple[np.ndarray, float, ForceSeries] | None = None
 
     def weighted(self, weight: float) -> "HarmonicBalance":
-        """The same equations with another ``weight``."""
+        """The equations with another ``weight``."""
         return HarmonicBalance(self.compliance, self.forces, self.order, self.odd, self.cosines, weight)
 
     def pack(self, z: np.ndarray) -> np.ndarray:

@@ -174,8 +174,10 @@ class BranchMonitor:
 
     def _retraces(self, point: Point, track: np.ndarray, here: np.ndarray) -> str | None:
         """A sentence if the branch, which is ``here`` now, lies on its earlier ``track``; else None."""
+        # Without contact a branch is its linear mode at every energy.
         if len(track) < FEWEST or not self._touched:
             return None
+
         starts = track[:-LATEST]
         ends = track[1 : 1 - LATEST]
         _, distance, length = _nearest(here, starts, ends)
@@ -183,6 +185,7 @@ class BranchMonitor:
         step = here - track[-1]
         size = np.linalg.norm(step)
         along = (ends[i] - starts[i]) @ step / max(length[i] * size, 1e-300)
+
         if distance[i] >= SAME_PLACE * size or abs(along) <= SAME_DIRECTION:
             return None
         where = f"point {point.index} lies on the step after point {i + 1}"

@@ -73,10 +73,14 @@ class ResponseOutputs:
                 "spring_harmonics": elongations.real,
                 "spring_harmonics_imaginary": elongations.imag,
             }
-        field = self._field(motion) if self.cells else np.empty(0)
+
+        field = np.empty(0)
+        if self.cells:
+            field = self._field(motion)
         if self._masses:
             places = [(self.cells.index(cell), mass) for cell, mass in self._masses]
             values |= self._motion(motion, np.array([field[:, cell, mass] for cell, mass in places]))
+
         if self.wants_forces:
             peaks = [
                 largest_force(stops, relative, [e for e in motion.episodes if e.pair == pair], motion.omega)

@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.lattice import bloch, max_group_velocity, pass_bands, waves_at
-from vipetsc.paper.claims.criteria import BESIDE, NATIVE
+from vipetsc.paper.claims.criteria import HALF_WIDTH, NATIVE
 from vipetsc.paper.claims.evidence import EXCITED, AnalysedMember, Evidence, Measurement, MissingEvidence
 from vipetsc.spectra import Dispersion, ridge
 
-BRANCHES = f"fraction within {100 * BESIDE:g} % of the top edge from the Bloch branches"
+BRANCHES = f"fraction within {100 * HALF_WIDTH:g} % of the top edge from the Bloch branches"
 STEP = "scattering-amplitudes"
 OPTICAL = 2  # the band that the paper drives
 
@@ -129,12 +129,12 @@ def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> No
 
 
 def _on_branches(run: AnalysedMember) -> float:
-    """Part of the 2-D spectrum's energy that lies within ``BESIDE`` times the top edge from a branch."""
+    """Part of the 2-D spectrum's energy that lies within ``HALF_WIDTH`` times the top edge from a branch."""
     wavenumber, frequency, energy = run.arrays("wavenumber", "frequency", "dispersion")
     cell = run.case.lattice.unit_cell()
     branches = bloch(cell, wavenumber).frequency
     distance = np.abs(frequency[None, :, None] - branches[:, None, :]).min(axis=2)
-    return energy[distance <= BESIDE * pass_bands(cell)[-1].high].sum() / energy.sum()
+    return energy[distance <= HALF_WIDTH * pass_bands(cell)[-1].high].sum() / energy.sum()
 
 
 def reflected(evidence: Evidence, reading: str, result: Measurement) -> None:
