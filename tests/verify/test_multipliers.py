@@ -12,7 +12,10 @@ import pytest
 
 from tests.breathers import BREATHER_FREQUENCY, breather_case, breather_chain
 from tests.models import CLEARANCE, four_band_contact
+from vipetsc.case import NnmCase
 from vipetsc.modes.balance.stops import Stops
+from vipetsc.modes.branches import condensed
+from vipetsc.modes.branches.condensed import CondensedMethod
 from vipetsc.modes.branches.files import read_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.lattice import floquet
@@ -171,3 +174,26 @@ def test_where_memory_runs_out_the_branch_does_not_continue(tmp_path, monkeypatc
     monkeypatch.setattr(floquet, "_krylov_basis", raise_petsc_error(55))
     with pytest.raises(PETSc.Error):
         follow_all(breather_case(multipliers=2), tmp_path, MPI.COMM_SELF)
+
+
+@pytest.mark.parametrize("sites", [[1], [1, -2]])
+def test_sensitivities_of_all_masses_and_hills_determinant_agree(monkeypatch, sites):
+    """A breather of a site is stable, two that move against each other are not, in a lattice of cubic springs."""
+    springs = [
+        {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True},
+        {"start": 1, "end": 2, "stiffness": 5e3, "cubic": 1e9},
+    ]
+    table = {
+        "lattice": {"cells": 3, "cell": {"masses": [4e-3, 2e-3], "springs": springs}},
+        "contacts": {"law": "hertz", "stiffness": 1e7, "sites": [1, 2], "clearance": 1e-4},
+        "nnm": {"system": "condensed", "start_frequency": [6000.0], "start_sites": sites, "truncation": 1e-5},
+    }
+    method = CondensedMethod(NnmCase.from_table(table), MPI.COMM_SELF)
+    point = method.start(method.motions, 0)
+    assert method.motions.forces.pairs > condensed.MOST_OF_HILL
+    by_orbit = method.assess(method.motions, point).multiplier
+    monkeypatch.setattr(condensed, "MOST_OF_HILL", method.motions.forces.pairs)
+    by_hill = method.assess(method.motions, point).multiplier
+
+    assert (by_orbit > 1.5) == (len(sites) == 2)
+    assert by_orbit == pytest.approx(by_hill, rel=1e-6)

@@ -157,13 +157,23 @@ class ForceSeries:
         """
         out = np.zeros((3, 2 * self.order + 1), complex)
         _transform(theta, np.ascontiguousarray(values[:3] * weights / (2 * np.pi)), out)
-        # The mean of f exp(-i k theta) is F_k/2, but F_0 for k = 0, since f is a real part.
-        self.forces[pair] += 2 * out[0]
-        self.forces[pair, 0] -= out[0, 0]
-        self._slopes[pair] += out[1]
+        self._include(pair, out)
         self._rates[pair] += out[2]
         self.potential[pair] += values[3] @ weights / (2 * np.pi)
         self.loss[pair] += (values[0] * rate) @ weights
+
+    def add_spring(self, pair: int, values: np.ndarray) -> None:
+        """Add a spring whose f, df/dz and potential are ``values`` (3, samples) at uniform phases of the period."""
+        samples = values.shape[1]
+        self._include(pair, np.fft.rfft(values[:2], axis=1)[:, : 2 * self.order + 1] / samples)
+        self.potential[pair] += values[2].mean()
+
+    def _include(self, pair: int, means: np.ndarray) -> None:
+        """Include the means of f exp(-i k theta) and of df/dz exp(-i k theta), the first rows of ``means``."""
+        # The mean of f exp(-i k theta) is F_k/2, but F_0 for k = 0, since f is a real part.
+        self.forces[pair] += 2 * means[0]
+        self.forces[pair, 0] -= means[0, 0]
+        self._slopes[pair] += means[1]
 
     def add_onset(self, onset: _Onset) -> None:
         """Add how the force of an arc depends on the approach velocity at its onset."""
@@ -271,14 +281,10 @@ class SiteForces:
                 series.add_dashpot(pair, stops.drag * omega, z[pair])
 
         # Uniform samples are exact for springs: f exp(-i k theta) has orders up to 3K + 2K, the energy up to 4K.
-        samples = motion.shape[1]
-        theta = np.arange(samples) * (2 * np.pi / samples)
-        weights = np.full(samples, 2 * np.pi / samples)
         for pair, spring in enumerate(self.springs, len(self.contacts)):
             x = motion[pair, :, 0]
-            rate = motion[pair, :, 1]
-            values = [spring.nonlinear_force(x), spring.nonlinear_slope(x), 0 * x, spring.nonlinear_energy(x)]
-            series.add(pair, theta, weights, np.array(values), rate)
+            values = [spring.nonlinear_force(x), spring.nonlinear_slope(x), spring.nonlinear_energy(x)]
+            series.add_spring(pair, np.array(values))
 
         series.episodes.sort(key=lambda e: (e.pair, e.onset))
         return series

@@ -90,6 +90,11 @@ class Stability(NamedTuple):
     at_minus_one: float
 
 
+def least_growth(finite: bool, decay: float = 0.0) -> float:
+    """Re lambda/Om up to which a motion counts as stable, of a ``finite`` system whose modes decay at least so fast."""
+    return max(LEAST_OF_FINITE - decay, LEAST) if finite else LEAST
+
+
 class Hill:
     """Stability of motions at ``omega`` (rad/s) with harmonics up to ``order``, ``odd`` ones alone or all.
 
@@ -104,7 +109,7 @@ class Hill:
         self.omega = omega
         self.finite = finite
         self.decay = decay
-        self.least = max(LEAST_OF_FINITE - decay, LEAST) if finite else LEAST
+        self.least = least_growth(finite, decay)
         orders = np.arange(-order, order + 1)
         self._blocks = [orders[1 - order % 2 :: 2], orders[order % 2 :: 2]] if odd else [orders]
         # Compliances by block, number of its orders and exponent, and the latest forces with their reduced Jacobians.
@@ -290,6 +295,9 @@ def _flat(jacobian: np.ndarray) -> np.ndarray:
 def _plus_one(g: np.ndarray, matrix: np.ndarray, one: float = 1.0) -> np.ndarray:
     """1 + G J, G (order, pair, pair) being diagonal in the orders."""
     count, pairs = g.shape[:2]
-    product = np.einsum("kij,kjn->kin", g, matrix.reshape(count, pairs, -1)).reshape(matrix.shape)
+    rows = matrix.reshape(count, pairs, -1)
+    # Products of matrices by BLAS pay for many pairs alone.
+    product = np.einsum("kij,kjn->kin", g, rows) if pairs <= FEW_PAIRS else np.matmul(g, rows)
+    product = product.reshape(matrix.shape)
     product[np.diag_indices(min(product.shape))] += one
     return product

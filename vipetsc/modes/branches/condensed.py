@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -19,7 +20,7 @@ from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, pass_bands
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
-from vipetsc.modes.balance.hill import Hill
+from vipetsc.modes.balance.hill import Hill, least_growth
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.losses import Dissipation, dissipation_of, force_for
 from vipetsc.modes.branches.orbits import NnmMethod, guarded_steps, start_energy
@@ -28,7 +29,10 @@ from vipetsc.modes.continuation.arclength import StepRule
 from vipetsc.modes.lattice.floquet import with_multipliers
 from vipetsc.modes.lattice.lattice_flow import LatticeFlow
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import PeriodicProblem
+from vipetsc.modes.problem import FlowError, PeriodicProblem
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.system import System, elastic_stops
 
 # A field is left out below this fraction of its largest value.
@@ -36,6 +40,9 @@ NEGLIGIBLE = 1e-16
 # A harmonic is followed so many cells from a site, at first and at last.
 FIRST_REACH = 8
 LAST_REACH = 2048
+# Places up to which Hill's determinant gives the largest multiplier. Its matrix has the harmonics of all of them, and
+# hundreds of determinants cost more than the sensitivities of one orbit of all masses.
+MOST_OF_HILL = 4
 
 
 class Condensed(NamedTuple):
@@ -133,17 +140,35 @@ class CondensedMethod(NnmMethod):
         return guarded_steps(problem, options, done)
 
     def assess(self, problem: PeriodicProblem[Point], point: Point) -> Point:
-        """The point with its largest multiplier by Hill's method, and with those of Floquet if they are asked for."""
-        motions = self.motions
-        omega = 2 * np.pi / point.period
-        hill = Hill(motions.compliance, omega, point.order, motions.forces.odd, finite=True)
-        fastest = hill.fastest(motions.balance(point.order).series(point.x, omega))
-        largest = np.nan if fastest is None else float(np.exp(2 * np.pi * fastest.real))
+        """The point with its largest multiplier, its loss, and the multipliers of Floquet if they are asked for."""
+        largest = self._largest_multiplier(point)
         if self.dissipation.acts:
-            point = with_condensed_loss(motions, self.dissipation, point, self.dofs)
+            point = with_condensed_loss(self.motions, self.dissipation, point, self.dofs)
         if self.options.multipliers and self.chain is not None:
             point = self._with_multipliers(point, self.chain)
         return replace(point, multiplier=largest)
+
+    def _largest_multiplier(self, point: Point) -> float:
+        """The largest multiplier by Hill's method, or by the orbit's sensitivities; NaN where it is not found."""
+        motions = self.motions
+        omega = 2 * np.pi / point.period
+        if motions.forces.pairs <= MOST_OF_HILL or not isinstance(motions.compliance, DenseCompliance):
+            hill = Hill(motions.compliance, omega, point.order, motions.forces.odd, finite=True)
+            fastest = hill.fastest(motions.balance(point.order).series(point.x, omega))
+            return np.nan if fastest is None else float(np.exp(2 * np.pi * fastest.real))
+
+        u = np.concatenate(list(state_of(motions, point, self.dofs).values()))
+        try:
+            _, largest = self._orbits.stability(self._orbits.arc(u, point.period))
+        except FlowError:
+            return np.nan
+        return largest if np.log(largest) > 2 * np.pi * least_growth(finite=True) else 1.0
+
+    @cached_property
+    def _orbits(self) -> Shooting:
+        """Orbits of all masses, with their sensitivities."""
+        system = self.system or System.from_chain(self.case.chain(), elastic_stops(self.case))
+        return Shooting(Dop853Flow(system), MAPS["quarter" if self.motions.forces.odd else "half"])
 
     def _with_multipliers(self, point: Point, chain: Chain) -> Point:
         """The point with its largest Floquet multipliers, from the lattice's state at phase 0."""
