@@ -311,19 +311,21 @@ UNCONNECTED_CELL = UnitCell(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cell", [diatomic(), four_band(), ODD_CELL, UNCONNECTED_CELL])
-@pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
-def test_any_cell_can_be_drawn(tmp_path, cell, ends):
+def test_any_cell_can_be_drawn(tmp_path, cell):
     with rc_style():
-        figure = new_figure(5, 3)
-        upper, lower = figure.subplots(2, 1)
+        figure = new_figure(5, 6)
+        upper, *lower = figure.subplots(4, 1)
         draw_unit_cell(upper, cell)
-        draw_lattice(lower, Chain(cell, 30, ends, (3, 4, 20), (1e-3,) * 3), 2)
+        for axes, ends in zip(lower, ("fixed", "free", "periodic"), strict=True):
+            draw_lattice(axes, Chain(cell, 30, ends, (3, 4, 20), (1e-3,) * 3), 2)
         figure.savefig(tmp_path / "cell.png")
 
     labels = [text.get_text() for text in upper.texts]
     for number in range(1, cell.dofs + 1):
         assert any(f"m_{{{number}}}" in label for label in labels)
-    assert imread(tmp_path / "cell.png").std() > 0.005
+    # Every strip shows something.
+    image = imread(tmp_path / "cell.png")[..., :3]
+    assert all(part.std() > 0.005 for part in np.array_split(image, 4))
     assert_not_blank(draw_bands(cell, tmp_path / "bands.png"))
 
 

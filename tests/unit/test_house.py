@@ -132,3 +132,11 @@ def test_no_two_classes_have_one_name():
             places[node.name].append(file)
 
     assert {name: files for name, files in places.items() if len(files) > 1} == {}
+
+
+def test_numbers_of_ranks_stand_where_scripts_test_looks_for_them():
+    """scripts/test chooses the files for a number of ranks by the lines with marks, each of which has its numbers."""
+    for path in (ROOT.parent / "tests/mpi").glob("test_*.py"):
+        text = path.read_text(encoding="utf-8")
+        with_numbers = re.findall(r"mark\.parallel\((?:\d|\[\d(?:, \d)*\])\)", text)
+        assert len(with_numbers) == text.count("mark.parallel"), path.name
