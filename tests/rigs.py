@@ -44,11 +44,13 @@ OUTPUT: dict[str, Any] = {
 def rate_of(states: SteadyStates, omega: float, amplitude: float):
     """The equations of motion of a lattice with elastic contacts, from its matrices: y' = f(t, y), y = (u, u').
 
-    Springs that are not linear are looked for cell by cell, between walls or on a line of cells with free ends.
+    States (..., component) may be several. Springs that are not linear are looked for cell by cell, between walls or on
+    a line of cells with free ends.
     """
     chain = states.case.model().chain
-    stiffness = chain.stiffness_matrix().tocsr()
-    damping = chain.damping_rows(0, chain.cells)
+    # Lattices are so small that products with whole matrices are the quicker ones.
+    stiffness = chain.stiffness_matrix().toarray()
+    damping = chain.damping_rows(0, chain.cells).toarray()
     masses = chain.masses()
     n = len(masses)
     d = chain.cell.dofs
@@ -73,44 +75,49 @@ def rate_of(states: SteadyStates, omega: float, amplitude: float):
         beyond.append((start, end, spring))
 
     def rate(t: float, y: np.ndarray) -> np.ndarray:
-        u = y[:n]
-        v = y[n:]
-        force = drive * np.cos(omega * t) - stiffness @ u - damping @ v
+        u = y[..., :n]
+        v = y[..., n:]
+        force = drive * np.cos(omega * t) - u @ stiffness.T - v @ damping.T
 
         for host, resonator, stops in joins:
-            w = u[resonator] - (0.0 if host is None else u[host])
+            w = u[..., resonator] - (0.0 if host is None else u[..., host])
             push = stops.law.elastic_force(w - stops.plus) - stops.law.elastic_force(-w - stops.minus) - stops.load
-            force[resonator] -= push
+            force[..., resonator] -= push
             if host is not None:
-                force[host] += push
+                force[..., host] += push
 
         for start, end, spring in beyond:
-            z = (0.0 if end is None else u[end]) - (0.0 if start is None else u[start])
+            z = (0.0 if end is None else u[..., end]) - (0.0 if start is None else u[..., start])
             pull = spring.quadratic * z**2 + spring.cubic * z**3
             if end is not None:
-                force[end] -= pull
+                force[..., end] -= pull
             if start is not None:
-                force[start] += pull
-        return np.concatenate([v, force / masses])
+                force[..., start] += pull
+        return np.concatenate([v, force / masses], axis=-1)
 
     return rate
 
 
 def after_a_period(states: SteadyStates, point: Response, state: np.ndarray) -> np.ndarray:
-    """The ``state`` (displacements, velocities) a period later, by SciPy."""
+    """The ``state`` (..., displacements and velocities), or several together, a period later, by SciPy."""
     omega, amplitude = states.drive(point.xi[-1])
     rate = rate_of(states, omega, amplitude)
     period = 2 * np.pi / omega
-    return solve_ivp(rate, (0, period), state, "DOP853", rtol=1e-10, atol=1e-12, max_step=period / 100).y[:, -1]
+
+    def flat_rate(t: float, y: np.ndarray) -> np.ndarray:
+        return rate(t, y.reshape(state.shape)).ravel()
+
+    span = (0, period)
+    solved = solve_ivp(flat_rate, span, state.ravel(), "DOP853", rtol=1e-10, atol=1e-12, max_step=period / 100)
+    return solved.y[:, -1].reshape(state.shape)
 
 
-def multipliers(states: SteadyStates, point: Response, state: np.ndarray, end: np.ndarray) -> np.ndarray:
+def multipliers(states: SteadyStates, point: Response, state: np.ndarray) -> np.ndarray:
     """Floquet multipliers of the motion through ``state``, by differences of the map of a period."""
     step = 1e-6
-    columns = []
-    for direction in np.eye(len(state)):
-        columns.append((after_a_period(states, point, state + step * direction) - end) / step)
-    return np.linalg.eigvals(np.array(columns).T)
+    # Integrated together, all have the same steps, whose errors the differences do not contain.
+    ends = after_a_period(states, point, state + step * np.vstack([np.zeros(len(state)), np.eye(len(state))]))
+    return np.linalg.eigvals((ends[1:] - ends[0]).T / step)
 
 
 def followed(case: NfrcCase, folder):

@@ -100,7 +100,7 @@ def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are
         state = np.concatenate([part.ravel() for part in motion_at(inner, xi, np.arange(2))])
         end = after_a_period(inner, Response(xi=xi), state)
         assert np.abs(end - state).max() < 1e-3 * np.abs(state).max()
-        grows = np.abs(multipliers(inner, Response(xi=xi), state, end)) > 1.001
+        grows = np.abs(multipliers(inner, Response(xi=xi), state)) > 1.001
         assert point.measured.unstable == np.count_nonzero(grows)
         unstable.add(point.measured.unstable)
     assert len(unstable) > 1

@@ -141,7 +141,7 @@ def test_a_response_is_a_periodic_motion_and_is_stable_as_its_multipliers_are(ri
         assert np.abs(end - state).max() < 1e-3 * np.abs(state).max()
         # Of ten cells a map has 40 columns: two states have to do.
         if rig == "two_masses" or point in chosen[::4]:
-            grows = np.abs(multipliers(states, point, state, end)) > 1.001
+            grows = np.abs(multipliers(states, point, state)) > 1.001
             assert point.measured.unstable == np.count_nonzero(grows)
             unstable.add(point.measured.unstable)
     assert rig == "ten_cells" or len(unstable) > 1

@@ -52,7 +52,7 @@ def misses(states: SteadyStates, point: Response) -> tuple[float, int]:
     """By how much a state misses itself after a period of SciPy's integration, relatively; multipliers beyond 1."""
     state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(states.case.lattice.cells))])
     end = after_a_period(states, point, state)
-    grows = np.abs(multipliers(states, point, state, end)) > 1.001
+    grows = np.abs(multipliers(states, point, state)) > 1.001
     return float(np.abs(end - state).max() / np.abs(state).max()), np.count_nonzero(grows)
 
 
