@@ -10,6 +10,8 @@ from vipetsc.cli.main import main
 from vipetsc.cli.verbs.sweep_verb import PICTURES
 from vipetsc.figures.sweep_members import Files
 
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
 LATTICE = """
 [lattice]
 cells = 24
