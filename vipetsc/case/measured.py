@@ -200,6 +200,7 @@ def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
     if not all(_is_number(field) for field in rows[0]):
         names = rows.pop(0)
 
+    # Before the conversion to numbers, whose error would not say that a line lacks a field.
     widths = {len(row) for row in rows}
     if len(widths) != 1:
         raise MeasuredError("file", record.file, f"its lines have {' or '.join(map(str, sorted(widths)))} fields")

@@ -205,6 +205,7 @@ def changed_case(base: Case, parameters: Sequence[SoughtParameter], values: Iter
             for member in parameter.members:
                 numbers[member] = float(value)
 
+    # By quantity, since a section takes all values of one at once: those that are not sought keep theirs.
     for quantity, numbers in of_quantity.items():
         if quantity == "amplitude":
             drive["amplitude"] = numbers[0]

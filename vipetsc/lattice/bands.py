@@ -59,6 +59,7 @@ def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     # Closer to zero, rounding of omega^2 (eps times the top band's) outweighs that of the acoustic branch.
     near_zero = np.abs(kappa) < OFF_ZERO
     off_zero = np.where(near_zero, OFF_ZERO, kappa)
+    # Frequencies and vectors stay those of the wavenumber itself: only the slope is taken next to it.
     eigenvalue = squared.copy()
     u = vectors.copy()
     if near_zero.any():
@@ -190,6 +191,7 @@ def waves_at(cell: UnitCell, frequency: float) -> tuple[tuple[int, float, float]
     waves = []
     grid = _grid(cell)
     for number, offset in enumerate((grid.frequency - frequency).T, 1):
+        # A band may pass the frequency several times, where it rises and falls.
         for i in np.nonzero(offset[:-1] * offset[1:] <= 0)[0]:
             if offset[i] == 0 and i > 0:
                 continue  # a root on the grid, which the interval before has given

@@ -190,6 +190,7 @@ class WaveCompliance:
         for row in range(2):
             for n in range(half):
                 unit_flux[row, n] = energy_flux(omega, waves.state[0, :, n + row * half])
+        # Waves that decay carry no energy away; rounding would give them some.
         travels = np.abs(1 - np.abs(waves.factor[0].reshape(2, half))) < NEUTRAL
         return np.where(travels, np.abs(unit_flux), 0) * np.abs(amplitudes) ** 2
 
@@ -259,11 +260,14 @@ class WaveCompliance:
             # put no load on it.
             matrix[omega == 0, chain.cell.host, chain.cell.host] += blocks.stiffness[0, 0]
 
+        # At each end of a stretch the loaded cell feels the springs that lead into it, whose far ends are states of the
+        # stretch's waves; and the same states have the displacements of the loaded cell as their near ends.
         row = size
         for stretch in stretches:
             count = stretch.unknowns(half)
             amplitudes = slice(row, row + count)
             if not count:
+                # Loaded cells that are neighbours are coupled without waves between them.
                 assert stretch.left is not None and stretch.right is not None
                 matrix[:, at[stretch.left], at[stretch.right]] += coupling
                 matrix[:, at[stretch.right], at[stretch.left]] += coupling.T
@@ -331,6 +335,7 @@ def _relative_motion(pair: Pair, shape: np.ndarray, factor: complex) -> complex:
 
 def _right_half(omegas: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies (w,) with real parts >= 0, whose answers are the complex conjugate where the second array is true."""
+    # Waves are sorted by the direction in which they carry energy at a positive frequency: at -omega it is the other.
     omega = np.atleast_1d(np.asarray(omegas, complex))
     mirrored = omega.real < 0
     return np.where(mirrored, -omega.conj(), omega), mirrored

@@ -165,6 +165,7 @@ def _octaves(cells: int, stride: int) -> list[_Octave]:
     """The octaves of the nodes; a transform's length is the padded one, which the lowest node sets, over ``stride``."""
     kappa = np.pi * np.arange(1, NODES + 1) / NODES
     octaves = []
+    # Wavelets of higher nodes are shorter: the transforms of an octave need the room of its lowest node alone.
     for number in range(int(np.log2(NODES)) + 1):
         nodes = kappa[2**number - 1 : 2 ** (number + 1) - 1]
         length = fft.next_fast_len(-(-padded_length(cells, KC, nodes[0]) // stride))

@@ -90,6 +90,7 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
         r2 = r2_adjusted(v, b * u)
         variance = float(np.sum((v - b * u) ** 2)) / freedom / (u @ u)
     else:
+        # As far as rounding allows.
         tolerances = {"ftol": 1e-14, "xtol": 1e-14, "gtol": 1e-14, "maxfev": 2000}
         try:
             (c, b), covariance = scipy.optimize.curve_fit(_exponential, u, w, p0=(c, b), jac=_gradient, **tolerances)

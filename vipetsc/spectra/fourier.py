@@ -31,6 +31,7 @@ class Dispersion:
         """Dispersion with kappa and -kappa added up, on [0, pi]."""
         zero = (len(self.wavenumber) - 1) // 2  # row of kappa = 0 in ascending order over (-pi, pi]
         energy = self.energy[zero:].copy()
+        # 0 is its own opposite, and so is pi, which an even number of wavenumbers has once.
         energy[1 : zero + 1] += self.energy[:zero][::-1]
         return Dispersion(self.wavenumber[zero:], self.frequency, energy)
 
@@ -73,6 +74,7 @@ def taper(length: int, fraction: float) -> np.ndarray:
     window = np.ones(length)
     if fraction > 0:
         window = 0.5 * (1 - np.cos(2 * np.pi * np.minimum(flank / fraction, 0.5)))
+    # So that the energy of a stationary signal stays what it is on the average.
     return window / np.sqrt(np.mean(window**2))
 
 
@@ -116,7 +118,9 @@ def dispersion(
         # The inverse transform's sign in space makes exp(i (kappa x - omega t)) land on +kappa.
         waves = fft.ifft(spectrum, nx, axis=1, norm="forward")
         energy += mass * (waves.real**2 + waves.imag**2)
+    # Parseval over both padded transforms; half of m v^2; the mean over the samples.
     energy /= 2 * t * nt * nx
+    # Of a real signal omega > 0 stands for -omega too; 0 and the highest of an even length have no opposite.
     has_opposite = [0 < row < (nt + 1) // 2 for row in taken]
     energy[has_opposite] *= 2
 
@@ -139,6 +143,7 @@ def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[np.ndarray, np.nda
     energetic = np.nonzero(energy[rows, peak] > floor * energy.max())[0]
 
     neighbours = energy[energetic[:, None], peak[energetic, None] + np.array([-1, 0, 1])]
+    # A neighbour may have no energy at all, and 0 no logarithm.
     left, top, right = np.log(np.maximum(neighbours, np.finfo(float).tiny)).T
     offset = 0.5 * (left - right) / (left - 2 * top + right)
     step = frequency[1] - frequency[0]

@@ -95,6 +95,7 @@ def cluster_samples(
     """
     first = np.maximum(np.searchsorted(time, onset, side="right") - 1, 0) // stride * stride
     stop = -(-np.searchsorted(time, separation) // stride) * stride
+    # An episode between two neighbouring samples is bounded by both.
     stop = np.minimum(np.maximum(stop, first + stride), len(time) - 1)
 
     # In the order of their beginnings, a cluster begins where all earlier episodes have ended.
@@ -118,6 +119,7 @@ def upper_fraction(chain: Chain, drive: Waveform, displacement: np.ndarray, velo
 
     Fields (cell, dof) in m and m/s are of all cells. NaN if there is no such band, or no work.
     """
+    # Energies of modes are constant between impacts: one instant is enough.
     parts = ModalParts.of(chain)
     above = parts.parts.above(drive.frequency)
     if not above.any() or work == 0:

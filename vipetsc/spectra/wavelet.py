@@ -64,6 +64,7 @@ def wavelet_spectrum(kappa: ArrayLike, kc: float, eta: ArrayLike) -> np.ndarray:
 @lru_cache
 def constant(kc: float) -> float:
     """C = integral of |Psi(kc e^x)|^2 over x, to rounding (the trapezoidal rule on a smooth bell)."""
+    # The integrand has fallen to exp(-49) at the upper end, and to exp(-kc^2) at the lower one.
     x = np.linspace(np.log(1e-3), np.log(1 + 7 / kc), 4001)
     return float(np.sum(np.exp(-((kc * np.exp(x) - kc) ** 2))) * (x[1] - x[0]))
 
@@ -106,6 +107,7 @@ def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | Non
         length = padded_length(cells, kc, float(kappa.min()))
     if length < cells:
         raise ValueError(f"length = {length}: below the {cells} cells of the signal")
+    # Negative wavenumbers stay zero: the wavelets have none, which makes the transform complex.
     spectrum = np.zeros((*signal.shape[:-1], len(kappa), length), dtype=complex)
     spectrum[..., : length // 2 + 1] = fft.rfft(signal, length)[..., None, :] * transform_filters(kappa, kc, length)
     return fft.ifft(spectrum, overwrite_x=True)

@@ -220,7 +220,7 @@ class ScatteringRuns:
         if z <= 1:
             return []
         options = self.case.law
-        # Narrower near the onset, so that all runs of a point touch.
+        # Narrower near the onset, so that all runs of a point touch the stop.
         width = min(options.jitter, (z - 1) / 10)
         spread = np.zeros(1)
         if options.samples > 1:

@@ -23,6 +23,9 @@ LOWEST = 0.15  # z of the first of the bins
 BINS = 40
 DECAY = 4.0  # windows fall by e^-4 over the transformed time, so that no response is folded back
 TINY = 1e-300  # in place of zero in a divisor
+# The quantities that are summed over the samples of a run, in the order of the rows of ``Burst.sums``.
+SQUARE, FUNDAMENTAL_REAL, FUNDAMENTAL_IMAGINARY, THIRD_REAL, THIRD_IMAGINARY, GIVEN, DISSIPATED = range(7)
+INTO = slice(7, None)
 # Half-widths of the lines at Om and 3 Om, over Om: frequencies outside the signal's own line are cut off.
 FIRST_LINE = 0.3
 THIRD_LINE = 0.4
@@ -132,9 +135,9 @@ class Burst:
     def sums(self, run: SiteRun, largest: float) -> Record:
         """``sums`` (quantity, bin) over a ``run``'s samples in contact, ``totals``, and the z of the ``release``.
 
-        The bins of log z go from ``LOWEST`` to ``largest``. Quantities: |c|^2, Re and Im of f1 c*, Re and Im of
-        f3 (c*/|c|)^3 |c|, power that the driven wave gives, power dissipated, power into each band. The totals are
-        those of the last two over all samples.
+        The bins of log z go from ``LOWEST`` to ``largest``. Quantities: |c|^2 (``SQUARE``), Re and Im of f1 c*, Re and
+        Im of f3 (c*/|c|)^3 |c|, power that the driven wave gives (``GIVEN``), power dissipated, power into each band
+        (``INTO``). The totals are those of the last two over all samples.
         """
         c = run.amplitude * self.c
         incident = run.amplitude * self.linear
@@ -160,7 +163,7 @@ class Burst:
         }
 
     def _force_rows(self, c: np.ndarray, force: np.ndarray, incident: np.ndarray) -> list[np.ndarray]:
-        """|c|^2, Re and Im of f1 c*, Re and Im of f3 (c*/|c|)^3 |c|, power that the driven wave gives, over time."""
+        """The quantities from ``SQUARE`` to ``GIVEN`` over time."""
         drive = self.drive
         f1 = self.envelope(force, drive, FIRST_LINE * drive)
         f3 = self.envelope(force, 3 * drive, THIRD_LINE * drive)
@@ -244,9 +247,9 @@ class SiteResponse(NamedTuple):
         release = np.array([record["release"] for record in records])
         spectrum = np.stack([_fractions(record.get("spectrum", [[]] * cell.dofs)) for record in records], axis=-1)
         wave = fastest_wave(cell, drive, pair)
-        squares = sums[:, 0]  # |c|^2, by run
+        squares = sums[:, SQUARE]
         total = sums.sum(axis=0)
-        seen = total[0] > 0
+        seen = total[SQUARE] > 0
         if wave is None or not seen.any():
             return cls(
                 x=x,
@@ -261,10 +264,10 @@ class SiteResponse(NamedTuple):
             )
 
         # Bins that no sample fell into lie between others that have some.
-        mean = np.array([np.interp(x, x[seen], row[seen] / total[0][seen]) for row in total])
-        given = mean[5] / wave.power_per_area
-        lost = np.maximum(mean[6], 0)
-        into = mean[7:].copy()
+        mean = np.array([np.interp(x, x[seen], row[seen] / total[SQUARE][seen]) for row in total])
+        given = mean[GIVEN] / wave.power_per_area
+        lost = np.maximum(mean[DISSIPATED], 0)
+        into = mean[INTO].copy()
         into[wave.band] = 0
         into = np.maximum(into, 0)
         scale = np.maximum(given, 0) / np.maximum(into.sum(axis=0) + lost, TINY)
@@ -277,8 +280,8 @@ class SiteResponse(NamedTuple):
         factor[1 + wave.band] = 1.0
         return cls(
             x=x,
-            fundamental=mean[1] + 1j * mean[2],
-            third=mean[3] + 1j * mean[4],
+            fundamental=mean[FUNDAMENTAL_REAL] + 1j * mean[FUNDAMENTAL_IMAGINARY],
+            third=mean[THIRD_REAL] + 1j * mean[THIRD_IMAGINARY],
             lost=table[0],
             into=table[1:],
             peaks=peaks,

@@ -52,6 +52,7 @@ class AmplitudeTriple:
         """Part of the kinetic energy outside the main lobe, from when the middle of the burst passes the first site."""
         time, wavenumber, content = run.arrays("time", "wavenumber", "wavenumber_content")
         content = content[time >= self.duration / 2 + self.distance / self.speed]
+        # The burst itself has a main lobe of that width about the driven wavenumber.
         new = np.abs(wavenumber - self.wavenumber) > self.lobe
         outside = content[:, new].sum(axis=1)
         whole = content.sum(axis=1)
