@@ -8,8 +8,11 @@ gaps, the inter-band targeted energy transfer, and the energies of the linear mo
 
 import json
 import sys
-from collections.abc import Collection, Mapping
-from typing import Any
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
 
 import numpy as np
 import xarray as xr
@@ -22,7 +25,8 @@ from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import tabulated
 from vipetsc.lattice import pass_bands
 from vipetsc.lattice.chain import cells_between
-from vipetsc.spectra.measures import MEASURES, PART, RunRecord, row_of, take
+from vipetsc.parallel import divided, on_every_rank, on_root
+from vipetsc.spectra.measures import MEASURES, PART, row_of, take
 from vipetsc.studies.analysis_options import describe_options
 from vipetsc.studies.band_measures import BANDS, band_energies
 from vipetsc.studies.modal_measures import MODAL, modal_energies
@@ -89,6 +93,7 @@ def analyse(
     measures: Collection[str] = FULL,
     arrival: float | None = None,
     options: AnalysisTable | None = None,
+    comm: MPI.Comm = MPI.COMM_SELF,
 ) -> xr.Dataset:
     """The content of ``analysis.h5``, from a ``run``, open or in memory, with its case in the attribute ``case``.
 
@@ -97,6 +102,8 @@ def analyse(
     estimated from the group velocity: half the burst and the time to the site. ``options`` are the case's where none
     are given. Measures that the run does not allow (no sites, a single cell) are left out and named in the attribute
     ``left_out``; those that the stored samples and cells do not resolve are also named in the list ``warnings``.
+
+    The ranks of ``comm`` take different measures of the same run; all must call it, and all get all measures.
     """
     sys.audit("vipetsc.analyse")
     case = Case.of(run)
@@ -108,26 +115,26 @@ def analyse(
         "status": run.attrs.get("status", ""),
         "analysis": describe_options(options),
     }
-    seen = record_of(run, case, options)
-    taken = take(seen, measures)
-    layout, numbers, attributes = _numbers(seen, taken)
+    # On one rank, since they include measures of a user's module.
+    numbers = on_root(comm, lambda: _numbers(run, case, options, measures))
     if "velocity" not in run:
         left_out = "all measures of fields: the velocity was not recorded"
-        about |= {"left_out": left_out, "warnings": json.dumps(seen.warnings)}
-        return _dataset(LAYOUT | layout, numbers, about, attributes)
+        about |= {"left_out": left_out, "warnings": json.dumps(numbers.warnings)}
+        return _dataset(LAYOUT | numbers.layout, numbers.values, about, numbers.attributes)
 
-    record = VelocityRecord(run, case, options)
-    values = _measure(run, record, set(measures) - record.unresolved(), arrival) | numbers
-    record.warnings += seen.warnings
+    record = on_every_rank(comm, lambda: VelocityRecord(run, case, options))
+    values = _measure(run, record, set(measures) - record.unresolved(), arrival, comm) | numbers.values
+    layout = LAYOUT | numbers.layout
+    record.warnings += numbers.warnings
     about["left_out"] = "; ".join(record.left_out + record.warnings)
     about["warnings"] = json.dumps(record.warnings)
     about |= record.attributes.pop("", {})
 
     # Axes are written only where some variable needs them.
-    dims = {dim for name in values for dim in (LAYOUT | layout)[name][0].split()}
+    dims = {dim for name in values for dim in layout[name][0].split()}
     axes = {"time": record.mean_time, "cell": record.mean_cells, "bands/sample": record.time}
     values = {name: axis for name, axis in axes.items() if name in dims} | values
-    return _dataset(LAYOUT | layout, values, about, record.attributes | attributes)
+    return _dataset(layout, values, about, record.attributes | numbers.attributes)
 
 
 def _dataset(
@@ -143,10 +150,19 @@ def _dataset(
     return data
 
 
-def _numbers(
-    record: RunRecord, taken: Mapping[str, Any]
-) -> tuple[dict[str, tuple[str, str, str]], dict[str, Any], dict[str, dict[str, Any]]]:
-    """Rows of a layout, values and attributes, all by name, of the computed measures of the registry."""
+class Numbers(NamedTuple):
+    """Measures of the registry: rows of a layout, values and attributes by name; warnings about them."""
+
+    layout: dict[str, tuple[str, str, str]]
+    values: dict[str, Any]
+    attributes: dict[str, dict[str, Any]]
+    warnings: list[str]
+
+
+def _numbers(run: xr.Dataset, case: Case, options: AnalysisTable, measures: Collection[str]) -> Numbers:
+    """Those of ``measures`` that are in the registry."""
+    record = record_of(run, case, options)
+    taken = take(record, measures)
     layout: dict[str, tuple[str, str, str]] = {}
     values = dict(taken)
     attributes: dict[str, dict[str, Any]] = {}
@@ -159,33 +175,55 @@ def _numbers(
         layout[name] = (dimension, unit, text)
         if name.startswith("steady"):
             attributes[name] = {"periods": record.periods, "tolerance": record.tolerance}
-    return layout, values, attributes
+    return Numbers(layout, values, attributes, record.warnings)
+
+
+class MeasuredKind(NamedTuple):
+    """Measures of one kind: variables by name, attributes of these, sentences on what is left out."""
+
+    values: dict[str, Any]
+    attributes: dict[str, dict[str, Any]]
+    left_out: list[str]
 
 
 def _measure(
-    run: xr.Dataset, record: VelocityRecord, measures: Collection[str], arrival: float | None
+    run: xr.Dataset, record: VelocityRecord, measures: Collection[str], arrival: float | None, comm: MPI.Comm
 ) -> dict[str, Any]:
-    """The variables of all ``measures``; the ``record`` names those that cannot be computed."""
+    """The variables of ``measures``, by the ranks of ``comm`` together; the ``record`` says what cannot be computed."""
     measures = set(measures)
     samples, cells = record.velocity.shape[:2]
-    values: dict[str, Any] = {}
-    if {"kinetic", "wavenumber"} & measures:
-        values |= _maps(record, measures)
-    if samples < 2:
-        record.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
-    else:
-        if "dispersion" in measures:
-            values |= _dispersions(record)
-        if "bands" in measures:
-            values |= band_energies(record, measures)
-        if cells > 1:
-            values |= _wavelets(record, measures, arrival)
 
-    # The energies of the modes at an instant need no second sample.
-    if {"modal", "transfers"} & measures:
-        values |= modal_energies(run, record, measures)
-    if cells == 1:
-        record.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
+    def maps(part: VelocityRecord) -> dict[str, Any]:
+        return _maps(part, measures) if {"kinetic", "wavenumber"} & measures else {}
+
+    def dispersions(part: VelocityRecord) -> dict[str, Any]:
+        if samples < 2:
+            part.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
+            return {}
+        return _dispersions(part) if "dispersion" in measures else {}
+
+    def bands(part: VelocityRecord) -> dict[str, Any]:
+        return band_energies(part, measures) if samples > 1 and "bands" in measures else {}
+
+    def wavelets(part: VelocityRecord) -> dict[str, Any]:
+        return _wavelets(part, measures, arrival) if samples > 1 and cells > 1 else {}
+
+    def modes(part: VelocityRecord) -> dict[str, Any]:
+        # The energies of the modes at an instant need no second sample.
+        values = modal_energies(run, part, measures) if {"modal", "transfers"} & measures else {}
+        if cells == 1:
+            part.left_out.append("wavenumber_content, partition, entropy: a single cell was recorded")
+        return values
+
+    def measured(kind: Callable[[VelocityRecord], dict[str, Any]]) -> MeasuredKind:
+        part = record.blank()
+        return MeasuredKind(kind(part), part.attributes, part.left_out)
+
+    values: dict[str, Any] = {}
+    for part in divided(comm, [partial(measured, kind) for kind in (maps, dispersions, bands, wavelets, modes)]):
+        values |= part.values
+        record.attributes |= part.attributes
+        record.left_out += part.left_out
     return values
 
 

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from vipetsc.case import Case, Sweep
+from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import FolderError, origin
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
@@ -110,21 +112,37 @@ def _measurable(path: Path) -> Iterator[MeasurableRun]:
 
 
 def measure_run(
-    folder: Path, sweep: Path | None = None, measures: Collection[str] = FULL, overrides: Sequence[str] = ()
+    folder: Path,
+    sweep: Path | None = None,
+    measures: Collection[str] = FULL,
+    overrides: Sequence[str] = (),
+    comm: MPI.Comm = MPI.COMM_SELF,
 ) -> Path:
     """Write ``folder/analysis.h5`` and return its path; raises as ``open_run``.
 
     The time at which the wave arrives is taken from the ``sweep`` of which the run is a member, by default the folder
-    that its own is in. ``overrides`` are of ``[analysis]``.
+    that its own is in. ``overrides`` are of ``[analysis]``. The ranks of ``comm`` take different measures, and all must
+    call it.
     """
-    with open_run(folder / "run.h5") as run:
+
+    def begin(stack: ExitStack) -> tuple[xr.Dataset, float | None, AnalysisTable]:
+        run = stack.enter_context(open_run(folder / "run.h5"))
         case = Case.of(run)
         linear = read_linear(sweep or folder.parent, case)
         arrival = linear.arrival_at(leading_cell(case)) if linear else None
-        analysis = analyse(run, measures, arrival, options_of(run.attrs["case"], folder, overrides))
-        write_netcdf(folder / "analysis.h5", analysis.assign_attrs(origin() | analysis.attrs))
-    _put_into_summary(folder / "summary.json", numbers_of(analysis))
-    return folder / "analysis.h5"
+        return run, arrival, options_of(run.attrs["case"], folder, overrides)
+
+    with ExitStack() as stack:
+        run, arrival, options = on_every_rank(comm, lambda: begin(stack))
+        analysis = analyse(run, measures, arrival, options, comm)
+
+    def write() -> Path:
+        path = folder / "analysis.h5"
+        write_netcdf(path, analysis.assign_attrs(origin() | analysis.attrs))
+        _put_into_summary(folder / "summary.json", numbers_of(analysis))
+        return path
+
+    return on_root(comm, write)
 
 
 def _put_into_summary(path: Path, numbers: Mapping[str, float | list[float]]) -> None:

@@ -1,6 +1,7 @@
 """Input of the measures: the velocity that a run kept, in memory or in its file, and numbers of its case."""
 
-from typing import Any
+from copy import copy
+from typing import Any, Self
 
 import numpy as np
 import xarray as xr
@@ -48,6 +49,14 @@ class VelocityRecord:
         self.attributes: dict[str, dict[str, Any]] = {}
         self.left_out: list[str] = []
         self.warnings: list[str] = []
+
+    def blank(self) -> Self:
+        """The same record, of which nothing has been measured: no attributes, nothing left out, no warnings."""
+        record = copy(self)
+        record.attributes = {}
+        record.left_out = []
+        record.warnings = []
+        return record
 
     def field(self, field: xr.DataArray, factor: ArrayLike = 1.0) -> Any:
         """A recorded ``field`` times a ``factor`` (cell, dof); read as a whole if it fits into the memory."""

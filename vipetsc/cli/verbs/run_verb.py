@@ -80,7 +80,8 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
         if work.options.member:
             # The linear run of its sweep has the time at which the wave arrives at the sites of a member.
             sweep = Path(work.options.case)
-        on_root(work.comm, lambda: is_measured(work.folder) or measure_run(work.folder, sweep))
+        if not on_root(work.comm, lambda: is_measured(work.folder)):
+            measure_run(work.folder, sweep, comm=work.comm)
         on_root(work.comm, lambda: has_xdmf(work.folder) or write_xdmf(work.folder))
         measured, unsettled = on_root(work.comm, lambda: measures_of_points(case, work.folder))
         work.warn(unsettled)

@@ -1,0 +1,36 @@
+"""Measures of one run by several ranks: the bits of one rank, one error for all."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+import pytest
+
+from tests.conftest import small_case
+from vipetsc.dynamics import simulate
+from vipetsc.studies import analysis
+from vipetsc.studies.analysis import analyse
+
+COMM = MPI.COMM_WORLD
+
+
+@pytest.mark.parallel([1, 2, 3])
+def test_ranks_take_different_measures_of_one_run(monkeypatch):
+    """Every rank gets all of them, in the order and with the attributes of one rank; an error is raised on all."""
+    run = simulate(small_case(time={"end": 0.02}), comm=MPI.COMM_SELF).dataset
+    alone = analyse(run)
+
+    taken = []
+    bands = analysis.band_energies
+    monkeypatch.setattr(analysis, "band_energies", lambda *arguments: taken.append(1) or bands(*arguments))
+    together = analyse(run, comm=COMM)
+    assert together.identical(alone)
+    assert list(together.variables) == list(alone.variables)
+    assert COMM.allreduce(len(taken)) == 1
+
+    def fail(*arguments):
+        raise ValueError("no bands")
+
+    monkeypatch.setattr(analysis, "band_energies", fail)
+    with pytest.raises(ValueError, match="no bands"):
+        analyse(run, comm=COMM)
