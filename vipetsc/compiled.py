@@ -21,7 +21,7 @@ from numba.core.caching import FunctionCache
 from numba.core.runtime import rtsys
 
 from vipetsc.kernel import Kernel
-from vipetsc.process import compiling, launched_rank, say
+from vipetsc.process import cache_folder, compiling, launched_rank, say
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -148,7 +148,7 @@ def kernel_cache(package: Path, file: Path, chosen: str = "") -> Path:
     elif os.access(package, os.W_OK):
         parent = package / "__pycache__"
     else:
-        parent = Path.home() / ".cache" / package.name
+        parent = cache_folder()
     return parent / f"kernels-{digest.hexdigest()[:16]}"
 
 

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 logger = logging.getLogger(__name__)
@@ -18,6 +19,15 @@ RANKS = "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"
 ALONE = {"OMPI_MCA_ess_singleton_isolated": "1", "OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self"}
 
 ALLOCATIONS = 10_000  # of objects that may hold others, between two searches for garbage
+
+
+def cache_folder() -> Path:
+    """The folder of the user's cache, which need not exist: ``vipetsc`` in ``$XDG_CACHE_HOME``, or in ``~/.cache``."""
+    parent = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if not parent.is_absolute():
+        # The standard has such a path ignored.
+        parent = Path(os.path.expanduser("~/.cache"))
+    return parent / "vipetsc"
 
 
 def launched_rank() -> int | None:

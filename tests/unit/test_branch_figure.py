@@ -126,6 +126,16 @@ def test_the_axis_of_a_response_names_what_drives_the_sites(options, label):
     assert nfrc.parameter_label(branch) == label
 
 
+def test_fractions_that_are_rounding_have_no_panel():
+    """Of a finite lattice whose contacts have no loss, or which takes up no energy."""
+    nothing = np.full((3, 4), np.nan)
+    assert not nfrc.has_fractions(xr.Dataset({"share": (("point", "way"), nothing)}))
+    for loss, is_shown in ((1e-15, False), (0.02, True)):
+        lost = nothing.copy()
+        lost[1:, 3] = loss
+        assert nfrc.has_fractions(xr.Dataset({"share": (("point", "way"), lost)})) == is_shown
+
+
 def put_condensed_branch(path: Path, points: int) -> None:
     """Write a condensed branch as it stands before its end: without motions."""
     case = NnmCase.load(EXAMPLES / "breather.toml")

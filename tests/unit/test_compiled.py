@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -16,6 +17,7 @@ import pytest
 import vipetsc
 from vipetsc import compiled, kernel, process
 from vipetsc.dynamics.ts.right_hand_side import compile_callback
+from vipetsc.process import cache_folder
 
 ROOT = Path(vipetsc.__file__).parent
 CONSTANTS = """
@@ -124,6 +126,19 @@ def test_kernels_may_be_kept_in_a_chosen_folder(package, tmp_path):
     file = folder / "outer.py"
     chosen = compiled.kernel_cache(folder, file, str(tmp_path / "chosen"))
     assert chosen == tmp_path / "chosen" / compiled.kernel_cache(folder, file).name
+
+
+def test_kernels_of_a_package_that_cannot_be_written_are_in_the_users_cache(package, tmp_path, monkeypatch):
+    """Where modes of lattices are kept, too."""
+    folder, _ = package
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "of-user"))
+    monkeypatch.setattr(os, "access", lambda *asked: False)
+    compiled.kernel_cache.cache_clear()
+    try:
+        kernels = compiled.kernel_cache(folder, folder / "outer.py")
+    finally:
+        compiled.kernel_cache.cache_clear()
+    assert kernels.parent == cache_folder() == tmp_path / "of-user" / "vipetsc"
 
 
 def test_tables_of_numbers_come_with_the_package():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -132,6 +133,18 @@ def test_unguarded_the_in_phase_hertz_branch_goes_over_to_the_out_of_phase_one()
     assert turns_too_far(problem, points) == [123]
     assert findings(problem, points)[0] == "left its branch: the orbit of point 200 is another one passed 3 times"
     assert is_jump(problem, points[123], points[124], NnmTable(chart="auto"))
+
+
+def test_a_branch_comes_back_to_a_mode_of_a_lattice_that_is_free_to_move():
+    """The motion as a rigid body has the frequency 0, which no branch returns to."""
+    omega = 2 * np.pi * np.array([0.0, 3.0, 5.0])
+    system = SimpleNamespace(dofs=3, linear_modes=lambda: (omega, np.eye(3)))
+    monitor = BranchMonitor(SimpleNamespace(system=system), Guards())
+    with np.errstate(all="raise"):
+        assert monitor._returned(SimpleNamespace(episodes=2, frequency=4.0)) is None
+        assert monitor._returned(SimpleNamespace(episodes=0, frequency=5.1)) is None
+        found = monitor._returned(SimpleNamespace(episodes=0, frequency=5.0 + 1e-12, energy=2.0, index=7))
+    assert found == "returned to linear mode 3 at E = 2 J (point 7)"
 
 
 @pytest.mark.slow

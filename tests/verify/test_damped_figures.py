@@ -8,22 +8,30 @@ import xarray as xr
 
 from tests.conftest import run_of, small_case
 from vipetsc.case import Case
-from vipetsc.figures import impact_panels, panels, runs
+from vipetsc.figures import impact_panels, panels, runs, style
 from vipetsc.lattice import four_band, max_group_velocity
 
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
-def test_the_ledger_has_the_dashpots(engine):
+def test_the_ledger_has_the_dashpots(engine, tmp_path):
     """Both engines compute what dashpots lose, so that the balance has a residual."""
     damping = {"mass": 10.0, "stiffness": 1e-5}
     run = run_of(small_case(lattice={"damping": damping}, time={"engine": engine, "end": 0.02}))
 
-    upper, lower = runs.ledger(run, None).axes
+    with style.rc_style():
+        figure = runs.ledger(run, None)
+        style.save(figure, tmp_path / "ledger.png")
+    upper, lower = figure.axes
 
     curves = {line.get_label(): np.asarray(line.get_ydata()) for line in upper.lines}
     assert curves["dissipated in dashpots"][-1] > 0.01 * curves["work of the drive"][-1]
     residual = np.asarray(lower.lines[0].get_ydata())
     assert 1e-18 < residual.max() < 1e-8
+
+    # The legend, of four rows here, stands above the work by half the height of a row at least.
+    box = upper.get_legend().get_window_extent()
+    _, highest = upper.transData.transform((0.0, curves["work of the drive"].max()))
+    assert box.y0 - highest > box.height / 8
 
 
 def test_bands_of_a_damped_cell_show_its_decay():

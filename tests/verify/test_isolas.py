@@ -9,6 +9,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.special import ellipk
 
 import vipetsc
 from tests.rigs import after_a_period, multipliers, rate_of
@@ -19,6 +20,7 @@ from vipetsc.figures.registry import draw
 from vipetsc.figures.response_family import legend_of
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.response_layout import measure
+from vipetsc.modes.response import free_motions, isolated
 from vipetsc.modes.response.free_motions import resonance, states_near_free_motions
 from vipetsc.modes.response.isolated import over_amplitude, places_of
 from vipetsc.modes.response.state import Response
@@ -199,6 +201,33 @@ def test_each_free_motion_leads_to_the_states_above_and_below_its_frequency():
     polynomial = [0.5625, 1.5 * (1 - 1.5**2), (1 - 1.5**2) ** 2 + 0.15**2, -(0.3**2)]
     expected = np.sqrt(np.sort(np.roots(polynomial).real))
     np.testing.assert_allclose(sizes, expected, rtol=0.02)
+
+
+def test_a_free_motion_has_the_frequency_that_is_asked_for():
+    """And the amplitude A of x'' + x + x^3 = 0 with that period, 4 K(m)/sqrt(1 + A^2) with m = A^2/(2 (1 + A^2))."""
+    states = SteadyStates(duffing(), 1.0, 0.3)
+    free = free_motions._conservative(states)
+    (points,) = free_motions._branches(free, states)
+    (motion,) = free_motions._at(free, points, 1.5)
+    assert 2 * np.pi / motion.period == pytest.approx(1.5, rel=1e-12)
+
+    # The elongation of the first spring is the mass's displacement, at rest at phase 0.
+    elongation = free.balance(motion.order).unpack(motion.x)[0]
+    squared = abs(elongation.real.sum()) ** 2
+    period = 4 * ellipk(squared / (2 * (1 + squared))) / np.sqrt(1 + squared)
+    assert 2 * np.pi / period == pytest.approx(1.5, rel=1e-4)
+
+
+def test_other_amplitudes_lead_from_a_state_to_the_other_two():
+    """The line begins at the amplitude of the curve, and does not count where it begins as one of its states."""
+    states = SteadyStates(duffing(), 1.0, 0.3)
+    p = 1.5 / states.parameter.scale
+    (three,) = states_near_free_motions(states, np.array([p]))
+    begin, *others = sorted(three, key=np.linalg.norm)
+    states_found = list(isolated._states_over_amplitude(states, begin))
+    for other in others:
+        assert isolated._is_among(other, states_found)
+    assert not isolated._is_among(begin, states_found)
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -253,7 +253,7 @@ def portraits(part: SubFigure, branch: xr.Dataset, tag: str) -> None:
         _draw_orbit(axes, orbits["orbits/displacement"].values[k], orbits["orbits/velocity"].values[k])
 
         # Orbits are stored without their regions: that of the regular point with the nearest energy is theirs.
-        nearest = int(np.abs(np.log(regular["energy"] / energy)).argmin())
+        nearest = int(np.abs(np.log(regular["energy"].values / energy)).argmin())
         region = REGIONS[int(regular["region"][nearest])]
         axes.set_title(f"{region}\n{float(f'{energy:.2g}'):g} J", loc="center", fontsize=7)
         axes.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)

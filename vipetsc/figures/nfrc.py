@@ -27,6 +27,7 @@ SPECIAL = {
     3: ("period doubling", "^", 3.8),
     4: ("branch point", "s", 3.2),
 }
+LEAST_FRACTION = 1e-3  # of the energy: below it a line cannot be told from that of zero
 
 
 def frequency_response(paths: Sequence[Path]) -> Figure:
@@ -39,11 +40,19 @@ def frequency_response(paths: Sequence[Path]) -> Figure:
     nfrc = NfrcCase.of(branches[0]).nfrc
     if nfrc.source == "force" and nfrc.over == "frequency":
         rows.append(_draw_phase)
-    # A steady state that takes up no energy, in a finite lattice without losses, has nothing to divide by.
-    if any(np.nan_to_num(branch["share"].values).any() for branch in branches):
+    if any(map(has_fractions, branches)):
         rows.append(_draw_energies)
 
     return response_page(branches, rows, height=2.3 * len(rows))
+
+
+def has_fractions(branch: xr.Dataset) -> bool:
+    """Return whether a curve has fractions of the energy that can be seen.
+
+    A state that takes up no energy, in a finite lattice without losses, has nothing to divide by, and contacts without
+    loss have the rounding of zero.
+    """
+    return bool(np.nan_to_num(branch["share"].values).max() > LEAST_FRACTION)
 
 
 def responses_in(paths: Sequence[Path], *needs: str) -> list[xr.Dataset]:

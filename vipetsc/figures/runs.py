@@ -142,7 +142,10 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     figure = style.new_figure(style.COLUMN, 3.3)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1))
     _draw_ledger(upper, run)
-    upper.set(ylabel="Energy", xlim=run["time"].values[[0, -1]], ylim=(-0.03 * largest, 1.4 * largest))
+    # Above the work each row of the legend has its room.
+    rows = -(-len(upper.get_lines()) // 2)
+    top = (1.04 + 0.12 * rows) * largest
+    upper.set(ylabel="Energy", xlim=run["time"].values[[0, -1]], ylim=(-0.03 * largest, top))
     upper.yaxis.set_major_formatter(EngFormatter("J"))
     upper.legend(loc="upper center", ncol=2, columnspacing=1.2, labelspacing=0.25)
     _draw_residual(lower, run, largest)

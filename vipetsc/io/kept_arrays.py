@@ -1,8 +1,7 @@
 """Arrays that take long to compute and follow from little, kept between runs in the user's cache.
 
-The folder is ``vipetsc`` in ``$XDG_CACHE_HOME``, by default in ``~/.cache``. A file is named by a hash of what its
-arrays follow from. Several processes may read and write there at once: files are complete or absent, and what cannot be
-read is computed.
+A file in that folder is named by a hash of what its arrays follow from. Several processes may read and write there at
+once: files are complete or absent, and what cannot be read is computed.
 """
 
 import hashlib
@@ -18,6 +17,7 @@ import scipy
 
 import vipetsc
 from vipetsc.io.atomic import Arrays, remove_abandoned, save_arrays
+from vipetsc.process import cache_folder
 
 LARGEST = 2**28  # bytes of all files together; those that were not used for the longest time go first
 CHECKSUM = "checksum"
@@ -44,15 +44,6 @@ def kept_arrays(kind: str, content: Iterable[bytes], compute: Callable[[], Array
             remove_abandoned(path.parent)
             _remove_oldest(path.parent)
     return arrays
-
-
-def cache_folder() -> Path:
-    """The folder of the user's cache, which need not exist."""
-    parent = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if not parent.is_absolute():
-        # The standard has such a path ignored.
-        parent = Path(os.path.expanduser("~/.cache"))
-    return parent / "vipetsc"
 
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:

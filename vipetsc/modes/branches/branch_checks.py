@@ -144,7 +144,8 @@ class BranchMonitor:
         if point.episodes > 0:
             self._touched = True
             return None
-        detuning = np.abs(point.frequency / self._linear - 1)
+        # Over the frequency of the point: a motion as a rigid body has none.
+        detuning = np.abs(self._linear / point.frequency - 1)
         if not self._touched or detuning.min() >= LINEAR:
             return None
         return f"returned to linear mode {detuning.argmin() + 1} at E = {point.energy:.6g} J (point {point.index})"
