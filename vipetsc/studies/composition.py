@@ -9,7 +9,8 @@ this is iterated with the Phi1 of the solution until it converges.
 Third harmonics f3 = Phi3(z) |c| (c/|c|)^3 of the sites add with their phases; a site in contact is stiff to those of
 others: f3 has the term -c3/g too. They press on contacts: z = (|c| + |c3|)/D. The energy that the upper bands carry
 past a site in contact loses the fraction that a driven wave of that amplitude loses. Waves that are not harmonics add
-by energies.
+by energies. G and g are those of the lattice with its dashpots; ``studies.wave_losses`` has what these take until the
+end.
 """
 
 from typing import NamedTuple

@@ -23,6 +23,7 @@ that meet or die away near the site are not orthogonal: what comes and what leav
 dashpots take there, which goes to zero with them.
 """
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -152,6 +153,22 @@ class SiteWaves:
         of_bin = np.arange(len(energies)) * bins // len(energies)
         return np.array([np.bincount(of_bin, column, bins) for column in energies.T])
 
+    @property
+    def padded(self) -> int:
+        """Samples of a run and as many more, so that the transform does not fold the response back."""
+        return 2 * (self.setting.samples + 1)
+
+    @property
+    def decay(self) -> float:
+        """Rate in 1/s at which signals are made to decay, less the imaginary part of their frequencies."""
+        return DECAY / (self.padded * self.setting.interval)
+
+    @cached_property
+    def response(self) -> np.ndarray:
+        """g (omega,) in m/N of the contact's masses to a pair of forces, at the frequencies of the transform."""
+        omega = 2 * np.pi * np.fft.rfftfreq(self.padded, self.setting.interval)
+        return self_response(self.cell, omega - 1j * self.decay, self.pair)
+
     def late(self, since: float) -> float:
         """Energy in J of the drive's band that arrives later than ``since`` s after it was sent."""
         band = self.setting.band
@@ -173,15 +190,12 @@ class SiteWaves:
         ``linear`` (time) in m is what w would be without the contact, which lasts from ``begin`` to ``end`` in s.
         """
         time = motion.time
-        step = float(time[1] - time[0])
-        padded = 2 * len(time)
-        decay = DECAY / (padded * step)
-        omega = 2 * np.pi * np.fft.rfftfreq(padded, step)
-        response = self_response(self.cell, omega - 1j * decay, self.pair)
-        spectrum = np.fft.rfft((motion.displacement[:, 0] - linear) * np.exp(-decay * time), padded) / response
-        force = np.fft.irfft(spectrum, padded)[: len(time)] * np.exp(decay * time)
+        by_contact = motion.displacement[:, 0] - linear
+        spectrum = np.fft.rfft(by_contact * np.exp(-self.decay * time), self.padded) / self.response
+        force = np.fft.irfft(spectrum, self.padded)[: len(time)] * np.exp(self.decay * time)
         # Rounding aside, all else of it is what the end of the record would need to stop the motion there.
-        touching = (time >= begin - MARGIN * step) & (time <= end + MARGIN * step)
+        margin = MARGIN * self.setting.interval
+        touching = (time >= begin - margin) & (time <= end + margin)
         return np.where(touching, force, 0.0)
 
 
