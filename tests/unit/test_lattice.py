@@ -222,6 +222,19 @@ def test_the_scale_of_the_wave_is_linear_in_the_drive():
     assert chain.wave_scale(ToneBurst(1.0, 1206.34, 30, "hann")) == pytest.approx(one / 2, rel=1e-12)
 
 
+def test_the_scale_of_the_wave_is_that_of_the_mass_that_is_driven():
+    """By Green's function of the whole lattice, for lattices and drives that differ in one thing each."""
+    burst = ToneBurst(2.0, 1206.34, 30)
+    omega = 1206.34 * (1 - 1j / 30)
+    cell = four_band()
+    for chain in (Chain(cell, 12), Chain(cell, 12, "free"), Chain(diatomic(), 12), Chain(cell, 13)):
+        dynamic = chain.stiffness_matrix().toarray() - omega**2 * np.diag(chain.masses())
+        green = np.abs(np.linalg.inv(dynamic)).reshape(chain.cells, chain.cell.dofs, -1)
+        for driven, mass in ((0, 0), (0, 1), (5, 1), (11, 0)):
+            expected = burst.peak * green[driven, mass].max()
+            assert chain.wave_scale(burst, cell=driven, mass=mass) == pytest.approx(expected, rel=1e-9)
+
+
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 def test_a_contacts_force_is_the_slope_of_its_potential(law):
     contact = Contact(law, 1e6)

@@ -6,6 +6,7 @@ import os
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 
@@ -13,7 +14,7 @@ import pytest
 from PIL import Image
 
 import vipetsc
-from tests.conftest import assert_same_bits, datasets
+from tests.conftest import assert_same_bits, datasets, put_members
 from tests.faults.inject import Injector
 from vipetsc.case import Case, case_id
 from vipetsc.io.folder import SEARCH, FolderError, claimed
@@ -73,6 +74,29 @@ def searched(tmp_path) -> tuple[Plan, Path]:
 def step_of(plan: Plan, name: str) -> PaperStep:
     """Return the step of a name."""
     return next(step for step in plan.steps if step.name == name)
+
+
+def test_a_sweep_of_which_members_failed_is_not_finished(tmp_path):
+    """It is counted among what is left, with its failures; without them nothing is left."""
+    plan = paper_plan(FULL)
+    step = replace(
+        step_of(plan, TRANSFER),
+        changes=('sweep.contacts.law=["hertz"]', "sweep.contacts.sites=[1]", "sweep.drive.cycles=[5]"),
+    )
+    plan = replace(plan, steps=(step,))
+
+    for failing in ({0, 2}, set()):
+        root = tmp_path / f"failing-{len(failing)}"
+
+        def outcome(number: int, case: Case, failing: set[int] = failing) -> dict[str, Any] | str:
+            if number in failing:
+                return "a fault"
+            statistics = {"episodes": 0, "work": 2.0, "dissipated": 0.0, "ledger_error": 0.0, "engine": "ts"}
+            return {"statistics": statistics, "measures": {}}
+
+        put_members(step.folder(root), step.case, outcome)
+        assert step.failures(root) == len(failing)
+        assert set(plan.left(root)) == ({TRANSFER} if failing else set())
 
 
 def test_times_of_files_make_nothing_stale(searched):
