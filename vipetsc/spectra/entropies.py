@@ -185,7 +185,7 @@ def _parts(filters: np.ndarray, length: int) -> list[_FilterPart]:
     return parts
 
 
-@njit("void(c16[:,:,::1], f8[:,::1], f8[:,::1])", error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _accumulate(x: np.ndarray, weight: np.ndarray, s_log_s: np.ndarray) -> None:
     """Add the sums of Eq. (a), S and S log2 S of the nodes of ``x`` (t, kappa, x), to arrays (t, cell).
 
@@ -220,7 +220,7 @@ def _accumulate(x: np.ndarray, weight: np.ndarray, s_log_s: np.ndarray) -> None:
                 s_log_s[t, c] += power[c] * (e + 1.4426950408889634 * (2.0 * u + u * z * r))
 
 
-@njit("void(f8[:,::1], f8[:,::1], f8[:,::1])")
+@njit
 def _entropies(weight: np.ndarray, s_log_s: np.ndarray, local: np.ndarray) -> None:
     """Write H of Eq. (a) to ``local`` (t, cell), kept from rounding below zero; W and H are 0 where S is its floor."""
     for t in range(weight.shape[0]):
