@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from vipetsc.dynamics.engine_choice import choose_engine
 from vipetsc.dynamics.propagator.groups import contact_dofs, group_dofs
 from vipetsc.dynamics.propagator.step_choice import refusal, step_series
 from vipetsc.dynamics.propagator.tangent import TangentPropagator
+from vipetsc.io.store import RunMemory
 
 pytestmark = pytest.mark.parallel(1)
 
@@ -102,6 +105,16 @@ def test_a_run_goes_on_after_a_stop(folder):
     assert_same_bits(datasets(folder / "straight/run.h5"), datasets(folder / "stopped/run.h5"))
     assert len(datasets(folder / "straight/run.h5")["impacts/site"]) > 0
     assert straight.complete
+
+
+def test_a_spring_that_tears_off_stalls_the_run():
+    """Beyond z = -k/q a quadratic spring pushes on: the motion ends in finite time, and the sentence says where."""
+    torn = sprung(
+        lattice={"profiles": {"springs[4].quadratic": {"cells": [2], "value": 2e7}}}, drive={"amplitude": 200.0}
+    )
+    result = simulate(torn, RunMemory(MPI.COMM_SELF))
+    assert not result.complete
+    assert "the nonlinear springs of cells 2 at 0.0" in result.sentence
 
 
 def test_elongations_are_degrees_of_freedom_behind_the_sites():

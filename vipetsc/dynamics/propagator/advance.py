@@ -4,8 +4,8 @@ A step (sec. 4 of the derivation in the package's docstring) is a chain of subst
 seems right (sec. 3), search it for the first time at which a site changes its mode, and if there is one, repeat the
 substep so that it ends there, since the force law inside a substep must be smooth. Then judge its error, take it or try
 a shorter one. ``advance_cluster`` returns at each change, at which ``forces`` switches the site, and at the end of the
-step. While no site is closed and no drive is on, the motion is a polynomial and the cluster goes to its first onset at
-once (sec. 2).
+step. While no site is closed, no drive is on and there is no nonlinear spring, the motion is a polynomial and the
+cluster goes to its first onset at once (sec. 2).
 
 Contacts that touch or are pressed at rest stay in the mode ``PERMANENT``: their force is that of max(x, 0), x the
 indentation, and not smooth where they open or close. Substeps end on such a *kink* as well, but without a landing: a
@@ -50,7 +50,7 @@ MOST_SUBSTEPS = 20_000
 # drives, a bound of all rates: the quintic that the search sees misses (omega h)^6/46080 of an oscillation's amplitude,
 # 9e-8 at this length.
 SEARCHED = 0.4
-# ... and where a drive alone acts: nothing is searched, and eight nodes integrate a sine over 1.25 rad to rounding.
+# ... and without sites: nothing is searched, and eight nodes integrate a drive's sine over 1.25 rad to rounding.
 DRIVEN = 1.25
 # Longest substep of a contact in ages of the contact. Hertz's force goes as the power 3/2 of the age: plain nodes
 # integrate that over 1.5 ages to 3e-14 of it, over 3 ages to 1e-11.

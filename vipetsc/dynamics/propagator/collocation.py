@@ -9,9 +9,10 @@ adds the forces to the moments by which the step will move the lattice (sec. 5).
 
 **Notation.** H is the linear step in s, s the position in it in units of H; a substep has its ``length`` in these units
 and nodes of one of three kinds, ``substep.kind``: plain ones, or ones that crowd where a force of Hertz begins or ends
-(``nodes``). A DoF is the relative displacement w of a contact site or the displacement of a driven mass; those on which
-a force acts in a substep are ``trial.active``: the sites in contact, ``trial.closed``, and the masses whose drive is
-on. A ``Cluster`` holds what has been taken, a ``Trial`` a substep that may still be thrown away.
+(``nodes``). A DoF is the relative displacement w of a contact site, the elongation of a spring that is not linear, or
+the displacement of a driven mass; those on which a force acts in a substep are ``trial.active``: the sites in contact,
+``trial.closed``, all springs, ``trial.springs``, and the masses whose drive is on. A ``Cluster`` holds what has been
+taken, a ``Trial`` a substep that may still be thrown away.
 
 **Picard's iteration** puts the motion at the nodes into the force law, the forces into the integrals, and so on. With a
 contact of stiffness k on a mass m each sweep leaves 0.006 (h omega)^2 of the error, omega^2 = k/m, h the substep's

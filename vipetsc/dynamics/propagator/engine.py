@@ -217,9 +217,9 @@ class Propagator(Engine):
             return FillResult(len(samples.work), bool(stop))
 
         reason = "the state is not finite"
-        sites = forces.sites(int(progress["cluster"]))
-        if sites:
-            reason = f"the contacts of sites {', '.join(map(str, sites))} at {progress['time']:.9g} s"
+        acting = forces.describe(int(progress["cluster"]))
+        if acting:
+            reason = f"{acting} at {progress['time']:.9g} s"
         _, reason = min(comm.allgather((int(progress["failed"]), reason)))
         return FillResult(failed // parts - samples.number + 1, bool(stop), reason)
 

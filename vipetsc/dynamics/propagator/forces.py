@@ -1,4 +1,4 @@
-"""The forces of clusters of contact sites and driven masses within one linear step; their records and log.
+"""The forces of clusters of sites, nonlinear springs and driven masses within one linear step; their records and log.
 
 ``Forces`` keeps all clusters that a rank's cells feel (sec. 6 of the derivation in the package's docstring), and
 ``follow_contacts`` takes one of them through a step: ``advance`` carries it to the next change of a site's mode, the
@@ -150,6 +150,7 @@ class Forces:
         all_groups = group_dofs(model, series.reach)
         groups = groups_within_reach(all_groups, all_dofs[all_groups.numbers], series.reach, layout)
         self._numbers = groups.numbers
+        self._cells = all_dofs["cell"][groups.numbers]
         self.dofs = create_dof_tables(groups, model, layout, series, halo)
         if dashpots is None:
             self.losses = no_losses(len(groups.numbers), len(groups.first) - 1)
@@ -184,6 +185,20 @@ class Forces:
             return []
         numbers = self._numbers[self.dofs.first[c] :][: self.dofs.sites[c]]
         return (numbers + 1).tolist()
+
+    def describe(self, c: int) -> str:
+        """The contacts and the nonlinear springs of cluster ``c`` in words; empty of -1, or if there are none."""
+        if c < 0:
+            return ""
+        sites = self.sites(c)
+        first_spring = self.dofs.first[c] + self.dofs.sites[c]
+        cells = self._cells[first_spring:][: self.dofs.springs[c]] + 1
+        acting = []
+        if sites:
+            acting.append(f"the contacts of sites {', '.join(map(str, sites))}")
+        if len(cells):
+            acting.append(f"the nonlinear springs of cells {', '.join(map(str, cells.tolist()))}")
+        return " and ".join(acting)
 
     def take_episodes(self, unfinished: bool) -> np.ndarray:
         """Episodes closed since the last call, and ``unfinished`` ones as they are, that this rank logs."""

@@ -1,7 +1,8 @@
 """The length of a linear step, and which lattices such steps do not suit; known before any kernel is loaded.
 
 The step H is a sample interval over a whole number: long, because a step costs the same whatever its length, but not so
-long that many sites feel one another within it.
+long that many sites feel one another within it. Springs that are not linear act in every step: where they are so many
+that ``ts`` costs less, linear steps are refused.
 """
 
 from functools import lru_cache
