@@ -68,7 +68,10 @@ def triad(a: np.ndarray, b: np.ndarray, c: np.ndarray, s: float) -> None:
 
 def bandwidth(size: int = 8_000_000, turns: int = 12) -> float:
     """GB/s of a triad on all ranks at once, the best of ``turns``, 24 bytes an element as STREAM counts."""
-    a, b, c = np.zeros(size), np.ones(size), np.ones(size)
+    a = np.zeros(size)
+    b = np.ones(size)
+    c = np.ones(size)
+    # The first call compiles, and touches the memory.
     triad(a, b, c, 0.5)
     best = np.inf
     for _ in range(turns):

@@ -79,10 +79,13 @@ COMMANDS = (
 def impact(contact: Contact, mass: float, clearance: float) -> tuple[np.ndarray, np.ndarray]:
     """Relative displacement in m and force in N during an impact of a free pair with the reduced ``mass`` in kg."""
     dt = 2 * contact.impact_time(SPEED, mass) / STEPS
-    x, rate = 0.0, SPEED
-    indentation, force = [0.0], [0.0]
+    x = 0.0
+    rate = SPEED
+    indentation = [0.0]
+    force = [0.0]
     for _ in range(2 * STEPS):
         pressed = float(contact.elastic_force(x) * contact.dissipation_factor(rate, SPEED))
+        # Velocity before displacement: this order keeps the energy of an elastic impact bounded.
         rate -= dt * pressed / mass
         x += dt * rate
         if x < 0:
@@ -96,7 +99,8 @@ def contact_law(case: Case) -> Figure:
     """Draw the force of one impact over the relative displacement, and what impacts return by damping factor."""
     model = case.model()
     cell = model.chain.cell
-    host, resonator = cell.masses[cell.host], cell.masses[cell.resonator]
+    host = cell.masses[cell.host]
+    resonator = cell.masses[cell.resonator]
     law = model.used_laws[0]
     clearance = model.chain.clearances[-1]
 
@@ -141,9 +145,12 @@ def named_cell(run: xr.Dataset) -> Figure:
     left_stop = min(stops, key=lambda box: (box.get_x(), -box.get_y()))
     top = frame.get_y() + frame.get_height()
     for box, word, shift in ((frame, "host", -1.35), (left_stop, "stop", -0.75), (resonator, "resonator", -0.1)):
-        x, y = box.get_x() + box.get_width() / 2, box.get_y() + 0.8 * box.get_height()
+        x = box.get_x() + box.get_width() / 2
+        y = box.get_y() + 0.8 * box.get_height()
         if box is frame:
-            x, y = box.get_x() + 0.1, top
+            # The other two are drawn in its middle.
+            x = box.get_x() + 0.1
+            y = top
         arrow = {"arrowstyle": "-", "color": style.GREY, "lw": 0.6, "shrinkA": 0, "shrinkB": 0}
         place = (frame.get_x() + frame.get_width() / 2 + shift, top + 0.42)
         axes.annotate(word, (x, y), place, arrowprops=arrow, ha="center", fontsize=7, color=style.BLACK, zorder=8)

@@ -203,7 +203,8 @@ def _problems(options: OptimiseTable, base: Case, given: Table, responses: NfrcC
         yield from measured_problems(table, at, base, bounds.varies_cell, responses)
     for number, constraint in enumerate(options.constraint or [], 1):
         at = f"optimise.constraint[{number}]"
-        low, high = constraint.at_least, constraint.at_most
+        low = constraint.at_least
+        high = constraint.at_most
         if low is None and high is None:
             yield Problem(at, None, "has no bound; give at_least, at_most or both")
         elif low is not None and high is not None and low > high:

@@ -101,9 +101,12 @@ def _draw_elongation(axes: Axes, branch: xr.Dataset) -> None:
 def _set_energy_axis(axes: Axes, branch: xr.Dataset) -> None:
     """Make the axis of energy logarithmic unless it is narrow, with as many labels as there is room for."""
     energy = branch["energy"].values
-    low, high = energy.min(), energy.max()
+    low = energy.min()
+    high = energy.max()
     if high > low and high > NARROW * low:
-        subdivisions = (1.0,) if high > DECADES * low else (1, 2, 5)
+        subdivisions: tuple[float, ...] = (1, 2, 5)
+        if high > DECADES * low:
+            subdivisions = (1,)
         axes.set(xscale="log")
         axes.xaxis.set_major_locator(LogLocator(subs=subdivisions))
         axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))

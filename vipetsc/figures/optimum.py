@@ -12,6 +12,7 @@ from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.response_measures import RESPONSE, response_measures
 from vipetsc.figures import panels, style
 from vipetsc.spectra.measures import row_of
+from vipetsc.wording import with_unit
 
 # The names of compared designs, in the order of drawing.
 COLOURS = {"case": style.GREY, "best-1": style.VERMILION, "best": style.BLUE, "best-2": style.GREEN}
@@ -38,7 +39,7 @@ def _label(objective: ObjectiveTable) -> str:
         return objective.name.replace(RESPONSE, "")
     if objective.is_of_runs:
         _, unit, _ = row_of(str(objective.measure))
-        return objective.name if unit == "1" else f"{objective.name} ({unit})"
+        return with_unit(objective.name, unit)
     part = f", {objective.part[0]:g}-{objective.part[1]:g} rad/s" if objective.part else ""
     return SYMBOLS.get(objective.measure, f"band {objective.band}{part} at the end / work")
 
@@ -215,10 +216,12 @@ def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: i
     case = plan.responses(plan.base)
     unit = response_measures(case)[str(objective.measure)].unit
     label = str(objective.measure).removeprefix(RESPONSE)
-    over = case.nfrc.over
-    axes.set_xlabel("Frequency (rad/s)" if over == "frequency" else over.capitalize())
+    over = case.nfrc.over.capitalize()
+    if case.nfrc.over == "frequency":
+        over += " (rad/s)"
+    axes.set_xlabel(over)
     axes.set_title("Responses (thin: unstable)")
-    axes.set_ylabel(label if unit == "1" else f"{label} ({unit})")
+    axes.set_ylabel(with_unit(label, unit))
 
 
 def _draw_measure(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: int) -> None:

@@ -270,7 +270,8 @@ def _draw_portrait(axes: Axes, motion: Motion, time: np.ndarray, first_contact: 
 
     # A line for each of the map's colours: a segment for each of a hundred thousand samples takes seconds.
     edges = np.linspace(first_contact, len(time) - 1, COLOURS + 1).astype(int)
-    begins, ends = edges[:-1], edges[1:]
+    begins = edges[:-1]
+    ends = edges[1:]
     lines = [points[begin : end + 1] for begin, end in zip(begins, ends, strict=True) if end > begin]
     by_time = LineCollection(lines, array=time[begins[ends > begins]], cmap="viridis", lw=0.4, rasterized=True)
     axes.add_collection(by_time)

@@ -50,7 +50,9 @@ class OpenCompliance(ModalCompliance):
         rows = np.column_stack([loads[:, : self.pairs], ends])
         whole = self._between(omega, rows, np.column_stack([loads, ends]))
 
-        pairs, count = self.pairs, loads.shape[1]
+        pairs = self.pairs
+        count = loads.shape[1]
+        # G - G_e S (1 + G_ee S)^-1 G_e: what is beyond the ends acts on the masses of the end cells alone.
         inner = self._inner(omega, whole[:, pairs:, count:])
         correction = whole[:, :pairs, count:] @ inner @ whole[:, pairs:, :count]
         return np.asarray(whole[:, :pairs, :count] - correction)

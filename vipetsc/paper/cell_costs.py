@@ -98,7 +98,8 @@ def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:
     paper's eta = 0.5 in both readings; unit modal mass would favour a light resonator (calibrated: eta = 0.16).
     """
     u = unit_vectors(point)
-    host, resonator = u[..., cell.host, :], u[..., cell.resonator, :]
+    host = u[..., cell.host, :]
+    resonator = u[..., cell.resonator, :]
     product = (host * resonator.conj()).real
     side = np.where(np.abs(product) < AT_REST, 0.0, -np.sign(product))
     return np.abs(resonator - host) * side
