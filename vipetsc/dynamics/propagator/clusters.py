@@ -139,7 +139,7 @@ def _form_rows(cells: np.ndarray, forms: np.ndarray, series: StepSeries) -> np.n
     ``cells`` (table, k) are these cells, or representatives of them.
     """
     tables, span, masses = forms.shape
-    # With dashpots rows for velocities beside those for displacements, and twice as many powers.
+    # With dashpots rows for velocities next to those for displacements, and twice as many powers.
     halves = 1 + series.is_damped
     rows = np.zeros((tables, halves * masses, series.width, halves * series.terms))
 

@@ -6,7 +6,7 @@ coefficients a that describe the free motion of a cluster. A variation therefore
 
     dy+ = P dy + (impulses of dmu),    (dmu, dq+) = J (da, dq),    da linear in dy (sec. 2),
 
-with one small matrix J for each step and cluster in contact, made once for an orbit; q are the approach velocities
+with one small matrix J for each step and cluster in contact, computed once for an orbit; q are the approach velocities
 w'_minus of the cluster's sites. J comes from the substeps on the orbit's ``tape``: in each the collocation of sec. 3 is
 linearised at its nodes, dF = F_w dw + F_v dv + F_q dq with dw, dv affine in dF, a linear system for the dF. Forces are
 continuous and a substep ends exactly on each change of a mode, so that the saltation matrix of the state is the

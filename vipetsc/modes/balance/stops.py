@@ -9,9 +9,9 @@ class Stops(NamedTuple):
     """The ``law`` of a contact, and where its stops are: clearances in m on the sides ``plus`` and ``minus``.
 
     inf: there is no stop; negative: it is pressed at rest, where a static load balances its force. On the way to a
-    state with stops that touch at rest the force has a factor ``weight``, and a dashpot of ``drag`` in N s/m beside it.
-    A linear system may have a ``spring`` in N/m in the place of a pressed contact: harmonics are then those of the
-    force less the spring's.
+    state with stops that touch at rest the force has a factor ``weight``, and a dashpot of ``drag`` in N s/m parallel
+    to it. A linear system may have a ``spring`` in N/m in the place of a pressed contact: harmonics are then those of
+    the force less the spring's.
     """
 
     law: Contact
