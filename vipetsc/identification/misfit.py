@@ -1,7 +1,7 @@
 """Residuals of measured records and their Jacobian, over windows from the beginning of each record."""
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -50,6 +50,8 @@ class Misfit:
         self.plan = plan
         self.records = records
         self.compute = compute
+        # Residuals, derivatives and onsets are asked for at the same values, one after the other.
+        self._case_of = lru_cache(maxsize=16)(plan.case_of)
         self.noise = [np.sqrt(np.mean(record.values**2, axis=0)) for record in records]
         base = plan.base
         dofs = base.lattice.unit_cell().dofs
@@ -78,7 +80,7 @@ class Misfit:
 
     def case(self, z: np.ndarray) -> Case:
         """The case at the coordinates ``z``; raises CaseError if it is impossible."""
-        return self.plan.case_of(self.values(z))
+        return self._case_of(tuple(self.values(z).tolist()))
 
     def values(self, z: np.ndarray) -> np.ndarray:
         """The values (parameter,) at the coordinates ``z``."""
