@@ -135,7 +135,10 @@ def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
             FigureCanvasPdf(figure).print_pdf(partial_path)
         elif path.suffix == ".png" and not lines:
             figure.set_dpi(SCREEN)
+            # The figure of a user's module may have no canvas that draws pixels.
             canvas = figure.canvas
+            if not isinstance(canvas, FigureCanvasAgg):
+                canvas = FigureCanvasAgg(figure)
             canvas.draw()
             # A page is opaque: without the channel for transparency it takes half the time, and less room.
             pixels = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
