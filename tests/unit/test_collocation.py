@@ -8,6 +8,7 @@ from scipy.integrate import trapezoid
 from scipy.special import ellipj
 
 from tests.unit.propagator_parts import MASS, RATE, SPEED, mass_on_cubic_spring, mass_on_stop
+from vipetsc.contact.law import FREE
 from vipetsc.dynamics.propagator.collocation import (
     accumulate_moments,
     collocate,
@@ -17,7 +18,7 @@ from vipetsc.dynamics.propagator.collocation import (
     update_taylor,
 )
 from vipetsc.dynamics.propagator.nodes import EXIT, NODES, ONSET, PLAIN, collocation
-from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial
+from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, create_trial
 
 
 def one_substep(cluster: Cluster, substep: Substep) -> Trial:
@@ -101,6 +102,24 @@ def test_a_cubic_spring_moves_a_mass_as_jacobis_cosine():
         assert error_ratio(cluster, trial, length) * allowed > error[1] * amplitude * omega
     assert errors[1] < 1e-11
     assert np.log2(errors[0] / errors[1]) > 14
+
+
+def test_springs_accelerate_the_sites_next_to_them():
+    """w'' has what the spring's force at its elongation does at once: H^2/mass times it, over H^2."""
+    cubic = mass_on_cubic_spring(2e3)
+    open_stop = mass_on_stop()
+    open_stop.contacts["mode"] = FREE
+    taylor = np.array([[0.5, 1e-4, 3e-9], [0.2, 0.0, 0.0]])
+    cluster = cubic._replace(
+        contacts=open_stop.contacts,
+        taylor=taylor,
+        response=np.full((2, 2, 1), cubic.interval**2 / MASS),
+        trial=create_trial(2, 1),
+    )
+    motion = np.zeros((1, 3))
+    evaluate_site_motion(cluster, taylor, motion)
+    expected = 2 * 3e-9 / cubic.interval**2 - 2e3 * 0.2**3 / MASS
+    np.testing.assert_allclose(motion[0], [0.5, 1e-4 / cubic.interval, expected], rtol=1e-14)
 
 
 def test_damping_takes_the_energy_that_is_booked():
