@@ -71,6 +71,21 @@ def test_a_mass_with_stops_that_differ_has_its_period_in_closed_form(plus, minus
         assert point.period == pytest.approx(2 * half, rel=1e-11)
 
 
+def test_free_masses_with_a_stop_between_them_move_about_their_centre():
+    """Two masses that nothing holds are one of their reduced mass, and their centre stays where it is."""
+    pair = ContactPair(0, 1, 0.1, Contact("bilinear", STOP), np.inf)
+    system = System.assemble([MASS * 3, MASS * 1.5], [(0, 1, SPRING)], [pair])
+    problem = Shooting(Dop853Flow(system), MAPS["half"])
+    start = linear_start(problem, 1, 0.4 * SPRING * 0.1**2)
+    points = [start, *Continuation(problem, start, NnmTable(points=20, largest_step=0.3, first_step=0.1))]
+
+    assert points[-1].episodes == 1
+    for point in points:
+        half = time_on_one_side(point.energy, 0.1) + time_on_one_side(point.energy, np.inf)
+        assert point.period == pytest.approx(2 * half, rel=1e-11)
+        assert abs(system.masses @ point.x) < 1e-12 * np.abs(point.x).max()
+
+
 def test_harmonic_balance_of_a_stop_on_one_side_has_even_harmonics():
     """Mean and even harmonics included, the condensed motion has the exact period of a stop on one side."""
     system = mass_between_stops(0.1, np.inf)

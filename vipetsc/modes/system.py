@@ -225,6 +225,19 @@ class System:
         slopes = np.array([pair.stops.slope_at_rest for pair in self.contacts])
         return np.asarray(stiffness + self.contact_rows.T @ (slopes[:, None] * self.contact_rows))
 
+    @cached_property
+    def mean_motion(self) -> np.ndarray | None:
+        """The matrix (n, n) that takes displacements to those of the centre of mass; None if anything holds the system.
+
+        A system that nothing holds may begin a motion anywhere.
+        """
+        moved = np.ones(self.dofs)
+        pulls = np.abs(self.stiffness_at_rest @ moved).max()
+        is_held = pulls > 1e-12 * np.abs(self.stiffness_at_rest).max()
+        if is_held or np.any(self.contact_rows @ moved) or np.any(self.spring_rows @ moved):
+            return None
+        return np.asarray(np.outer(moved, self.masses) / np.sum(self.masses))
+
     def linear_modes(self) -> tuple[np.ndarray, np.ndarray]:
         """Frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) of small motions about rest."""
         # Only dense solvers give all modes.

@@ -109,7 +109,7 @@ class LatticeFlow:
         model = self._model(duration, steps)
         why = TangentPropagator.refusal(model)
         if why:
-            raise FlowError(why)
+            raise FlowError(f'{why}; nnm.shooting = "dense" does without such steps')
 
         engine = TangentPropagator(model, self.layout, 0 if look else MOST_ROWS)
         largest = np.abs(start).max(axis=1, initial=0.0) if start.size else np.zeros(len(start))

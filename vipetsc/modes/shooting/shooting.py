@@ -299,6 +299,9 @@ class Shooting(ShootingEquations[Arc]):
     def __init__(self, flow: Flow, shooting_map: ShootingMap, tolerance: float = 1e-13, max_newton: int = 7) -> None:
         super().__init__(flow.system, shooting_map, tolerance)
         self.flow = flow
+        # From rest to rest the momentum of a system that nothing holds is 0 whatever the start: its centre of mass is
+        # kept where it is at rest instead. From the centre on the arc itself does so.
+        self._kept = flow.system.mean_motion if shooting_map.start == shooting_map.end == "rest" else None
         self.newton = DenseNewton(flow.system.dofs + 1, max_newton)
 
     def _integrate(self, start: np.ndarray, period: float) -> Arc:
@@ -314,14 +317,22 @@ class Shooting(ShootingEquations[Arc]):
         # A single mass has the trivial pair alone, whose multiplier is 1.
         return traces, float(np.abs(multipliers(traces, self.map.quarter)).max(initial=1.0))
 
+    def residual(self, arc: Arc) -> np.ndarray:
+        """What vanishes at the arc's end (n,), and the displacement of the centre of mass times a frequency."""
+        end = super().residual(arc)
+        return end if self._kept is None else end + self.flow.omega * (self._kept @ arc.start[self.free])
+
     def jacobian(self, arc: Arc) -> np.ndarray:
         """Derivative (n, n + 1) of the residual with respect to initial values and period."""
         sensitivity = arc.sensitivity[self.zero, self.free]
+        if self._kept is not None:
+            sensitivity = sensitivity + self.flow.omega * self._kept
         return np.column_stack([sensitivity, self.map.fraction * self.end_rate(arc)])
 
     def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray | None = None) -> DenseFrame:
         """The frame at any initial values and period, in the ``chart`` of that name."""
-        return DenseFrame(self, CHARTS[chart](self.system, x, period), x, period, _or_empty(tangent))
+        given = np.empty(0) if tangent is None else tangent
+        return DenseFrame(self, CHARTS[chart](self.system, x, period), x, period, given)
 
     def relative_frame(self, x: np.ndarray, period: float) -> DenseFrame:
         """The unknowns of ``relative_chart``."""
@@ -387,7 +398,3 @@ class Shooting(ShootingEquations[Arc]):
 def without_touch(grazing: Point, left: Point, right: Point) -> Point:
     """A grazing orbit with the episodes of the neighbour that has fewer: what just touches is not counted."""
     return replace(grazing, episodes=min(left.episodes, right.episodes))
-
-
-def _or_empty(tangent: np.ndarray | None) -> np.ndarray:
-    return np.empty(0) if tangent is None else tangent
