@@ -93,6 +93,7 @@ def measure(case: Case, options: argparse.Namespace) -> dict:
     found: dict = {
         "mode": "quick" if options.quick else "full",
         "rounds": options.rounds,
+        "parts": list(parts),
         "rows": [],
         "ratios": {},
         "cells": cells,

@@ -10,6 +10,8 @@ from vipetsc.io.atomic import atomic_write, write_text
 
 MANUAL = Path(__file__).parents[1] / "vipetsc" / "manual"
 CHAPTER = MANUAL / "measurements.md"
+# A part of the bench has a part of the goals: the others stay as they were measured before.
+GOALS = "goal|measured"
 PICTURES = {"work-precision.png": MANUAL / "pictures" / "bench.png"}
 
 
@@ -17,7 +19,7 @@ def with_tables(chapter: str, measured: str) -> tuple[str, list[str]]:
     """``chapter`` with its tables replaced by those in ``measured`` that have the same first two titles of columns.
 
     The second value has the titles of the tables in ``measured`` for which the chapter has no place. Tables of the
-    chapter that were not measured, and all other text, remain.
+    chapter that were not measured, goals of parts that were not, and all other text, remain.
     """
     found = {_titles(table): table for is_table, table in _blocks(measured) if is_table}
     blocks = []
@@ -26,11 +28,18 @@ def with_tables(chapter: str, measured: str) -> tuple[str, list[str]]:
         titles = _titles(block) if is_table else ""
         if titles in found:
             placed.add(titles)
-            block = found[titles]
+            block = _with_goals(block, found[titles]) if titles == GOALS else found[titles]
         blocks.append(block)
 
     left = [titles for titles in found if titles not in placed]
     return "\n".join(blocks) + "\n", left
+
+
+def _with_goals(before: str, measured: str) -> str:
+    """The table of goals ``before`` with the rows of ``measured`` in place of those of the same names, or after all."""
+    rows = {_titles(row, columns=1): row for row in before.splitlines()}
+    rows |= {_titles(row, columns=1): row for row in measured.splitlines()}
+    return "\n".join(rows.values())
 
 
 def _blocks(text: str) -> list[tuple[bool, str]]:
@@ -39,10 +48,10 @@ def _blocks(text: str) -> list[tuple[bool, str]]:
     return [(is_table, "\n".join(lines)) for is_table, lines in groups]
 
 
-def _titles(table: str) -> str:
-    """The titles of a table's first two columns, by which it is recognised."""
+def _titles(table: str, columns: int = 2) -> str:
+    """The titles of a table's first ``columns``, by which it is recognised; of one line, what it has there."""
     cells = table.splitlines()[0].split("|")
-    return "|".join(cell.strip() for cell in cells[1:3])
+    return "|".join(cell.strip() for cell in cells[1 : columns + 1])
 
 
 def write_chapter(measured: str, pictures: list[Path]) -> list[str]:

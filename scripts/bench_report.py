@@ -68,6 +68,7 @@ def _origin_table(found: dict[str, Any]) -> str:
         "date": origin["date"][:10],
         "version": origin["revision"],
         "processor": f"{processor()}, {os.cpu_count()} cores",
+        "parts": ", ".join(found["parts"]),
         "rounds": f"{found['rounds']} ({found['mode']})",
         "libraries": f"PETSc {origin['petsc_version']}, {origin['mpi_version']}, numpy {origin['numpy_version']}",
     }

@@ -198,6 +198,11 @@ def test_the_chapter_takes_the_tables_that_were_measured(monkeypatch):
     assert written == chapter.replace("| ms |", "| s |").replace("| 1 |", "| 7 |")
     assert left == ["goal|met"]
 
+    # Of the goals only those that were measured change.
+    goals = "| goal | measured |\n|---|---|\n| ts | 1 |\n| plot | 2 |\n"
+    written, _ = with_tables(goals, "| goal | measured |\n|---|---|\n| plot | 3 |\n| run | 4 |\n")
+    assert written == goals.replace("| 2 |", "| 3 |") + "| run | 4 |\n"
+
     # A table that is measured twice changes nothing else in the real chapter either.
     text = CHAPTER.read_text(encoding="utf-8")
     assert with_tables(text, text) == (text, [])
