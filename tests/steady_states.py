@@ -65,3 +65,9 @@ def motion_at(states: SteadyStates, xi: np.ndarray, cells: np.ndarray, phase: fl
         displacement = displacement + field.real
         velocity = velocity + (1j * order * omega * field).real
     return displacement, velocity
+
+
+def first_harmonic(motion: np.ndarray, samples: int) -> float:
+    """The amplitude of the first harmonic of a ``motion`` (time,) over whole periods of so many ``samples``."""
+    turns = np.exp(-2j * np.pi * np.arange(len(motion)) / samples)
+    return float(2 * np.abs(np.mean(turns * motion)))

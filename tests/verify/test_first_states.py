@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.independent_lattice import ScipyLattice, Stop
+from tests.models import TWO_MASS_CELL
 from tests.steady_states import motion_at, refined
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.modes.response import steps
@@ -17,10 +18,6 @@ from vipetsc.modes.response.steps import first_state
 CLEARANCE = 1e-4
 RESTITUTION = 0.7
 PHASE = 1.5  # rad, without contact
-ROW = {
-    "masses": [4e-3, 2e-3],
-    "springs": [{"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 5e3}],
-}
 
 
 def states_from(omega: float, touches: float, **nfrc: Any) -> SteadyStates:
@@ -30,7 +27,7 @@ def states_from(omega: float, touches: float, **nfrc: Any) -> SteadyStates:
         case = NfrcCase.from_table(
             {
                 "name": "x",
-                "lattice": {"cells": 3, "cell": ROW},
+                "lattice": {"cells": 3, "cell": TWO_MASS_CELL},
                 "contacts": {"stiffness": 1e7, "sites": [2], "clearance": CLEARANCE, "restitution": RESTITUTION},
                 "drive": {"frequency": omega, "cell": 1, "amplitude": 1.0, "cycles": 3},
                 "nfrc": {"source": "force", "infinite": False, "harmonics": 21, "range": [low, 1e4]} | nfrc,

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_matrix
 
+from tests.models import TWO_MASS_CELL
 from tests.rigs import TWO_MASSES
 from tests.unlike_lattices import TABLE, independent_lattice
 from vipetsc.case import NnmCase
@@ -94,17 +95,7 @@ def test_free_decay_takes_the_loss(shot):
 
 CHAIN: dict[str, Any] = {
     "name": "chain",
-    "lattice": {
-        "cells": 14,
-        "cell": {
-            "masses": [4e-3, 2e-3],
-            "springs": [
-                {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True},
-                {"start": 1, "end": 2, "stiffness": 5e3},
-            ],
-        },
-        "damping": {"mass": 1.0, "stiffness": 1e-6},
-    },
+    "lattice": {"cells": 14, "cell": TWO_MASS_CELL, "damping": {"mass": 1.0, "stiffness": 1e-6}},
 }
 
 

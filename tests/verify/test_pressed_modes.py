@@ -12,6 +12,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 from tests.condensed_branches import condensed_branch
+from tests.models import TWO_MASS_CELL
 from vipetsc.case import Case, CaseError, NnmCase
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.lattice import Contact
@@ -224,16 +225,7 @@ def corrected(problem: Any, u: np.ndarray, period: float) -> Any:
 
 SITES: dict[str, Any] = {
     "name": "sites",
-    "lattice": {
-        "cells": 14,
-        "cell": {
-            "masses": [4e-3, 2e-3],
-            "springs": [
-                {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True},
-                {"start": 1, "end": 2, "stiffness": 5e3},
-            ],
-        },
-    },
+    "lattice": {"cells": 14, "cell": TWO_MASS_CELL},
     "contacts": {
         "law": "hertz",
         "stiffness": 1e7,

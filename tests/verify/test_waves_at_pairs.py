@@ -15,6 +15,8 @@ from scipy.sparse import diags
 from scipy.sparse.linalg import spsolve
 
 from tests.conftest import run_of
+from tests.models import TWO_MASS_CELL
+from tests.steady_states import first_harmonic
 from vipetsc.case import Case, CaseError
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.lattice import Chain, Spring, UnitCell, WaveCompliance
@@ -69,11 +71,6 @@ def test_the_relative_motions_of_a_wave_are_differences_of_its_field():
     assert wave.relative[0] == pytest.approx(1.0)
 
 
-# The same row without springs between resonators is its own mirror image.
-ROW = {
-    "masses": [4e-3, 2e-3],
-    "springs": [{"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 5e3}],
-}
 GROUND = {"pair": [0, 2], "sites": [12, 14]}
 NEIGHBOURS = {"pair": [1, 1], "next_cell": True, "sites": [12, 14]}
 # A resonator meets the next one; in another cell one meets its host and the ground.
@@ -97,7 +94,7 @@ def wave_case(contacts: dict[str, Any], **nfrc: Any) -> NfrcCase:
     return NfrcCase.from_table(
         {
             "name": "x",
-            "lattice": {"cells": 24, "cell": ROW},
+            "lattice": {"cells": 24, "cell": TWO_MASS_CELL},
             "contacts": common | contacts,
             "drive": {"frequency": 1000.0, "cycles": 3, "amplitude": 1.0, "cell": 4},
             "nfrc": steps | nfrc,
@@ -143,7 +140,7 @@ def test_a_steady_state_under_a_wave_is_where_a_long_run_ends():
         "each": {"pair": [[0, 2], [1, 1]], "next_cell": [False, True]},
     }
     # Waves go 8 cells a period: they come back from the ends after the run.
-    lattice = {"cells": 640, "cell": ROW}
+    lattice = {"cells": 640, "cell": TWO_MASS_CELL}
     drive = {"waveform": "harmonic", "frequency": omega, "cell": 300}
     table = {"name": "x", "lattice": lattice, "contacts": contacts, "drive": drive}
     options = {"harmonics": 31, "largest_step": 1.0, "first_step": 0.2}
@@ -168,9 +165,8 @@ def test_a_steady_state_under_a_wave_is_where_a_long_run_ends():
         }
     )
     u = run_of(run)["displacement"].values[-1 - 4 * samples : -1]
-    turns = np.exp(-2j * np.pi * np.arange(len(u)) / samples)
     motions = (u[:, 0, 1], u[:, 3, 0] - u[:, 2, 0])
-    found = [2 * np.abs(np.mean(turns * motion)) for motion in motions]
+    found = [first_harmonic(motion, samples) for motion in motions]
     assert found == pytest.approx(np.abs(measures.harmonics[:, 1]).tolist(), rel=1e-4)
 
 

@@ -72,7 +72,11 @@ class Engine(ABC):
         """Go back to a checkpoint, given the parts of all ranks that wrote it, in order; their number may differ."""
 
     def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go on from a checkpoint of a run without sites, given the parts of all its ranks; sites stand at rest."""
+        """Go on from a checkpoint of a run without sites, given the parts of all its ranks; sites stand at rest.
+
+        Raises NotImplementedError, on all ranks, for an engine that cannot: only members of sweeps that the propagator
+        simulates begin so (``studies.linear_history.begins_linearly``).
+        """
         raise NotImplementedError(f"{self.name} does not open with samples of another run")
 
     @abstractmethod

@@ -26,7 +26,11 @@ from vipetsc.studies.response import Burst, SiteRun
 from vipetsc.studies.ring import Ring
 from vipetsc.studies.site_waves import SiteWaves
 
-LINEAR, SITE, MEMBER = "linear", "site", "member"
+# Kinds of runs, as the records name them.
+LINEAR = "linear"
+SITE = "site"
+MEMBER = "member"
+
 # Largest linear relative displacement over clearance, less 1, of the runs near the onset; others are log-spaced above.
 NEAR_ONSET = (5e-4, 2e-3, 7e-3, 0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.8, 1.2)
 HIGH = 2.8
