@@ -74,8 +74,7 @@ class Engine(ABC):
     def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Go on from a checkpoint of a run without sites, given the parts of all its ranks; sites stand at rest.
 
-        Raises NotImplementedError, on all ranks, for an engine that cannot: only members of sweeps that the propagator
-        simulates begin so (``studies.linear_history.begins_linearly``).
+        Raises NotImplementedError, on all ranks, for an engine whose ``opens`` is false; ``simulate`` asks it for none.
         """
         raise NotImplementedError(f"{self.name} does not open with samples of another run")
 
