@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import allocating, kernel
-from vipetsc.contact.law import CLIPPED, CLOSED, FREE, PERMANENT, RESTING, contact_force, gap_of, resting_side
+from vipetsc.contact.law import CLIPPED, CLOSED, FREE, PERMANENT, RESTING, contact_force, gap_of, resting_side, side_of
 from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
 # A site has landed on its clearance when |side w - D| is within this fraction of D (of its ``scale``).
@@ -81,8 +81,9 @@ def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
     if abs(site.mode) == PERMANENT:
         return AffineForm(1, 0.0, -np.inf, 0.0, site.mode)
 
-    side = 1 if site.mode > 0 else -1
+    side = side_of(site.mode)
     if abs(site.mode) == RESTING:
+        # Not on D itself: there the many landings would begin again by which the site came to rest.
         moved = MOVED_W * site.scale
         if function == 0:
             return AffineForm(0, float(-side), gap_of(site, side) - moved, tolerance, FREE)
@@ -91,10 +92,12 @@ def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
         return AffineForm(0, float(-side), gap_of(site, side), tolerance, FREE)
     if not site.clip:
         return AffineForm(1, 0.0, -np.inf, 0.0, site.mode)
-    clipped = abs(site.mode) == CLIPPED
-    sign = 1.0 if clipped else -1.0
-    mode = side * (CLOSED if clipped else CLIPPED)
-    return AffineForm(1, sign * (site.damping / site.approach), sign, LANDED_G, mode)
+
+    # g = 1 + c w'/w'_minus falls through zero where clipping begins, and rises through it where it ends.
+    slope = site.damping / site.approach
+    if abs(site.mode) == CLIPPED:
+        return AffineForm(1, slope, 1.0, LANDED_G, side * CLOSED)
+    return AffineForm(1, -slope, -1.0, LANDED_G, side * CLIPPED)
 
 
 @kernel
@@ -171,7 +174,7 @@ def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, h: fl
 def _push(contacts: np.ndarray, i: int, b: np.ndarray, d: np.ndarray, s: float, room: np.ndarray) -> float:
     """Contact force in N at position ``s`` in a step with the Bernstein forms ``b`` of w and ``d`` of w'."""
     force, _ = contact_force(contacts, i, evaluate(b, s, room), evaluate(d, s, room))
-    return force if contacts[i].mode > 0 else -force
+    return side_of(contacts[i].mode) * force
 
 
 @allocating
@@ -180,7 +183,7 @@ def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h
     b, room = np.empty(6), np.empty(6)
     bernstein(start[i], end[i], h, b)
     d = 5.0 * (b[1:] - b[:5]) / h
-    side = 1.0 if contacts[i].mode > 0 else -1.0
+    side = side_of(contacts[i].mode)
 
     # Deepest at an end, or where side w' falls through zero inside.
     deepest = max(side * b[0], side * b[5])

@@ -86,12 +86,17 @@ def create_contacts(
     the clearance of a site that has none.
     """
     gaps = np.array(clearances, float)
-    gaps = gaps.reshape(-1, 2) if gaps.ndim == 2 else np.column_stack([gaps, gaps])
-    per_site = [laws] * len(gaps) if isinstance(laws, Contact) else list(laws)
+    if gaps.ndim == 1:
+        gaps = np.column_stack([gaps, gaps])
+    per_site = [laws] * len(gaps)
+    if not isinstance(laws, Contact):
+        per_site = list(laws)
+    # Sites have few different laws, and the damping of some is the root of an equation.
     dampings = {law: law.damping for law in dict.fromkeys(per_site)}
 
     sites = np.zeros(len(gaps), SITE)
     sites["clearance"], sites["clearance_minus"] = gaps.T
+    # Landings are as exact as the smaller stop needs; one without clearance has no size of its own.
     sizes = np.where((gaps != 0) & np.isfinite(gaps), np.abs(gaps), np.inf).min(axis=1)
     sites["scale"] = np.where(np.isfinite(sizes), sizes, scale)
     sites["approach"] = 1.0
@@ -109,6 +114,7 @@ def hold(sites: np.ndarray, laws: Sequence[Contact], which: np.ndarray, speed: f
     ``laws`` (site,) are those of all ``sites``; ``speed`` in m/s is that of relative motion, for what is small
     compared with it.
     """
+    # A contact that is pressed at rest has one stop: that of the smaller clearance, which is negative.
     side = np.where(sites["clearance"] < sites["clearance_minus"], 1, -1)
     pressed = np.maximum(-np.minimum(sites["clearance"], sites["clearance_minus"]), 0.0)
     sites["mode"][which] = (side * PERMANENT)[which]
@@ -123,8 +129,14 @@ def hold(sites: np.ndarray, laws: Sequence[Contact], which: np.ndarray, speed: f
 
 
 @kernel
-def gap_of(site: Any, side: float) -> float:
-    """Clearance in m of a ``SITE`` on one side."""
+def side_of(mode: int) -> int:
+    """The side, 1 or -1, at which a site of a ``mode`` other than ``FREE`` touches."""
+    return 1 if mode > 0 else -1
+
+
+@kernel
+def gap_of(site: Any, side: int) -> float:
+    """Clearance in m of a ``SITE`` on one side, 1 or -1."""
     return site.clearance if side > 0 else site.clearance_minus
 
 
@@ -138,7 +150,9 @@ def resting_side(site: Any) -> int:
         return 0
     if site.clearance == 0.0:
         return 1
-    return -1 if site.clearance_minus == 0.0 else 0
+    if site.clearance_minus == 0.0:
+        return -1
+    return 0
 
 
 @kernel
@@ -230,7 +244,7 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
     if site.mode == FREE:
         return 0.0, 0.0
 
-    side = 1.0 if site.mode > 0 else -1.0
+    side = side_of(site.mode)
     x = side * w - gap_of(site, side)
     if abs(site.mode) >= PERMANENT:
         # No change of mode at x = 0 is looked for: the force itself has the kink where the masses part.

@@ -1,7 +1,7 @@
 """Modes of sites over time, compiled: switching at located changes, and the log of impacts."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from vipetsc.contact.law import (
     gap_of,
     impact_time,
     resting_side,
+    side_of,
 )
 
 # Limits of the contact law, of which it is counted how often they acted.
@@ -90,7 +91,7 @@ def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extrem
 def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end: np.ndarray, h: float) -> None:
     """Update all open episodes with a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
     for i in range(contacts.size):
-        side = 1 if contacts[i].mode > 0 else -1
+        side = side_of(contacts[i].mode)
         turns = side * start[i, 1] > 0.0 > side * end[i, 1]
         if abs(contacts[i].mode) == PERMANENT and not turns:
             # Monotonous in the step: its end is enough, which matters where thousands of beads touch all the time.
@@ -139,39 +140,58 @@ def rest_site(contacts: np.ndarray, tracks: Tracks, i: int, motion: np.ndarray, 
     return True
 
 
+@kernel
+def _begin_episode(site: Any, track: Any, rate: float, t: float, rested: bool) -> None:
+    """Begin the episode of a ``site`` whose contact begins at w' = ``rate``, from rest in contact if it ``rested``."""
+    # What is pressed from rest has no approach velocity but the floor, which only a law with loss needs.
+    if rested and site.damping != 0.0:
+        rate = 0.0
+    side = side_of(site.mode)
+    # A grazing onset would make the factor g unbounded.
+    track.counts.floored += abs(rate) < site.floor
+    site.approach = side * max(abs(rate), site.floor)
+
+    episode = track.episode
+    episode.site = track.number
+    episode.side = side
+    episode.onset = t
+    episode.approach_velocity = rate
+    if rested:
+        episode.approach_velocity = 0.0
+    episode.separation = np.nan
+    episode.indentation = 0.0
+    episode.force = 0.0
+
+
+@kernel
+def _end_episode(site: Any, track: Any, tracks: Tracks, energy: float, t: float) -> None:
+    """Write the episode of a ``site`` whose contact has ended to the log, if it was an impact."""
+    track.pulls = False
+    episode = track.episode
+    # A site that comes to rest where it had landed has had no impact.
+    if site.mode != FREE and episode.indentation <= LANDED_W * site.scale:
+        return
+    episode.separation = t
+    episode.loss += energy
+    tracks.log[tracks.closed[0]] = episode
+    tracks.closed[0] += 1
+
+
 @njit(error_model="numpy")
 def _set_mode(contacts: np.ndarray, tracks: Tracks, i: int, mode: int, rate: float, energy: float, t: float) -> None:
     """Give site ``i`` its new mode at w' = ``rate``; begin or end its episode, ``energy`` in J dissipated so far."""
     site = contacts[i]
     track = tracks.sites[i]
-    episode = track.episode
     had_episode = in_episode(site.mode)
     rested = abs(site.mode) == RESTING
     site.mode = mode
+
     if not had_episode and in_episode(mode):
-        if rested and site.damping != 0.0:
-            # What is pressed from rest has no approach velocity but the floor.
-            rate = 0.0
-        side = 1 if mode > 0 else -1
-        # A grazing onset would make the factor g unbounded.
-        track.counts.floored += abs(rate) < site.floor
-        site.approach = side * max(abs(rate), site.floor)
-        episode.site = track.number
-        episode.side = side
-        episode.onset = t
-        episode.approach_velocity = 0.0 if rested else rate
-        episode.separation = np.nan
-        episode.indentation = 0.0
-        episode.force = 0.0
-        episode.loss = -energy  # what the site has dissipated by its end is added
+        _begin_episode(site, track, rate, t, rested)
+        # What the site will have dissipated by the episode's end is added to this.
+        track.episode.loss = -energy
     elif had_episode and not in_episode(mode):
-        track.pulls = False
-        if mode != FREE and episode.indentation <= LANDED_W * site.scale:
-            return  # it comes to rest where it had landed: no impact
-        episode.separation = t
-        episode.loss += energy
-        tracks.log[tracks.closed[0]] = episode
-        tracks.closed[0] += 1
+        _end_episode(site, track, tracks, energy, t)
     elif abs(mode) == CLIPPED:
         track.counts.clipped += 1
 

@@ -34,7 +34,7 @@ def begin_contacts(lattice: Lattice, motion: MotionState, tracker: ImpactTracker
 
     for i in closed:
         site = contacts[i]
-        side = 1.0 if site["mode"] > 0 else -1.0
+        side = int(np.sign(site["mode"]))
         which = 0 if side > 0 else 1
         speed = abs(float(site["approach"]))
         # At the floor w'_minus is held and does not vary.

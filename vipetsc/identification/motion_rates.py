@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel
-from vipetsc.contact.law import CLIPPED, FREE, elastic_force_and_slope, gap_of
+from vipetsc.contact.law import CLIPPED, FREE, elastic_force_and_slope, gap_of, side_of
 from vipetsc.dynamics.drives import Drives, drive_force
 from vipetsc.dynamics.spring_law import nonlinear_force, nonlinear_slope
 
@@ -108,7 +108,7 @@ def _add_contact(lattice: Lattice, i: int, y: np.ndarray, approach: np.ndarray, 
     n = lattice.inverse_mass.size
     site = lattice.contacts[i]
     slopes = lattice.slopes
-    side = 1.0 if site.mode > 0 else -1.0
+    side = side_of(site.mode)
     which = 0 if site.mode > 0 else 1
     w = difference(y, lattice.ends, i, 0, 0)
     rate = difference(y, lattice.ends, i, n, 0)
@@ -256,7 +256,7 @@ def jerk(lattice: Lattice, motion: MotionState, t: float, i: int) -> float:
         if not (is_host or lattice.ends[c, 1] == i) or site.mode == FREE or abs(site.mode) == CLIPPED:
             continue
 
-        side = 1.0 if site.mode > 0 else -1.0
+        side = side_of(site.mode)
         x = side * motion.before[c, 0] - gap_of(site, side)
         elastic, slope = elastic_force_and_slope(site.elastic, x)
         # The force is elastic(x) g(w'), the rate has a term of each factor.

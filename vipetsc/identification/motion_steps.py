@@ -9,7 +9,7 @@ import numpy as np
 
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.changes import first_change, switching
-from vipetsc.contact.law import FREE
+from vipetsc.contact.law import FREE, side_of
 from vipetsc.contact.search import LANDED, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.contact.tracker import Tracks, shortest_impact, switch_sites, with_room
 from vipetsc.dynamics.drives import select_piece
@@ -134,7 +134,7 @@ def _switch(lattice: Lattice, motion: MotionState, tracks: Tracks, t: float) -> 
     for i in range(contacts.size):
         if modes[i] != FREE or contacts[i].mode == FREE:
             continue
-        side = 1.0 if contacts[i].mode > 0 else -1.0
+        side = side_of(contacts[i].mode)
         which = 0 if contacts[i].mode > 0 else 1
         rate = motion.before[i, 1]
         for j in range(1, motion.state.shape[1]):

@@ -16,7 +16,7 @@ import numpy as np
 
 from vipetsc.compiled import inlined, kernel
 from vipetsc.contact.changes import LANDED_W, ModeChange, extremes, first_change, stays_landed, switching
-from vipetsc.contact.law import CLOSED, PERMANENT, begins_linearly, contact_force, gap_of
+from vipetsc.contact.law import CLOSED, PERMANENT, begins_linearly, contact_force, gap_of, side_of
 from vipetsc.contact.search import (
     LANDED,
     MOST_ATTEMPTS,
@@ -147,7 +147,7 @@ def first_kink(cluster: Cluster, trial: Trial, length: float) -> float:
         site = cluster.contacts[i]
         if abs(site.mode) < PERMANENT:
             continue
-        side = 1.0 if site.mode > 0 else -1.0
+        side = side_of(site.mode)
         gap = gap_of(site, side)
         tolerance = LANDED_W * site.scale
         bernstein(cluster.site_motion[i], trial.site_motion[i], length * cluster.interval, c)
@@ -277,7 +277,7 @@ def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> 
     start = cluster.site_motion[i]
     end = trial.site_motion[i]
     history = cluster.history[i]
-    side = 1.0 if cluster.contacts[i].mode > 0 else -1.0
+    side = side_of(cluster.contacts[i].mode)
     depth = max(side * start[0], side * end[0]) - gap_of(cluster.contacts[i], side)
     first = side * contact_force(cluster.contacts, i, start[0], start[1])[0]
     last = side * contact_force(cluster.contacts, i, end[0], end[1])[0]

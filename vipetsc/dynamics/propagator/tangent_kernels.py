@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel, njit
-from vipetsc.contact.law import CLIPPED, PERMANENT, elastic_force_and_slope, gap_of
+from vipetsc.contact.law import CLIPPED, PERMANENT, elastic_force_and_slope, gap_of, side_of
 from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.collocation import accumulate_moments, node_responses, update_taylor
 from vipetsc.dynamics.propagator.nodes import NODES
@@ -49,7 +49,7 @@ def _slopes(site: Any, row: Any, w: float, v: float) -> tuple[float, float, floa
     if abs(row.mode) == CLIPPED:
         # The force is clipped to zero.
         return 0.0, 0.0, 0.0
-    side = 1.0 if row.mode > 0 else -1.0
+    side = side_of(row.mode)
     depth = side * w - gap_of(site, side)
     if abs(row.mode) >= PERMANENT and depth <= 0.0:
         # A contact that is pressed at rest has opened.

@@ -47,7 +47,7 @@ def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
 
 
 @kernel
-def _onset_on_side(series: np.ndarray, site: Any, side: float, curvature: float, length: float) -> float:
+def _onset_on_side(series: np.ndarray, site: Any, side: int, curvature: float, length: float) -> float:
     """First s in [0, length] at which w is on the clearance of one ``side`` and grows; 2 if there is none.
 
     ``curvature`` bounds |w''| over the length, so that a parabola bounds w towards this side: up to where that
@@ -102,6 +102,6 @@ def first_onset(series: np.ndarray, site: Any, length: float) -> float:
     if bound < min(site.clearance, site.clearance_minus) - tolerance:
         return 2.0
 
-    plus = _onset_on_side(series, site, 1.0, curvature, length)
-    minus = _onset_on_side(series, site, -1.0, curvature, length)
+    plus = _onset_on_side(series, site, 1, curvature, length)
+    minus = _onset_on_side(series, site, -1, curvature, length)
     return min(plus, minus)
