@@ -88,8 +88,9 @@ def create_contacts(
     gaps = np.array(clearances, float)
     if gaps.ndim == 1:
         gaps = np.column_stack([gaps, gaps])
-    per_site = [laws] * len(gaps)
-    if not isinstance(laws, Contact):
+    if isinstance(laws, Contact):
+        per_site = [laws] * len(gaps)
+    else:
         per_site = list(laws)
     # Sites have few different laws, and the damping of some is the root of an equation.
     dampings = {law: law.damping for law in dict.fromkeys(per_site)}
