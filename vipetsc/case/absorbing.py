@@ -13,8 +13,10 @@ from vipetsc.lattice.chain import Ends
 from vipetsc.lattice.ends import EndSection, absorbing_section, reflection
 from vipetsc.lattice.sent import Source
 
-# Numbers of cells of an absorbing end that are tried, and logarithmic losses of a wave over both of its passes.
+# Lengths (cells) that are tried double: from one to the next the waves of lower and lower group velocity are absorbed.
 LENGTHS = (10, 20, 40, 80, 160, 320, 640)
+# Logarithmic losses of a wave over both of its passes. Where the end is long enough that its gradient reflects less,
+# they leave 3e-4, 5e-5, 2e-6 and 4e-8 of the energy; in the built-in case 40 cells are within 1.3 times of that.
 LOSSES = (8.0, 10.0, 13.0, 17.0)
 
 
@@ -22,6 +24,7 @@ def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) 
     """The ``drives`` of a lattice as sources of waves; a wall attached to several springs is a single source."""
     loads: dict[tuple[Waveform, int], np.ndarray] = {}
     for drive in with_unit_amplitude(drives):
+        # The waves of springs at one wall interfere, so that their energies do not add: they are one source.
         load = loads.setdefault((drive.waveform, drive.cell), np.zeros(cell.dofs))
         load[drive.mass] += drive.stiffness or 1.0
     return [Source(cell, ends, cells, place, load, waveform) for (waveform, place), load in loads.items()]
@@ -59,6 +62,7 @@ def reflected(sources: Sequence[Source], sections: Sequence[EndSection]) -> floa
 
     NaN if nothing arrives.
     """
+    # A sine without end has one frequency and no energy; all pulses together have one energy.
     endless = [source.waveform.frequency for source in sources if source.waveform.repeats]
     fractions = [reflected_at(omega, sections) for omega in endless]
     energies = [source.energies(sections) for source in sources if not source.waveform.repeats]
@@ -66,6 +70,7 @@ def reflected(sources: Sequence[Source], sections: Sequence[EndSection]) -> floa
         arriving, back = np.sum(energies, axis=0)
         if arriving > 0:
             fractions.append(back / arriving)
+    # The worst one counts: what the end reflects of a weak sine must not hide behind a strong pulse.
     finite = [fraction for fraction in fractions if np.isfinite(fraction)]
     return float(max(finite, default=np.nan))
 
@@ -81,6 +86,7 @@ def designed_end(
     if not waves:
         raise ValueError("the drive frequency is in a gap: no wave reaches the end")
 
+    # The fastest wave passes the dashpots in the shortest time and loses least.
     speed = max(wave[2] for wave in waves)
     end = _first_end(table, cell, ends, with_unit_amplitude(drives), cells, speed)
     if end.cells:
@@ -115,6 +121,8 @@ def _first_end(
         lengths = [table.cells]
 
     sources = sources_of(drives, cell, ends, cells)
+    # From the shortest end on, which costs fewest cells; of one length from the weakest on, whose gradient reflects
+    # least.
     best = np.inf
     for length in lengths:
         # The dashpots leave exp(-loss) of a wave's energy, the integral of strength x^3 through the end and back.

@@ -60,6 +60,7 @@ def amplitude_changes(case: Case, amplitude: float) -> Changes:
         return {"initial": {"amplitude": float(amplitude)}}
 
     assert initial.velocity is not None and initial.amplitude is not None
+    # The magnitude, since an amplitude is positive and the sign of a velocity is its direction.
     factor = float(amplitude) / abs(initial.velocity)
     changes: dict[str, Any] = {"velocity": factor * initial.velocity, "amplitude": factor * initial.amplitude}
     if initial.more:

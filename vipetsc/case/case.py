@@ -41,6 +41,7 @@ from vipetsc.lattice import Chain, Drive, UnitCell, pass_bands
 
 # Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
 WEAKEST = 0.1
+# One recorded mass would take 16 GB, displacement and velocity: more samples are a mistyped interval.
 MOST_SAMPLES = 1e9
 ORDER = ("lattice", "contacts", "disorder", "drive", "initial", "time", "output", "analysis", "petsc")
 
@@ -90,6 +91,7 @@ class Case(CaseFile):
             return sections, [Problem("lattice.absorbing.reflection", reflection, str(error))]
 
         problems = [*_resolved_problems(sections, resolved), *_touching_problems(sections, beginning)]
+        # Scatter is drawn last, about the values of the resolved case: a preset's stiffness, clearances over a span.
         if problems or "disorder" not in table:
             return resolved, problems
         return with_drawn(super().read, resolved, disorder, sections["contacts"])
@@ -142,6 +144,7 @@ class Case(CaseFile):
         # ``read`` has replaced both words by numbers; the assertion narrows their types.
         assert time.end != "traverse" and time.sample_interval != "auto"
         chain = build_chain(self.lattice, contacts)
+        # The drive by which tolerances are judged: without a force it has the frequency of the initial motion.
         drive = reference_drive(self.drive, self.initial)
         drives = build_drives(drive, chain)
         scale = self._scale(chain, drives)
@@ -259,6 +262,7 @@ def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem
         return None, []
     lattice = sections["lattice"]
     frequency = None
+    # A drive that gives its wave gives the motion's frequency, too; a pulse has no frequency that it would share.
     if drive.wave_choices:
         frequency, _ = driven_wave(lattice.unit_cell(), drive)
 
@@ -364,4 +368,5 @@ def _too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[P
 
 def case_id(case: Case) -> str:
     """The first 16 digits of the SHA-256 of the resolved case."""
+    # 64 bits: among a million cases two have one id with a probability of 3e-8.
     return hashlib.sha256(case.to_toml().encode()).hexdigest()[:16]

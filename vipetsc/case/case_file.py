@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 FOLDER = re.compile(r"[^\s./\\-][^/\\]*")
-LARGEST = 1e50  # products of a few larger numbers overflow, and those of a few below its inverse vanish
+LARGEST = 1e50  # products of six larger numbers overflow, and those of six below its inverse vanish
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
 Table = dict[str, Any]  # a parsed TOML table
 Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid
@@ -160,6 +160,7 @@ class CaseFile(Section):
             raise CaseError(problems + wrong + mistyped, source)
 
         try:
+            # Another case may have imported further modules in this process, whose parts this case must not find.
             with only(module_names(table)):
                 fields, wrong = cls.read(table)
         except PartError as error:

@@ -77,6 +77,7 @@ def _divided(place: Any, path: str) -> tuple[str, str]:
     dotted: list[str] = []
     if isinstance(place, dict):
         dotted = [key for key in place if "." in key and f"{path}.".startswith(f"{key}.")]
+    # The longest: of the keys "a" and "a.b" in one table, the path "a.b.c" begins with the second.
     key = max(dotted, key=len, default=path.partition(".")[0])
     return key, path[len(key) + 1 :]
 

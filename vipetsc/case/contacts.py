@@ -56,6 +56,7 @@ def check_per_site(
         yield Problem(f"contacts.{lacking[0]}", None, "missing; needed for the stiffness of each site")
     yield from _check_laws(contacts, count)
     yield from _check_sides(contacts, count)
+    # A stop that is wrong itself touches, too: only the first reason is given.
     wrong = list(_check_stops(contacts, gaps))
     yield from wrong or check_touching(contacts, gaps, at_rest)
 
@@ -96,6 +97,7 @@ def _check_registered(contacts: ContactsTable, laws: list[str], count: int) -> I
 
     # Of many sites with parameters of their own, the first of each law.
     first: dict[str, Contact] = {}
+    # The stiffness of a case that lacks one is reported elsewhere: formulas are checked with 1.
     for law in laws_of_sites(contacts, count) or (contact_of(contacts),):
         if registered_law(law.law):
             first.setdefault(law.law, replace(law, stiffness=law.stiffness or 1.0))
@@ -165,6 +167,7 @@ def resolved_per_site(contacts: ContactsTable, count: int) -> PerSiteTable | Non
 
 def with_stiffness(contacts: ContactsTable, count: int) -> ContactsTable:
     """``contacts`` with stiffnesses in place of materials, for all sites and in the lists over ``count`` sites."""
+    # The radius stays: claims and pictures compare indentations with it.
     update: dict[str, Any] = {"each": resolved_per_site(contacts, count)}
     modulus = contacts.modulus
     radius = contacts.radius
@@ -243,6 +246,7 @@ def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple
         pairs.append(Pair(host - 1, resonator - 1, bool(is_in_next_cell)))
 
     sites = contacts.sites if isinstance(contacts.sites, list) else []
+    # Without pairs a chain is treated by the methods for one contact, of the cell's own pair, in a cell.
     is_plain = set(pairs) <= {Pair(cell.host, cell.resonator)} and len(set(sites)) == len(sites)
     return () if is_plain else tuple(pairs)
 
@@ -293,6 +297,7 @@ def gaps_of_sites(contacts: ContactsTable, gaps: list[float]) -> Gaps:
         elif side == "plus":
             minus = np.inf
         stops.append((plus, minus))
+    # Equal clearances are no gaps, by which symmetric motions are recognised.
     if all(plus == minus for plus, minus in stops):
         return ()
     return tuple(stops)

@@ -9,7 +9,8 @@ from pydantic import Field
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid
 from vipetsc.case.schema import OutputTable, Positive
 
-LARGEST = 20_000_000  # Bloch problems (lambda, eta, kappa) of a reading whose bands fit in memory and on disk
+# Bloch problems (lambda, eta, kappa) of one reading: the four bands of so many are 640 MB in memory and on disk.
+LARGEST = 20_000_000
 
 
 class GridTable(Section):

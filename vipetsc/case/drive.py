@@ -13,7 +13,9 @@ from vipetsc.case.schema import LatticeTable, TimeTable
 from vipetsc.case.waveforms import DEFAULT, OneDrive, waveform_of
 from vipetsc.lattice import Chain, Drive, UnitCell, bloch, fastest_speed, max_group_velocity, pass_bands, waves_at
 
-STANDING = 1e-6  # of the cell's largest group velocity, below which a wave counts as standing
+# A wave with less than this fraction of the cell's largest group velocity counts as standing: it would cross the
+# lattice in a million times the usual time. A rounded wavenumber or frequency at a band's edge leaves up to 1e-8.
+STANDING = 1e-6
 WAVE_REMEDY = 'give one of: frequency; wavenumber and band; band and at = "max-group-velocity"'
 
 
@@ -154,6 +156,7 @@ def frequency_of(cell: UnitCell, drive: OneDrive) -> float:
     """
     if drive.wave_choices or drive.record.frequency is None:
         return driven_wave(cell, drive)[0]
+    # A cell without springs has no bands, and contacts can follow any frequency.
     highest = pass_bands(cell)[-1].high or np.inf
     return drive.record.frequency(drive, highest)
 
@@ -174,6 +177,7 @@ def _wave(cell: UnitCell, frequency: float | None, wavenumber: float | None, ban
 
 def packet_speed(cell: UnitCell, drive: OneDrive) -> float:
     """Speed in cells/s of the wave of a resolved ``drive``; without a sine, the speed of the fastest wave."""
+    # A pulse has waves of all frequencies, of which the fastest arrive first.
     if drive.is_sine and drive.frequency:
         return wave_speed(cell, drive.frequency)
     return wave_speed(cell, np.inf)

@@ -10,6 +10,7 @@ from vipetsc.case.case_file import Problem, Table, put
 from vipetsc.case.names import distinct
 from vipetsc.case.value_ranges import Values, leaves, short_names, values_in
 
+# To read a member takes half a millisecond, but to follow its curve takes seconds to minutes: a thousand are a day.
 MOST_MEMBERS = 1000
 SECTIONS = ("lattice", "contacts", "disorder", "drive")  # whose keys may vary
 PLAIN = re.compile(r"\w[\w.+-]*")  # a text that can be a part of a file's name
@@ -56,12 +57,14 @@ def family_of(table: Table) -> tuple[Family, list[Problem]]:
         except ValueError as error:
             problems.append(Problem(f"nfrc.family.{key}", value, str(error)))
 
+    # One more than is allowed, rather than all: the product of a few ranges may exceed the memory.
     combinations = list(itertools.islice(itertools.product(*values.values()), MOST_MEMBERS + 1))
     if len(combinations) > MOST_MEMBERS:
         problems.append(Problem("nfrc.family", None, f"has more than {MOST_MEMBERS} members; give fewer values"))
     if problems:
         return Family([], table), problems
 
+    # Ranges are written out, so that a resumed family has the same values whatever later versions make of a range.
     expanded = copy.deepcopy(table)
     expanded["nfrc"]["family"] = {key: list(of_key) for key, of_key in values.items()}
     names = [_texts(key, of_key) for key, of_key in values.items()]

@@ -93,6 +93,7 @@ def _other_lattices(kind: type[CaseFile], lattice: LatticeTable) -> Iterator[Pro
 
     cell, wrong = check_cell(lattice)
     if cell and not wrong:
+        # One message for all of them: they have one reason and one remedy.
         for key in lattice.nonlinear_keys[:1]:
             yield from _refusal(kind, "nonlinear springs", key)
         if cell.is_damped:

@@ -11,8 +11,10 @@ from vipetsc.lattice import UnitCell, pass_bands
 from vipetsc.lattice.chain import Pair
 
 MOST_SHOWN = 8  # of a list
-ROUNDING = 1e-6  # of a band's upper edge
-# Of the drawing, in pixels.
+# Fraction of a band's upper edge that counts as zero: a frequency is the root of an eigenvalue, which has a rounding
+# error of 1e-16 of the largest one, so that an edge at zero comes out as 1e-8 of the upper one.
+ROUNDING = 1e-6
+# Lengths of the drawing in pixels.
 COLUMN = 96.0
 ROW = 62.0
 RADIUS = 15.0
@@ -163,6 +165,7 @@ def _through(cell: UnitCell, joined: Mapping[int, Sequence[int]]) -> list[int]:
             last = spring.start
             break
 
+    # Breadth first: the list of paths grows while it is read, shorter paths before longer ones.
     paths = [[entry]]
     seen = {entry}
     for path in paths:
@@ -204,6 +207,7 @@ def _zigzag(begin: Point, end: Point) -> str:
     points = [start]
     for number in range(COILS + 1):
         side = COIL_HEIGHT * (-1) ** number
+        # The zigzag begins and ends on the line between the masses.
         if number in (0, COILS):
             side = 0.0
         points.append(start + along * (0.3 + 0.4 * number / COILS) + across * side)

@@ -173,6 +173,7 @@ def _case_problems(base: Case) -> Iterator[Problem]:
 
 def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
     """Problems of the unknowns in a case."""
+    # A value that two unknowns change would be determined by neither.
     taken: set[tuple[str, int]] = set()
     for index, unknown in enumerate(options.unknowns, 1):
         at = f"identify.unknowns[{index}]"

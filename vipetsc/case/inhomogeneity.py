@@ -17,7 +17,8 @@ from vipetsc.lattice import Chain, SpringTerms, UnitCell, Variation
 from vipetsc.lattice.ends import absorber
 
 QUANTITY = re.compile(r"(masses|grounding)\[([1-9]\d*)\]|springs\[([1-9]\d*)\]\.(stiffness|damping|quadratic|cubic)")
-MOST_VARIED = 10**8  # cells that may differ: every rank holds them all
+# Cells of an inhomogeneous lattice. Every rank holds all of them: each quantity of so many takes 0.8 GB a rank.
+MOST_VARIED = 10**8
 
 
 def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
@@ -55,6 +56,7 @@ def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
     if (given.value is None) == (given.factor is None):
         return values, "give either value or factor"
     at = np.array(given.cells) - 1
+    # A copy: the values of other cells stay, and the caller compares old and new.
     new = values.copy()
     if given.factor is None:
         new[at] = given.value
@@ -91,6 +93,7 @@ def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[dict[str, np.ndarray], 
             return
 
         name, index = place
+        # A view into the array of all cells, which the change is written into.
         column = arrays[name][:, index]
         column[:], wrong = change(column.copy())
         wrong = wrong or _wrong_values(name, column)
@@ -137,6 +140,7 @@ def cell_variation(lattice: LatticeTable) -> Variation | None:
 
     absorbing = lattice.absorbing
     if absorbing and absorbing.cells and absorbing.strength:
+        # Last: absorbing dashpots are added to what profiles, scatter and Rayleigh damping give.
         graded = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength, 0)
         assert graded.variation is not None and graded.variation.grounding is not None
         extra = graded.variation.grounding - graded.coefficients(-2, -1).grounding

@@ -29,6 +29,8 @@ class Deviation(Section):
 
     def draw(self, values: np.ndarray, seed: int, name: str) -> np.ndarray:
         """Values (n) of the quantity ``name`` about ``values`` (n); a larger n begins with the same numbers."""
+        # A generator for each quantity, keyed by seed and name: to scatter one more quantity leaves the others as
+        # they were.
         key = np.random.SeedSequence([seed, int.from_bytes(name.encode(), "little")])
         generator = np.random.Generator(np.random.Philox(key))
         if self.relative is None:

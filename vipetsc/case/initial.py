@@ -185,6 +185,7 @@ def check_initial(
             yield Problem(f"initial.{group[0]}", given.get(group[0]), f"give one of {' and '.join(group)}")
 
     yield from _check_strikes(initial, cell)
+    # The first strike is the section itself, whose cell other kinds have, too.
     others = [(path, strike.cell) for path, strike in initial.strikes[1:]]
     for path, at in [("initial", initial.cell), *others]:
         if at and valid("lattice.cells") and at > lattice.cells:
@@ -290,6 +291,7 @@ def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
 
     path = path_named(str(initial.path)).resolve()
     state, digest = _read_state(path, initial)
+    # The lattice is checked before the numbers: those of another lattice would have no meaning.
     _check_state(state, path, initial, chain)
     frequency = frequency or state.frequency()
     if not frequency:

@@ -159,6 +159,7 @@ def chapter() -> str:
 
 def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator[str]:
     """The table of one section, and those of the tables in it that were not shown yet."""
+    # Sections contain each other's tables, and a table may contain itself.
     if name in shown:
         return
     shown.add(name)

@@ -78,6 +78,7 @@ def contacts_of_one(contacts: ContactsTable, site: int, kind: SiteKind, cell: in
 
     ``clearance`` in m is its lesser one; ``site`` (from 0) is one of that kind.
     """
+    # What the lists say of this site becomes the value for all, of which there is one.
     of_site = {key: values[site] for key, values in lists_of(contacts).items()}
     if "stiffness" in of_site:
         # The stiffness of the site is that of its own material.

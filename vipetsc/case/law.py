@@ -22,7 +22,7 @@ from vipetsc.lattice.packet import packet_speeds
 LARGEST = 1e9  # cells times samples of a run
 RESOLVED = 8  # times the top band's edge: frequencies that the samples of a damped lattice resolve
 SHORTEST = 64  # cells of the ring: more than the propagator's band
-SLOWEST = 1e-9  # cells/s, so that a standing wave needs a run that is too large, and is refused for this reason
+SLOWEST = 1e-9  # cells/s: a standing wave then needs a run that is too large, and is refused for that reason
 
 
 class LawTable(Section):
@@ -193,6 +193,7 @@ class LawCase(Case):
             # The contact's force follows from samples, and has parts far above the bands.
             interval = min(interval, np.pi / (RESOLVED * pass_bands(cell)[-1].high))
         band, slow, _ = packet_speeds(cell, model.drive, model.drive_mass)
+        # The slow waves of the burst set the end: until they have passed, the fractions of the energy still change.
         end = law.distance / max(slow, SLOWEST) + law.settle * model.drive.duration
         samples = int(np.ceil(end / interval))
         # No wave that the site sends out returns along the ring before the end.
@@ -242,6 +243,7 @@ class LawCase(Case):
         if not distance:
             length = model.drive.duration * packet_speeds(model.chain.cell, model.drive, model.drive_mass)[1]
             distance = int(min(length, LARGEST))
+        # A site that is nearer would reflect into the burst while the drive still works.
         return max(distance, self._least_distance())
 
     def _place_problems(self) -> list[Problem]:

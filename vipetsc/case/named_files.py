@@ -51,6 +51,7 @@ def relative_names(table: dict[str, Any]) -> list[str]:
 def _absolute_name(name: str, folder: Path) -> str:
     """The ``name`` of a file of ``folder``, or of the current folder; as it is where neither has the file."""
     path = path_named(name)
+    # The folder of the case file first: a case that is moved with its data must not find other data of the same name.
     for place in (folder, Path()):
         # Unlike the methods of paths, it takes names that are too long for the system.
         if os.path.isfile(place / path):

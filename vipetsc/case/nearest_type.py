@@ -28,6 +28,7 @@ def of_nearest_type(errors: Sequence[Any]) -> list[Any]:
             types = costs.setdefault(value, {})
             types[tried_type] = types.get(tried_type, 0) + cost
 
+    # Of types with equal costs the first one, which is the type that the section lists first.
     nearest = {value: min(types, key=lambda name: types[name]) for value, types in costs.items()}
     kept_errors = []
     for error in errors:

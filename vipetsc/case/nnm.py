@@ -83,7 +83,7 @@ class NnmCase(CaseFile):
         lattice = fields["lattice"]
         contacts = fields["contacts"]
         if not (problems or has_no_lattice or contacts.clearance):
-            count = 1 if fields["nnm"].system == "reduced" else len(site_cells(lattice, contacts))
+            count = _contact_count(fields["nnm"], lattice, contacts)
             fields["contacts"] = contacts.model_copy(update={"clearance": clearances(lattice, contacts, count)})
         if "disorder" not in table:
             return fields, problems
@@ -91,7 +91,9 @@ class NnmCase(CaseFile):
         disorder, wrong = read_section(DisorderTable, table["disorder"], "disorder")
         system = fields["nnm"].system
         if system in ("reduced", "own"):
-            reason = f"{ONE_CONTACT} and one cell, which" if system == "reduced" else "a system of one's own"
+            reason = "a system of one's own"
+            if system == "reduced":
+                reason = f"{ONE_CONTACT} and one cell, which"
             wrong.append(Problem("disorder", None, f"{reason} has nothing that scatters; omit [disorder]"))
         if problems or wrong:
             return fields, problems + wrong
@@ -111,8 +113,10 @@ class NnmCase(CaseFile):
         lattice = sections["lattice"]
         contacts = sections["contacts"]
         nnm = sections["nnm"]
+        refusable = {"contacts": contacts}
         # A user-defined system ignores the section [lattice].
-        refusable = {"contacts": contacts} if nnm.system == "own" else {"contacts": contacts, "lattice": lattice}
+        if nnm.system != "own":
+            refusable["lattice"] = lattice
         problems = [*check_options(nnm), *refusals(cls, refusable, valid)]
         if nnm.system == "own":
             problems += _check_own(nnm, contacts, problems, valid)
@@ -156,6 +160,7 @@ class NnmCase(CaseFile):
     def physics(self) -> tuple[Any, ...]:
         """Keys that a resumed branch must keep: the system, the shooting map and the flow."""
         nnm = self.nnm
+        # Steps, bounds and numbers of points may change from one resumption to the next: they do not move the curve.
         begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation, self.krylov
         return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, nnm.flow, nnm.jacobian, begun
 
@@ -185,7 +190,10 @@ class NnmCase(CaseFile):
         if self.nnm.forced is None:
             return None
         *cell, mass = self.nnm.forced
-        return (cell[0] - 1) * self.lattice.unit_cell().dofs + mass - 1 if cell else mass - 1
+        masses_before = 0
+        if cell:
+            masses_before = (cell[0] - 1) * self.lattice.unit_cell().dofs
+        return masses_before + mass - 1
 
     def gaps(self) -> Gaps:
         """Clearances in m of each contact on the sides + and -; inf where there is no stop."""
@@ -196,7 +204,7 @@ class NnmCase(CaseFile):
         """The clearance in m of each contact, on the side + unless stops are on the other side alone."""
         if self.nnm.custom is not None:
             return [pair.clearance for pair in self.nnm.custom.contacts]
-        count = 1 if self.nnm.system == "reduced" else len(site_cells(self.lattice, self.contacts))
+        count = _contact_count(self.nnm, self.lattice, self.contacts)
         return clearances(self.lattice, self.contacts, count)[:count]
 
     def laws(self) -> list[Contact]:
@@ -208,6 +216,13 @@ class NnmCase(CaseFile):
     def elastic_laws(self) -> list[Contact]:
         """The law of each contact without dissipation."""
         return [replace(law, restitution=1.0) for law in self.laws()]
+
+
+def _contact_count(nnm: NnmTable, lattice: LatticeTable, contacts: ContactsTable) -> int:
+    """The number of contacts of a system that is built of the cells of a lattice."""
+    if nnm.system == "reduced":
+        return 1
+    return len(site_cells(lattice, contacts))
 
 
 def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], valid: Valid) -> Iterator[Problem]:

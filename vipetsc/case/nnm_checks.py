@@ -48,7 +48,10 @@ def check_options(nnm: NnmTable) -> Iterator[Problem]:
 
 
 def check_forced(nnm: NnmTable, cells: int | None, masses: int) -> Iterator[Problem]:
-    """Problems with the forced mass of a lattice of ``cells``, each of so many ``masses``; None: of a small system."""
+    """Problems with the forced mass of a lattice of ``cells`` cells with ``masses`` each.
+
+    ``cells`` is None for a system that is no lattice, whose masses ``masses`` counts.
+    """
     if nnm.forced is None:
         return
     *cell, mass = nnm.forced
@@ -60,7 +63,7 @@ def check_forced(nnm: NnmTable, cells: int | None, masses: int) -> Iterator[Prob
 
 
 def check_size(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> list[Problem]:
-    """Problems with a chain of such cells, of which the way that orbits are solved for allows so many masses."""
+    """The problem of a chain of ``cell`` with more masses than the shooting method of ``nnm`` allows."""
     most = MOST_MASSES
     what = "with dense matrices"
     dofs = lattice.cells * cell.dofs
@@ -207,4 +210,4 @@ def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iter
         key = "multipliers" if nnm.multipliers else "start_frequency"
         yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs nnm.shooting = "krylov"; "dense" has all half-traces')
     if krylov and dofs > MOST_MASSES and not nnm.start_frequency:
-        yield Problem("nnm.modes", nnm.modes, f"are known up to {MOST_MASSES} masses: give nnm.start_frequency")
+        yield Problem("nnm.modes", nnm.modes, f"are computed up to {MOST_MASSES} masses: give nnm.start_frequency")

@@ -7,9 +7,11 @@ from pydantic import AfterValidator, Field
 from vipetsc.case.case_file import Section
 from vipetsc.case.schema import Finite, Positive, once
 
-MOST_MASSES = 4000  # that orbits are solved for with dense matrices
-MOST_OF_LATTICE = 40_000  # without any
-FEW_MASSES = 100  # of a lattice, beyond which "auto" does without
+# Masses of a system whose orbits are shot with dense matrices: the derivatives of the state at the period by the state
+# at the beginning are 8000 x 8000 numbers, 512 MB, and twice the masses take four times the memory.
+MOST_MASSES = 4000
+MOST_OF_LATTICE = 40_000  # masses of a lattice whose orbits are shot without matrices
+FEW_MASSES = 100  # masses of a lattice beyond which "auto" shoots without matrices
 
 
 class LinearSpringTable(Section):
@@ -133,6 +135,7 @@ class NnmTable(Section):
 
     def is_krylov(self, dofs: int, is_linear: bool = True) -> bool:
         """Whether orbits of a lattice of so many masses, with linear springs or others, are shot without matrices."""
+        # Other flows, branch switching and difference quotients work on the whole matrix of derivatives.
         needs_dense = self.compare or self.switch or self.flow != "compiled" or self.jacobian != "variational"
         auto = is_linear and (bool(self.start_frequency or self.multipliers) or (dofs > FEW_MASSES and not needs_dense))
         return self.method == "shooting" and self.shooting != "dense" and (auto or self.shooting == "krylov")

@@ -8,6 +8,7 @@ from pydantic import Field
 from vipetsc.case.case_file import Problem, Section
 
 NAME = "^[A-Za-z][A-Za-z0-9_]*$"  # of a point: it is a part of names in files
+# Points are recorded at every sample, whatever the stride of the fields: a thousand take 24 kB a sample.
 MOST_POINTS = 1000
 
 

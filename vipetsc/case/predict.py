@@ -14,8 +14,10 @@ from vipetsc.case.waveforms import DEFAULT
 from vipetsc.lattice.packet import narrow_fraction
 
 MOST = 10_000  # amplitudes
-WIDTH = 0.3  # of the main frequency, within which the waves of a pulse lie that is no burst
-NARROW = 0.95  # of their energy, at least
+# A pulse that is no burst has at least the fraction NARROW of its energy within WIDTH of its main frequency: the
+# scattering law that a prediction reads has one frequency.
+WIDTH = 0.3
+NARROW = 0.95
 
 
 class PredictTable(Section):
@@ -50,7 +52,7 @@ class PredictCase(LawCase):
         model = self.model()
         warnings = [*wave_warnings(model), *length_warnings(model), *end_warnings(model, self.output)]
         nearest = min(abs(site - model.drive_cell) for site in model.chain.sites)
-        # Once around and on to the site, until the end of the burst has passed it.
+        # One revolution of the ring and on to the site, until the end of the burst has passed it.
         passed = (model.chain.cells + nearest) / model.speed + model.drive.duration
         if model.chain.ends == "periodic" and passed < model.end:
             warnings.append(

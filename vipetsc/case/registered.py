@@ -14,7 +14,9 @@ from vipetsc.wording import with_unit
 # Indentations in m at which the formulas of a law are compared with each other, and those of its onset.
 DEPTHS = np.geomspace(1e-6, 1e-3, 7)
 ONSET = np.array([1e-9, 1e-8])
-CLOSE = 1e-5  # relative difference of a derivative from a difference quotient
+# Relative difference of a derivative from a central difference quotient with a step of 1e-5 x. The quotient of a power
+# of x is exact to 1e-10, and a wrong factor or exponent in a formula differs by far more.
+CLOSE = 1e-5
 
 
 def check_parameters(
@@ -81,6 +83,7 @@ def check_law(law: Contact) -> str:
     if not ((force > 0).all() and (slope >= 0).all()):
         return "its force must be positive for x > 0, and must not fall"
 
+    # Relative to each indentation: these span three decades.
     step = 1e-5 * DEPTHS
     quotient = (law.elastic_force(DEPTHS + step) - law.elastic_force(DEPTHS - step)) / (2 * step)
     work = (law.elastic_energy(DEPTHS + step) - law.elastic_energy(DEPTHS - step)) / (2 * step)
@@ -93,6 +96,7 @@ def check_law(law: Contact) -> str:
             return f"its force at x = {DEPTHS[worst]:.3g} m is {values_there} as the differences of its energy"
 
     power = float(np.log10(onset[1] / onset[0]))
+    # 0.05 tells the exponents 1, 1.5 and 2 apart, and allows for terms of higher order at these indentations.
     if abs(power - law.onset_exponent) > 0.05:
         return f"its force begins as x^{power:.3g}, and onset_exponent is {law.onset_exponent:g}"
     return ""

@@ -75,6 +75,7 @@ def _preset_drive(defaults: Table, given: Table) -> Table:
 
 def _with_defaults(defaults: Table, given: Table) -> Table:
     """``given`` with the ``defaults`` that none of its keys replaces."""
+    # Both would contradict each other: a stiffness replaces the preset's material, a frequency its wavenumber.
     replaced = {key for choice in given.keys() & REPLACES.keys() for key in REPLACES[choice]}
     return {key: value for key, value in defaults.items() if key not in replaced} | given
 
@@ -296,6 +297,7 @@ def contact_frequency(lattice: LatticeTable, contacts: ContactsTable, speed: flo
     resolved = resolved_contacts(contacts, lattice)
     chain = build_chain(lattice, resolved)
     laws = laws_of_sites(resolved, len(chain.sites)) or (contact_of(resolved),) * len(chain.sites)
+    # A set, since sites of one kind have one duration, and each takes a quadrature.
     impacts = {*zip(laws, chain.reduced_masses(), strict=True)}
     return max((np.pi / law.impact_time(speed, mass) for law, mass in impacts), default=None)
 
@@ -303,6 +305,7 @@ def contact_frequency(lattice: LatticeTable, contacts: ContactsTable, speed: flo
 def _resolved_lattice(lattice: LatticeTable, cell: UnitCell, drive: DriveTable) -> LatticeTable:
     """The lattice with an absorbing end that suits the ``drive``, and with fitted dashpots."""
     update: dict[str, Any] = {}
+    # An end whose cells and strength are both given is taken as it is, whatever it reflects.
     absorbing = lattice.absorbing
     if absorbing and not (absorbing.cells and absorbing.strength):
         drives = build_drives(drive, Chain(cell, lattice.cells, lattice.ends))

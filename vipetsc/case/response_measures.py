@@ -7,7 +7,7 @@ from vipetsc.spectra.measures import JOINT
 from vipetsc.spectra.responses import LAYOUT, OUTPUTS
 
 RESPONSE = "response/"  # begins the names
-WAYS = ("transmitted", "reflected", "upper", "lost")
+FRACTIONS = ("transmitted", "reflected", "upper", "lost")
 WALLS = ("left", "right")
 OF_POINTS = tuple(f"{kind}_{of}" for kind in ("peak", "first") for of in ("displacement", "velocity", "acceleration"))
 
@@ -32,7 +32,7 @@ def response_measures(case: NfrcCase) -> dict[str, ResponseMeasure]:
     if sites:
         members |= {"largest": sites, "closed": sites}
     if case.nfrc.infinite:
-        members["share"] = list(WAYS)
+        members["share"] = list(FRACTIONS)
     if output.points:
         points = [point.name for point in output.points]
         members |= dict.fromkeys(OF_POINTS, points)

@@ -14,6 +14,7 @@ from vipetsc.case.named_files import MISSING
 from vipetsc.case.schema import Finite
 from vipetsc.io.names import path_named, readable
 
+# The resolved case holds the samples, and so does every result: so many are 5 MB of text and 0.6 s to read.
 MOST_SAMPLES = 100_000
 
 
@@ -57,6 +58,8 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
     key = f"{path}.samples.file"
     if {"time", "value"} & samples.keys():
         return drive, [Problem(key, samples["file"], "give it or time and value, not both")]
+    # The absolute path is recorded: the resolved case stands in a folder of results, relative to which the name is
+    # wrong.
     file = path_named(samples["file"]).resolve()
     try:
         rows = _read(file, samples.get("dataset"))

@@ -40,14 +40,17 @@ def once(values: list[Any]) -> list[Any]:
     return values
 
 
-MOST_CELLS = 10**12
+MOST_CELLS = 10**12  # products with masses and samples stay below 2^63, the largest index of an array
+# The resolved case lists the cell and the clearance of every site: a million are 39 MB of text and take 4 s to resolve.
 MOST_SITES = 10**6
-MOST_STRIDE = 10**9  # samples, cells or pixels; array indices hold no more than 2^63
+MOST_STRIDE = 10**9  # samples, cells or pixels; products of two stay below 2^63, the largest index of an array
 
 
 def _text(value: Any) -> Any:
     """PETSc's options are text; a case may give numbers and truth values."""
-    return str(value) if isinstance(value, bool | int | float) else value
+    if isinstance(value, bool | int | float):
+        return str(value)
+    return value
 
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -190,6 +193,7 @@ class LatticeTable(Section):
         if damping is None or not (damping.mass or damping.stiffness or damping.loss):
             return cell
 
+        # Both kinds of proportional damping, and the dashpots that the cell has itself, act in parallel: they add.
         fitted_grounding, fitted_dashpots = damping.fitted(cell)
         dashpots = np.multiply(damping.stiffness, [spring.stiffness for spring in cell.springs]) + fitted_dashpots
         springs = tuple(

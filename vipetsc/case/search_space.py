@@ -33,6 +33,7 @@ class SearchSpace:
         """The values (variable) of the case to begin with, or with other clearances in m, within the bounds."""
         values = [variable.start for variable in self.variables]
         if clearance:
+            # By either path: clearances vary one by one, or as the ends of a profile.
             at = {f"contacts.clearance[{i}]": gap for i, gap in enumerate(clearance, 1)}
             at |= {"contacts.clearance.first": clearance[0], "contacts.clearance.last": clearance[-1]}
             values = [at.get(variable.path, variable.start) for variable in self.variables]
@@ -59,6 +60,7 @@ class SearchSpace:
 
     def table_at(self, values: Iterable[float]) -> Table:
         """The table of the case with ``values`` (variable)."""
+        # Designs must not change the table of the case to begin with, which all of them are built from.
         table = copy.deepcopy(self.table)
         for variable, value in zip(self.variables, values, strict=True):
             put(table, variable.path, variable.in_case(value))
@@ -81,6 +83,7 @@ def search_space(bounds: VariablesTable, table: Table, base: Case) -> SearchSpac
 
     A variable of which the case has no number begins with NaN.
     """
+    # Variables with names come first: the order of a design's values in files does not depend on the keys that vary.
     rows = _named_rows(bounds, len(base.model().chain.sites))
     given = bounds.keys_of_case()
     table = _with_entries(table, base, [*(path for row in rows for path in row.paths), *given])

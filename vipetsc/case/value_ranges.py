@@ -9,9 +9,10 @@ import numpy as np
 from vipetsc.case.case_file import LARGEST, Problem, Table
 from vipetsc.case.disorder import SEED
 
+# Every rank lists the names of all members: 0.6 s and 70 MB for a million.
 MOST_MEMBERS = 1_000_000
 DIGITS = 12  # of numbers that a range is meant to meet
-ROUNDINGS = 8  # by which a value of a range may miss such a number
+ROUNDINGS = 8  # relative roundings by which a value of a range may miss such a number; geomspace misses it by up to 3.2
 RANGES = {"log", "linear", "whole"}  # the last one only in searches
 Values = dict[str, tuple[Any, ...]]  # the values of each key; an axis has those of keys that vary together
 
@@ -61,6 +62,7 @@ def values_in(value: Any) -> tuple[Any, ...]:
     if kind == "log":
         values = np.geomspace(first, last, count)
     largest = max(abs(first), abs(last))
+    # The names of members are hashes of their values: 5 and 4.999999999999999 would be two members.
     return tuple(_without_rounding(value, largest) for value in values.tolist())
 
 

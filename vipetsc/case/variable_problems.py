@@ -47,6 +47,7 @@ def variable_problems(bounds: VariablesTable, table: Table, base: Case) -> Itera
         if missing and not problems:
             remedy = "has no number in the case, at which the search would begin; give one there"
             problems.append(Problem(f"{AT}.{key}", given[key], remedy))
+        # One problem a key: the later checks meet what the first one has found, too.
         yield from problems[:1]
         paths += row.paths
 

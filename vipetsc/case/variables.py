@@ -79,6 +79,7 @@ class Variable(NamedTuple):
         if self.kind == "log":
             return float(np.log(value / self.low) / np.log(self.high / self.low))
         if self.kind == "choice":
+            # The middle of the interval that each choice has: choices are equally likely.
             return (value - 0.5) / self.high
         return (value - self.low) / (self.high - self.low)
 

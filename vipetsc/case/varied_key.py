@@ -7,7 +7,8 @@ from vipetsc.case.case_file import Problem, Table, put
 
 PARAMETERS = "amplitude", "frequency"
 SECTIONS = ("lattice", "contacts", "disorder")  # whose keys can vary along a curve
-# Places in the range at which the case is read before a curve is followed: a key that counts is invalid between them.
+# Positions in the range at which the case is read before a curve is followed. A key that takes whole numbers alone may
+# be valid at both ends of its range, and is invalid at an irrational position between them.
 TRIED = (0.0, 0.381966, 1.0)
 
 OVER_FREQUENCY = "sweeps and breathers are looked for over the frequency; omit them, or take curves over it"

@@ -21,7 +21,7 @@ VERB_CASES = (Case, Sweep, NnmCase, DesignCase, LawCase, OptimiseCase, PredictCa
 
 OF_SECTION = {kind.section: kind for kind in VERB_CASES if kind.section}
 SECTIONS: dict[str, type[Section]] = {name: table for kind in VERB_CASES for name, table in kind.sections().items()}
-"""Sections that a case file may have. A case reads those it declares and ignores the others."""
+"""Sections that a case file may have. A case reads those that it declares and ignores the others."""
 
 # Sections that mark a file as one of a run, or of verbs that consist of runs; normal modes read the others too.
 SECTIONS_OF_RUNS = {"disorder", "drive", "initial", "time", "output", "sweep", "optimise", "identify"}

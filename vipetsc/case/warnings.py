@@ -1,4 +1,4 @@
-"""Warnings about a run that is likely not meant: one sentence each, with numbers and what helps.
+"""Warnings about settings of a run that are probably unintended: one sentence each, with numbers and a remedy.
 
 Waves are those of the first drive, at its group velocity; what contacts send into other bands may be faster.
 """
@@ -15,19 +15,21 @@ from vipetsc.lattice import Chain, bloch, max_group_velocity, pass_bands, waves_
 from vipetsc.lattice.damped import KAPPAS, damped_bloch
 from vipetsc.lattice.drive import main_frequency, spectrum
 
-SLOW = 0.1  # of the band's fastest group velocity
-WAVELENGTHS = 4.0  # that a lattice should hold
-MISSED = 0.1  # of the loss asked, in the mean over the wavenumbers of a band
-TINY = 1e-6  # a loss that is none
-BRIEF = 0.1  # a contact's time over the sample interval
-MOST_ENERGY = 0.95  # of samples
-FAR = 3.0  # times the lattice's highest frequency, or that part of its lowest
-STEPS = 10.0  # of fixed length that a contact should take
+# Bounds of what is probably meant. They change no result: a warning that comes too seldom or too often costs a reader
+# a glance, so that they are round numbers.
+SLOW = 0.1  # fraction of the band's fastest group velocity
+WAVELENGTHS = 4.0  # in a lattice: its spectra over the wavenumber then have eight bins up to twice the driven one
+MISSED = 0.1  # relative deviation of a loss from the request, in the mean over the wavenumbers of a band
+TINY = 1e-6  # a loss ratio, or ratio of frequencies, that stands for 0
+BRIEF = 0.1  # duration of a contact over the sample interval
+MOST_ENERGY = 0.95  # fraction of the energy of samples
+FAR = 3.0  # ratio to the lattice's highest frequency, or of its lowest one
+STEPS = 10.0  # of fixed length in a contact: a half sine of ten points has its peak to 1 %
 DEFAULT_STEP = 0.05  # of 1/frequency: the first step of ``ts`` where -ts_dt does not give one
 
 
 def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str]) -> list[str]:
-    """The sentences about a run of ``model`` of which ``output`` is kept, with these options of PETSc."""
+    """The warnings about a run of ``model`` of which ``output`` is kept, with the options ``petsc`` of PETSc."""
     return [
         *wave_warnings(model),
         *length_warnings(model),
@@ -44,6 +46,7 @@ def losses(lattice: LatticeTable) -> np.ndarray:
     """
     if not (lattice.damping and lattice.damping.loss):
         return np.zeros((0, 4))
+    # A loss ratio is twice the damping ratio.
     loss = 2 * damped_bloch(lattice.unit_cell(), KAPPAS).ratio
     asked = [lattice.damping.loss.get(str(band + 1), np.nan) for band in range(loss.shape[1])]
     return np.column_stack([asked, loss.min(axis=0), loss.mean(axis=0), loss.max(axis=0)])
@@ -102,6 +105,8 @@ def unit_warnings(drives: DriveTable, chain: Chain) -> Iterator[str]:
         samples = drive.samples
         if samples is None:
             continue
+        # The band that holds most of the energy, not the largest line: one line of noise may be larger than a broad
+        # spectrum.
         frequency, content = spectrum(samples.time, samples.value)
         energy = np.cumsum(content**2)
         least, most = np.interp([1 - MOST_ENERGY, MOST_ENERGY], energy / energy[-1], frequency)

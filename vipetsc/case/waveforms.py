@@ -21,9 +21,10 @@ from vipetsc.plugins import call
 from vipetsc.register import PARTS, WAVEFORM, Parameter, PartError, WaveformPart, reserve
 from vipetsc.wording import counted
 
-CYCLES = 30  # of a burst, where they are not given
-RAMP_PERIODS = 10  # of a harmonic drive's ramp, where it is not given
-RAMP_FRACTION = 0.1  # of a chirp's duration that its ramp takes, where it is not given
+# Defaults of keys.
+CYCLES = 30  # of a burst, as in the paper
+RAMP_PERIODS = 10  # of a harmonic drive's ramp: its transient lies mostly within a tenth of its frequency
+RAMP_FRACTION = 0.1  # of a chirp's duration, at either end: eight tenths of its band have the full amplitude
 
 
 class WaveformRecord(NamedTuple):
@@ -173,6 +174,7 @@ def waveform_record(name: str) -> WaveformRecord:
         return [given[key] for key in part.parameters]
 
     def build(drive: "OneDrive") -> Waveform:
+        # A user's function may return anything: what it returns is checked here, where the file can be named.
         built = call(part, part.function, drive, *numbers(drive))
         if not isinstance(built, get_args(Waveform)):
             returned = f"the waveform {part.name!r} of {part.file} returns {built!r}"

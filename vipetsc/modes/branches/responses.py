@@ -10,7 +10,7 @@ import numpy as np
 
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
-from vipetsc.case.response_measures import WALLS, WAYS
+from vipetsc.case.response_measures import FRACTIONS, WALLS
 from vipetsc.io.branch_kinds import RESPONSES
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.lattice import ModalCompliance, WaveCompliance, nonlinear_places
@@ -156,7 +156,7 @@ def _axes(case: NfrcCase) -> Variables:
     axes = {
         "site": variable("site", np.array(chain.sites) + 1, "1", "cell of the site, counted from 1"),
         "order": variable("order", orders, "1", "harmonic"),
-        "way": variable("way", np.array(WAYS), "1", "destination of the energy"),
+        "way": variable("way", np.array(FRACTIONS), "1", "destination of the energy"),
         "clearance": variable("site", np.array(chain.clearances), "m", "clearance"),
     }
 
