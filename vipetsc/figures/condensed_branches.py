@@ -19,9 +19,12 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice import pass_bands
 
 COLOURS = style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE
-SMALLEST = 1e-12  # of the largest displacement, that the shape's axis shows
-NARROW = 3.0  # ratio of the energies' ends below which the axis is linear
-DECADES = 30.0  # ratio above which only powers of ten are labelled
+# Fraction of the largest displacement that the shape's axis shows: localised motions decay to rounding, 1e-16.
+SMALLEST = 1e-12
+# Ratios of the largest to the smallest energy: below the first a logarithmic axis would have one label, above the
+# second labels at 2 and 5 between the powers of ten would touch.
+NARROW = 3.0
+DECADES = 30.0
 
 
 def condensed_branches(paths: Sequence[Path]) -> Figure:
@@ -65,6 +68,7 @@ def _draw_frequency(axes: Axes, branch: xr.Dataset) -> None:
     energy = branch["energy"].values
     frequency = branch["frequency"].values
     draw_branch(axes, branch, width=1.0)
+    # A curve of one point is no line.
     if len(energy) == 1:
         axes.plot(energy, frequency, ".", color=style.BLACK)
 
@@ -85,6 +89,7 @@ def _shade_pass_bands(axes: Axes, case: NnmCase) -> None:
     limits = axes.get_ylim()
     for band in pass_bands(case.lattice.unit_cell()):
         axes.axhspan(band.low / (2 * np.pi), band.high / (2 * np.pi), color=style.PALE, lw=0, zorder=0)
+    # A pass band far from the branch must not squeeze the curve.
     axes.set_ylim(limits)
 
 

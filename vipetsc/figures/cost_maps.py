@@ -15,8 +15,10 @@ TITLES = {"deflection": "Deflection", "group_velocity": "Group velocity", "weigh
 LABELS = {"deflection": "max w (1)", "group_velocity": "Σ max |v$_g$| (cells/s)", "weighted": "cost (cells/s)"}
 SYMBOLS = {"lambda": "λ", "eta": "η"}
 MASSES = ("$u_1$", "$u_2$", "$u_3$, negative if out of phase with $u_2$", "$u_4$")
-LINES = 10  # values of the parameter that is followed
-HEADROOM = 1.9  # frequencies are shown up to this many times the best cell's highest
+LINES = 10  # values of the parameter that is followed: neighbouring colours of the scale can be told apart
+# Frequencies are shown up to this many times the highest one of the best cell: some cells of the grid have bands
+# that are many times higher, and would press all others together.
+HEADROOM = 1.9
 
 
 def deflections(search: xr.Dataset) -> Figure:
@@ -28,6 +30,7 @@ def deflections(search: xr.Dataset) -> Figure:
         cell = optimum.isel(reading=i, band=j)
         deflection = cell["optimum_deflection"].values
         amplitude = cell["optimum_amplitude"].values.copy()
+        # Amplitudes are moduli: the sign shows whether the resonator moves against its host.
         amplitude[:, 2] = np.where(deflection > 0, -amplitude[:, 2], amplitude[:, 2])
 
         axes.axhline(0, color=style.GREY, lw=0.5)
@@ -41,6 +44,7 @@ def deflections(search: xr.Dataset) -> Figure:
 
     label_panels(grid)
     grid[0, 0].set(xlim=(0, 1), xticks=(0, 0.5, 1))
+    # Room above the panels for the legend, which constrained layout does not place outside the grid.
     figure.get_layout_engine().set(rect=(0, 0, 1, 1 - 0.22 / figure.get_figheight()))
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="upper center", ncols=5)
     return figure
@@ -108,6 +112,7 @@ def dispersions(search: xr.Dataset, along: str, other: str) -> Figure:
         result = search.isel(reading=i)
         best = _best_cell(result)
         last = search.sizes[other] - 1
+        # An optimum at the edge of the search is the first or the last column already.
         middle = best[other] if 0 < best[other] < last else last // 2
 
         top = HEADROOM * float(result["frequency"].isel(best).max()) / 1e3

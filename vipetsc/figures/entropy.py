@@ -24,9 +24,9 @@ from vipetsc.wording import counted
 AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "joint"}
 COLOURS = {"energy_weighted": style.BLUE, "masked": style.VERMILION, "joint": style.GREEN}
 FACETS = ("reading", "wavenumber")
-SPAN = 4e-3, 40.0  # of the logarithmic axes: room for what is written above the peak
-FEWEST = 4  # amplitudes that show a peak and a power law
-MOST_COLUMNS = 3  # of histories
+SPAN = 4e-3, 40.0  # limits of logarithmic axes of values from 0.01 to 1: room for the text above the peak
+FEWEST = 4  # amplitudes: the least by which a peak and a power law beyond it can be seen
+MOST_COLUMNS = 3  # of histories: each is then as wide as a third of a page
 FIT_VALUES = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r2_nonlinear")
 
 
@@ -51,7 +51,7 @@ class EntropyCurve(NamedTuple):
         if valid.sum() < 2 or np.ptp(value) == 0:
             return None
 
-        # Of normalised values, which lie between 0.01 and 1.
+        # The deviation and the quantiles are scaled as ``normalised`` scales the values, to between 0.01 and 1.
         scale = 0.99 / np.ptp(value)
         ends = band_of(row, f"entropy/{average}")
         return cls(
@@ -135,6 +135,7 @@ def _facets(sweeps: Sweeps, names: Collection[str] = FACETS, needs: str = "entro
     for ensemble in measured:
         if needs in ensemble:
             others = [name for name in axes_of(ensemble) if name != AMPLITUDE]
+            # The case may list amplitudes in any order, and a curve needs them rising.
             ordered = ensemble.sortby(AMPLITUDE)
             indices = np.ndindex(*(ensemble.sizes[name] for name in others))
             rows = (ordered.isel(dict(zip(others, index, strict=True))) for index in indices)
@@ -268,6 +269,7 @@ def _draw_log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float) 
     fit = curve.fit
     doubts = doubt(fit["points"], fit["r2_log_log"])
     if not doubts:
+        # The fit was of these points; an amplitude read from a file may differ from its attribute by rounding.
         x = amplitude[amplitude >= fit["peak_amplitude"] * (1 - 1e-9)]
         label = "power law, adjusted R² (nonlinear fit)"
         axes.plot(x, fit["factor"] * x ** fit["exponent"], color=style.BLACK, lw=2.0, zorder=4, label=label)
@@ -330,6 +332,7 @@ def _draw_history(axes: Axes, row: xr.Dataset, norm: Normalize) -> QuadMesh:
     touched = row["contact_episodes"].values > 0
     if touched.any() and not touched.all():
         first = int(np.argmax(touched))
+        # Between the last member without contact and the first one with it, halfway on the logarithmic axis.
         onset = np.sqrt(amplitude[first - 1] * amplitude[first])
         axes.axhline(onset, color="white", lw=0.8, ls=":")
     return image

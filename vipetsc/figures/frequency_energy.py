@@ -41,7 +41,9 @@ MARKS = {
     "period-doubling": ("v", "period doubling"),
 }
 HOLLOW = {"mfc": "white", "mec": style.BLACK, "mew": 0.6, "zorder": 4}
-MOST_MARKS = 12  # with more special points, tongues are labelled by their resonance instead, at their highest fold
+# Special points that are marked. A branch through many tongues has hundreds, whose marks would hide the curve: there
+# the tongues are labelled by their resonance instead, at their highest fold.
+MOST_MARKS = 12
 LABELLED_TONGUES = 3, 5  # k of k:1; later ones crowd together
 LEAST_DIFFERENCE = 1e-17  # shown in place of 0, which a logarithmic axis has not: below all rounding
 
@@ -56,8 +58,10 @@ INSET = (0.41, 0.36)
 SHRINKING = (1.0, 0.85, 0.7)
 MARGINS = (0.13, 0.1), (0.03, 0.07)  # left and below, right and above
 LEGEND = (0.45, 0.6)  # the upper left corner beyond which the legend is
-PLACES = 17  # along either axis that are tried
-CURVE_POINTS = 4000  # of the curve that the inset is kept off
+# Positions along either axis that are tried for the inset, and points of the curve that it is kept off: neighbouring
+# positions differ by 3 % of the axes, and points by less than that is wide.
+PLACES = 17
+CURVE_POINTS = 4000
 
 
 def backbone(paths: Sequence[Path]) -> Figure:
@@ -232,6 +236,7 @@ def flow_differences(axes: Axes, branch: xr.Dataset) -> None:
     for name, colour in zip(flows, (style.VERMILION, style.GREEN, style.PURPLE), strict=False):
         energy = branch[f"flows/{name}/energy"]
         for key, face in (("frequency", colour), ("energy", "white")):
+            # Flows that agree to the last bit differ by 0, which would be missing from the panel.
             difference = np.maximum(np.abs(branch[f"flows/{name}/{key}_difference"].values), LEAST_DIFFERENCE)
             look = {"ms": 2.2, "mec": colour, "mfc": face, "mew": 0.5}
             axes.loglog(energy, difference, "o", label=f"{name}: {key}", **look)
@@ -281,6 +286,7 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     frequency = branch["frequency"].values
     folds = np.nonzero(branch["kind"].values == "fold-energy")[0]
     last = int(folds[-1]) if folds.size else first
+    # A tenth beyond the fold the branch has its trend again, which the panel shows.
     last += int(np.searchsorted(frequency[last:], frequency[last] * 1.1))
     last = min(max(last, first + 3), len(energy) - 1)
     near = branch.isel(point=slice(max(first - 1, 0), last + 1))
@@ -306,6 +312,8 @@ def _free_place(axes: Axes, curve: np.ndarray) -> tuple[float, float, float, flo
     along = np.linspace(0.0, position[-1], CURVE_POINTS)
     points = np.column_stack([np.interp(along, position, values) for values in corners.T])
 
+    # From the lower right corner on and from the largest size down: the first position that covers nothing is the
+    # best.
     least = (len(points) + 1, (0.0, 0.0, *INSET))
     for scale in SHRINKING:
         size = scale * np.array(INSET)

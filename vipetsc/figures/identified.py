@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.figures import panels, style
 
-MOST_CHANNELS = 8  # on a page
-MOST_NAMES = 12  # parameters whose correlations are written into the cells
-MOST_LAGS = 40
+MOST_CHANNELS = 8  # on a page, which is 15 inches high then
+MOST_NAMES = 12  # parameters whose correlations are written into the cells: numbers of more would overlap
+MOST_LAGS = 40  # samples over which residuals of neglected physics are correlated: a few periods of the record
 
 
 def record_and_model(identified: xr.Dataset) -> Figure:
@@ -47,6 +47,7 @@ def residual_correlations(identified: xr.Dataset) -> Figure:
     for number, panel in enumerate(axes):
         chosen = identified["data/channel"].values == number
         residuals = identified["data/measured"].values[chosen] - identified["data/model"].values[chosen]
+        # An offset would correlate all lags and hide what varies.
         residuals = residuals - residuals.mean()
         lags = np.arange(1, min(MOST_LAGS, len(residuals) // 2) + 1)
         values = np.array([residuals[lag:] @ residuals[:-lag] for lag in lags])
@@ -122,6 +123,7 @@ def parameter_correlation(identified: xr.Dataset) -> Figure:
             value = float(identified["correlation"].values[row, column])
             matrix.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=4.5)
 
+    # A direction that the record does not determine has a singular value of 0 and no error that an axis could show.
     singular = np.maximum(identified["singular"].values, 1e-6)
     directions.semilogy(identified["direction"].values, 1 / singular, "o", color=style.BLUE, ms=4)
     directions.axhline(0.5, color=style.GREY, lw=0.7, ls=style.DASHED)

@@ -12,7 +12,10 @@ from vipetsc.figures import panels, style
 from vipetsc.io.read import field_time
 
 MOST_ROWS = 16  # sites with a row of their own
-MOST_MARKERS = 2000  # episodes with a marker of their own
+# Episodes with a marker of their own. More cover each other, and cost more: 8,000 markers take as long as the rest of
+# the picture, 16,000 twice as long.
+MOST_MARKERS = 2000
+# Rows and columns of the map in place of markers: a row is at least 0.02 inches high, as a site must be to be seen.
 MAP_ROWS = 150
 MAP_COLUMNS = 300
 MOST_LABELS = 12  # of sites next to a map
@@ -108,6 +111,7 @@ def _draw_indentation(axes: Axes, run: xr.Dataset, model: Model) -> None:
 def _draw_markers(axes: Axes, episodes: Episodes) -> None:
     """Draw a triangle at the onset of every episode, those of the two sides a little above and below their row."""
     norm = panels.log_norm(episodes.speed, decades=2)
+    # Shifted, since both stops of a site may be struck within the width of a marker.
     for side, marker, shift in ((1, "^", 0.13), (-1, "v", -0.13)):
         at = episodes.side == side
         heights = episodes.site[at] + shift
@@ -164,6 +168,7 @@ def _draw_bars(axes: Axes, episodes: Episodes, has_rows: bool, force: np.ndarray
         axes.set(title="(b) Episodes", xlabel="Episodes")
 
     colour = style.VERMILION if loss.any() else style.BLUE
+    # Bars of many sites touch each other, so that they form a profile.
     height = 0.6 if has_rows else 1.0
     row = axes.barh(episodes.rows, length, height, color=colour)
     room = 1.05

@@ -44,6 +44,7 @@ def _draw_sites(axes: Axes, chain: Chain, gaps: Gaps) -> None:
         texts = [_gap_label(plus, minus) for plus, minus in gaps]
     else:
         texts = [f"{1e3 * clearance:#.3g}" for clearance in chain.clearances]
+    # From the left on: sites are sorted, and the first of a group has the label.
     last_labelled = -np.inf
     for site, text in sorted(zip(chain.sites, texts, strict=True)):
         axes.add_patch(Rectangle((site + 1 - width / 2, 0), width, 1, fc=style.VERMILION, lw=0))

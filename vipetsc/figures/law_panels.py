@@ -47,6 +47,7 @@ def law(data: xr.Dataset) -> Figure:
         sums_to_one = "T + R + U + L + D + rest = 1"
     _draw_bands(by_band, data)
     for name in ("transmitted", "upper"):
+        # Over z - 1, since over z the onset is a vertical line.
         _draw_curve(onset, z - 1, _curve(data, name), ENERGIES[name])
     efficiency = data["efficiency"].values
     positive = np.where(efficiency > 0, efficiency, np.nan)
@@ -90,6 +91,7 @@ def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
         for direction, marks in MARKS.items():
             j = directions.index(direction)
             value = data["share"].values[:, i, j]
+            # Below the floor a curve would be a line of noise across the panel.
             curve = LawCurve(np.where(value > FLOOR, value, np.nan), data["share_scatter"].values[:, i, j])
             label = f"band {number}" if direction == "forward" else None
             _draw_curve(axes, z, curve, {"label": label, **style.band_look(number), **marks})

@@ -51,6 +51,7 @@ class _Measurement:
         frame = self._axes.get_window_extent(renderer).get_points()
 
         ticks = [axis.get_majorticklocs().tolist() for axis in (self._axes.xaxis, self._axes.yaxis)]
+        # The labels' texts follow from the ticks, and their sizes from the texts.
         if ticks != self._ticks:
             box = type(self._axes).get_tightbbox(self._axes, renderer, **options)
             self._around = box.get_points() - frame

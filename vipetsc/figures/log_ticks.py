@@ -7,18 +7,21 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogFormatter, LogLocator, MaxNLocator, NullFormatter
 
-LEAST_TICKS = 3
+LEAST_TICKS = 3  # two labels do not tell a logarithmic axis from a linear one
 MOST_TICKS = 8
-LETTER = 0.062  # inches of a letter of a tick's label
-LINE = 0.14  # inches of its height
+LETTER = 0.062  # width in inches of a letter of a tick's label, in the type of the house style
+LINE = 0.14  # height in inches of a tick's label
 PLAIN = 1e-3, 1e4  # numbers that need no power of ten
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-PART = 0.8  # of the room of axes before they are laid out, that is left for what they show
+# Fraction of the room of axes before they are laid out that is left once their labels stand: ticks are chosen before
+# the layout, which depends on them.
+PART = 0.8
 
 
 def log_ticks(low: float, high: float) -> list[float]:
     """Return three numbers or more between ``low`` and ``high``, both positive, for a logarithmic scale."""
     exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    # The roundest numbers first, finer ones only where these are too few.
     for steps in ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 5, 7)):
         ticks = [step * 10.0**exponent for exponent in exponents for step in steps]
         inside = [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]

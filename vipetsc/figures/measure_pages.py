@@ -31,8 +31,8 @@ from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import over_samples
 from vipetsc.wording import with_unit
 
-MOST_PAGES = 12  # of a measure; a longer study is cut through its largest value
-BAND = "band"  # how those begin that are pass bands
+MOST_PAGES = 12  # of a measure, as many as a reader turns over; a longer study is cut through its largest value
+BAND = "band"  # begins the names of those parts of the frequency axis that are pass bands
 LONGEST_STEM = 150  # letters: file systems take 255, and figures of a report have prefixes
 
 # About the members and their accuracy, not about the lattice's motion.
@@ -79,6 +79,7 @@ class Measure(NamedTuple):
         place: dict[str, Any] = {}
         if PART in values.dims:
             numbers, bands = _bands_of(values)
+            # Gaps and what lies above the bands are left out: a transfer is one between pass bands.
             place[PART] = numbers
             axes += [bands]
         # Axes of one value have no part in a picture.
@@ -236,6 +237,7 @@ def _pages_over_keys(measure: Measure, heading: str, stem: str, others: Sequence
     cut = ""
     if len(places) > MOST_PAGES:
         best = measure.largest()
+        # One page rather than none: the largest value is what a search over so many keys is for.
         places = [{dimension: best[dimension] for dimension in dimensions}]
         cut = "through the largest value: "
 
@@ -263,6 +265,7 @@ def _samples_page(ensemble: xr.Dataset, measure: Measure, heading: str) -> Figur
 
     labels = []
     for name, samples in zip(names, series, strict=True):
+        # The quantiles of the band that curves over keys have.
         low, high = np.nanquantile(samples, (0.05, 0.95))
         labels.append(f"{name}mean {np.nanmean(samples):.4g}, 5 to 95 % of samples: {low:.4g} to {high:.4g}")
     page = MeasurePage(measure.label, [heading, f"of {measure.samples} samples"], labels)
@@ -301,6 +304,7 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAx
         marked = measure.place_text({axis.dimension: best[axis.dimension] for axis in roles.panels})
     if roles.y:
         fields = [panel.values.transpose(roles.y.dimension, roles.x.dimension).values for panel in panels.values()]
+        # The ring is on the panel of the largest value, which another page may hold.
         ring = None
         if marked is not None:
             ring = LargestOnMap(best[roles.x.dimension], best[roles.y.dimension], list(panels).index(marked))

@@ -28,8 +28,10 @@ MOST_TICKS = 8  # values of a key that are all ticks
 SIDES = 0.9  # inches of a page's width that its labels and its colour bar take
 PANEL_HEIGHT = 1.4  # inches, at least
 USED = 0.85  # of an axis that lies between the first and the last position
-LOG_RATIO = 100.0  # of the largest over the smallest value of a measure on a logarithmic scale
-CONTOURS = 6, 3  # at most, of a map alone and of one of several
+# Ratio of the largest to the smallest value of a measure above which its scale is logarithmic: on a linear one the
+# lower of its two decades would be a tenth of the axis.
+LOG_RATIO = 100.0
+CONTOURS = 6, 3  # at most, of a map alone and of one of several, whose labels have less room
 BAND = "band "
 TOGETHER = "band\u00a0"  # no line ends between a band and its number
 
@@ -78,6 +80,7 @@ class MeasurePage:
         """Make the page with a panel for each of ``titles``, in ``columns`` if these are few."""
         count = len(titles)
         if not 0 < columns <= MOST_COLUMNS:
+            # As few rows as possible, and these equally long: five panels are three and two, not four and one.
             columns = -(-count // -(-count // MOST_COLUMNS))
         rows = -(-count // columns)
         self.width = style.PAGE
@@ -150,6 +153,7 @@ class MeasurePage:
         if finite.min() > 0 and finite.max() > LOG_RATIO * finite.min():
             first.set_yscale("log")
             label_log_axis(first.yaxis, float(finite.min()), float(finite.max()), USED * PANEL_HEIGHT)
+        # From 0 on where that costs less than half of the axis: ratios can then be read off.
         elif 0 <= finite.min() < 0.5 * finite.max():
             first.set_ylim(bottom=0)
 
@@ -167,6 +171,7 @@ class MeasurePage:
 
 def draw_curves(axes: Axes, x: SweptAxis, curves: Sequence[Curve], ring: tuple[int, float] | None) -> None:
     """Draw ``curves`` over ``x``, points alone over categories, and a ``ring`` at an index and value."""
+    # A key's values may stand in any order in the case.
     order = np.argsort(x.positions, kind="stable")
     for curve in curves:
         shift = 0.0
@@ -235,6 +240,7 @@ def draw_maps(
 
     if ring:
         at = x.positions[ring.x], y.positions[ring.y]
+        # White below the red, so that the ring is seen on any colour of the map.
         for colour, thickness in (("white", 2.2), (style.RED, 1.2)):
             page.panels[ring.panel].plot(*at, "o", mfc="none", mec=colour, mew=thickness, ms=9)
     page.label_axes(x, y.label)
@@ -268,6 +274,7 @@ def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray,
     levels = [level for level in locator.tick_values(norm.vmin, norm.vmax) if finite.min() < level < finite.max()]
     if not levels:
         return
+    # The map is dark up to about 0.6 of its scale.
     colours = ["white" if norm(level) < 0.6 else "black" for level in levels]
     lines = axes.contour(x, y, np.ma.masked_invalid(values), levels=levels, colors=colours, linewidths=0.6)
     axes.clabel(lines, fmt="%.3g", fontsize=6)

@@ -7,8 +7,8 @@ from typing import NamedTuple, Self
 from vipetsc.figures.swept_axes import SweptAxis
 
 MOST_CURVES = 6  # of a panel: as many as there are markers
-MOST_PANELS = 16  # of a page
-LEAST_ON_A_MAP = 3  # values of a number that is an axis of a map
+MOST_PANELS = 16  # of a page: four by four are an inch and a half wide each
+LEAST_ON_A_MAP = 3  # values of a number that is an axis of a map; two values are compared better as curves
 PART = "part"  # the dimension of parts of the frequency axis
 
 
@@ -35,6 +35,8 @@ class Roles(NamedTuple):
     @classmethod
     def of(cls, axes: Sequence[SweptAxis]) -> Self:
         """Return the roles of ``axes``, of which there is at least one."""
+        # The axis with most values is the one that a reader follows; a stable sort keeps the case's order of equal
+        # ones.
         longest_first = sorted(axes, key=lambda axis: -axis.size)
         numbers = [axis for axis in longest_first if axis.is_number]
         of_a_map = [axis for axis in numbers if axis.size >= LEAST_ON_A_MAP]

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
 
-LEAST = 1e-4  # of the largest energy, at the end or in transfers, below which a gap is not drawn
-MOST_ROWS = 24  # sites of a matrix; of more, those with the largest transfers
-MOST_TICKS = 6  # of sites next to the raster of impacts
+LEAST = 1e-4  # of the largest energy, at the end or in transfers, below which a gap is not drawn: its line is flat
+MOST_ROWS = 24  # sites of a matrix, whose rows are a letter high then; of more, those with the largest transfers
+MOST_TICKS = 6  # of sites next to the raster of impacts, which is an inch high
 SEVERAL = "several"  # sites in contact between the same samples
 
 
@@ -37,6 +37,7 @@ class MovedEnergies(NamedTuple):
         # A cluster is of one site if the lowest and the highest of its episodes are the same.
         lowest = np.full(len(transfer), len(sites))
         highest = np.full(len(transfer), -1)
+        # Unbuffered: several episodes of a cluster change the same entry.
         np.minimum.at(lowest, cluster, site)
         np.maximum.at(highest, cluster, site)
         row = np.where(lowest == highest, lowest, len(sites))
@@ -68,6 +69,7 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 
     # Bands are always drawn, gaps where they have or had any energy to speak of.
     names = list(energy.attrs["parts"])
+    # A gap may have given back by the end all that it took.
     weight = np.maximum(energy.values[:, -1], np.abs(analysis["bands/transfer"].values).sum(axis=0))
     parts = [p for p, name in enumerate(names) if "band" in name or weight[p] > LEAST * largest]
     moved = MovedEnergies.of(run, analysis, parts)

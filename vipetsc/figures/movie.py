@@ -22,12 +22,12 @@ from vipetsc.figures.movie_frames import WIDTH, MovieFrames
 from vipetsc.io.atomic import atomic_write
 from vipetsc.lattice import UnitCell, bloch
 
-SHAPE = 9 / 16  # height over width
+SHAPE = 9 / 16  # height over width, that of screens
 INCHES = 8.0  # the width that type is set for
-DECADES = 4  # of energy that are shown
-FAINTEST = 0.05  # light that is shown
+DECADES = 4  # of energy that are shown, each on half an inch of the panel
+FAINTEST = 0.05  # light that is shown: less cannot be seen, and would change pixels that a GIF has to store
 LARGEST = 60.0  # area in square points of the dot of the wave with the most energy
-UNCHANGED = 255  # the colour of pixels of a GIF that stay as they are
+UNCHANGED = 255  # the colour of pixels of a GIF that stay as they are, the last one of 256
 REMEDY = "an MP4 needs ffmpeg: apt-get install --no-install-recommends ffmpeg, or pip install imageio-ffmpeg"
 
 
@@ -150,12 +150,14 @@ class MovieFigure:
         self._time.set_text(f"t = {now:.4f} s")
 
         if self._waves is not None:
+            # Over the largest of all frames: a dot that shrinks has lost energy.
             relative = content.waves[k].ravel() / (content.waves.max() or 1.0)
             level = np.log10(np.maximum(relative, 1e-30)) / DECADES + 1  # 1 of the largest, 0 of the least shown
             self._waves.set_sizes(LARGEST * np.maximum(level, 0.0) ** 2)
 
         for line, curve in self._growing:
             past = slice(0, int(np.searchsorted(curve.time, now, side="right")))
+            # Between samples, so that the line ends where the frame is.
             energy_now = np.interp(now, curve.time, curve.energy)
             line.set_data(np.append(curve.time[past], now), np.append(curve.energy[past], energy_now))
 
@@ -198,6 +200,7 @@ def _write_gif(movie: MovieFigure, rate: float, path: Path) -> None:
     palette = _palette(movie)
 
     def images() -> Iterator[Image.Image]:
+        # No pixel of the first frame has this index: all are stored.
         before: Any = -1
         for k in range(count):
             frame = Image.fromarray(movie.frame(k)[..., :3])

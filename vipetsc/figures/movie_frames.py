@@ -11,14 +11,15 @@ from vipetsc.figures import panels
 from vipetsc.io.read import field_time
 from vipetsc.lattice import Chain, UnitCell
 
-# Where none are asked for.
+# Defaults of a movie's options.
 LENGTH = 10.0  # s
-RATE = 15.0  # frames a second
+RATE = 15.0  # frames a second; fewer are seen one by one
 WIDTH = 960  # pixels
 
-MOST_FRAMES = 5000
+MOST_FRAMES = 5000  # five minutes at the default rate
+# Every frame transforms the motion of all shown cells, which are more than there are pixels.
 MOST_CELLS = 20_000
-FADE = 0.6  # of an impact's light from frame to frame
+FADE = 0.6  # factor of an impact's light from frame to frame: 0.4 s until it is too faint to be drawn
 
 
 class Shot(NamedTuple):
@@ -98,6 +99,7 @@ def _check_cells(run: xr.Dataset, shot: Shot) -> slice:
     if shot.cells and not recorded[0] <= first < last <= recorded[-1]:
         raise ValueError(f"--cells {first}:{last}: the run recorded cells {recorded[0]} to {recorded[-1]}")
 
+    # By number, since a run may have recorded every n-th cell.
     begin, end = np.searchsorted(recorded, (first, last + 1)).tolist()
     if end - begin > MOST_CELLS:
         raise ValueError(f"--movie: {end - begin} cells are more than {MOST_CELLS}; select some with --cells A:B")
@@ -190,6 +192,7 @@ def _flash(run: xr.Dataset, sites: np.ndarray, time: np.ndarray) -> np.ndarray:
     light = np.zeros(len(sites))
     for k, now in enumerate(time):
         struck = np.isin(sites, struck_cell[(onset > now - step) & (onset <= now)])
+        # An impact lasts less than a frame: without the afterglow most would be seen by nobody.
         light = np.where(struck, 1.0, FADE * light)
         flash[k] = light
     return flash
@@ -200,6 +203,7 @@ def _energies(run: xr.Dataset, analysis: xr.Dataset | None) -> BandEnergies:
     for name, axis in (("bands/modal_energy", "bands/instant"), ("bands/energy", "bands/sample")):
         if analysis is not None and name in analysis:
             names = np.array(analysis[name].attrs["parts"])
+            # Gaps hold no waves, and their lines would lie on the axis.
             is_band = np.char.startswith(names, "band")
             return BandEnergies(tuple(names[is_band]), analysis[axis].values, analysis[name].values[is_band])
 

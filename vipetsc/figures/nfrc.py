@@ -120,6 +120,7 @@ def largest_motions(branch: xr.Dataset) -> np.ndarray:
 def lag_of(branch: xr.Dataset) -> np.ndarray:
     """Return the phase (point,) in degrees of the fundamental of the first site, or spring, behind the drive."""
     name = "harmonics" if branch.sizes["site"] else "spring_harmonics"
+    # Index 1: harmonics count from the mean, which is number 0.
     fundamental = branch[name].values[:, 0, 1] + 1j * branch[f"{name}_imaginary"].values[:, 0, 1]
     lag = -np.degrees(np.unwrap(np.angle(fundamental)))
     # The first state lags by less than a turn.

@@ -250,6 +250,7 @@ def _draw_measure(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: in
 def _draw_energies(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase) -> None:
     """Draw bars of the energy in every band, and what was lost, of each design at the case's amplitude, or near it."""
     amplitudes = optimum["amplitude"].values
+    # By ratios: amplitudes of a curve are log-spaced.
     nearest = int(np.argmin(np.abs(np.log(amplitudes / plan.amplitude))))
     labels = [*(f"band {band}" for band in optimum["band"].values), "lost"]
 

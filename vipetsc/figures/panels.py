@@ -17,9 +17,11 @@ from vipetsc.case import Model
 from vipetsc.figures import style
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 
-DECADES = 5  # of energy that a map shows
-PIXELS = 600  # most rows and columns of a map: a printed page shows no more
-MOST_LINES = 30  # of sites in a map
+DECADES = 5  # of energy that a map shows: neighbouring decades are 50 of its 256 colours apart
+# Most rows and columns of a map: twice as many as the pixels of a panel at the resolution of the screen. A page of maps
+# takes 153 kB as a PDF; at half as many 117 kB, and blocks can be seen.
+PIXELS = 600
+MOST_LINES = 30  # of sites in a map; more lines would hide it
 ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii", "viii", "ix", "x", "xi", "xii")
 REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by number
 REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
@@ -71,6 +73,7 @@ def log_norm(*fields: ArrayLike, decades: float = DECADES) -> LogNorm:
 
     Fields without a largest value, since all of them vanish or one is not finite, have colours up to 1.
     """
+    # One largest value for all fields: what differs between their colours is energy.
     top = max(float(np.max(np.asarray(field))) for field in fields)
     if not (np.isfinite(top) and top > 0):
         top = 1.0
@@ -81,6 +84,7 @@ def percentile_norm(fields: Iterable[xr.DataArray]) -> Normalize:
     """Return colours from the 2nd to the 99.8th percentile of what is finite in the ``fields``."""
     values = np.concatenate([np.ravel(field) for field in fields])
     finite = values[np.isfinite(values)]
+    # Entropies have a few outliers at both ends, which would take most of the colours.
     low, high = np.percentile(finite if finite.size else 0, (2, 99.8))
     return Normalize(low, high if high > low else low + 1)
 
@@ -176,6 +180,7 @@ def dispersion_map(axes: Axes, spectrum: xr.DataArray, norm: Normalize, cell: Un
     wavenumber = spectrum["wavenumber"].values / np.pi
     frequency = spectrum["frequency"].values / 1e3
     image = draw_map(axes, wavenumber, frequency, spectrum.values.T, norm)
+    # One degree of phase a cell: the steepest branches are smooth.
     kappa = np.linspace(0, np.pi, 181)
     axes.plot(kappa / np.pi, bloch(cell, kappa).frequency / 1e3, color="white", lw=0.5, ls=(0, (4, 3)), alpha=0.75)
     axes.set(xlim=(0, wavenumber[-1]), ylim=(0, frequency[-1]), xlabel=KAPPA, ylabel=OMEGA)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from vipetsc.figures import panels, style
 
 LEAST = 1e-4  # of the work, the smallest energy shown
-MOST_SITES = 6  # with a name in the legend
+MOST_SITES = 6  # with a name in the legend: as many as there are dashes
 LOOKS: dict[str, dict[str, Any]] = {"predicted": {"lw": 1.2}, "simulated": {"ls": "", "marker": "o", "ms": 3.2}}
 LOSSES: dict[str, dict[str, Any]] = {
     "dissipated": {"label": "contacts", "color": style.BLACK, "ls": "-"},
@@ -34,6 +34,7 @@ def prediction(data: xr.Dataset) -> Figure:
 
     _draw_total(transferred, data, name)
     transferred.set(title=title, ylabel="Energy at the end / work", xscale="log", yscale="log")
+    # Members without contact transfer nothing; they would stretch the axis to rounding.
     transferred.set_ylim(max(LEAST, _least(data, name) / 1.5), None)
     _put_legend_above(transferred, columns=2)
 
@@ -61,6 +62,7 @@ def prediction(data: xr.Dataset) -> Figure:
     rms = data.attrs.get(f"rms_{name}")
     if rms is not None:
         transferred.set_title(f"{title}: rms {rms:.3f} decades")
+        # A lattice without dashpots has no such error.
         worst = max(data.attrs["worst_dissipated"], data.attrs.get("worst_dashpots", 0.0))
         dissipated.set_title(f"Dissipated: error at most {worst:.3f}")
     panels.label_panels(grid.ravel())
@@ -121,6 +123,7 @@ def _put_legend_above(axes: Axes, columns: int) -> None:
     entries = len(axes.get_legend_handles_labels()[0])
     room = MARGIN + ROW * -(-entries // columns)
     low, high = axes.get_ylim()
+    # The old range is then the fraction 1 - room of the new one, in logarithms.
     axes.set_ylim(low, high * (high / low) ** (room / (1 - room)))
     axes.legend(loc="upper left", ncols=columns, columnspacing=0.8, handlelength=style.DASHES_SEEN)
 

@@ -42,6 +42,7 @@ def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, 
 def _modules(folder: Path) -> list[str]:
     """The modules that the case of the results in ``folder`` names."""
     for pattern in RESULTS:
+        # All branches of a folder have one case: the first one stands for them.
         for path in sorted(folder.glob(pattern))[:1]:
             try:
                 case = tomllib.loads(root_attributes(path, "result").get("case", ""))

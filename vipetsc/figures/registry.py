@@ -45,7 +45,7 @@ from vipetsc.lattice import UnitCell
 from vipetsc.register import FIGURE, reserve
 
 NUMBER = re.compile(r"\d[\d.e+-]*")
-MOST_WARNINGS = 4  # below a picture
+MOST_WARNINGS = 4  # below a picture, whose strip must not be higher than its panels
 
 
 class FigureSpec(NamedTuple):
@@ -167,6 +167,7 @@ def figure_names(
     valid = [*measures, *specified]
     for name in names:
         if name not in valid:
+            # However far it is: to a reader who knows no name, a guess shows what names look like.
             (nearest,) = difflib.get_close_matches(name, valid, n=1, cutoff=0) or valid[:1]
             holder = source if source == BRANCHES else f"a {source}"
             listed = ", ".join(valid)
@@ -269,6 +270,7 @@ def _sweep_drawings(names: Sequence[str], folders: Sequence[Path], files: Files,
         spec = specs.get(name)
         offered = specified_drawings(spec, ensembles, files) if spec else _measure_drawings(name, ensembles, by_name)
         for drawing in offered:
+            # Two sweeps in one folder of pictures may offer one stem, and the second would replace the first.
             used[drawing.stem] = used.get(drawing.stem, 0) + 1
             count = used[drawing.stem]
             yield drawing if count == 1 else drawing._replace(stem=f"{drawing.stem}-no-{count}")

@@ -20,8 +20,8 @@ from vipetsc.figures.nfrc import draw_special, lag_of, largest_motions, paramete
 from vipetsc.figures.swept_axes import SweptKey
 from vipetsc.io.branch_kinds import RESPONSES, branch_kind
 
-MOST_LOCATIONS = 4  # that have a row of their own
-MOST_CURVES = 24  # of a legend; others have no line in it
+MOST_LOCATIONS = 4  # that have a row of their own: with the sites and the phase they fill the height of a page
+MOST_CURVES = 24  # of a legend, three inches; others have no line in it
 LEGEND_LINE = 0.13  # inches of a legend's line
 
 
@@ -88,6 +88,7 @@ def legend_of(curves: Sequence[xr.Dataset]) -> list[str]:
             part.append(text)
     texts = []
     for part, curve in zip(parts, curves, strict=True):
+        # An isolated curve has the keys of its main curve, from which only its number tells it.
         isola = curve.attrs.get("isola")
         named = [*part, f"isola {isola}"] if part and isola else part
         texts.append(", ".join(named) or str(curve.attrs["name"]))

@@ -53,6 +53,7 @@ def _draw_amplitude(axes: Axes, curve: xr.Dataset, quantity: str) -> None:
 def _draw_lag(axes: Axes, curve: xr.Dataset) -> None:
     """Draw the phase of each location's first harmonic behind the drive."""
     for number in range(curve.sizes["location"]):
+        # Files hold lags within one revolution: a curve through a resonance would jump across the panel.
         lag = np.degrees(np.unwrap(np.radians(curve["lag"].values[:, number])))
         _draw_states(axes, curve, lag, number)
     axes.set_ylabel("phase lag (degrees)")

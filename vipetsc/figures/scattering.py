@@ -24,7 +24,7 @@ BINS_KC = 6.0  # the wavelets of the bins
 SHOWN = 7  # bins whose maps are drawn
 EXPLAINED = 4  # bins in the picture that explains them
 BINS_DECADES = 4
-LEVEL = 0.003  # of the largest energy of any bin: where the contours lie
+LEVEL = 0.003  # of the largest energy of any bin: contours there enclose the packets, and not their tails
 FIELD = "partition/kinetic_energy"  # (bin, snapshot, cell)
 BLUR = 0.006, 0.01  # of all snapshots and cells: the carrier's beat is smoothed out before contours are drawn
 LEAST_WEIGHT = 1e-5  # of the largest: cells with less energy have no entropy
@@ -220,8 +220,10 @@ def _draw_contours(axes: Axes, member: MemberRun, colours: np.ndarray) -> None:
     field = member.analysis[FIELD].values
     cells = member.analysis["cell"].values
     time = member.analysis["partition/snapshot"].values
+    # A panel is 300 pixels high: contours through more rows cost time that nobody sees.
     step = max(1, len(cells) // 300)
     widths = np.multiply(BLUR, field.shape[1:])
+    # "nearest": at the edges of the record the energy goes on, and is not reflected.
     smooth = [gaussian_filter(energy, widths, mode="nearest")[:, ::step] for energy in field]
     level = LEVEL * max(float(energy.max()) for energy in smooth)
 
@@ -251,6 +253,7 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
         energies.plot(time, reconstructed / square, color=style.ORANGE, lw=0.8, ls="--", label="KE of the bins' sum")
         energies.plot(time, parts.sum(axis=0) / square, color=style.BLUE, lw=0.7, label="sum of the twelve KE")
 
+        # Before the wave comes both energies are 0, and so is their difference.
         errors.semilogy(time, np.where(error > 0, error, np.nan), lw=0.7)
         errors.axhline(0.01, color=style.VERMILION, lw=0.8, ls="--")
 

@@ -283,6 +283,8 @@ def _layout(cell: UnitCell) -> CellLayout:
     for spring in cell.springs:
         joined[spring.start, spring.end] |= not spring.next_cell
     through = next((s for s in cell.springs if s.next_cell), Spring(cell.dofs - 1, 0, 1.0, next_cell=True))
+    # Steps from where a wave comes in, and to where it leaves: a mass on the shortest chain has the least sum of
+    # both.
     ends = [through.end, through.start]
     passed, ahead = shortest_path(csr_array(joined), directed=False, unweighted=True, indices=ends)
 
@@ -299,6 +301,7 @@ def _layout(cell: UnitCell) -> CellLayout:
         x = PITCH * depth[mass] + extra * (1 + np.sign(depth[mass] - depth[cell.host]))
         on_line = passed[mass] + ahead[mass] == passed[through.start]
         y = 0.0 if on_line else -0.75 * PITCH
+        # Masses at one depth hang below each other.
         while (x, y) in centre.values():
             y -= 0.75 * PITCH
         centre[mass] = (x, y)
@@ -364,6 +367,7 @@ def _draw_spring(
     start = legs[longest, 0]
     along = legs[longest, 1] - start
     across = np.array([-along[1], along[0]]) / np.hypot(*along)
+    # Straight leads of a fifth at either end, and turning points between them.
     position = np.concatenate([[0, 0.2], 0.2 + 0.6 * (np.arange(2 * turns) + 0.5) / (2 * turns), [0.8, 1]])
     swing = np.zeros(len(position))
     swing[2:-2] = height * (-1.0) ** np.arange(2 * turns)

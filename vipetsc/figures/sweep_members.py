@@ -261,6 +261,7 @@ def _triples(ensemble: xr.Dataset) -> list[list[_MemberFolder]]:
     for group in grouped(members, configuration).values():
         if len(group) >= len(LEVELS):
             group.sort(key=lambda member: member.row[AMPLITUDE].item())
+            # The middle one by rank: amplitudes may be linear, logarithmic or a list.
             triples.append([group[0], group[len(group) // 2], group[-1]])
     return triples
 

@@ -13,11 +13,11 @@ from vipetsc.io.read import axes as axes_of
 from vipetsc.wording import with_unit
 
 FEW_TOGETHER = 6  # values of keys that vary together and stand as categories
-FRACTION_LIMIT = 36  # largest denominator of a wavenumber over pi that is written as a fraction
+FRACTION_LIMIT = 36  # largest denominator of a wavenumber over pi that is written as a fraction: 5 degrees of phase
 LONGEST = 24  # letters of a list that stands in a legend
-DIGITS = range(3, 18)  # of a number; as many as tell the values apart
+DIGITS = range(3, 18)  # of a number, as many as tell the values apart; 17 tell all doubles apart
 NO_BREAK = "\u00a0"  # the space between a value and its unit
-LEAST_RATIO = 5.0  # of a logarithmic axis, largest over smallest value
+LEAST_RATIO = 5.0  # of a logarithmic axis, largest over smallest value: over less the two scales look alike
 
 
 class SweptKey(NamedTuple):
@@ -46,6 +46,7 @@ class SweptKey(NamedTuple):
             return _number_texts(self.values)
         texts = [str(value) for value in self.values]
         shortened = [_shortened(text) for text in texts]
+        # Lists may differ beyond the letters that a legend has room for.
         if len(set(shortened)) < len(set(texts)):
             shortened = [f"{text} (no. {number})" for number, text in enumerate(shortened, 1)]
         return shortened
@@ -164,6 +165,7 @@ def _swept_key(values: xr.DataArray, case: dict[str, Any]) -> SweptKey:
 def even_scale(values: np.ndarray) -> str:
     """Return the scale, "linear" or "log", on which ``values`` lie more evenly."""
     ordered = np.unique(values)
+    # Two values are even on both scales.
     if len(ordered) < 3 or ordered[0] <= 0 or ordered[-1] < LEAST_RATIO * ordered[0]:
         return "linear"
     linear = np.diff(ordered)
@@ -181,6 +183,7 @@ def in_pi(wavenumber: float) -> str:
     """Return a wavenumber in rad/cell as 5π/9, or as a decimal where no such fraction is near."""
     multiple = float(wavenumber) / np.pi
     near = Fraction(multiple).limit_denominator(FRACTION_LIMIT)
+    # Fractions with small denominators are near any number: only one that is the number itself is written.
     if abs(float(near) - multiple) > 1e-6:
         return f"{multiple:.3f}π"
     text = "π"

@@ -49,8 +49,8 @@ MOST_COLUMNS = 4  # of dispersions
 MOST_PANELS = 12
 LETTERS = 14  # of their titles on an inch
 DECADES = 6  # below the total energy, that parts of it are shown over
-LARGEST_ERROR = 0.01
-LEAST_TOTAL = 1e-3  # of the largest total: the error is not judged below
+LARGEST_ERROR = 0.01  # of the sum of the parts, in the paper's terms 1 %
+LEAST_TOTAL = 1e-3  # of the largest total: below it the error of a sum of parts is that of the filters' tails
 
 
 def transfer(sweeps: Sweeps) -> Iterator[Drawing]:
@@ -137,6 +137,7 @@ def _draw_spectra(axes: Axes, member: MemberRun, velocity: np.ndarray) -> None:
     cell = member.model.chain.cell
     step = field_interval(member.run)
     frequency = 2e-3 * np.pi * np.fft.rfftfreq(len(velocity), step)  # krad/s
+    # Times the step: the transform approximates the integral over time, whatever the sample interval is.
     spectrum = np.abs(np.fft.rfft(velocity * taper(len(velocity), TAPER)[:, None], axis=0)) * step
     bands = pass_bands(cell)
     shown = frequency <= 1.1e-3 * bands[-1].high
@@ -151,6 +152,7 @@ def _draw_spectra(axes: Axes, member: MemberRun, velocity: np.ndarray) -> None:
     labels = [f"mass {mass + 1}{roles.get(mass, '')}" for mass in range(cell.dofs)]
     line = {"lw": 0.5, "alpha": 0.85, "rasterized": True}
     axes.plot(frequency[shown], np.maximum(spectrum[shown], 1e-300), label=labels, **line)
+    # A cell that the wave does not reach has a spectrum of zeros, and the axis needs a positive limit.
     peak = spectrum.max() or 1.0
     low = min(10.0**-panels.DECADES * peak, axes.get_ylim()[1])
     axes.set(yscale="log", xlim=(0, frequency[shown][-1]), ylim=(low, ROOM * peak))
@@ -282,6 +284,7 @@ def closing_error(parts: np.ndarray, total: np.ndarray, samples: int) -> np.ndar
     """
     samples = max(min(samples, len(total)), 1)
     energies = np.stack([parts.sum(axis=0), total])
+    # Means of both, then their difference: the error of a mean, not the mean of errors of either sign.
     together, whole = sliding_window_view(energies, samples, axis=1).mean(axis=2)
     above_threshold = whole > LEAST_TOTAL * whole.max()
     return np.divide(np.abs(together - whole), whole, out=np.full_like(whole, np.nan), where=above_threshold)
@@ -309,6 +312,7 @@ def energies_over_time(member: MemberRun) -> Figure:
     upper.set_title("(a) Parts of the frequency axis, mean over a period of the drive")
 
     error = closing_error(parts, total, samples)
+    # Sums that agree to the last bit would leave gaps in the curve.
     lower.plot(mean_time, 100 * np.maximum(error, 1e-12), lw=0.7)
     lower.axhline(100 * LARGEST_ERROR, color=style.VERMILION, lw=0.7, ls="--")
     whole_record = abs(parts.sum() / (total.sum() or 1.0) - 1)

@@ -34,9 +34,9 @@ from vipetsc.io.read import curves, field_interval, field_time
 from vipetsc.spectra import doubt
 
 MARKERS = "os^Dv"  # of configurations
-FEWEST = 6  # amplitudes that make a curve
-PERIODS = 10  # of the drive that a phase portrait shows
-REACH = 6  # times the amplitude of the peak, to which the linear panels go
+FEWEST = 6  # amplitudes that make a curve: below, at and beyond the peak, two each
+PERIODS = 10  # of the drive that a phase portrait shows: more turns would cover each other
+REACH = 6  # times the amplitude of the peak, to which the linear panels go; the logarithmic ones show the rest
 BACKBONE_LABEL = "Inter-band transfer, normalised slope (1)"
 
 
@@ -172,7 +172,7 @@ def _draw_sampled(axes: Axes, point: TransferCurve, look: _Look) -> None:
 
 
 def _mark_peak(axes: Axes, curve: TransferCurve, look: _Look, row: int) -> None:
-    """Draw a ring round the largest value, and write what it is in the text's line ``row``."""
+    """Mark the largest value by a ring, and write what it is in the text's line ``row``."""
     peak = curve.data["peak"]
     amplitude = np.asarray(curve.data[AMPLITUDE])[peak]
     largest = np.asarray(curve.data["ibtet"])[peak]
@@ -189,6 +189,7 @@ def ibtet_backbone(sweeps: Sweeps) -> Iterator[Drawing]:
             continue
         with open_netcdf(path, "backbone", ("case",)) as file:
             values = {**file.attrs, **{name: variable.values for name, variable in file.variables.items()}}
+        # The file stays when a sweep is computed again with another case: its curves are of the former one.
         if values["case"] != ensemble.attrs["case"]:
             continue
 
@@ -287,6 +288,7 @@ class ContactMotion(NamedTuple):
         displacement = motion["displacement"].values
         velocity = motion["velocity"].values
 
+        # The motion at its strongest: earlier the wave has not come, later it has left.
         middle = int(np.argmax(np.abs(displacement[:, 1] - displacement[:, 0])))
         half = round(PERIODS * np.pi / member.model.drive.frequency / field_interval(run))
         shown = slice(max(middle - half, 0), middle + half + 1)

@@ -65,6 +65,7 @@ def _reasons_of_branches(folders: Sequence[Path], files: Files, names: Sequence[
             branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
             of_branch = [branches] if spec.together else [[branch] for branch in branches]
             missing = [spec.without(shown) for shown in of_branch]
+            # One branch with a picture is enough: the figure is then not missing.
             reasons[name] = missing[0] if all(missing) else ""
     return reasons
 
@@ -86,6 +87,7 @@ def _reasons_of_sweeps(folders: Sequence[Path], files: Files, names: Sequence[st
             continue
 
         by_sweep = [_reason(ensemble, name, by_name=names is not None) for ensemble in ensembles]
+        # The sweeps are asked one by one: a measure that one of them has gives the figure pages.
         if all(by_sweep):
             reasons[name] = by_sweep[0]
     return reasons
