@@ -56,6 +56,15 @@ def test_the_exact_damping_meets_every_restitution():
     assert found == pytest.approx(asked, abs=1e-7)
 
 
+@pytest.mark.parametrize(("factor", "asked"), [("flores", 0.05), ("flores", 0.052), ("flores", 0.06)])
+def test_the_strongest_damping_parts_the_masses_where_its_force_vanishes(factor, asked):
+    contact = Contact("hertz", STIFFNESS, asked, factor=factor)
+    c = 1.6 * (1 - asked) / asked
+    # With 1 - c e = exp(-q) the equation has its root at q = c + 1 - log(1 + c), to terms of exp(-q).
+    expected = (1 - np.exp(np.log1p(c) - c - 1)) / c
+    assert contact.effective_restitution == pytest.approx(expected, rel=1e-10)
+
+
 def test_the_manual_has_a_table_of_effective_restitutions():
     lines = (Path(vipetsc.__file__).parent / "manual/case-file.md").read_text(encoding="utf-8").splitlines()
     first = next(number for number, line in enumerate(lines) if line.startswith("| restitution"))

@@ -239,6 +239,9 @@ class Contact:
         if c < 1e-6:
             return 1 - 2 * c / 3
         most = min(1.0, (1 - 1e-12) / c)
+        # Of strong damping the masses part at the speed at which the force vanishes, e = 1/c, to all digits sought.
+        if rebound(c, most) > 0:
+            return most
         return float(scipy.optimize.brentq(lambda e: rebound(c, e), 0.0, most))
 
     def dissipation_factor(self, rate: ArrayLike, approach: ArrayLike) -> np.ndarray:
