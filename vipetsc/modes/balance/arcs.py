@@ -37,7 +37,9 @@ def _crossings(motion: np.ndarray, offset: float, out: np.ndarray) -> int:
             continue
 
         # The search finds where a polynomial turns positive (2 if nowhere); downcrossings are those of its negative.
-        c[:] = b if not above else -b
+        c[:] = b
+        if above:
+            c[:] = -b
         begin = 0.0
         root = first_upcrossing(c)
         while root <= 1.0 and count < out.size:
@@ -71,11 +73,14 @@ def arcs(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
     if len(roots) % 2 and motion[0, 0] <= offset:
         # The motion comes down to the offset exactly at the period's end, whose value counts as below already.
         roots = np.append(roots, 2 * np.pi)
+    begins_above = motion[0, 0] > offset
     if len(roots) < 2:
-        return [(0.0, 2 * np.pi)] if motion[0, 0] > offset else []
+        if begins_above:
+            return [(0.0, 2 * np.pi)]
+        return []
 
     # A period ends as it began: crossings are even in number. If it begins above, the last one, upwards, comes first.
-    if motion[0, 0] > offset:
+    if begins_above:
         roots = np.concatenate([[roots[-1] - 2 * np.pi], roots[:-1]])
     return [(a, b) for a, b in zip(roots[::2].tolist(), roots[1::2].tolist(), strict=True) if b > a]
 
@@ -90,7 +95,11 @@ def minima(slope: np.ndarray) -> np.ndarray:
 
 def cut(a: float, b: float, places: np.ndarray) -> Iterator[tuple[float, float]]:
     """The interval from ``a`` to ``b``, cut at ``places`` of period 2 pi; a whole period stays whole."""
-    turns = np.concatenate([places - 2 * np.pi, places]) if b - a < 2 * np.pi else np.empty(0)
+    if b - a >= 2 * np.pi:
+        yield a, b
+        return
+    # An interval that contains phase 0 begins at a negative phase.
+    turns = np.concatenate([places - 2 * np.pi, places])
     inside = np.sort(turns[(turns > a) & (turns < b)]).tolist()
     yield from itertools.pairwise([a, *inside, b])
 
@@ -100,6 +109,7 @@ def common(
 ) -> Iterator[tuple[float, float]]:
     """The parts of ``pieces`` that lie in one of ``others``, both of period 2 pi."""
     for (a, b), (c, d), turn in itertools.product(pieces, others, (-2 * np.pi, 0.0, 2 * np.pi)):
-        low, high = max(a, c + turn), min(b, d + turn)
+        low = max(a, c + turn)
+        high = min(b, d + turn)
         if high > low:
             yield low, high

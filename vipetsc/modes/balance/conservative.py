@@ -114,7 +114,10 @@ class HarmonicFrame:
             energies = [balance.energy(*self.motion(xi + s * SLOPE_STEP * direction), self.shift) for s in (1, -1)]
             energy_tangent = (energies[0] - energies[1]) / (2 * SLOPE_STEP)
             by_frequency = direction[-1] * self.omega / (2 * np.pi)
-            slope = by_frequency / energy_tangent if energy_tangent else np.inf
+            # At a fold of the energy the branch is vertical.
+            slope = np.inf
+            if energy_tangent:
+                slope = by_frequency / energy_tangent
             period = 2 * np.pi / omega
             tangent = np.append(direction[:-1] * self.size, -direction[-1] * self.omega / (2 * np.pi) * period**2)
 
@@ -136,11 +139,15 @@ class HarmonicFrame:
 
     def _episodes(self, episodes: list[Episode]) -> int:
         """How often contacts close, or open if they are pressed at rest, in the arc that shooting would cover."""
-        end = np.pi / 2 if self.balance.forces.odd else np.pi
+        end = np.pi
+        if self.balance.forces.odd:
+            end = np.pi / 2
         middles: list[float] = []
         for pair, stops in enumerate(self.balance.forces.contacts):
             spans = [(episode.onset, episode.onset + episode.length) for episode in episodes if episode.pair == pair]
-            middles += [(begin + stop) / 2 for begin, stop in (_between(spans) if stops.is_pressed else spans)]
+            if stops.is_pressed:
+                spans = _between(spans)
+            middles += [(begin + stop) / 2 for begin, stop in spans]
 
         count = 0
         for middle in middles:
@@ -244,7 +251,9 @@ class ConservativeMotions:
             order = point.order
             frame = self.frame(point)
             x = self.resized(point.x, frame.balance)
-            row = np.append(0 * x, 1.0) if keep_frequency else unit(np.append(x, 0.0))
+            row = unit(np.append(x, 0.0))
+            if keep_frequency:
+                row = np.append(0 * x, 1.0)
             attempt = frame.solve(frame.xi, row, row @ frame.xi)
             if not attempt.converged:
                 why = f"{attempt.reason}; residuals {attempt.residuals}"
@@ -263,7 +272,10 @@ class ConservativeMotions:
         Raises ContinuationError where there is none with one harmonic, or none is reached by bringing in the others.
         """
         # A harmonic motion of forces that are odd has no mean, and the static compliance need not be there.
-        static, dynamic = self.compliance.at(np.array([omega if self.forces.odd else 0.0, omega]))
+        static_at = 0.0
+        if self.forces.odd:
+            static_at = omega
+        static, dynamic = self.compliance.at(np.array([static_at, omega]))
         z = np.zeros(len(signs))
         mean = np.zeros(len(signs))
         for place in np.nonzero(signs)[0].tolist():

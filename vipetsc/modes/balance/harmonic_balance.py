@@ -90,8 +90,12 @@ class HarmonicBalance:
         self.odd = odd
         self.cosines = cosines
         self.weight = weight
-        self.orders = np.arange(1, order + 1, 2) if odd else np.arange(order + 1)
-        self._sines = self.orders[:0] if cosines else self.orders[self.orders > 0]
+        self.orders = np.arange(order + 1)
+        if odd:
+            self.orders = np.arange(1, order + 1, 2)
+        self._sines = self.orders[self.orders > 0]
+        if cosines:
+            self._sines = self.orders[:0]
         self.size = forces.pairs * (len(self.orders) + len(self._sines))
         # The latest compliances and forces: Newton's method asks for the same ones several times.
         self._compliances: tuple[float, Compliances] | None = None
@@ -130,10 +134,14 @@ class HarmonicBalance:
         sizes = np.maximum(rates, LEAST_RATE * rates[-1])
         with np.errstate(divide="ignore", invalid="ignore"):
             values = self.compliance.at(rates)
-        if not np.all(np.isfinite(values)):  # on a linear mode
+        # On a linear mode the compliance is infinite, and the motion finite.
+        if not np.all(np.isfinite(values)):
             values = self.compliance.at(rates * (1 + DETUNING))
 
-        circle = RADIUS * NODES if np.isrealobj(values) else STEP * np.array([1.0, -1.0])
+        # A compliance that is real on the real axis has conjugate values above and below it: half a circle is enough.
+        circle = STEP * np.array([1.0, -1.0])
+        if np.isrealobj(values):
+            circle = RADIUS * NODES
         near = self.compliance.at((rates + sizes * circle[:, None]).ravel())
         values = np.concatenate([values[None], near.reshape(len(circle), *values.shape)])
         values[:, self.orders > 1] *= self.weight
@@ -144,6 +152,8 @@ class HarmonicBalance:
         g = self.compliances(omega).values[0]
         one = np.eye(self.forces.pairs)
         squared = np.maximum(self.orders, 1) ** 2
+        # At the highest order inertia alone counts: G = -1/(mass omega^2). Of the two signs of the stiffness the one
+        # that keeps 1 + s G farther from singular has the poles of G_s farther away.
         mass = 1 / (self.orders[-1] ** 2 * np.abs(np.trace(g[-1])) / self.weight / len(one))  # times omega^2
         size = (mass * squared)[:, None, None]
         plus, minus = (np.linalg.svd(one + sign * size * g, compute_uv=False)[:, -1] for sign in (1, -1))
@@ -208,7 +218,7 @@ class HarmonicBalance:
         two_sided[:, self.orders == 0] *= 0.5  # one-sided series have the mean once
         plus = two_sided[:, :, :count]
         minus = two_sided[:, :, count:]
-        sines = self.orders > 0 if len(self._sines) else self.orders < 0
+        sines = np.isin(self.orders, self._sines)
         columns = np.concatenate([plus + minus, 1j * (plus - minus)[:, :, sines]], axis=2)
         same = np.concatenate([np.eye(count), 1j * np.eye(count)[:, sines]], axis=1)
 

@@ -88,7 +88,9 @@ def _evaluate(z: np.ndarray, theta: np.ndarray, motion: np.ndarray) -> None:
             value = value * turn + z[k]
             slope = slope * turn + k * z[k]
             curvature = curvature * turn + k * k * z[k]
-        motion[i, 0], motion[i, 1], motion[i, 2] = value.real, -slope.imag, -curvature.real
+        motion[i, 0] = value.real
+        motion[i, 1] = -slope.imag
+        motion[i, 2] = -curvature.real
 
 
 @kernel
@@ -305,22 +307,27 @@ class SiteForces:
 
         ``motion`` (samples, 4) is that of the pair (``_sampled``), ``z`` (pairs, K + 1) are the harmonics.
         """
-        pair, side, a, length, _ = arc
+        pair = arc.pair
+        side = arc.side
         stops = self.contacts[pair]
         law = stops.law
-        clearance = stops.plus if side > 0 else stops.minus
         c = law.damping
-        at_onset = np.empty((1, 3))
-        _evaluate(z[pair], np.array([a]), at_onset)
-        approach = at_onset[0, 1]  # z'_minus in m/rad
-        bend = at_onset[0, 2] / at_onset[0, 1] if at_onset[0, 1] else 0.0
-        if c and length >= 2 * np.pi:
+        if c and arc.length >= 2 * np.pi:
             raise ArithmeticError("a dissipative contact never separates, so that it has no approach velocity")
+
+        # The slope z'_minus in m/rad with which the arc begins, and z''/z' there, 0 where the motion only touches.
+        at_onset = np.empty((1, 3))
+        _evaluate(z[pair], np.array([arc.onset]), at_onset)
+        approach = at_onset[0, 1]
+        bend = 0.0
+        if approach:
+            bend = at_onset[0, 2] / approach
         floored = c > 0 and abs(approach) * omega < law.approach_floor
         if floored:
             approach = side * law.approach_floor / omega
 
-        pieces = list(cut(a, a + length, minima(side * motion[:, 1])))
+        # Where the force is smooth: between minima of the indentation, and where the contact is not clipped.
+        pieces = list(cut(arc.onset, arc.onset + arc.length, minima(side * motion[:, 1])))
         if c and law.adhesion == "clip":
             # g > 0 where side z' > -side z'_minus/c = -|z'_minus|/c.
             pushing = arcs(np.ascontiguousarray(side * motion[:, 1:]), -side * approach / c)
@@ -329,9 +336,11 @@ class SiteForces:
         theta, weights = nodes(pieces, 2 * series.order)
         at_nodes = np.empty((len(theta), 3))
         _evaluate(z[pair], theta, at_nodes)
-        x = np.maximum(side * at_nodes[:, 0] - clearance, 0.0)
+        # An end that is found to rounding may leave its first node outside the contact.
+        x = np.maximum(side * at_nodes[:, 0] - stops.clearance_on(side), 0.0)
         rate = at_nodes[:, 1]
 
+        # f = side elastic(x) g(z'): of its derivatives that by z has the slope of the law, that by z' the slope of g.
         elastic = stops.weight * law.elastic_force(x)
         slope = stops.weight * law.elastic_slope(x)
         g = np.ones_like(rate)
@@ -342,9 +351,9 @@ class SiteForces:
         values = np.array([side * elastic * g, slope * g, per_rate, stops.weight * law.elastic_energy(x)])
         series.add(pair, theta, weights, values, rate)
 
+        # An onset that moves changes z'_minus, and with it the force of the whole arc; at the floor it does not.
         if c and not floored:
-            # An onset that moves changes z'_minus, and with it the force of the whole arc (at the floor it does not).
             weighted = -per_rate * rate / approach * weights / (2 * np.pi)
-            series.add_onset(_Onset(pair, a, bend, theta, weighted))
-        series.closed[pair] += length / (2 * np.pi)
+            series.add_onset(_Onset(pair, arc.onset, bend, theta, weighted))
+        series.closed[pair] += arc.length / (2 * np.pi)
         series.episodes.append(arc._replace(approach=abs(approach) * omega))

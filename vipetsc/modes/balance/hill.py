@@ -65,7 +65,10 @@ class ContourLine(NamedTuple):
     def zeros_beyond(self) -> int:
         """The number of zeros to the right of the line; -1 if it is undecided."""
         turned = -float(self.logs[-1].imag) / np.pi
-        return round(turned) if abs(turned - round(turned)) < 0.25 else -1
+        # D is real at both ends: a number that is far from whole says that a turn of D was missed.
+        if abs(turned - round(turned)) >= 0.25:
+            return -1
+        return round(turned)
 
 
 class Perturbations(NamedTuple):
@@ -92,7 +95,9 @@ class Stability(NamedTuple):
 
 def least_growth(finite: bool, decay: float = 0.0) -> float:
     """Re lambda/Om up to which a motion counts as stable, of a ``finite`` system whose modes decay at least so fast."""
-    return max(LEAST_OF_FINITE - decay, LEAST) if finite else LEAST
+    if not finite:
+        return LEAST
+    return max(LEAST_OF_FINITE - decay, LEAST)
 
 
 class Hill:
@@ -111,7 +116,9 @@ class Hill:
         self.decay = decay
         self.least = least_growth(finite, decay)
         orders = np.arange(-order, order + 1)
-        self._blocks = [orders[1 - order % 2 :: 2], orders[order % 2 :: 2]] if odd else [orders]
+        self._blocks = [orders]
+        if odd:
+            self._blocks = [orders[1 - order % 2 :: 2], orders[order % 2 :: 2]]
         # Compliances by block, number of its orders and exponent, and the latest forces with their reduced Jacobians.
         self._compliances: dict[tuple[int, int, complex], np.ndarray] = {}
         self._reduced: tuple[ForceSeries, list[np.ndarray | None]] | None = None
@@ -125,10 +132,15 @@ class Hill:
         if not acting.size:
             return out
         for block, (orders, jacobian) in enumerate(zip(self._blocks, self._reduced[1], strict=True)):
-            low = orders if jacobian is None else orders[np.abs(orders) <= KEPT]
+            low = orders
+            if jacobian is not None:
+                low = orders[np.abs(orders) <= KEPT]
             compliances = self._at(block, low, exponents.tolist())
             for i, (mu, g) in enumerate(zip(exponents.tolist(), compliances, strict=True)):
-                matrix = _flat(series.jacobian(mu, low)[acting]) if jacobian is None else jacobian
+                matrix = jacobian
+                if matrix is None:
+                    matrix = _flat(series.jacobian(mu, low)[acting])
+                # As phase and logarithm: at large exponents the product of so many pivots overflows.
                 phase, log = np.linalg.slogdet(_plus_one(_of_pairs(g, acting), matrix))
                 out[i] *= phase * np.exp(min(log, LARGEST_LOG))
         return out
@@ -140,7 +152,9 @@ class Hill:
         are taken, which costs little.
         """
         pairs = len(series.potential)
-        return series.acting if pairs > FEW_PAIRS else np.arange(pairs)
+        if pairs <= FEW_PAIRS:
+            return np.arange(pairs)
+        return series.acting
 
     def _at(self, block: int, orders: np.ndarray, exponents: Sequence[complex]) -> list[np.ndarray]:
         """The compliances (order, pair, pair) of a block's ``orders`` at ``exponents``: new ones all in one call."""
@@ -173,8 +187,11 @@ class Hill:
 
     def _line(self, series: ForceSeries, growth: float) -> ContourLine:
         """D on Re lambda = ``growth`` Om, so finely that no turn of it is missed."""
-        count = max(COARSE, int(0.5 / (growth + self.decay)) if self.finite else 0) + 1
-        positions = np.linspace(0, 0.5, count)
+        # D varies over the distance from the line to the poles, which are those of the modes of a finite system.
+        intervals = COARSE
+        if self.finite:
+            intervals = max(COARSE, int(0.5 / (growth + self.decay)))
+        positions = np.linspace(0, 0.5, intervals + 1)
         values = self.determinants(series, growth + 1j * positions)
         for _ in range(FINEST):
             turns = np.abs(np.angle(values[1:] / values[:-1]))
@@ -222,7 +239,9 @@ class Hill:
             zeros = self._beyond(series, growth)
             if zeros:
                 return max(zeros, key=lambda mu: mu.real)
-        return None if zeros is None else 0j
+        if zeros is None:
+            return None
+        return 0j
 
     def _beyond(self, series: ForceSeries, growth: float) -> list[complex] | None:
         """lambda/Om of all that grow faster than ``growth`` Om; None if undecided or if not all are found."""
@@ -251,7 +270,9 @@ class Hill:
                 zeros += [mu, mu.conjugate()]
             else:
                 zeros.append(mu.real + 0.5j * round(2 * mu.imag))
-        return zeros if len(zeros) == count else None
+        if len(zeros) != count:
+            return None
+        return zeros
 
     def _zero(self, series: ForceSeries, guess: complex, others: list[complex]) -> complex | None:
         """A zero of D that is none of the ``others``, Im in [0, 1/2], by the secant method."""
@@ -269,8 +290,9 @@ class Hill:
             if value_here == value_before:
                 return None
             following = mu - value_here * (mu - before) / (value_here - value_before)
-            before, mu = mu, following
+            before = mu
             value_before = value_here
+            mu = following
             if not abs(mu - guess) < 1:
                 return None
             if abs(mu - before) < ACCURACY:
@@ -280,7 +302,9 @@ class Hill:
 
 def _of_pairs(g: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """G (order, pair, pair) between some of the ``pairs``."""
-    return g if len(pairs) == g.shape[1] else g[:, pairs[:, None], pairs]
+    if len(pairs) == g.shape[1]:
+        return g
+    return g[:, pairs[:, None], pairs]
 
 
 def _flat(jacobian: np.ndarray) -> np.ndarray:
@@ -297,7 +321,10 @@ def _plus_one(g: np.ndarray, matrix: np.ndarray, one: float = 1.0) -> np.ndarray
     count, pairs = g.shape[:2]
     rows = matrix.reshape(count, pairs, -1)
     # Products of matrices by BLAS pay for many pairs alone.
-    product = np.einsum("kij,kjn->kin", g, rows) if pairs <= FEW_PAIRS else np.matmul(g, rows)
+    if pairs <= FEW_PAIRS:
+        product = np.einsum("kij,kjn->kin", g, rows)
+    else:
+        product = np.matmul(g, rows)
     product = product.reshape(matrix.shape)
     product[np.diag_indices(min(product.shape))] += one
     return product

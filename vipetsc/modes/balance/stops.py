@@ -31,6 +31,12 @@ class Stops(NamedTuple):
         """The smaller clearance in m."""
         return min(self.plus, self.minus)
 
+    def clearance_on(self, side: int) -> float:
+        """The clearance in m on a ``side``, 1 or -1; inf where there is no stop."""
+        if side > 0:
+            return self.plus
+        return self.minus
+
     def force(self, w: float) -> float:
         """Elastic force in N at the relative displacement ``w`` in m, without what a static load balances."""
         elastic = self.law.elastic_force(w - self.plus) - self.law.elastic_force(-w - self.minus)
@@ -54,7 +60,9 @@ class Stops(NamedTuple):
     @property
     def slope_at_rest(self) -> float:
         """Stiffness in N/m for small motions about rest: the slope of the force of a pressed contact, else 0."""
-        return float(self.law.elastic_slope(-self.clearance)) if self.is_pressed else 0.0
+        if not self.is_pressed:
+            return 0.0
+        return float(self.law.elastic_slope(-self.clearance))
 
     @property
     def energy_at_rest(self) -> float:

@@ -32,7 +32,7 @@ from vipetsc.lattice import Contact
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.lattice.krylov import LatticeShooting
 from vipetsc.modes.point import Point
-from vipetsc.modes.shooting.flow import Arc
+from vipetsc.modes.shooting.flow import SEPARATION, Arc
 from vipetsc.modes.shooting.orbit import whole_period
 from vipetsc.modes.shooting.shooting import Shooting
 from vipetsc.modes.system import elongation_rows
@@ -175,7 +175,7 @@ def _contacts_on_tape(substeps: ClosedSubsteps, stops: Stops, number: int, durat
     begins[0] = True
     for part in np.split(rows, np.flatnonzero(begins)[1:]):
         side = substeps.side[part[0]]
-        depths = side * substeps.w[part] - (stops.plus if side > 0 else stops.minus)
+        depths = side * substeps.w[part] - stops.clearance_on(int(side))
         densities = substeps.weights[part] * stops.law.elastic_force(depths) * substeps.rate[part] ** 2
         onset = abs(float(substeps.first_rate[part[0]])) if substeps.onset[part[0]] else None
         is_closed_at_end = substeps.end[part[-1]] > (1 - AT_END) * duration
@@ -246,7 +246,7 @@ def _contacts_of_arc(problem: Shooting, arc: Arc, moments: list[_Moment], number
         of_side = changes[changes[:, 2] == side]
         bounds = of_side[:, 0].tolist()
         speeds: list[float | None] = [_speed(problem, arc, moments, time, row) for time in bounds]
-        if len(of_side) and of_side[0, 3] == -1:
+        if len(of_side) and of_side[0, 3] == SEPARATION:
             bounds.insert(0, 0.0)
             speeds.insert(0, None)
         if len(bounds) % 2:

@@ -27,7 +27,7 @@ from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, StartError
 from vipetsc.modes.shooting.charts import Chart
 from vipetsc.modes.shooting.maps import ShootingMap
-from vipetsc.modes.shooting.shooting import ShootingEquations, ShootingFrame
+from vipetsc.modes.shooting.shooting_equations import ShootingEquations, ShootingFrame
 from vipetsc.modes.system import System
 
 # Residual of GMRES over the right side, its vectors before a restart, its products.

@@ -211,8 +211,7 @@ def largest_force(stops: Stops, relative: np.ndarray, episodes: Sequence[Episode
         displacement = episode.side * (turns @ relative).real
         velocity = episode.side * omega * (turns @ (1j * orders * relative)).real
 
-        clearance = stops.plus if episode.side > 0 else stops.minus
-        force = stops.law.elastic_force(displacement - clearance)
+        force = stops.law.elastic_force(displacement - stops.clearance_on(episode.side))
         if stops.law.damping:
             force = force * stops.law.dissipation_factor(velocity, episode.approach)
         largest = max(largest, float(np.abs(force).max()))

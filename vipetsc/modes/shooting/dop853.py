@@ -90,6 +90,7 @@ def _scaled_error(stepper: Stepper, h: float) -> float:
         estimates[0, e] = e3
         estimates[1, e] = e5
 
+    # The orbit and each variation are judged by themselves: a variation may be many times as large as another one.
     n = stepper.step.system.inverse_mass.size
     error = 0.0
     for j in range(y.shape[1]):
@@ -97,12 +98,16 @@ def _scaled_error(stepper: Stepper, h: float) -> float:
         third = 0.0
         scale = 0.0
         for i in range(2 * n):
-            unit = 1.0 if i < n else 1.0 / stepper.omega_ref
+            unit = 1.0
+            if i >= n:
+                unit = 1.0 / stepper.omega_ref
             fifth = max(fifth, abs(errors[1, i, j]) * unit)
             third = max(third, abs(errors[0, i, j]) * unit)
             scale = max(scale, abs(end[i, j]) * unit, abs(y[i, j]) * unit)
         if fifth > 0.0:
-            allowed = (RTOL if j == 0 else RTOL_SENSITIVITY) * scale
+            allowed = RTOL_SENSITIVITY * scale
+            if j == 0:
+                allowed = RTOL * scale
             error = max(error, h * fifth * fifth / np.sqrt(fifth * fifth + 0.01 * third * third) / allowed)
     return error
 
@@ -127,11 +132,31 @@ def _land(stepper: Stepper, t: float, h: float, change: Change) -> tuple[float, 
         length = change.length
         _advance(stepper, length)
         flow.observe(step, stepper.end, stepper.end_rates, step.end)
-        floor = 1e-15 * h if change.extremum else 1e-16 * (t + h)
+        # A root is sought to the rounding of the arc's time; an extremum, near which the gap is flat, to that of h.
+        floor = 1e-16 * (t + h)
+        if change.extremum:
+            floor = 1e-15 * h
         change, outcome = correct(change, step.end[change.contact], floor)
         if outcome != NONE:
             break
     return length, outcome != EXTREMUM
+
+
+@kernel
+def _begin_at_end(stepper: Stepper) -> None:
+    """Begin the next step at the end of the last one."""
+    _, _, start, end = stepper.flat
+    for e in range(end.size):
+        start[e] = end[e]
+
+
+@kernel
+def _shortened(h: float, error: float) -> float:
+    """The length to try after a step of length ``h`` whose scaled ``error`` is not below 1."""
+    # A number that has overflowed says nothing of the next length.
+    if not error < 1e300:
+        return h * 0.1
+    return h * max(LEAST_FACTOR, SAFETY * error ** (-0.125))
 
 
 @kernel
@@ -151,8 +176,8 @@ def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, i
     and kind (1 onset, -1 separation), and the seconds with a contact closed.
     """
     step = stepper.step
+    # At most a radian of the fastest motion: beyond, the quintic that is searched for changes would miss some.
     largest = 1.0 / stepper.omega_ref
-    _, _, start, end = stepper.flat
     t = 0.0
     closed = 0.0
     count = 0
@@ -169,9 +194,10 @@ def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, i
 
         error = _advance(stepper, h)
         if not error < 1.0:
+            # A stage that overflowed is infinite or NaN, which a weight of 0 in the next sums would not remove.
             if not error < 1e300:
-                stepper.stages[1:] = 0.0  # or a number that overflowed would stay in the sums
-            h *= max(LEAST_FACTOR, SAFETY * error ** (-0.125)) if error < 1e300 else 0.1
+                stepper.stages[1:] = 0.0
+            h = _shortened(h, error)
             continue
         grown = min(largest, h * min(MOST_FACTOR, SAFETY * max(error, SMALLEST_ERROR) ** (-0.125)))
 
@@ -182,7 +208,8 @@ def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, i
         whole = h
         if not smooth:
             h, changed = _land(stepper, t, h, change)
-        if not smooth and not changed and t + h == t:  # what rounding took for an extremum lies before the step
+        # What rounding took for an extremum lies before the step, which is then taken as it was tried.
+        if not smooth and not changed and t + h == t:
             if whole > SHORT * duration:
                 return STUCK, count, closed
             h = whole
@@ -190,10 +217,13 @@ def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, i
             _advance(stepper, h)
             flow.observe(step, stepper.end, stepper.end_rates, step.end)
 
-        for e in range(end.size):
-            start[e] = end[e]
-        closed += h if np.any(step.side) else 0.0
-        t = duration if last and smooth else t + h
+        _begin_at_end(stepper)
+        if np.any(step.side):
+            closed += h
+        t += h
+        # Exactly, not by a sum of steps that is rounded.
+        if last and smooth:
+            t = duration
         h = grown
         if changed:
             if count >= events.shape[0]:

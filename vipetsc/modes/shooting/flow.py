@@ -6,7 +6,7 @@ contact is searched, and the step is repeated so that it ends on the first chang
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,12 @@ from vipetsc.modes.shooting.landing import EXTREMUM, NONE, Change, first_rise, h
 from vipetsc.modes.system import System
 
 CONTACT = np.dtype([("plus", np.float64), ("minus", np.float64), ("elastic", ELASTIC)])
-Shape = tuple[int, int, int]  # see restore
+"""A contact: its clearances in m on the sides + and -, inf where there is no stop; its elastic law."""
+Shape = tuple[int, int, int]
+"""The first row of the displacements' rates, n, and 1 + m: see ``restore``."""
+# Kinds of changes in an arc's list of events.
+ONSET = 1
+SEPARATION = -1
 # A step below this fraction of the interval means that the flow is stuck.
 SMALLEST_STEP = 1e-15
 
@@ -51,6 +56,12 @@ class FlowStep(NamedTuple):
 
 
 @inlined
+def clearance_on(contact: Any, side: int) -> float:
+    """Clearance in m of a ``CONTACT`` on one side, 1 or -1."""
+    return contact.plus if side > 0 else contact.minus
+
+
+@inlined
 def elongation(rows: np.ndarray, c: int, y: np.ndarray, first: int, j: int, n: int) -> float:
     """Row ``c`` of ``rows`` (rows, n) times n entries of column ``j`` of ``y``, from ``first`` on."""
     z = 0.0
@@ -61,14 +72,16 @@ def elongation(rows: np.ndarray, c: int, y: np.ndarray, first: int, j: int, n: i
 
 @inlined
 def _add(rows: np.ndarray, c: int, law: tuple[float, float], y: np.ndarray, pull: np.ndarray, shape: Shape) -> None:
-    """Add the pull of a spring with the elongations ``rows[c]`` u by its ``law``, force and slope there.
+    """Add the pull of a spring with the elongations z = ``rows[c]`` u by its ``law``, force f and slope f' there.
 
-    The force acts on the orbit, the slope on its variations.
+    On the orbit acts -rows^T f, on a variation du its derivative -rows^T f' rows du.
     """
     force, slope = law
     first, n, columns = shape
-    for j in range(columns):
-        along = force if j == 0 else slope * elongation(rows, c, y, 0, j, n)
+    for i in range(n):
+        pull[first + i, 0] -= rows[c, i] * force
+    for j in range(1, columns):
+        along = slope * elongation(rows, c, y, 0, j, n)
         for i in range(n):
             pull[first + i, j] -= rows[c, i] * along
 
@@ -80,6 +93,7 @@ def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.nd
     ``shape``, their first row in ``pull``, n and 1 + m, may be constants, so that the compiler knows all loops.
     """
     first, n, columns = shape
+    # The static load, which acts on the orbit alone, and the springs: -K times each column.
     for i in range(n):
         for j in range(columns):
             pull[first + i, j] = 0.0
@@ -93,9 +107,8 @@ def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.nd
     for c in range(side.size):
         if side[c] != 0:
             contact = system.contacts[c]
-            clearance = contact.plus if side[c] > 0 else contact.minus
-            x = side[c] * elongation(system.rows, c, y, 0, 0, n) - clearance
-            # past the exit, which is landed on anyway, the law is odd
+            x = side[c] * elongation(system.rows, c, y, 0, 0, n) - clearance_on(contact, side[c])
+            # Not cut off at x = 0: within a step the force is smooth, and steps end where the masses part.
             force, slope = elastic_force_and_slope(contact.elastic, x)
             _add(system.rows, c, (side[c] * force, slope), y, pull, shape)
 
@@ -161,7 +174,7 @@ def first_change(step: FlowStep, h: float) -> Change:
     change = Change(-1, 0, 0.0, 0.0, False, 0.0, h, h, 0)
     for c in range(step.side.size):
         for s in (-1, 1):
-            clearance = step.system.contacts[c].plus if s > 0 else step.system.contacts[c].minus
+            clearance = clearance_on(step.system.contacts[c], s)
             if clearance == np.inf or (step.side[c] != 0 and step.side[c] != s):
                 continue
             # An open contact's gap s w - D rises at an onset, a closed one's D - s w at its separation.
@@ -179,10 +192,12 @@ def first_change(step: FlowStep, h: float) -> Change:
 
 @kernel
 def switch(step: FlowStep, change: Change) -> int:
-    """Close or open the contact of a ``change``: 1 for an onset, -1 for a separation."""
-    onset = step.side[change.contact] == 0
-    step.side[change.contact] = change.side if onset else 0
-    return 1 if onset else -1
+    """Close or open the contact of a ``change``; returns ``ONSET`` or ``SEPARATION``."""
+    if step.side[change.contact] == 0:
+        step.side[change.contact] = change.side
+        return ONSET
+    step.side[change.contact] = 0
+    return SEPARATION
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +205,7 @@ class Arc:
     """A piece of an orbit of ``duration`` seconds.
 
     ``start`` and ``end`` (2n,) hold displacements in m, then velocities in m/s; ``sensitivity`` (2n, 2n) is
-    d end/d start; ``events`` (changes, 4) lists time in s, contact, side (1 or -1) and kind (1 onset, -1 separation);
+    d end/d start; ``events`` (changes, 4) lists time in s, contact, side (1 or -1), kind (``ONSET``, ``SEPARATION``);
     ``episodes`` counts how often contacts close, or open if they are pressed at rest, and ``closed`` are the seconds
     with a contact closed.
     """
@@ -240,7 +255,7 @@ class Flow(ABC):
         # Contacts that are not at the start as they are at rest, and changes away from what they are at rest.
         is_pressed = self.system.is_pressed
         is_closed = self.system.gaps(start[: self.system.dofs]) > 0
-        away = np.where(is_pressed, -1, 1)[events[:, 1].astype(int)]
+        away = np.where(is_pressed, SEPARATION, ONSET)[events[:, 1].astype(int)]
         episodes = np.count_nonzero(is_closed != is_pressed) + np.count_nonzero(events[:, 3] == away)
         return Arc(
             duration=duration,

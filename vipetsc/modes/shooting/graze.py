@@ -39,7 +39,7 @@ class Touch(NamedTuple):
     @classmethod
     def nearest(cls, arc: Arc, shooting_map: ShootingMap) -> Self:
         """The two neighbouring changes of an arc that are nearest to each other; one at time 0 if there are none."""
-        pairs = cls.neighbours(arc, shooting_map.start == "rest", shooting_map.end == "rest")
+        pairs = cls.neighbours(arc, shooting_map.starts_at_rest, shooting_map.ends_at_rest)
         return min(pairs, default=cls(0.0, np.nan, 0, 0))
 
     @classmethod
@@ -91,8 +91,8 @@ def _equations(
     """
     system = problem.system
     n = system.dofs
-    plus, minus = system.clearances[touch.contact]
-    row = touch.side * system.contact_rows[touch.contact] / (plus if touch.side > 0 else minus)
+    pair = system.contacts[touch.contact]
+    row = touch.side * system.contact_rows[touch.contact] / pair.stops.clearance_on(touch.side)
     x, period = chart.decode(xi)
     arc = problem.arc(x, period)
     inner = chart.derivative(xi)
@@ -103,8 +103,10 @@ def _equations(
     u, v = np.split(part.end, 2)
     du, dv = np.split(part.sensitivity[:, problem.free] @ inner[:-1], 2)
     pull = -system.forces(u) / system.masses
-    u, v = u + remaining * (v + remaining / 2 * pull), v + remaining * pull
+    u = u + remaining * (v + remaining / 2 * pull)
+    v = v + remaining * pull
 
+    # Rows: the orbit's equations, s w = D over D, and w' = 0 over D; columns: the chart's unknowns, and the time.
     matrix = np.zeros((n + 2, n + 2))
     end_unit = chart.size * problem.map.end_unit(chart.period)
     matrix[:n, :-1] = problem.jacobian(arc) @ inner / end_unit
@@ -112,8 +114,7 @@ def _equations(
     matrix[n + 1] = np.append(row @ dv, row @ pull)
     values = np.array([*problem.residual(arc) / end_unit, row @ u - 1, row @ v])
 
-    resonator = system.contacts[touch.contact].resonator
-    if touch.time == 0 and isinstance(chart, Grazing) and chart.index == resonator:
+    if touch.time == 0 and isinstance(chart, Grazing) and chart.index == pair.resonator:
         # The gap's root is an unknown of this chart, and the gap is stationary in it at the touch.
         matrix[n] = np.eye(n + 2)[chart.index]
         values[n] = xi[chart.index]

@@ -16,7 +16,7 @@ from vipetsc.compiled import kernel, njit
 from vipetsc.contact.search import first_upcrossing_after_start
 
 # Outcomes of a search: no change; a change; an extremum so near zero that only the flow can tell.
-NONE, CROSSING, EXTREMUM = 0, 1, 2
+NONE, CROSSING, EXTREMUM = range(3)
 EXTREMUM_ATTEMPTS = 40  # attempts at one extremum
 MOST_ATTEMPTS = 120  # attempts of one landing in all
 # Coefficients of a polynomial of degree 5 in the position in a step, from 0 to 1, the lowest first.
@@ -62,11 +62,17 @@ def correct(change: Change, motion: np.ndarray, floor: float) -> tuple[Change, i
         high = min(high, length)
     else:
         low = max(low, length)
-    newton = -value / rate if rate > 0.0 else high
     attempts += 1
 
-    # rounding of w' may keep Newton's method from the extremum for ever
-    if abs(newton) > floor and (attempts < EXTREMUM_ATTEMPTS if extremum else high - low > floor):
+    # Without a rise there is no Newton step: one beyond the bracket stands for it, and leads to its bisection.
+    newton = high
+    if rate > 0.0:
+        newton = -value / rate
+    # A root's bracket shrinks to its floor. Rounding of w' may keep Newton's method from an extremum for ever.
+    goes_on = high - low > floor
+    if extremum:
+        goes_on = attempts < EXTREMUM_ATTEMPTS
+    if goes_on and abs(newton) > floor:
         target = length + newton
         if not low < target < high:
             target = 0.5 * (low + high)
@@ -76,6 +82,7 @@ def correct(change: Change, motion: np.ndarray, floor: float) -> tuple[Change, i
         return change, CROSSING
     if gap <= 0.0:
         return change, EXTREMUM
+    # The flow is beyond zero where the interpolant could not tell: the root lies before, and is sought as such.
     return Change(contact, side, sign, offset, False, 0.0, length, 0.5 * length, 0), NONE
 
 
@@ -114,7 +121,11 @@ def _bisect(c: Coefficients, low: float, high: float, sign: float) -> float:
         middle = 0.5 * (low + high)
         if middle in (low, high):
             break
-        if sign * _slope(c, middle) <= 0.0 if sign else _value(c, middle) > 0.0:
+        if sign == 0.0:
+            is_beyond = _value(c, middle) > 0.0
+        else:
+            is_beyond = sign * _slope(c, middle) <= 0.0
+        if is_beyond:
             high = middle
         else:
             low = middle
@@ -126,7 +137,8 @@ def _extremum(c: Coefficients, position: float) -> float:
     """The zero of the slope near ``position``, in its quarter of the step."""
     low = 0.25 * min(np.floor(4.0 * position), 3.0)
     sign = _slope(c, low)
-    if sign * _slope(c, low + 0.25) >= 0.0:  # two of them in one quarter
+    # Two zeros in one quarter leave no change of sign to bisect.
+    if sign * _slope(c, low + 0.25) >= 0.0:
         return position
     return _bisect(c, low, low + 0.25, sign)
 
@@ -138,7 +150,8 @@ def _next_turn(slope: np.ndarray, low: float, sign: float) -> float:
     if turn > 1.0:
         return turn
     if turn > 0.0:
-        for k in range(1, slope.size):  # de Casteljau: the part after the turn
+        # De Casteljau's scheme leaves the coefficients on the part after the turn, which begins with 0.
+        for k in range(1, slope.size):
             for i in range(slope.size - k):
                 slope[i] = (1.0 - turn) * slope[i] + turn * slope[i + 1]
         slope[0] = 0.0
@@ -148,8 +161,10 @@ def _next_turn(slope: np.ndarray, low: float, sign: float) -> float:
 @njit(_nrt=True)  # makes arrays, also where it is called from kernels
 def first_rise(c: Coefficients) -> tuple[float, int]:
     """Position in the step at which a gap that starts at or below zero first rises through it, and the outcome."""
-    margin = 0.01 * (abs(c[5]) + 0.3 * abs(c[4]))  # above the interpolant's error
-    b1 = c[0] + c[1] / 5.0  # Bernstein coefficients bound the gap
+    # Above the interpolant's error, which is that of the next power of the position.
+    margin = 0.01 * (abs(c[5]) + 0.3 * abs(c[4]))
+    # Bernstein coefficients bound the gap: nearly every call ends here.
+    b1 = c[0] + c[1] / 5.0
     b2 = c[0] + (4.0 * c[1] + c[2]) / 10.0
     b3 = c[0] + (6.0 * c[1] + 3.0 * c[2] + c[3]) / 10.0
     b4 = c[0] + (4.0 * c[1] + 3.0 * c[2] + 2.0 * c[3] + c[4]) / 5.0
@@ -157,29 +172,41 @@ def first_rise(c: Coefficients) -> tuple[float, int]:
     if max(b1, b2, b3, b4, b5) <= -margin:
         return 1.0, NONE
 
-    start = 0.0 if abs(c[1]) <= ROUNDING * abs(c[2]) else b1 - c[0]
+    start = b1 - c[0]
+    if abs(c[1]) <= ROUNDING * abs(c[2]):
+        start = 0.0
     slope = np.array([start, b2 - b1, b3 - b2, b4 - b3, b5 - b4])
     high = 0.0
-    for _ in range(3):  # a quartic slope has at most two pairs of zeros
+    # The pieces on which the gap rises, each from ``left`` to ``top``: a quartic slope has at most two pairs of zeros.
+    for _ in range(3):
         low = _next_turn(slope, high, 1.0)
         if low > 1.0:
             break
         high = _next_turn(slope, low, -1.0)
-        top = _extremum(c, high) if high <= 1.0 else 1.0
-        left = _extremum(c, low) if low > 0.0 else 0.0
+        left = 0.0
+        if low > 0.0:
+            left = _extremum(c, low)
+        top = 1.0
+        if high <= 1.0:
+            top = _extremum(c, high)
 
-        for part in range(1, 5):  # the first quarter of the step that ends above zero
+        # The root is in the first quarter of the step that ends above zero.
+        for part in range(1, 5):
             end = 0.25 * part
-            if end > left:
-                root = _bisect(c, left, end, 0.0) if _value(c, end) > 0.0 else 2.0
-                if root <= top:
-                    return root, CROSSING
-                if end >= top:
-                    break
-                left = end
+            if end <= left:
+                continue
+            root = 2.0
+            if _value(c, end) > 0.0:
+                root = _bisect(c, left, end, 0.0)
+            if root <= top:
+                return root, CROSSING
+            if end >= top:
+                break
+            left = end
         if high > 1.0:
             break
 
+        # Not above zero at the ends of quarters: between them the largest value decides, unless it is within the error.
         peak = _value(c, top)
         if peak > margin:
             return _bisect(c, left, top, 0.0), CROSSING

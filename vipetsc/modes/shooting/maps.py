@@ -19,6 +19,16 @@ class ShootingMap:
     fraction: float
 
     @property
+    def starts_at_rest(self) -> bool:
+        """Whether an arc starts with v = 0, else with u = 0: its initial values are displacements, else velocities."""
+        return self.start == "rest"
+
+    @property
+    def ends_at_rest(self) -> bool:
+        """Whether an arc ends with v = 0, else with u = 0."""
+        return self.end == "rest"
+
+    @property
     def quarter(self) -> bool:
         """Whether it goes from one section to the other; the orbit is then odd about its end."""
         return self.start != self.end
@@ -32,7 +42,9 @@ class ShootingMap:
         if self.quarter:
             return 1.0
         frequency = float(2.0 ** np.round(np.log2(2 * np.pi / period)))
-        return frequency if self.start == "rest" else 1 / frequency
+        if not self.starts_at_rest:
+            return 1 / frequency
+        return frequency
 
 
 # The whole period is here to be compared with, by the case key ``nnm.map``: its condition is 1e6 times worse.

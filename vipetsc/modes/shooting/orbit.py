@@ -49,10 +49,13 @@ def whole_period(part: np.ndarray, shooting_map: ShootingMap, samples: int, pari
 
     ``parity`` is 1 of displacements, which are even about a rest and odd about the centre, and -1 of velocities.
     """
-    if shooting_map.quarter:  # to the centre
+    # A quarter ends at the centre, about which displacements are odd: the part then ends at rest.
+    if shooting_map.quarter:
         part = np.concatenate([part, -parity * part[-2::-1]])
-    if len(part) < samples:  # to a rest (or from centre to centre): mirror image about it
-        sign = -1 if shooting_map.start == shooting_map.end == "centre" else 1
+    if len(part) < samples:
+        sign = 1
+        if not (shooting_map.starts_at_rest or shooting_map.ends_at_rest):
+            sign = -1
         part = np.concatenate([part, parity * sign * part[-2::-1]])
     return part[:samples]
 
@@ -64,7 +67,10 @@ def resonance(problem: ShotOrbits, point: Point, samples: int = 1024) -> int:
     """
     u, _ = sample_orbit(problem, point, samples)
     rows = problem.system.contact_rows
-    w = u @ rows.T if len(rows) else u
+    w = u
+    if len(rows):
+        w = u @ rows.T
+    # What moves by rounding alone, as a contact at a node, passes zero at random.
     amplitude = np.abs(w).max(axis=0)
     positive = w[:, amplitude > SAME * amplitude.max()] > 0
     passes = np.sum(positive != np.roll(positive, 1, axis=0), axis=0)
@@ -80,7 +86,9 @@ def repetitions(problem: ShotOrbits, point: Point) -> int:
     # Displacements and velocities are compared with the orbit's size; a motion passed n times repeats for a prime of n.
     start = problem.arc(point.x, point.period).start
     rate = problem.flow.omega_ref(point.period)
-    size = np.abs(start).max() / (1.0 if problem.map.start == "rest" else rate)
+    size = np.abs(start).max()
+    if not problem.map.starts_at_rest:
+        size = size / rate
     scale = size * np.repeat([1.0, rate], problem.system.dofs)
 
     for count in PRIMES:

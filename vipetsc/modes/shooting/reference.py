@@ -65,8 +65,13 @@ class Tsrk(Flow):
             if changed:
                 length, state, changed = self._land(y, length, change)
 
-            closed += length if np.any(step.side) else 0.0
-            t = duration if duration - t - length <= 1e-16 * duration else t + length
+            if np.any(step.side):
+                closed += length
+            # A remainder that is rounding is no step.
+            if duration - t - length <= 1e-16 * duration:
+                t = duration
+            else:
+                t += length
             y = state
             if changed:
                 events.append((t, change.contact, change.side, flow.switch(step, change)))
@@ -224,8 +229,12 @@ class Newmark(Flow):
         after = side[1:]
         events = []
         for i, c in zip(*np.nonzero(before != after), strict=True):
-            onset = after[i, c] != 0
-            events.append(((i + 1) * h, c, after[i, c] if onset else before[i, c], 1 if onset else -1))
+            side = after[i, c]
+            kind = flow.ONSET
+            if side == 0:
+                side = before[i, c]
+                kind = flow.SEPARATION
+            events.append(((i + 1) * h, c, side, kind))
         closed = float(np.any(after != 0, axis=1).sum() * duration / count)
         return y, np.array(events).reshape(-1, 4), closed
 

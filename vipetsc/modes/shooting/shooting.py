@@ -1,260 +1,26 @@
-"""Periodic orbits as solutions of boundary value problems over a part of their period, by PETSc's SNES.
+"""Shooting with matrices: periodic orbits by Newton's method of PETSc's SNES and the flow's sensitivities."""
 
-Newton's method works in the unknowns xi (n + 1,) of a chart (``charts``), in place of initial values x (n,) and the
-period. ``Shooting`` has the matrix of the flow's sensitivities; a lattice without one uses ``ShootingEquations``, too.
-"""
-
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, Frame, SpecialKind, unit
-from vipetsc.modes.shooting.charts import CHARTS, Chart, DenseChart, Relative, near_grazing
+from vipetsc.modes.problem import Attempt, ContinuationError, Frame, SpecialKind
+from vipetsc.modes.shooting.charts import CHARTS, DenseChart, Relative
 from vipetsc.modes.shooting.flow import Arc, Flow
 from vipetsc.modes.shooting.graze import Touch, graze
 from vipetsc.modes.shooting.maps import ShootingMap
 from vipetsc.modes.shooting.orbit import resonance
+from vipetsc.modes.shooting.shooting_equations import ShootingEquations, ShootingFrame
 from vipetsc.modes.shooting.stability import HalfTraceAbove, half_traces, multipliers, real_half_traces
-from vipetsc.modes.system import System
 
 # A half-trace is (lambda + 1/lambda)/2 of a pair of multipliers. Along narrow tongues it only touches +-1: a change of
 # sign smaller than this is rounding, and no special point.
 LEAST_CROSSING = 1e-6
 # Singular values of the Jacobian below this fraction of the largest leave the tangent open.
 DEGENERATE = 1e-12
-
-
-class AnyArc(Protocol):
-    """Interface of the arcs of all flows: the quantities of the orbit."""
-
-    @property
-    def duration(self) -> float:
-        """Length of the arc in s."""
-
-    @property
-    def episodes(self) -> int:
-        """Number of contact episodes in the arc."""
-
-    @property
-    def closed(self) -> float:
-        """Time in s with a contact closed."""
-
-
-A = TypeVar("A", bound=AnyArc)
-
-
-class ShootingFrame(Generic[A]):
-    """The shooting equations in the unknowns of a ``chart`` at one orbit.
-
-    The argument ``tangent`` (n + 1,) is d(x, period) along the branch, or empty where there is none yet. The attribute
-    is its unit image in the chart's unknowns, and is there only with a tangent. ``unit`` is that of the residual: the
-    chart's, times the frequency where velocities should vanish at the end of an arc that starts with displacements.
-    """
-
-    tangent: np.ndarray
-
-    def __init__(
-        self, problem: "ShootingEquations[A]", chart: Chart, x: np.ndarray, period: float, tangent: np.ndarray
-    ) -> None:
-        self.problem = problem
-        self.chart = chart
-        self.unit = chart.size * problem.map.end_unit(period)
-        self.xi = chart.encode(x, period)
-        if tangent.size:
-            self.tangent = unit(chart.to_unknowns(self.xi, tangent))
-
-    def encode(self, point: Point) -> np.ndarray:
-        """The unknowns of another orbit."""
-        return self.chart.encode(point.x, point.period)
-
-    def direction(self, point: Point) -> np.ndarray:
-        """The branch's direction at another orbit, of any length."""
-        return self.chart.to_unknowns(self.encode(point), point.tangent)
-
-    def arc(self, xi: np.ndarray) -> A:
-        """The arc from the unknowns ``xi``; raises FlowError where there is none."""
-        if not np.all(np.isfinite(xi)) or self.chart.decode(xi)[1] <= 0:
-            raise FlowError("Newton's method left the domain: the period is not positive")
-        return self.problem.arc(*self.chart.decode(xi))
-
-    def residual(self, xi: np.ndarray) -> np.ndarray:
-        """The residual (n,) at the arc's end, which vanishes for an orbit, over its unit."""
-        return self.problem.residual(self.arc(xi)) / self.unit
-
-    def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` for the orbit at an ``arclength`` along the tangent."""
-        return self.solve(guess, self.tangent, self.tangent @ self.xi + arclength)
-
-    @abstractmethod
-    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the orbit with row . xi = value."""
-
-    @abstractmethod
-    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent at a solution, on the side of the frame's own."""
-
-    def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
-        """The orbit that an attempt has converged to, where ``direction`` is the branch's unit tangent or None."""
-        problem = self.problem
-        chart = self.chart
-        x, period = chart.decode(attempt.xi)
-        arc = problem.arc(x, period)
-        traces, largest = problem.stability(arc)
-        size = float(np.abs(x).max()) * problem.map.end_unit(period)
-
-        tangent = np.empty(0)
-        energy_tangent = slope = np.nan
-        if direction is not None:
-            # df/dE from the tangent: along a vertical piece of the branch the energy stands still.
-            tangent = chart.to_changes(attempt.xi, direction)
-            energy_tangent = float(problem.energy_gradient(x) @ tangent[:-1])
-            slope = float(-tangent[-1] / period**2 / energy_tangent) if energy_tangent else np.inf
-
-        return Point(
-            x=x,
-            period=period,
-            energy=problem.energy(x),
-            residual=float(np.abs(problem.residual(arc)).max()) / size,
-            half_traces=traces,
-            multiplier=largest,
-            episodes=arc.episodes,
-            closed=arc.closed / arc.duration,
-            newton=len(attempt.history) - 1,
-            tangent=tangent,
-            slope=slope,
-            energy_tangent=energy_tangent,
-        )
-
-
-class ShootingEquations(ABC, Generic[A]):
-    """Periodic orbits of a ``system``: initial values x (n,) and a period.
-
-    The ``shooting_map`` says over which part of the period an arc goes, and whether it starts and ends at rest or at
-    the centre; for an orbit half of the state vanishes at its end. x are displacements in m for a map that starts at
-    rest, velocities in m/s for one that starts at the centre. Raises ValueError if the map needs an odd system and the
-    system is not.
-    """
-
-    has_half_traces: bool
-    guards: frozenset[str]
-
-    def __init__(self, system: System, shooting_map: ShootingMap, tolerance: float) -> None:
-        if "centre" in (shooting_map.start, shooting_map.end) and not system.odd:
-            raise ValueError(
-                f"the {shooting_map.name} map needs forces that change sign with the displacement; "
-                "this system's do not: use map = 'half'"
-            )
-        self.system = system
-        self.map = shooting_map
-        self.tolerance = tolerance
-        n = system.dofs
-        displacements = slice(0, n)
-        velocities = slice(n, 2 * n)
-        # the half of the state that is free at the arc's start, and the half that should vanish at its end
-        self.free = displacements if shooting_map.start == "rest" else velocities
-        self.zero = velocities if shooting_map.end == "rest" else displacements
-        self._latest: tuple[np.ndarray, float, A] | None = None
-
-    def start(self, x: np.ndarray) -> np.ndarray:
-        """The state (2n,) at the start of the arc from initial values ``x``."""
-        state = np.zeros(2 * self.system.dofs)
-        state[self.free] = x
-        return state
-
-    def arc(self, x: np.ndarray, period: float) -> A:
-        """The arc from initial values ``x``; raises FlowError where the flow fails. The latest one is kept."""
-        if self._latest is None or self._latest[1] != period or not np.array_equal(self._latest[0], x):
-            self._latest = x.copy(), period, self._integrate(self.start(x), period)
-        return self._latest[2]
-
-    @abstractmethod
-    def _integrate(self, start: np.ndarray, period: float) -> A:
-        """The arc from a state ``start`` (2n,) over the map's fraction of the ``period``."""
-
-    @abstractmethod
-    def end(self, arc: A) -> np.ndarray:
-        """The state (2n,) at an arc's end."""
-
-    @abstractmethod
-    def stability(self, arc: A) -> tuple[np.ndarray, float]:
-        """Half-traces of an orbit, and the largest modulus of its multipliers; empty and NaN without a matrix."""
-
-    def residual(self, arc: A) -> np.ndarray:
-        """The residual (n,) at the arc's end, which vanishes for an orbit: displacements in m or velocities in m/s."""
-        return self.end(arc)[self.zero]
-
-    def end_rate(self, arc: A) -> np.ndarray:
-        """Time derivative (n,) of what should vanish at the arc's end."""
-        n = self.system.dofs
-        end = self.end(arc)
-        if self.map.end == "centre":
-            return end[n:]
-        return -self.system.forces(end[:n]) / self.system.masses
-
-    def energy(self, x: np.ndarray) -> float:
-        """Energy in J of the orbit with initial values ``x``."""
-        zero = np.zeros_like(x)
-        return self.system.energy(x, zero) if self.map.start == "rest" else self.system.energy(zero, x)
-
-    def energy_gradient(self, x: np.ndarray) -> np.ndarray:
-        """dE/dx (n,) in J over the unit of ``x``."""
-        return self.system.forces(x) if self.map.start == "rest" else self.system.masses * x
-
-    @abstractmethod
-    def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray) -> ShootingFrame[A]:
-        """The frame at any initial values and period; ``tangent`` may be empty."""
-
-    def frame(self, point: Point, chart: str = "auto") -> ShootingFrame[A]:
-        """The frame at an orbit; the chart ``auto`` is grazing if the orbit starts near a touch, else relative."""
-        if chart == "auto":
-            at_rest = self.map.start == "rest"
-            chart = "grazing" if at_rest and near_grazing(self.system, point.x) else "relative"
-        return self.frame_at(chart, point.x, point.period, point.tangent)
-
-    @abstractmethod
-    def null_vector(self, start: Point) -> np.ndarray:
-        """Tangent d(x, period) at a corrected orbit, of either sign; raises ContinuationError if it is not unique."""
-
-    def first_tangent(self, start: Point, direction: int) -> np.ndarray:
-        """Tangent d(x, period) at a corrected orbit, towards growing (+1) or falling (-1) energy.
-
-        Raises ContinuationError at a branch point, where the tangent is not unique.
-        """
-        tangent = self.null_vector(start)
-        # The null vector has either sign; where the energy is stationary, the sign is arbitrary.
-        energy_tangent = self.energy_gradient(start.x) @ tangent[:-1]
-        return tangent * (np.sign(energy_tangent) * direction or direction)
-
-    def turn(self, before: Point, after: Point) -> float:
-        """Angle in rad between the tangents of two orbits in relative units at the first; 0 without a tangent."""
-        if not (before.tangent.size and after.tangent.size):
-            return 0.0
-        chart = self.relative_chart(before.x, before.period)
-        tangents = np.column_stack([before.tangent, after.tangent])
-        first, second = chart.to_unknowns(chart.encode(before.x, before.period), tangents).T
-        # The product of two unit vectors may be beyond 1 by rounding.
-        return float(np.arccos(np.clip(unit(first) @ unit(second), -1.0, 1.0)))
-
-    @abstractmethod
-    def relative_chart(self, x: np.ndarray, period: float) -> Chart:
-        """The chart ``relative``, with the gaps of contacts only where they are at the start of the map."""
-
-    def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
-        """Folds of the energy and of the frequency."""
-        # Where all contacts are as at rest an orbit may lie on a linear branch, whose energy and frequency turn by
-        # rounding alone: folds are then sought between two orbits that both have contacts which close or open.
-        if not self.system.is_linear_at_rest or (left.episodes and right.episodes):
-            yield SpecialKind("fold-energy", lambda p: p.energy_tangent, finish=self.with_resonance)
-            yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
-
-    def with_resonance(self, fold: Point, left: Point, right: Point) -> Point:
-        """The ``fold`` of the energy; a subclass may add the resonance whose tongue it begins or ends."""
-        return fold
 
 
 class DenseFrame(ShootingFrame[Arc]):
@@ -281,8 +47,11 @@ class DenseFrame(ShootingFrame[Arc]):
 
     def tangent_towards(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
         """The unit tangent at a solution, on the side of ``reference``."""
-        direction = np.linalg.svd(self.jacobian(xi))[2][-1]  # the null vector
-        return -direction if direction @ reference < 0 else direction
+        # The null vector, of either sign.
+        direction = np.linalg.svd(self.jacobian(xi))[2][-1]
+        if direction @ reference < 0:
+            return -direction
+        return direction
 
 
 class Shooting(ShootingEquations[Arc]):
@@ -301,7 +70,9 @@ class Shooting(ShootingEquations[Arc]):
         self.flow = flow
         # From rest to rest the momentum of a system that nothing holds is 0 whatever the start: its centre of mass is
         # kept where it is at rest instead. From the centre on the arc itself does so.
-        self._kept = flow.system.mean_motion if shooting_map.start == shooting_map.end == "rest" else None
+        self._kept = None
+        if shooting_map.starts_at_rest and shooting_map.ends_at_rest:
+            self._kept = flow.system.mean_motion
         self.newton = DenseNewton(flow.system.dofs + 1, max_newton)
 
     def _integrate(self, start: np.ndarray, period: float) -> Arc:
@@ -320,7 +91,9 @@ class Shooting(ShootingEquations[Arc]):
     def residual(self, arc: Arc) -> np.ndarray:
         """What vanishes at the arc's end (n,), and the displacement of the centre of mass times a frequency."""
         end = super().residual(arc)
-        return end if self._kept is None else end + self.flow.omega * (self._kept @ arc.start[self.free])
+        if self._kept is None:
+            return end
+        return end + self.flow.omega * (self._kept @ arc.start[self.free])
 
     def jacobian(self, arc: Arc) -> np.ndarray:
         """Derivative (n, n + 1) of the residual with respect to initial values and period."""
@@ -331,8 +104,9 @@ class Shooting(ShootingEquations[Arc]):
 
     def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray | None = None) -> DenseFrame:
         """The frame at any initial values and period, in the ``chart`` of that name."""
-        given = np.empty(0) if tangent is None else tangent
-        return DenseFrame(self, CHARTS[chart](self.system, x, period), x, period, given)
+        if tangent is None:
+            tangent = np.empty(0)
+        return DenseFrame(self, CHARTS[chart](self.system, x, period), x, period, tangent)
 
     def relative_frame(self, x: np.ndarray, period: float) -> DenseFrame:
         """The unknowns of ``relative_chart``."""
@@ -340,7 +114,7 @@ class Shooting(ShootingEquations[Arc]):
 
     def relative_chart(self, x: np.ndarray, period: float) -> Relative:
         """The chart ``relative``, with the gaps of contacts only where the map starts at rest."""
-        return Relative(self.system, x, period, rest=self.map.start == "rest")
+        return Relative(self.system, x, period, rest=self.map.starts_at_rest)
 
     def null_vector(self, start: Point) -> np.ndarray:
         """Tangent d(x, period) at a corrected orbit, of either sign; raises ContinuationError if it is not unique."""
@@ -375,13 +149,14 @@ class Shooting(ShootingEquations[Arc]):
             for i in real_half_traces(left, right):
                 test = HalfTraceAbove(i, level)
                 yield SpecialKind(name, test, LEAST_CROSSING, accept=test.is_real)
+
+        def sides_with_right(point: Point) -> float:
+            if point.episodes == right.episodes:
+                return 1.0
+            return -1.0
+
         if left.episodes != right.episodes:
-            yield SpecialKind(
-                "grazing",
-                lambda p: 1.0 if p.episodes == right.episodes else -1.0,
-                seek=self.seek_touch,
-                finish=without_touch,
-            )
+            yield SpecialKind("grazing", sides_with_right, seek=self.seek_touch, finish=without_touch)
 
     def seek_touch(self, frame: Frame[Point], guess: np.ndarray, left: Point, right: Point) -> np.ndarray:
         """Unknowns of the orbit near ``guess`` at which a contact grazes that only one of two orbits has."""

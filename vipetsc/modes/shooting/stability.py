@@ -21,30 +21,39 @@ def half_traces(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarr
     blocks = sensitivity[:n, :n], sensitivity[:n, n:], sensitivity[n:, :n], sensitivity[n:, n:]
     a, b, c, d = (root[:, None] * block / root for block in blocks)
 
-    if shooting_map.fraction == 1.0:  # the whole period needs no mirror image
+    # The whole period needs no mirror image.
+    if shooting_map.fraction == 1.0:
         product = (a - np.eye(n)) / 2
-    elif shooting_map.start == "rest":
-        product = d.T @ a if shooting_map.quarter else b.T @ c
+    elif shooting_map.quarter:
+        product = d.T @ a
+    elif shooting_map.starts_at_rest:
+        product = b.T @ c
     else:
         product = c.T @ b
 
-    if n == 2:  # the trace is more exact than a projection
+    # Of two masses the trivial eigenvalue is 0 and the trace is the other one, more exactly than by a projection.
+    if n == 2:
         eigenvalues = np.array([np.trace(product)])
     else:
         trivial = _start_rate(system, shooting_map, arc) * root
         basis = np.linalg.svd(trivial[None, :])[2][1:].T
         eigenvalues = np.linalg.eigvals(basis.T @ product @ basis)
 
-    traces = 1 - 2 * eigenvalues if shooting_map.quarter else 1 + 2 * eigenvalues
+    sign = 1
+    if shooting_map.quarter:
+        sign = -1
+    traces = 1 + sign * 2 * eigenvalues
     traces = traces[np.argsort(traces.real)]
     # Pairs of multipliers that leave the unit circle together have complex half-traces; all others are real.
-    return traces.real if np.all(np.abs(traces.imag) == 0) else traces
+    if np.any(np.abs(traces.imag) != 0):
+        return traces
+    return traces.real
 
 
 def _start_rate(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarray:
     """The time derivative (n,) of what is zero at the arc's start."""
     n = system.dofs
-    if shooting_map.start == "centre":
+    if not shooting_map.starts_at_rest:
         return arc.start[n:]
     return -system.forces(arc.start[:n]) / system.masses
 
@@ -53,9 +62,13 @@ def multipliers(traces: np.ndarray, quarter: bool) -> np.ndarray:
     """Floquet multipliers (2n - 2,) over the whole period from half-traces (n - 1,)."""
     c = traces.astype(complex)
     root = np.sqrt(c * c - 1)
-    mu = np.where(np.abs(c + root) >= np.abs(c - root), c + root, c - root)  # the larger one, no cancellation
+    # The larger root of mu^2 - 2 c mu + 1 = 0 without cancellation; the smaller one is its inverse.
+    mu = np.where(np.abs(c + root) >= np.abs(c - root), c + root, c - root)
     mu = np.concatenate([mu, 1 / mu])
-    return mu**2 if quarter else mu
+    # The basic map of a quarter is half a period.
+    if quarter:
+        return mu**2
+    return mu
 
 
 def real_half_traces(left: Point, right: Point) -> list[int]:

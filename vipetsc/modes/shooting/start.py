@@ -4,7 +4,7 @@ import numpy as np
 
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import StartError
-from vipetsc.modes.shooting.shooting import A, ShootingEquations
+from vipetsc.modes.shooting.shooting_equations import A, ShootingEquations
 
 
 def linear_start(problem: ShootingEquations[A], mode: int, energy: float) -> Point:
@@ -15,8 +15,11 @@ def linear_start(problem: ShootingEquations[A], mode: int, energy: float) -> Poi
     omega, shapes = problem.system.linear_modes()
     if not omega[mode] > 0:
         raise StartError(f"mode {mode + 1} is a rigid-body motion; it has no period")
-    # From rest all of the energy is potential, from the centre all of it is kinetic.
-    amplitude = np.sqrt(2 * energy) / (omega[mode] if problem.map.start == "rest" else 1.0)
+    # The energy of a mass-normalised mode q is (q'^2 + omega^2 q^2)/2: from rest all of it is potential, from the
+    # centre, where the initial values are velocities, all of it is kinetic.
+    amplitude = np.sqrt(2 * energy)
+    if problem.map.starts_at_rest:
+        amplitude /= omega[mode]
     x = shapes[:, mode] * amplitude
     frame = problem.frame_at("relative", x, 2 * np.pi / omega[mode], np.empty(0))
     row = np.append(x / np.linalg.norm(x), 0.0)  # keep the amplitude
