@@ -146,7 +146,7 @@ def test_one_rank_that_is_asked_to_stop_stops_all(folder, whole, team, looks):
 
     assert stopped.resumable
     assert not (folder / "out" / "ensemble.h5").exists()
-    assert stopped.newly_made == stopped.count(0) + stopped.count(1)
+    assert stopped.computed == stopped.count(0) + stopped.count(1)
 
     comm.Barrier()
     assert run_sweep(plan, folder / "out", comm).complete

@@ -103,7 +103,7 @@ def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
         again = run_sweep(plan, out)
 
         assert again.complete
-        assert again.newly_made == missing
+        assert again.computed == missing
         (warning,) = (text for text in again.warnings if "reaches the right end" not in text)
         assert (
             warning == f"{out}/members.jsonl, line {number + 1}: truncated or damaged; its results are computed again"
@@ -117,7 +117,7 @@ def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
         again = run_sweep(plan, out)
 
         assert again.complete
-        assert again.newly_made == 0
+        assert again.computed == 0
         assert_same_bits(before, datasets(out / "ensemble.h5"))
         assert json.loads((out / "index.json").read_text())["members"]["missing"] == 0
 
@@ -149,7 +149,7 @@ def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
 
     os.truncate(kept / "run.h5", 300)
     again = run_sweep(Sweep.from_table(table | {"output": thin}), tmp_path / "thin")
-    assert again.newly_made == 1
+    assert again.computed == 1
     assert "run.h5 cannot be read" in again.warnings[0]
     assert_same_bits(found, datasets(kept / "run.h5"))
 

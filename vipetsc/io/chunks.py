@@ -171,6 +171,7 @@ def parts_to_copy(output: Chunks, number: int, wanted: Collection[str]) -> Itera
 
 def read_log(output: Chunks) -> np.ndarray:
     """The episodes in the parts that fall to this rank, in no order."""
+    # Unsorted: episodes of several ranks are sorted once, when all are read.
     parts = [part for number in range(output.count) for part in parts_to_copy(output, number, ["impacts"])]
     return np.concatenate([part["impacts"] for part in parts])
 

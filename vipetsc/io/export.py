@@ -15,8 +15,8 @@ from vipetsc.io.read import field_time, open_results, open_run
 from vipetsc.wording import with_unit
 
 MOST_FRAMES = 5000  # of a run with more samples, every n-th; a frame takes about 1 kB of the text
-MOST_ROWS = 1_000_000  # of a table
-MOST_NUMBERS = 20_000_000  # of a table with a column for each point or site
+MOST_ROWS = 1_000_000  # of a table, as many as spreadsheets read
+MOST_NUMBERS = 20_000_000  # of a table with a column for each point or site: 400 MB of text
 ANALYSIS = "analysis.h5"
 FIELDS = "displacement", "velocity"
 # Of the designs of a search, by the dimension whose labels say what each column is.
@@ -118,6 +118,7 @@ def write_curves(path: Path) -> list[Path]:
                 continue
             table = data[names].assign(_columns_of_designs(data, dims) | _columns_of_responses(data, dims))
             foreign = [name for name, item in table.coords.items() if not set(item.dims) <= set(dims)]
+            # The dimensions name the file: variables over other ones are another table.
             over = "-".join(dims)
             if dims == axes:
                 over = "members"

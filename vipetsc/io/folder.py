@@ -33,7 +33,7 @@ from vipetsc.io.names import readable
 from vipetsc.parallel import on_root
 
 FORMAT_VERSION = 1
-MOST_NAMED = 6  # keys of another case that a message names
+MOST_NAMED = 6  # keys of another case that a message names: more do not help to tell which case it is
 NEW, READY, MOVING, OLD = ".new", ".ready", ".moving", ".replaced.old"
 
 Difference = Callable[[str], str | None]
@@ -149,7 +149,7 @@ def _claim(
     aside = path / NEW
     going_on = filled and not force
     if going_on:
-        # Results begun with --force are gone on with, if they are of this case; else those that they are to replace.
+        # Results begun with --force are continued if they are of this case, otherwise those that they are to replace.
         folder = path
         if (aside / kind.marker).exists() and not _problem(aside, kind, text, difference):
             folder = aside
@@ -164,6 +164,7 @@ def _claim(
             folder = aside
         folder.mkdir(exist_ok=True)
 
+    # A key that may change while results stay valid is brought up to date.
     if not going_on or _text_of(folder / kind.marker) != text:
         write_text(folder / kind.marker, text)
     remove_temporary_files(folder)
@@ -191,6 +192,7 @@ def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference |
         return None
     remedy = "replace it with --force, or choose another folder with --out"
     try:
+        # Key by key: a reader cannot see in two files of a hundred lines which one has changed.
         then = dict(_keys(tomllib.loads(earlier)))
         now = dict(_keys(tomllib.loads(text)))
     except (tomllib.TOMLDecodeError, RecursionError) as error:

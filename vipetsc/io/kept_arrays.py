@@ -19,7 +19,9 @@ import vipetsc
 from vipetsc.io.atomic import Arrays, remove_abandoned, save_arrays
 from vipetsc.process import cache_folder
 
-LARGEST = 2**28  # bytes of all files together; those that were not used for the longest time go first
+# Bytes of all files together; those that were not used for the longest time go first. The modes of the built-in
+# lattice take 12 MB.
+LARGEST = 2**28
 CHECKSUM = "checksum"
 
 

@@ -73,6 +73,7 @@ def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
     for name in names:
         item = data.variables[name]
         values = item.values
+        # HDF5 has no type for numpy's text of fixed width.
         dtype = h5py.string_dtype() if values.dtype.kind in "UO" else values.dtype
         dataset = add_variable(file, name, item.dims, values.shape, dtype, item.attrs)
         if write and values.size:
@@ -81,6 +82,7 @@ def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
     for path, value in data.attrs.items():
         group, _, key = str(path).rpartition("/")
         node = file.require_group(group) if group else file
+        # An attribute is a number, a text or an array of either.
         node.attrs[key] = json.dumps(value) if isinstance(value, dict | list) else value
 
 

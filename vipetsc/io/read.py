@@ -162,6 +162,7 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
 
         coordinate = data[name].values
         if np.issubdtype(coordinate.dtype, np.number):
+            # Five digits, as messages print them; amplitudes of one sweep lie further apart.
             match = np.isclose(coordinate, value, rtol=1e-5, atol=0)
         else:
             match = coordinate == value

@@ -47,6 +47,7 @@ class RecordFile:
     def append(self, record: Record) -> None:
         """Write ``record`` after the last one; raises OSError that names the file."""
         text = json.dumps(record).encode()
+        # In one call of write, so that a kill leaves a line cut off rather than two lines mixed.
         line = memoryview(text[:-1] + CHECK % zlib.crc32(text))
         try:
             sys.audit("vipetsc.append", str(self.path))

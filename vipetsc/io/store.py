@@ -35,7 +35,9 @@ from vipetsc.parallel import SortedRows, on_every_rank, on_root, sort_over_ranks
 if TYPE_CHECKING:
     import xarray as xr
 
-GATHER_LIMIT = 2 * 2**30  # bytes of fields above which writer = "auto" has every rank write its own
+# Bytes of fields above which writer = "auto" has every rank write its own part. Below, one rank copies them in some
+# seconds, and a file that is written in parallel needs a file system that all ranks share.
+GATHER_LIMIT = 2 * 2**30
 
 
 class _Contents(NamedTuple):
@@ -155,6 +157,7 @@ class RunFolder:
         """Number and ranks of the last complete checkpoint, (-1, 0) if there is none; later files are removed."""
         names = [path.stem.split("-") for path in self._parts.glob("state-*.npy")]
         counts = Counter((int(number), int(size)) for _, number, _, size in names)
+        # A checkpoint counts once as many parts are there as ranks wrote it.
         complete = [key for key, count in counts.items() if count == key[1]]
         number, size = max(complete, default=(-1, 0))
 

@@ -19,7 +19,9 @@ from vipetsc.lattice import Band
 from vipetsc.spectra.cosine_transform import cosine_transform
 from vipetsc.spectra.pooling import block_means, blocks
 
-COLUMNS = 32  # histories of masses that are transformed together, which fit into a cache
+# Histories of masses that are transformed together. Those of 4,421 samples are 1 MB, the size of a core's cache: from
+# 16 to 128 the time is the same, with 8 it is a sixth more.
+COLUMNS = 32
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,7 @@ def part_energies(
         for mass, first in itertools.product(range(dofs), range(0, held.shape[1], COLUMNS)):
             together = slice(first, first + COLUMNS)
             spectrum = cosine_transform(held[:, together, mass])
+            # The first and the last cosine are their own mirror images: their amplitudes count half.
             spectrum[[0, -1]] *= 0.5
             for number, (energy, part) in enumerate(zip(energies, parts, strict=True)):
                 filtered = _folded(spectrum[part.low : part.high + 1], part.low, steps[number])

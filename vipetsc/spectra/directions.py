@@ -26,6 +26,7 @@ def wave_energies(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray
     ``displacement`` in m and ``velocity`` in m/s are (cell, dof); wavenumbers are in the order of ``fftfreq``.
     """
     cells = len(displacement)
+    # A copy: the array is kept between calls.
     speed = _waves(cell, cells).group_velocity.copy()
     # Standing waves: 0 and pi are their own opposites.
     speed[0] = 0.0

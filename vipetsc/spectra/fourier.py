@@ -110,6 +110,7 @@ def dispersion(
     in_space = taper(x, tapers[1])
 
     energy = np.zeros((len(taken), nx))
+    # Time first, of blocks of cells: frequencies that are dropped are never held for all cells.
     spectrum = np.empty((len(taken), x), dtype=complex)
     for j, mass in enumerate(np.asarray(masses)):
         for block in blocks(x, 8 * t, memory):

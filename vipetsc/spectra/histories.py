@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy import fft
 
-WINDOWS = 3  # that are compared
-HARMONICS = 5  # of the drive that are fitted at most
-RESOLVED = 0.8  # of the samples' Nyquist frequency, up to which harmonics are fitted
+WINDOWS = 3  # that are compared: two may agree where a slow beat turns
+HARMONICS = 5  # of the drive that are fitted at most: contacts on both sides send the third and the fifth
+RESOLVED = 0.8  # of the samples' Nyquist frequency: nearer to it sines and cosines at the samples are nearly parallel
 FADING = 0.2  # of a record, over which a vibration fades out that does not end
-SILENT = 1e-12  # of a mean square: what a part of the frequencies has less is rounding
+SILENT = 1e-12  # of a mean square: a part of the frequencies with less than that holds rounding
 
 
 class History(NamedTuple):
@@ -89,6 +89,7 @@ def _phasor(time: np.ndarray, values: np.ndarray, frequency: float, harmonics: i
     for harmonic in range(1, harmonics + 1):
         phase = harmonic * frequency * time
         columns += [np.cos(phase), -np.sin(phase)]
+    # Least squares rather than a Fourier sum: the window need not hold a whole number of samples a period.
     solution = np.linalg.lstsq(np.column_stack(columns), values, rcond=None)[0]
     return complex(solution[1], solution[2])
 

@@ -9,7 +9,7 @@ from vipetsc.io.kept_arrays import kept_arrays
 from vipetsc.lattice import Chain, modes
 from vipetsc.lattice.modes import Modes, linear_modes
 
-LEAST_DOFS = 400  # of a lattice whose modes are kept: those of smaller ones are computed in a hundredth of a second
+LEAST_DOFS = 400  # of a lattice whose modes are kept; those of smaller ones are computed in a hundredth of a second
 
 
 def kept_modes(chain: Chain) -> Modes:

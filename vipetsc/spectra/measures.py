@@ -22,8 +22,10 @@ from vipetsc.spectra.histories import History, SteadyAmplitude, SteadyDrive
 if TYPE_CHECKING:
     import xarray as xr
 
-PERIODS = 10  # of the drive in a window of the steady amplitude, where the case gives none
-TOLERANCE = 0.01  # of its drift
+# Defaults of the steady amplitude: periods of the drive in a window, and the largest drift between windows over
+# the amplitude: 1 %, to which accelerometers are calibrated.
+PERIODS = 10
+TOLERANCE = 0.01
 QUANTITIES = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s2"}
 PART = "part"  # the dimension of parts of the frequency axis: pass bands, gaps, what is above
 UNSETTLED = "steady amplitude"  # how sentences begin about one that is not
@@ -226,6 +228,7 @@ def take(record: RunRecord, groups: Collection[str]) -> dict[str, Any]:
         if measure.of is None or measure.group not in groups or name in foreign:
             continue
         value = measure.of(record)
+        # None is a measure that the run cannot have; NaN, one that it should have, is written.
         if value is not None:
             values[name] = value
     return values

@@ -15,7 +15,7 @@ from vipetsc.spectra.wavelet import BINS
 
 Rows = Sequence[int] | np.ndarray
 EDGE = 1e-9  # modes nearer to a pass band than this fraction of the top one's edge are in it
-BLOCK = 2**26  # bytes of fields that are transformed together
+BLOCK = 2**26  # bytes of fields that are transformed together; from a 16th to four times of it the time is the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +93,7 @@ def cluster_samples(
     episode, from 0. Samples are those at ``time`` whose number ``stride`` divides, and the last one. An episode without
     an end (NaN) lasts to the last sample.
     """
+    # Rounded down to the sample before and up to the one after: the cluster must enclose its episodes.
     first = np.maximum(np.searchsorted(time, onset, side="right") - 1, 0) // stride * stride
     stop = -(-np.searchsorted(time, separation) // stride) * stride
     # An episode between two neighbouring samples is bounded by both.

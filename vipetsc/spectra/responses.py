@@ -113,6 +113,7 @@ def _vertex(s: np.ndarray, y: np.ndarray) -> float:
     rise = (y[1] - y[0]) / before
     fall = (y[2] - y[1]) / after
     bend = (fall - rise) / (before + after)
+    # Three equal values, of which a parabola has no vertex.
     if bend == 0:
         return float(y[1])
     slope = rise + bend * before
@@ -139,6 +140,7 @@ def widest_gap(parts: list[CurvePart], level: float, low: float, high: float) ->
     # What is left between the intervals in which some state is above the level.
     widest = 0.0
     reached = low
+    # Sorted by their begins, intervals that overlap merge in one pass.
     for begin, end in sorted(above):
         widest = max(widest, min(begin, high) - reached)
         reached = max(reached, end)

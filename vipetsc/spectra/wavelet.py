@@ -19,8 +19,10 @@ LOWEST = np.pi / 60
 """Lowest node in rad per cell; wavenumbers below it belong to the first bin."""
 
 BINS = 12  # wavenumber bins of equal width in [0, pi]
-VOICES = 256  # nodes an octave
-CHUNK = 16  # snapshots that are partitioned together
+# Nodes an octave. Bins begin between nodes: with 256 the filters differ from those of a grid without end by 0.8 % next
+# to the bounds of the bins, with 128 by 1.1 %, with 64 by 2.4 %. Filters are computed once, in 0.01 s.
+VOICES = 256
+CHUNK = 16  # snapshots that are partitioned together: with 4 a fifth slower, with 64 a tenth, in twice the memory
 
 
 @dataclass(frozen=True)
@@ -154,6 +156,8 @@ def filter_bank(cells: int, kc: float = 6.0) -> Bank:
     length = padded_length(cells, kc)
     nodes = Nodes.log(kc)
     gain = nodes.weight / constant(kc) * wavelet_spectrum(nodes.kappa, kc, wavenumbers(length)) ** 2
+    # Masking bins in the wavelet domain and inverting is linear in each wavenumber: one factor for each bin has all
+    # of it.
     transfer = np.stack([gain[nodes.bins == b].sum(axis=0) for b in range(BINS)])
     transfer.flags.writeable = False  # all who ask get the same array
     return Bank(transfer=transfer, length=length)

@@ -127,6 +127,7 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     the ends of its 95 % interval, ``r2_adjusted``), and ``slope_exponent`` at the fitted energies.
     """
     valid = np.isfinite(ibtet) & (ibtet > 0) & np.isfinite(work)
+    # By energy, not amplitude: the drive's work need not grow with the amplitude once sites are in contact.
     order = np.argsort(work[valid], kind="stable")
     energy = work[valid][order] * (branch.attrs["grazing"] / initiation)
     ibtet = ibtet[valid][order]
@@ -146,6 +147,7 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
 
     # Without a floor the mean of the differences is the answer; the floor only asks for a larger divisor.
     start = float(np.mean(slope - log_transfer))
+    # In ln s, over which the misfit has one minimum, and in which a bracket has no sign to respect.
     best = minimize_scalar(misfit, bracket=(start, start + 0.5), options={"xtol": 1e-10})
     law = power_law(energy[fitted], ibtet[fitted])
     slope_law = power_law(energy[fitted], np.exp(slope))

@@ -112,6 +112,7 @@ def _transfers(
     # Energies at twice the stride, interpolated, show the error that the stride makes.
     coarse = energy.copy()
     taken = np.arange(0, samples, 2 * stride)
+    # Only the last part, above the bands, is sampled at a stride: all others are exact at every sample.
     coarse[-1] = np.interp(np.arange(samples), taken, energy[-1, taken])
 
     def transfer(end: int) -> tuple[float, float]:

@@ -26,16 +26,28 @@ from vipetsc.studies.response import SiteResponses, fastest_wave, in_contact, se
 from vipetsc.studies.spectral_line import SpectralLine
 from vipetsc.studies.wave_losses import SentPowers, WaveLosses
 
-WIDTH = 14  # of the burst's line, half of what is followed about a frequency
-WIDEST = 0.45  # of the drive's frequency, the largest half width: the followed line reaches neither 0 nor 2 Om
-WAVENUMBERS = 181  # from 0 to pi, at which the bands are sampled for their edges
-WEAK = 0.35  # over clearance: weaker waves lose as much at a site in contact as a driven wave of this amplitude
-SAMPLES_OF_PERIOD = 40  # of a waveform's highest frequency
-MOST = 60  # iterations
-LEAST = 9  # iterations
-HELD = 30  # iterations after which the sites in contact are held
-FULL_STEPS = 4  # iterations before steps are halved
-CLOSE = 1e-3  # largest change of c over the linear wave at which the iteration ends
+# The changes below are those of the energies of bands in the built-in lattice and a shorter one with shorter bursts,
+# where predictions differ from simulations by 0.08 and 0.1 decades (root mean square).
+
+# Lines of a burst (2 pi over its duration) that are followed on either side of a frequency. With 10 energies change by
+# 0.06 decades, with 7 by 0.05; with more it is WIDEST that limits the line.
+WIDTH = 14
+# Largest half width over the drive's frequency: the line reaches neither 0 nor 2 Om. With 0.3 energies change by 0.004
+# decades, with 0.2 by 0.008.
+WIDEST = 0.45
+WAVENUMBERS = 181  # from 0 to pi, at which the bands are sampled for their edges; a quarter of them changes nothing
+# Amplitude over clearance: weaker waves lose as much at a site in contact as a driven wave of this amplitude. Half
+# of it changes energies by 0.02 decades, twice as much by 0.006.
+WEAK = 0.35
+SAMPLES_OF_PERIOD = 40  # of a waveform's highest frequency: rectangles then integrate its spectrum to 1e-3
+# Iterations: at least LEAST, since the third harmonics converge after c does (with 5 energies change by 0.01 decades,
+# with 18 by 0.0008 in 1.4 times the CPU time), until c changes by less than CLOSE of the linear wave (at a tenth of it
+# energies change by 0.0005 decades), and at most MOST, of which the built-in lattice never needs half.
+MOST = 60
+LEAST = 9
+CLOSE = 1e-3
+HELD = 30  # iterations after which the sites in contact are held: a site at its limit would switch for ever
+FULL_STEPS = 4  # iterations before steps are halved; without any energies change by 0.001 decades
 
 
 class Composed(NamedTuple):
@@ -143,6 +155,7 @@ class Network:
             step = 1.0
             if i >= FULL_STEPS:
                 step = 0.5
+            # Full steps come near, half ones converge: Phi1 depends on c, and full steps may swing about the solution.
             c = c + step * (arriving - c)
 
             if self.third:
@@ -277,6 +290,7 @@ class Network:
 
         bands = bands * passed
         if self.third:
+            # The gain may be negative, where sites cancel each other's third harmonics; an energy may not.
             bands[self.third.band] = max(bands[self.third.band] + float(gain.sum()) * step, 0.0)
         return Composed(into=bands, dissipated=dissipated, absorbed=0.0, z=largest, change=change)
 
@@ -304,6 +318,7 @@ class Network:
                 passing = np.interp(self.time - lag, self.time, passing, left=0.0) * np.exp(-rate * lag)
                 last = k
 
+                # The amplitude of a travelling wave with this power, as if all of it were the third harmonic.
                 z = np.sqrt(np.maximum(passing, 0) / self.power3[k]) / self.clearance[k]
                 fraction = np.minimum(sites.of_site(k).at(np.maximum(z, WEAK)).lost, 1) * on[k]
                 total += float((passing * fraction).sum())

@@ -41,6 +41,7 @@ class OptimumSearch:
         self.objective = objective
         self.sampler = sampler
         self.designs = [Design(plan.begin(), 0, plan.base, [*objective.runs(plan.base).values()])]
+        # The case itself is a design even where the search begins elsewhere: results are compared with it.
         first = self._design(start, 0)
         if first.case is None or case_id(first.case) != case_id(plan.base):
             self.designs.append(first)
@@ -89,6 +90,7 @@ class OptimumSearch:
         Methods Appl. Mech. Eng. 186, 311); one that failed is worse than all others.
         """
         judged = self.feasible_losses()
+        # Over all designs so far, not those of this generation: losses that the sampler has must stay comparable.
         worst = np.max(judged, axis=0, initial=0.0, where=np.isfinite(judged)) + 1
         most = max(design.excess for design in self.designs)
         losses = []

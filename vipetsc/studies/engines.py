@@ -25,6 +25,7 @@ def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
     random = np.random.default_rng(seed)
     number = np.arange(np.prod(sweep.shape)).reshape(sweep.shape)
     along = next(i for i, axis in enumerate(sweep.axes) if AMPLITUDE in axis)
+    # Rows are the sweep's curves, columns their amplitudes, entries the members' numbers.
     curves = np.moveaxis(number, along, -1).reshape(-1, sweep.shape[along])
     # One amplitude in each of equal parts, and each on another curve: few members go through all regimes.
     count = min(count, len(curves))

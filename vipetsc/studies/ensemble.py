@@ -165,6 +165,7 @@ class Results:
                 missing_columns = len(value) - table.shape[1]
                 table = np.pad(table, ((0, 0), (0, missing_columns)), constant_values=np.nan)
                 self.tables[name] = table
+            # The rest of the row stays NaN: lists of members may have different lengths.
             table[(number, *map(slice, value.shape))] = value
 
     def _scale(self, sources: Mapping[int, LinearSource]) -> None:
@@ -188,6 +189,7 @@ class Results:
             self._put(numbers, row)
             if "bands/modal_energy" in run.measures[source.site]:
                 energy = self.tables["bands/modal_energy"]
+                # Energies grow with the square of the amplitude, as the work does.
                 energy[numbers] *= self.tables["work"][numbers, None] / run.statistics["work"]
 
     def merge_files(self) -> None:
@@ -340,6 +342,7 @@ def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict
     if normalise:
         y = normalised(y)
     line = power_law(x[peak:], y[peak:])
+    # The paper gives both fits: the line weighs relative errors, the nonlinear fit the large values.
     curved = power_law(x[peak:], y[peak:], "nonlinear")
     low, high = line.exponent_interval
     return row | {

@@ -68,6 +68,7 @@ def run(engine: str) -> None:
 
 def follow(table: dict[str, Any]) -> None:
     """Two points of a branch, whatever it comes to."""
+    # The branch itself is of no use: its kernels are what is left.
     with tempfile.TemporaryDirectory() as folder:
         follow_all(NnmCase.from_table(table), Path(folder), MPI.COMM_SELF)
 

@@ -115,6 +115,7 @@ class Identification:
         count = self.plan.options.starts - 1
         if count:
             bounds = np.array([(p.to_coordinate(p.low), p.to_coordinate(p.high)) for p in parameters]).T
+            # Over coordinates, which are logarithms of most parameters: bounds may be decades apart.
             drawn = qmc.LatinHypercube(len(parameters), seed=self.plan.options.seed).random(count)
             begins = np.vstack([first, qmc.scale(drawn, *bounds)])
         states = self.windows().misfit.size - len(parameters)
@@ -173,6 +174,7 @@ def _identify(work: Identification, folder: Path, comm: MPI.Comm, progress: bool
     fitted = [number for number, record in enumerate(fits) if "deviance" in record]
     if not fitted:
         raise RuntimeError(f"no start leads to a fit: {fits[0]['reason']}")
+    # The number decides between equal fits, so that every rank takes the same one.
     best = min(fitted, key=lambda number: (fits[number]["deviance"], number))
     recorded = _recorded_runs(work, folder, comm, ranks=1)
     profile = on_root(comm, lambda: work.profile(fits[best]))
@@ -211,6 +213,7 @@ def _fits(work: Identification, starts: list[str], folder: Path, comm: MPI.Comm,
 
     def fit(key: Key) -> Record:
         solved: list[list[float]] = []
+        # Windows are recorded one by one: the first that is missing is where an earlier call was stopped.
         while (part := f"{key} window {len(solved)}") in recorded.records:
             solved.append(recorded.records[part]["coordinates"])
 

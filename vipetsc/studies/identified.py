@@ -119,6 +119,7 @@ def _sensor_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncertai
     stride = -(-numbers // MOST_NUMBERS)
     response = misfit.respond(z, record, windows.last[record], range(misfit.size), candidates, stride)
     slopes = np.zeros((*response.motion.shape[:2], len(z)))
+    # Each sample stands for ``stride`` of them, whose information adds: sensitivities grow with its root.
     slopes[:, :, inner + estimated] = np.sqrt(stride) * response.motion[:, :, ROWS[quantity], 1:]
     errors = errors_with_sensor(uncertainty, slopes, noise)[:, : misfit.count]
     chosen = errors.argmin(axis=0)
@@ -182,6 +183,7 @@ def _state_values(windows: GrowingWindows, z: np.ndarray, jacobian: np.ndarray) 
     misfit = windows.misfit
     dofs = misfit.plan.base.lattice.unit_cell().dofs
     data_rows = len(jacobian) - len(misfit.prior())
+    # Coordinates that nothing determines have no finite variance: the pseudo-inverse leaves them out.
     covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     parts: dict[str, list[np.ndarray]] = {name: [np.zeros(0)] for name in LAYOUT if name.startswith("initial/")}
     for number, state in misfit.states.items():

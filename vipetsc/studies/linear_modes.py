@@ -153,10 +153,14 @@ def _band_of(bands: Sequence[Band], frequency: float) -> int:
 
 
 def _place(chain: Chain, cell: int, at_ends: float) -> str:
-    """Place of a mode in a gap whose energy is largest in ``cell`` (from 0), with the part ``at_ends`` at the ends."""
+    """Place of a mode in a gap whose energy is largest in ``cell`` (from 0).
+
+    ``at_ends`` is the fraction of its energy at the ends.
+    """
     if chain.ends != "periodic" and at_ends > 0.5:
         return "edge"
     sites = np.array(chain.sites, int)
+    # A contact with the next cell may have its energy on either side.
     near = sites[np.abs(sites - cell) <= 1]
     return f"at site {near[0] + 1}" if near.size else f"in cell {cell + 1}"
 

@@ -155,6 +155,7 @@ def measured(analysis: xr.Dataset) -> Record:
         if name in row and row_of(name)[0] == PART:
             row["parts"] = list(analysis[name].attrs["parts"])
     if "bands/modal_energy" in row:
+        # Of a history the ensemble has the last value: what the run leaves.
         row["bands/modal_energy"] = analysis["bands/modal_energy"].values[:, -1].tolist()
     warnings = json.loads(analysis.attrs.get("warnings", "[]"))
     unsettled = [text for text in warnings if text.startswith(UNSETTLED)]
@@ -205,6 +206,8 @@ def linear_case(case: Case) -> Case:
     if other_pairs(case):
         return case.varied(name="linear", without=("output",), drive=drive, output=output)
     without = ("output", "contacts")
+    # Without the whole section: cases that differ in a law or a clearance must have one linear run, and one name of
+    # it.
     return case.varied(name="linear", without=without, drive=drive, contacts={"sites": 0}, output=output)
 
 

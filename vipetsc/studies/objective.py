@@ -177,6 +177,8 @@ def measured(run: xr.Dataset, statistics: dict[str, Any], tables: Sequence[Measu
     # The ledger counts the energy of the motion at t = 0 as work.
     work = float(run["energy/work"][-1])
     u, v = (run[name].values[-1:] for name in ("displacement", "velocity"))
+    # By modes rather than filters: the energies of an undamped lattice's modes are constant after the last contact,
+    # so that one sample suffices.
     modal = ModalParts.of(model.chain)
     energy = 0.5 * np.abs(modal.modes.amplitudes(u, v)[0]) ** 2 / work
     frequency = modal.modes.frequency
@@ -254,5 +256,6 @@ def _energy_beyond(model: Model, displacement: np.ndarray, velocity: np.ndarray)
 
     u = displacement.ravel()
     v = velocity.ravel()
+    # Twice the energy of each mass: its own of kinetic energy, and k u (u - u') of each spring to a mass u'.
     energy = u * (chain.stiffness_matrix() @ u) + chain.masses() * v**2
     return 0.5 * float(energy.reshape(chain.cells, -1)[beyond].sum())

@@ -130,6 +130,7 @@ class ScatteringRuns:
         run = self.ring.run_to_end(1.0, with_site=False)
         energy, speed = wave_energies(self.cell, *_last_state(run))
         since_burst = setting.end - self.case.model().drive.duration
+        # Waves towards the site that have not reached it, had they left when the burst ended.
         late = (speed * setting.towards > 0) & (np.abs(speed) * since_burst < setting.distance)
 
         # The run is simulated twice: its last sample in all cells and all samples of the site fit where all would not.
@@ -330,6 +331,7 @@ def refine(runs: ScatteringRuns, progress: bool = False) -> dict[float, float]:
     runs.make([run for z in first for run in runs.jittered(z)], progress)
 
     errors = dict.fromkeys(first, np.nan)
+    # Round by round rather than depth first: each round is a list of runs that all ranks divide.
     halves = list(itertools.pairwise(first))
     while halves:
         middles = {float(np.sqrt(low * high)): (low, high) for low, high in halves}

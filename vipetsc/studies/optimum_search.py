@@ -27,7 +27,7 @@ from vipetsc.studies.sampler import CmaEs, Nsga2, Sampler, smooth
 from vipetsc.studies.scattering_law import matched_clearances
 from vipetsc.studies.sweep import is_whole
 
-POPULATION = 24  # of NSGA-II
+POPULATION = 24  # of NSGA-II: a front of as many designs, and generations enough within the default budget of 100
 
 
 def run_search(
@@ -71,6 +71,7 @@ def _search(plan: OptimiseCase, folder: Path, comm: MPI.Comm, stop: StopRequest,
         on_root(comm, lambda: searches.append(OptimumSearch(plan, objective, _sampler(plan, start), start)))
         more = True
         while more:
+            # One rank has the sampler: its random numbers and ties must not differ between ranks.
             objective.make(on_root(comm, lambda: searches[0].runs()))
             more = on_root(comm, lambda: searches[0].tell_and_ask())
             bar.update(sum(len(search.designs) for search in searches))

@@ -74,6 +74,8 @@ def largest_between(
 
     It is that of the cubic through ``w`` with slopes ``rate``.
     """
+    # With the rates that the run has, the cubic is of fourth order in the interval: a sample misses a peak by the
+    # second.
     curve = CubicHermiteSpline(times, w, rate)
     extrema = curve.derivative().roots(extrapolate=False)
     # A piece on which w is constant has NaN for its root.

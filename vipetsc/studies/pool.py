@@ -12,7 +12,7 @@ from vipetsc.io.errors import is_disk_full
 from vipetsc.parallel import SharedCounter, StoppedError, StopRequest, on_root, wait_for_all
 from vipetsc.progress import Progress
 
-BLOCKS = 100  # that each team draws, at least, so that none waits long for the last
+BLOCKS = 100  # that each team draws, at least: none then waits for the last longer than 1 % of the whole
 PATIENCE = 5.0  # s that a rank whose job failed waits for the rest of its team to have failed as well
 
 Job = TypeVar("Job", bound=Hashable)

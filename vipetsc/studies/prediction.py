@@ -207,6 +207,7 @@ def errors(values: dict[str, np.ndarray]) -> dict[str, float]:
     summary: dict[str, float] = {}
     for name in ("upper", "other"):
         pair = np.array([values[f"{kind}/{name}"] for kind in ("predicted", "simulated")])
+        # Decades need positive energies, and members without contact have no error to judge.
         comparable = touched & (pair > 0).all(axis=0)
         if comparable.any():
             decades = np.abs(np.diff(np.log10(pair[:, comparable]), axis=0))

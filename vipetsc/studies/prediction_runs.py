@@ -79,6 +79,7 @@ def amplitudes_of(case: PredictCase, linear: Record) -> np.ndarray:
 
 def site_points(case: PredictCase, largest: float) -> list[float]:
     """z of the runs of one site, up to ``largest``."""
+    # Above the onset the response changes with the logarithm of z.
     high = np.geomspace(HIGH, largest / BEYOND, case.predict.points - len(NEAR_ONSET))
     return [1 + z for z in NEAR_ONSET] + np.unique(high).tolist()
 

@@ -132,6 +132,7 @@ def measure_run(
         arrival = linear.arrival_at(leading_cell(case)) if linear else None
         return run, arrival, options_of(run.attrs["case"], folder, overrides)
 
+    # The run stays open while all ranks measure it, and is closed on each even where one fails.
     with ExitStack() as stack:
         run, arrival, options = on_every_rank(comm, lambda: begin(stack))
         analysis = analyse(run, measures, arrival, options, comm)

@@ -19,7 +19,11 @@ from vipetsc.io.records import Record
 from vipetsc.lattice import Band, Chain, OpenCompliance, UnitCell, WaveCompliance, bloch, pass_bands, waves_at
 from vipetsc.lattice.chain import Pair
 
-LOWEST = 0.15  # z of the first of the bins
+# The z of the first of the bins, below which no contact goes on. Half and twice of it change predicted energies by 0.02
+# decades, a fifth of the prediction's error.
+LOWEST = 0.15
+# Bins of log z. With half as many energies change by 0.02 decades, with twice as many by 0.03, where the
+# prediction's error is 0.1.
 BINS = 40
 DECAY = 4.0  # windows fall by e^-4 over the transformed time, so that no response is folded back
 TINY = 1e-300  # in place of zero in a divisor
@@ -155,6 +159,7 @@ class Burst:
 
         grid = np.linspace(np.log(LOWEST), np.log(largest), BINS)
         position = (np.log(np.maximum(z[on], LOWEST)) - grid[0]) / (grid[1] - grid[0])
+        # To the nearest bin, with no interpolation: sums of bins are then sums over disjoint samples.
         nearest = np.clip(np.rint(position), 0, BINS - 1).astype(int)
         return {
             "sums": [np.bincount(nearest, row[on], BINS).tolist() for row in rows],
@@ -270,6 +275,8 @@ class SiteResponse(NamedTuple):
         into = mean[INTO].copy()
         into[wave.band] = 0
         into = np.maximum(into, 0)
+        # Powers by band overlap in time and need not sum to what is given: their ratios are kept, and their sum is
+        # set.
         scale = np.maximum(given, 0) / np.maximum(into.sum(axis=0) + lost, TINY)
         table = np.array([lost * scale, *(into * scale)])
 

@@ -17,7 +17,7 @@ from vipetsc.modes.branches.responses import ISOLA
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.spectra.responses import CurvePart, largest_response, widest_gap
 
-ROUNDING = 1e-9  # of the parameter at the end of a range
+ROUNDING = 1e-9  # relative, of the parameter at the end of a range, where a curve is corrected to its tolerance
 
 
 def measured_responses(
@@ -86,6 +86,7 @@ def _values(branch: Branch[Any], of: ResponseMeasure) -> np.ndarray:
 
 def _part(branch: Branch[Any], of: ResponseMeasure) -> CurvePart:
     """What is measured along a curve, over the parameter."""
+    # Over the length along the curve, which the parameter need not follow: it turns back at folds.
     steps = np.linalg.norm(np.diff(branch.column("xi"), axis=0), axis=1)
     return CurvePart(
         parameter=parameter_values(branch),

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 RESOLVED = 1e-4  # of the range between the bounds: impacts turn a finer change into noise
-LARGEST = 8  # times the first population
-WHOLE = 0.3  # least standard deviation of a whole number
+LARGEST = 8  # times the first population: three restarts, each of which looks at a larger part of the range
+WHOLE = 0.3  # least standard deviation of a whole number: a tenth of the designs then have a neighbouring one
 
 
 class CmaEs:
@@ -36,6 +36,7 @@ class CmaEs:
         self._directions = directions
         self._best: tuple[float, np.ndarray] = np.inf, start
         self._begin({"popsize": population} if population else {})
+        # The package chooses a population by the number of variables where none is given.
         self._first = int(self._search.popsize)
 
     def _begin(self, options: dict[str, Any]) -> None:
@@ -80,6 +81,7 @@ class Nsga2:
         from pymoo.core.termination import NoTermination
 
         first = start + step * np.random.default_rng(seed).standard_normal((population, len(start)))
+        # The start itself, which a search that is stopped early must not miss.
         first[0] = start
         self._problem = Problem(n_var=len(start), n_obj=objectives, xl=0.0, xu=1.0)
         self._search = NSGA2(pop_size=population, sampling=np.clip(first, 0.0, 1.0))
@@ -119,6 +121,7 @@ def front(losses: np.ndarray) -> np.ndarray:
     Of equal ones the first is taken; for one objective it is the best.
     """
     finite = np.flatnonzero(np.isfinite(losses).all(axis=1))
+    # Sorted by the first objective, then by the second: a design can only be dominated by one before it.
     order = finite[np.lexsort(losses[finite].T[::-1])]
     best: list[int] = []
     for number in order:

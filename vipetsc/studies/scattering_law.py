@@ -13,8 +13,8 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.studies.linear_run import LinearRun
 
 FORWARD, BACKWARD = 0, 1  # directions: from the drive to the site and on, and the other
-LEAST = 0.02  # of the energy that must leave the drive's wave where the transfer's efficiency is judged
-NEAR = 5  # cells from the site within which energy counts as near it
+LEAST = 0.02  # of the energy that must leave the drive's wave where the transfer's efficiency U/(1-T) is judged
+NEAR = 5  # cells from the site within which energy counts as near it: evanescent waves have decayed beyond
 FLAT = 0.1  # of the efficiency: smaller differences are within its scatter
 BROAD = 0.05  # half the width in log z over which it is averaged: a design has to bear as much
 LISTED = (1.01, 1.1, 1.5, 3.0, 10.0, 30.0, 100.0)  # values of z in the printed table

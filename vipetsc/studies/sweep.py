@@ -39,13 +39,13 @@ MOST_SURVEYED = 10_000  # members whose cases are resolved beforehand, for their
 class SweepResult:
     """Outcome of a sweep: ``status`` (member), an index of ``studies.ensemble.STATUS``.
 
-    ``newly_made`` counts the members simulated or scaled now; ``busy`` (rank) is the fraction of the time in which each
+    ``computed`` counts the members simulated or scaled now; ``busy`` (rank) is the fraction of the time in which each
     rank worked on members. ``warnings`` are sentences about lost results and about the members. Rank 0 has what is
     ``held`` of a sweep without a folder.
     """
 
     status: np.ndarray
-    newly_made: int
+    computed: int
     seconds: float
     busy: tuple[float, ...]
     folder: Path | None
@@ -178,7 +178,7 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
 
     order = on_root(comm, lambda: surveys[0].order(runs.linear))
     bar = Progress(comm, len(order), "runs", show=progress)
-    newly_made = pool.run(order, runs.make, bar, runs.fail)
+    computed = pool.run(order, runs.make, bar, runs.fail)
     runs.recorded.file.close()
 
     seconds = time.perf_counter() - begin
@@ -195,7 +195,7 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     status, warnings = on_root(comm, put_together)
     # MPI has a limited number of communicators, and a process may run many sweeps.
     runs.recorded.team.Free()
-    return SweepResult(status, newly_made, seconds, busy, folder, warnings)
+    return SweepResult(status, computed, seconds, busy, folder, warnings)
 
 
 def _join_linear_runs(runs: SweepRuns, comm: MPI.Comm) -> None:

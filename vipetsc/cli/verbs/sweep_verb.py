@@ -48,7 +48,7 @@ def sweep_table(result: "SweepResult") -> str:
     counts = f"{complete} simulated, {scaled} scaled from a linear run, {failed} failed"
     rows = [
         ("members", f"{result.status.size}: {counts}"),
-        ("computed now", f"{result.newly_made} in {result.seconds:.1f} s"),
+        ("computed now", f"{result.computed} in {result.seconds:.1f} s"),
         ("ranks busy", ", ".join(f"{100 * busy:.0f} %" for busy in result.busy)),
     ]
     if missing:
