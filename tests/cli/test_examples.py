@@ -38,6 +38,12 @@ def test_every_case_file_is_listed_with_its_verb_and_a_sentence(in_process, monk
     assert remedy.startswith("vipetsc examples NAME copies")
 
 
+def test_a_case_with_scatter_is_validated(in_process):
+    ended = in_process("validate", EXAMPLES / "disorder.toml")
+    assert ended.returncode == 0, ended.stderr
+    assert re.search(r"disorder of clearance +normal, deviation 1 %; seed 0: times 0\.99", ended.stdout)
+
+
 def test_a_copied_case_reads_its_data_wherever_it_is_and_wherever_it_is_called(in_process, tmp_path, monkeypatch):
     """The case and the file that it names are copied together, and the case is the same from another folder."""
     ended = in_process("examples", "waveform", "three-mass.toml", "--out", tmp_path / "mine", cwd=tmp_path)

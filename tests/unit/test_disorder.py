@@ -139,6 +139,11 @@ def test_what_cannot_be_drawn_is_refused(disorder, message):
     assert len(error.value.problems) == 1, error.value
 
 
+def test_a_deviation_is_described_with_its_size_and_distribution():
+    assert str(Deviation(relative=0.05)) == "normal, deviation 5 %"
+    assert str(Deviation(absolute=2e-5, distribution="lognormal")) == "lognormal, deviation 2e-05"
+
+
 def test_a_restitution_is_drawn_for_every_site():
     case = draw(seed=3, restitution={"relative": 0.05})
     drawn = case.contacts.each.restitution

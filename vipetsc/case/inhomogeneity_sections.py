@@ -49,8 +49,9 @@ class Deviation(Section):
             return np.asarray(values * np.exp(np.sqrt(spread) * normal - spread / 2))
 
     def __str__(self) -> str:
-        size = f"{self.absolute:g}"
-        if self.relative is not None:
+        if self.relative is None:
+            size = f"{self.absolute:g}"
+        else:
             size = f"{100 * self.relative:g} %"
         return f"{self.distribution}, deviation {size}"
 
