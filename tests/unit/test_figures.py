@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -247,7 +248,7 @@ def test_ranks_divide_the_figures_among_them(tmp_path):
     write_run(tmp_path / "run.h5")
     written = []
     for rank in range(2):
-        paths = draw("run", [tmp_path], formats=("pdf",), rank=rank, ranks=2)
+        paths = draw("run", [tmp_path], formats=("pdf",), turns=count(rank, 2))
         written += [path.name for path in paths]
     drawable = {*figure_names("run")} - {*reasons_without_pictures("run", [tmp_path], Files())}
     assert sorted(written) == sorted(f"{name}.pdf" for name in drawable)

@@ -1,22 +1,28 @@
 """Pictures of the results in a folder, drawn from its files on all ranks."""
 
+import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
 from vipetsc.cli.messages import echo
+from vipetsc.figures.second_process import SecondProcess
 from vipetsc.io.errors import is_disk_full
 from vipetsc.io.folder import FolderError
+from vipetsc.io.netcdf import root_attributes
 from vipetsc.parallel import on_every_rank, on_root
 
 if TYPE_CHECKING:
     from vipetsc.figures.sweep_members import Files
 
+MEASURES = "analysis.h5"  # the file of what `Pictures.prepare` measures
 SWEEP_FIGURES = "sweep"  # the source of pictures whose measures are those of the file
 
 
@@ -28,6 +34,7 @@ class Pictures:
     contains results to draw (a pattern as of ``Path.glob``), ``noun`` what that file is. ``prepare`` checks folders,
     and measures what is missing in them or older than its run; without it, a file that cannot be read is found out by
     drawing it. ``recognise`` says whether folders hold such results where one ``file`` in one folder does not decide.
+    ``unmeasured`` are figures that show the ``file`` alone, so that they can be drawn while it is measured.
     """
 
     source: str
@@ -35,12 +42,33 @@ class Pictures:
     noun: str
     prepare: Callable[[Sequence[Path]], None] | None = None
     recognise: Callable[[Sequence[Path]], bool] | None = None
+    unmeasured: tuple[str, ...] = ()
 
     def are_of(self, folders: Sequence[Path]) -> bool:
         """Whether these pictures show the results in ``folders``."""
         if self.recognise:
             return self.recognise(folders)
         return len(folders) == 1 and any(folders[0].glob(self.file))
+
+
+def second_process(
+    pictures: Pictures, comm: MPI.Comm, names: Sequence[str] | None = None
+) -> AbstractContextManager[SecondProcess | None]:
+    """A second process for ``pictures``, or None where it is of no use.
+
+    It helps where pictures take long, those of a run that are not restricted to ``names``, and where this process is
+    alone and a core is idle.
+    """
+    if pictures.unmeasured and not names and comm.size == 1 and SecondProcess.is_useful():
+        return SecondProcess()
+    return nullcontext()
+
+
+def draw_unmeasured(pictures: Pictures, folder: Path, second: SecondProcess) -> None:
+    """Let the ``second`` process draw what shows the new results in ``folder`` alone; they are measured meanwhile."""
+    # Earlier measures would put their warnings below the pictures.
+    if not (folder / MEASURES).exists():
+        second.ask(pictures.source, [folder], names=pictures.unmeasured)
 
 
 def draw_pictures(
@@ -50,24 +78,42 @@ def draw_pictures(
     names: list[str] | None = None,
     formats: tuple[str, ...] = ("png",),
     afresh: bool = True,
+    second: SecondProcess | None = None,
 ) -> list[Path]:
     """Draw what ``folders`` hold as `vipetsc.figures.registry.draw`, measured first where that is missing or older.
 
     ``names`` are figures among ``pictures``, all by default; unless ``afresh``, those that are newer than the files
-    they show stay. Returns the files written, on rank 0, an empty list on the others. Raises FolderError for folders
-    that hold nothing to draw, and for a figure that does not exist.
+    they show stay. A ``second`` process, which may have been asked to `draw_unmeasured`, draws half of all figures.
+    Returns the files written, on rank 0, an empty list on the others. Raises FolderError for folders that hold nothing
+    to draw, and for a figure that does not exist.
     """
+    on_root(comm, lambda: prepare(pictures, folders, names))
+    # Rank 0 reads the time, so that all ranks use the same one even if their file systems differ.
+    newest = None
+    if not afresh:
+        newest = on_root(comm, lambda: newest_result(folders))
+    # Asked before this process loads what it needs to draw itself.
+    drawn_ahead: tuple[str, ...] = ()
+    if second:
+        if second.is_asked and not measures_warn(folders[0]):
+            drawn_ahead = pictures.unmeasured
+        second.ask(pictures.source, folders, divided=True, formats=formats, newest=newest, omit=drawn_ahead)
+
     from vipetsc.figures.registry import draw
     from vipetsc.figures.sweep_members import Files
 
     def draw_part() -> list[Path]:
-        ranks = {"rank": comm.rank, "ranks": comm.size}
         with reading(pictures, folders):
-            return draw(pictures.source, folders, names, formats, **ranks, newest=newest, files=files)
+            if second:
+                from_here = draw_here(turns=second.turns, omit=drawn_ahead)
+                others = second.drawn()
+                if others is not None:
+                    return [*{*from_here, *others}]
+            return draw_here(turns=count(comm.rank, comm.size))
 
-    on_root(comm, lambda: prepare(pictures, folders, names))
     # What is left out and what is drawn is read from the same results, which are opened once.
     with Files() as files:
+        draw_here = partial(draw, pictures.source, folders, names, formats, newest=newest, files=files)
         sentences = on_root(comm, lambda: left_out(pictures, folders, files, names))
         for sentence in sentences:
             if pictures.source == SWEEP_FIGURES:
@@ -75,13 +121,14 @@ def draw_pictures(
             else:
                 # A lattice without sites has no impacts: no matter to warn of.
                 echo(comm, f"  {sentence}")
-        # Rank 0 reads the time, so that all ranks use the same one even if their file systems differ.
-        newest = None
-        if not afresh:
-            newest = on_root(comm, lambda: newest_result(folders))
         drawn = on_every_rank(comm, draw_part)
     # ``gather`` gives None on all ranks but the first.
     return sorted(path for paths in comm.gather(drawn) or [] for path in paths)
+
+
+def measures_warn(folder: Path) -> bool:
+    """Whether the measures in ``folder`` carry warnings, which stand below every picture."""
+    return bool(json.loads(root_attributes(folder / MEASURES, "analysis")["warnings"]))
 
 
 @contextmanager

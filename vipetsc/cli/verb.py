@@ -10,6 +10,7 @@ import os
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,9 @@ from mpi4py import MPI
 
 from vipetsc.case import CaseFile
 from vipetsc.cli.arguments import Argument
-from vipetsc.cli.drawing import Pictures, draw_pictures
+from vipetsc.cli.drawing import Pictures, draw_pictures, second_process
 from vipetsc.cli.messages import echo, echo_paths, echo_warnings
+from vipetsc.figures.second_process import SecondProcess
 from vipetsc.io.folder import FolderKind
 from vipetsc.io.lock import locked
 from vipetsc.io.names import path_named
@@ -70,12 +72,16 @@ class PlainVerb(Verb):
 
 @dataclass
 class Work:
-    """Arguments of a study besides its case: the folder of its results, the ranks, the options and the stop request."""
+    """Arguments of a study besides its case: the folder of its results, the ranks, the options and the stop request.
+
+    ``second`` is a process that draws pictures, while the study still measures what they do not show.
+    """
 
     options: argparse.Namespace
     folder: Path
     comm: MPI.Comm
     stop: StopRequest
+    second: SecondProcess | None = None
     warned: list[str] = field(default_factory=list)
 
     @property
@@ -137,15 +143,23 @@ class StudyVerb(Verb):
         work = Work(options, folder, comm, stop)
         # On rank 0, since warnings compute the bands of the cell.
         work.warn(on_root(comm, case.warnings))
+        pictures = None
+        if case.wants_pictures:
+            pictures = self.pictures
 
         # Studies lock their folder themselves, which the same process may do again; this lock spans the pictures too.
-        with locked(comm, folder):
+        with ExitStack() as stack:
+            stack.enter_context(locked(comm, folder))
+            # Results of an earlier command have their pictures.
+            if pictures and (options.force or not pictures.are_of([folder])):
+                work.second = stack.enter_context(second_process(pictures, comm))
+
             outcome = self.study(case, work)
             # What was computed is saved; pictures are drawn by the command that goes on.
             stop.check(comm)
-            if self.pictures and outcome.drawable and case.wants_pictures:
+            if pictures and outcome.drawable:
                 with stop.at_once():
-                    drawn = draw_pictures(self.pictures, [folder], comm, afresh=False)
+                    drawn = draw_pictures(pictures, [folder], comm, afresh=False, second=work.second)
                 echo_paths(comm, drawn)
 
         # Last, where a user sees them; with --quiet they are all that is printed.

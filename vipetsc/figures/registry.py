@@ -5,7 +5,7 @@ import itertools
 import json
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -188,9 +188,9 @@ def draw(
     names: Sequence[str] | None = None,
     formats: Sequence[str] = ("png",),
     *,
-    rank: int = 0,
-    ranks: int = 1,
+    turns: Iterator[int] | None = None,
     newest: float | None = None,
+    omit: Collection[str] = (),
     files: Files | None = None,
 ) -> list[Path]:
     """Draw what the ``folders`` hold into ``figures/`` of the first of them; return the files, each complete.
@@ -202,10 +202,12 @@ def draw(
         names, side by side), "design", "optimum", "law" or "prediction" (one folder).
     names
         Figures, and of sweeps measures; by default all figures, and the measures that most readers look at.
-    rank, ranks
-        Every ``ranks``-th picture from number ``rank`` on is drawn.
+    turns
+        Rising numbers of the pictures to draw, from 0, as of ``draw_each``; by default all.
     newest
         A time in s since the epoch: pictures that are not older stay.
+    omit
+        Figures that are left out.
     files
         Results that the caller has opened and will close.
 
@@ -223,10 +225,10 @@ def draw(
     with rc_style(), Files() as opened_here:
         opened = opened_here if files is None else files
         return draw_each(
-            drawings(source, folders, opened, names),
+            drawings(source, folders, opened, names, omit),
             target=folders[0] / "figures",
             formats=formats,
-            turns=itertools.count(rank, ranks),
+            turns=itertools.count() if turns is None else turns,
             keep=keep,
         )
 
@@ -239,14 +241,14 @@ def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None)
 
 
 def drawings(
-    source: str, folders: Sequence[Path], files: Files, names: Sequence[str] | None = None
+    source: str, folders: Sequence[Path], files: Files, names: Sequence[str] | None = None, omit: Collection[str] = ()
 ) -> Iterator[Drawing]:
-    """Return the drawings of what the ``folders`` hold, in the order in which ``draw`` draws them.
+    """Return the drawings of what the ``folders`` hold, in the order in which ``draw`` draws them, but for ``omit``.
 
     Warnings in the files are the figures' labels. A drawing can be called as long as its ``files`` are open. Raises
     KeyError as ``figure_names``.
     """
-    chosen = figure_names(source, names, folders, files)
+    chosen = [name for name in figure_names(source, names, folders, files) if name not in omit]
     if source == SWEEP:
         return _sweep_drawings(chosen, folders, files, by_name=names is not None)
     named = figures_of(source, folders)

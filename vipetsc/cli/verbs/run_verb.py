@@ -13,7 +13,7 @@ from vipetsc.case import Case, Sweep
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.cli.arguments import CASE, OF_STUDIES, argument
 from vipetsc.cli.case_rows import lattice_rows
-from vipetsc.cli.drawing import Pictures
+from vipetsc.cli.drawing import Pictures, draw_unmeasured
 from vipetsc.cli.messages import logger
 from vipetsc.cli.tables import duration, first_few, table
 from vipetsc.cli.verb import Outcome, Rows, StudyVerb, Work
@@ -75,6 +75,8 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     # Measures need a second sample: a run that fails in its first has none.
     has_two_samples = result.statistics["samples"] > 1
     has_fields = bool(case.output.fields) and has_two_samples
+    if has_fields and work.second:
+        draw_unmeasured(PICTURES, work.folder, work.second)
     if has_fields or (case.output.points and has_two_samples):
         sweep = None
         if work.options.member:
@@ -269,6 +271,13 @@ def measure_where_missing(folders: Sequence[Path]) -> None:
         measure_run(folder)
 
 
+PICTURES = Pictures(
+    source="run",
+    file="run.h5",
+    noun="run",
+    prepare=measure_where_missing,
+    unmeasured=("phase", "unit_cell", "impacts", "ledger"),
+)
 VERB = StudyVerb(
     name="run",
     text="simulate a case, analyse it and draw pictures",
@@ -279,6 +288,6 @@ VERB = StudyVerb(
     study=simulate_and_measure,
     table=run_rows,
     results=RUN,
-    pictures=Pictures(source="run", file="run.h5", noun="run", prepare=measure_where_missing),
+    pictures=PICTURES,
     takes_petsc_options=True,
 )

@@ -1,0 +1,158 @@
+"""Pictures that a second process draws: the same files, also where it fails; it ends with the process that asks."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from mpi4py import MPI
+
+import pytest
+
+from tests.conftest import small_case
+from vipetsc.cli.drawing import draw_pictures, draw_unmeasured
+from vipetsc.cli.verbs.run_verb import PICTURES
+from vipetsc.dynamics import simulate
+from vipetsc.figures.common_turns import CommonTurns
+from vipetsc.figures.second_process import SecondProcess
+
+pytestmark = pytest.mark.parallel(1)
+WITHOUT_MEASURES = {"phase.png", "unit_cell.png", "impacts.png", "ledger.png"}
+
+
+def run_in(folder: Path, stride: int) -> Path:
+    """Write a run with few pictures, whose fields are those of every ``stride``-th sample."""
+    output = {"fields": ["velocity"], "stride": stride}
+    case = small_case(contacts={"sites": []}, time={"engine": "propagator", "end": 0.03}, output=output)
+    simulate(case, folder, MPI.COMM_SELF)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """The folder of a run that is not measured."""
+    return run_in(tmp_path_factory.mktemp("whole") / "run", stride=1)
+
+
+@pytest.fixture(scope="module")
+def thinned(tmp_path_factory) -> Path:
+    """The folder of a run whose measures will warn that its samples do not resolve the highest band."""
+    return run_in(tmp_path_factory.mktemp("thinned") / "run", stride=20)
+
+
+def pictures_in(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in (folder / "figures").iterdir()}
+
+
+class Recorded:
+    """A second process that has failed; keeps what it was asked for."""
+
+    is_asked = False
+
+    def __init__(self) -> None:
+        self.turns = iter(())
+        self.requests = []
+
+    def ask(self, source, folders, divided=False, **options):
+        self.requests.append(options)
+        self.is_asked = True
+
+    def drawn(self):
+        return None
+
+
+@pytest.mark.slow
+def test_two_processes_draw_what_one_draws(run, tmp_path):
+    alone = shutil.copytree(run, tmp_path / "alone")
+    expected = draw_pictures(PICTURES, [alone], MPI.COMM_SELF)
+
+    with SecondProcess() as second:
+        draw_unmeasured(PICTURES, run, second)
+        drawn = draw_pictures(PICTURES, [run], MPI.COMM_SELF, afresh=False, second=second)
+        # A folder without results: that a request fails ends nothing.
+        second.ask("run", [tmp_path])
+        assert second.drawn() is None
+        assert second._process.poll() is None
+
+    assert [path.name for path in drawn] == [path.name for path in expected]
+    assert pictures_in(run) == pictures_in(alone)
+
+
+def test_pictures_that_the_second_process_did_not_draw_are_drawn_here(thinned):
+    second = Recorded()
+    drawn = draw_pictures(PICTURES, [thinned], MPI.COMM_SELF, second=second)
+    assert {path.name for path in drawn} == {"spacetime.png", "unit_cell.png", "ledger.png"}
+    assert all(path.stat().st_size for path in drawn)
+
+
+@pytest.mark.parametrize("name", ["run", "thinned"])
+def test_pictures_without_the_warnings_of_the_measures_are_drawn_again(name, request, monkeypatch, tmp_path):
+    """A picture that was drawn before the run was measured stays if the measures have nothing to warn of."""
+    folder = shutil.copytree(request.getfixturevalue(name), tmp_path / "run")
+    (folder / "analysis.h5").unlink(missing_ok=True)
+    monkeypatch.setattr("vipetsc.figures.registry.draw", lambda *arguments, **options: [])
+    second = Recorded()
+    draw_unmeasured(PICTURES, folder, second)
+    draw_pictures(PICTURES, [folder], MPI.COMM_SELF, second=second)
+    ahead, rest = second.requests
+    assert {f"{figure}.png" for figure in ahead["names"]} == WITHOUT_MEASURES
+    assert rest["omit"] == (ahead["names"] if name == "run" else ())
+
+
+def test_earlier_measures_keep_pictures_from_being_drawn_ahead(tmp_path):
+    (tmp_path / "analysis.h5").touch()
+    second = Recorded()
+    draw_unmeasured(PICTURES, tmp_path, second)
+    assert not second.requests
+
+
+def test_a_second_process_that_was_killed_has_drawn_nothing(tmp_path):
+    with SecondProcess() as second:
+        second._process.kill()
+        second._process.wait()
+        second.ask("run", [tmp_path])
+        assert second.drawn() is None
+
+
+def test_the_second_process_ends_with_the_one_that_asks():
+    """The first one is killed; what both hold open is closed when neither is left."""
+    program = (
+        "import os, signal\n"
+        "from vipetsc.figures.second_process import SecondProcess\n"
+        "second = SecondProcess()\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60)
+    assert ended.returncode == -signal.SIGKILL
+    assert not ended.stderr
+
+
+def test_no_second_process_on_one_core(monkeypatch):
+    monkeypatch.delitem(sys.modules, "matplotlib", raising=False)
+    assert SecondProcess.is_useful() == (len(os.sched_getaffinity(0)) > 1)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0})
+    assert not SecondProcess.is_useful()
+
+
+def test_two_processes_take_each_turn_once():
+    program = (
+        "import sys; from itertools import islice\n"
+        "from vipetsc.figures.common_turns import CommonTurns\n"
+        "print(*islice(CommonTurns(int(sys.argv[1])), 2000))\n"
+    )
+    file = os.memfd_create("turns")
+    try:
+        words = [sys.executable, "-c", program, str(file)]
+        with (
+            subprocess.Popen(words, stdout=subprocess.PIPE, text=True, pass_fds=(file,)) as first,
+            subprocess.Popen(words, stdout=subprocess.PIPE, text=True, pass_fds=(file,)) as second,
+        ):
+            taken = [[int(word) for word in process.communicate()[0].split()] for process in (first, second)]
+        assert sorted(taken[0] + taken[1]) == list(range(4000))
+        assert next(CommonTurns(file)) == 4000
+    finally:
+        os.close(file)
