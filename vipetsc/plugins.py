@@ -45,6 +45,7 @@ class Plugin:
 
 
 _PLUGINS: dict[str, Plugin] = {}
+# A context variable rather than an argument: types of keys ask for the names, and pydantic passes them nothing.
 _NAMED: ContextVar[tuple[str, ...] | None] = ContextVar("named", default=None)
 
 
@@ -109,6 +110,7 @@ def load(name: str) -> Plugin:
 
 def _imported(name: str) -> Plugin:
     """The module ``name``, imported."""
+    # What an import adds is what the module has brought along: it may import others that register.
     earlier = _every_module()
     entry: metadata.EntryPoint | None = None
     try:

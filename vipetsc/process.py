@@ -18,7 +18,9 @@ RANKS = "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"
 # For Open MPI, where one process runs alone: no daemon is started for it, and no network is looked for.
 ALONE = {"OMPI_MCA_ess_singleton_isolated": "1", "OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self"}
 
-ALLOCATIONS = 10_000  # of objects that may hold others, between two searches for garbage
+# Objects that may hold others, allocated between two searches for garbage. With Python's own 700 the searches take a
+# tenth of a run's time.
+ALLOCATIONS = 10_000
 
 
 def cache_folder() -> Path:
@@ -58,7 +60,7 @@ def quick_start_alone() -> Iterator[None]:
 
 
 def collect_seldom() -> None:
-    """Look for cyclic garbage less often than Python does by itself, whose searches take a tenth of a run's time.
+    """Look for cyclic garbage less often than Python does by itself.
 
     Most objects are those of libraries, which stay; fields and records are freed without a search.
     """

@@ -27,6 +27,7 @@ class Progress:
     def __init__(self, comm: MPI.Comm, total: float, unit: str, show: bool = True) -> None:
         self._total = total
         self._unit = unit
+        # Monotonic: a clock that is set back would silence the lines.
         self._last = time.monotonic()
         self._compiled = compiling.seconds
         self._begin = self._last - self._compiled

@@ -27,7 +27,9 @@ WAVEFORM = "waveform"
 MEASURE = "measure"
 FIGURE = "figure"
 NAME = re.compile(r"[A-Za-z][\w-]*")
-MOST_PARAMETERS = 4  # of an elastic law: its compiled functions take so many numbers besides x and k
+# Parameters of an elastic law: the compiled record of a site has a field for each, and its functions take so many
+# numbers besides x and k.
+MOST_PARAMETERS = 4
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -315,6 +317,7 @@ def _add(part: RegisteredPart) -> None:
         raise ValueError(f"there is a {part.kind} {part.name!r} of vipetsc already")
 
     earlier = PARTS[part.kind].get(part.name)
+    # In a notebook a cell is executed again and again, each time with another source.
     if earlier is None or earlier.modules == part.modules:
         PARTS[part.kind][part.name] = part
     elif earlier.sha256 == part.sha256:

@@ -1,5 +1,17 @@
 """Numbers with nouns and names with units, as tables, messages and pictures write them."""
 
+from collections.abc import Sequence
+
+MOST_SHOWN = 8  # entries of a list, which with the number of all of them fit on a line
+
+
+def shortened(items: Sequence[object]) -> str:
+    """The first of ``items`` between commas, and how many there are if these are not all; "" of an empty list."""
+    shown = ", ".join(map(str, items[:MOST_SHOWN]))
+    if len(items) > MOST_SHOWN:
+        shown += f", ... ({len(items)})"
+    return shown
+
 
 def counted(number: int | str, noun: str) -> str:
     """A ``number``, or its text, with a ``noun`` whose plural ends in s: "1 site", "5 sites"."""

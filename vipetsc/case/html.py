@@ -9,8 +9,8 @@ from vipetsc.case.contacts import describe_stops
 from vipetsc.case.model import Model
 from vipetsc.lattice import UnitCell, pass_bands
 from vipetsc.lattice.chain import Pair
+from vipetsc.wording import MOST_SHOWN, shortened
 
-MOST_SHOWN = 8  # of a list
 # Fraction of a band's upper edge that counts as zero: a frequency is the root of an eigenvalue, which has a rounding
 # error of 1e-16 of the largest one, so that an edge at zero comes out as 1e-8 of the upper one.
 ROUNDING = 1e-6
@@ -50,7 +50,7 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
         masses = f"{cell.dofs} masses"
     rows = [
         ("lattice", f"{chain.cells} cells of {masses}, {ends} ends"),
-        ("pass bands in rad/s", first_few(_band_edges(cell))),
+        ("pass bands in rad/s", shortened(_band_edges(cell))),
     ]
 
     pair = None
@@ -59,8 +59,8 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
         laws = model.used_laws[:MOST_SHOWN]
         rows += [
             ("contact", "; ".join(dict.fromkeys(map(str, laws)))),
-            ("sites", first_few([f"cell {site + 1}" for site in chain.sites])),
-            ("clearance", first_few(describe_stops(model.gaps, chain.clearances))),
+            ("sites", shortened([f"cell {site + 1}" for site in chain.sites])),
+            ("clearance", shortened(describe_stops(model.gaps, chain.clearances))),
         ]
     if model.initial:
         rows.append(("begins with", model.initial.describe()))
@@ -83,14 +83,6 @@ def _band_edges(cell: UnitCell) -> list[str]:
             low = 0.0
         edges.append(f"{low:.5g} to {band.high:.5g}")
     return edges
-
-
-def first_few(items: Sequence[str]) -> str:
-    """The first of ``items``, and how many there are if these are not all."""
-    shown = ", ".join(items[:MOST_SHOWN])
-    if len(items) > MOST_SHOWN:
-        shown += f", ... ({len(items)})"
-    return shown
 
 
 def cell_svg(cell: UnitCell, pair: Pair | None) -> str:

@@ -16,10 +16,10 @@ from vipetsc.io.state import State
 from vipetsc.lattice import Chain, UnitCell, bloch
 from vipetsc.lattice.modes import mode_frequency, mode_shape, number_near
 from vipetsc.lattice.packet import Packet, gaussian_packet
+from vipetsc.wording import shortened
 
 # A packet's envelope has fallen below 1e-10, the tolerance of a landing, so many widths from its middle.
 PACKET_WIDTHS = 6.8
-MOST_SHOWN = 8  # struck masses that are named in words
 
 
 class KindKeys(NamedTuple):
@@ -143,11 +143,7 @@ class InitialTable(Section):
 
     def _describe_strikes(self) -> str:
         """The first of the masses that are struck, and the number of all if there are more."""
-        struck = [f"{one.velocity:g} m/s of mass {one.mass} of cell {one.cell}" for _, one in self.strikes]
-        text = ", ".join(struck[:MOST_SHOWN])
-        if len(struck) > MOST_SHOWN:
-            text += f", ... ({len(struck)})"
-        return text
+        return shortened([f"{one.velocity:g} m/s of mass {one.mass} of cell {one.cell}" for _, one in self.strikes])
 
     def packet(self, cell: UnitCell) -> Packet:
         """The packet, of 1 m; only of that kind."""

@@ -16,10 +16,11 @@ from pydantic import Field
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, CaseFile, Problem, Section, Table, put, read_section
-from vipetsc.case.html import first_few, html_table
+from vipetsc.case.html import html_table
 from vipetsc.case.schema import number
 from vipetsc.case.study import StudyCase, with_fastest_engine
 from vipetsc.case.value_ranges import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
+from vipetsc.wording import shortened
 
 # Members whose cases are resolved to check a sweep before it begins, and sites that they have together: either takes
 # about a second, at 0.6 ms a member and 5 us a site.
@@ -110,7 +111,7 @@ class Sweep(StudyCase):
     def _repr_html_(self) -> str:
         """The keys that vary and their values, as a notebook shows them."""
         rows = [
-            (key, first_few([f"{value}" for value in values])) for axis in self.axes for key, values in axis.items()
+            (key, shortened([f"{value}" for value in values])) for axis in self.axes for key, values in axis.items()
         ]
         return html_table(f"{self.name}: {self.count} members", rows)
 

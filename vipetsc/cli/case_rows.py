@@ -8,6 +8,7 @@ from vipetsc.case.contacts import describe_stops
 from vipetsc.case.warnings import losses
 from vipetsc.cli.tables import first_few
 from vipetsc.lattice import gaps, pass_bands
+from vipetsc.wording import MOST_SHOWN
 
 
 def lattice_rows(case: Case) -> list[tuple[str, str]]:
@@ -28,7 +29,7 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
         if between := gaps(bands):
             gap_list = ", ".join(f"{low:.2f}-{high:.2f}" for low, high in between) + " rad/s"
     # Each of a million sites may have its own law: a list shows only the first ones.
-    laws = model.used_laws[:8]
+    laws = model.used_laws[:MOST_SHOWN]
     clearances = first_few(describe_stops(model.gaps, chain.clearances))
 
     return [

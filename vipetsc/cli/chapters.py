@@ -89,6 +89,7 @@ def _columns(rows: str) -> str:
     # An escaped bar is text of a cell.
     cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", row.strip("|"))] for row in rows.splitlines()]
     cells = [row for row in cells if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
+    # The last column needs no width: nothing stands after it.
     widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]) - 1)]
     lines = []
     if sum(widths) > WIDEST * len(widths):

@@ -57,7 +57,7 @@ class Feature:
 
 @dataclass(frozen=True)
 class Column:
-    """A verb in one of its ways: the ``heading``, the class of its case, and the ``sections`` that it needs.
+    """A verb in one of its forms: the ``heading``, the class of its case, and the ``sections`` that it needs.
 
     ``refusal`` checks a valid case further and returns the reason for which it is refused, or an empty text.
     """
@@ -158,7 +158,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("own", NnmCase, QUIET | {"nnm": NNM | {"system": "own", "own": OWN}}, is_system=True),
     Column("condensed", NnmCase, QUIET | {"nnm": NNM | BREATHER | {"system": "condensed"}}),
 )
-"""The verbs that read a case, each in its ways."""
+"""The verbs that read a case, each in its forms."""
 
 
 def _lattice(**changes: Any) -> Table:
@@ -298,7 +298,7 @@ def _introduction() -> Iterator[str]:
         f"that refuses it, below the table; `{UNREAD}` where the verb reads no section that has the feature. A message",
         "with *not yet* gives no reason of physics: the verb could accept the feature, but is not written for it.",
         "",
-        "The columns are verbs, and some of their ways: `run` by `ts` and by the `propagator` (a run that it refuses",
+        "The columns are verbs, and some of their forms: `run` by `ts` and by the `propagator` (a run that it refuses",
         "goes on with `ts`), `bands --modes` (linear modes, without dashpots), `nfrc` of a force or a moved wall and",
         "of an incident `wave`, and `nnm` of each system, of which `condensed` has the breathers. `plot` and `export`",
         "accept the run of every feature.",

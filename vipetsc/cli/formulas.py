@@ -127,6 +127,7 @@ def _script(mark: str, text: str, is_word: bool) -> str:
     letters = {"^": RAISED, "_": LOWERED}[mark]
     if text and not is_word and all(character in letters for character in text):
         return "".join(letters[character] for character in text)
+    # A letter with an index of its own is one factor.
     has_one_letter = all(character in LOWERED.values() for character in text[1:])
     if is_word or has_one_letter or (mark == "_" and FACTOR.fullmatch(text)):
         return mark + text

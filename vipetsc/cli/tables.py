@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-MOST_SHOWN = 8  # of a list
+from vipetsc.wording import shortened
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
@@ -12,13 +12,8 @@ def table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def first_few(items: Sequence[object]) -> str:
-    """The first ``items``, followed by the number of all items if there are more."""
-    if not items:
-        return "none"
-    shown = ", ".join(map(str, items[:MOST_SHOWN]))
-    if len(items) > MOST_SHOWN:
-        shown += f", ... ({len(items)})"
-    return shown
+    """The first ``items``, and how many there are if these are not all; "none" of an empty list."""
+    return shortened(items) or "none"
 
 
 def duration(seconds: float) -> str:

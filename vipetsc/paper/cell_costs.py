@@ -11,8 +11,11 @@ from vipetsc.lattice.bands import BlochPoint, bloch
 from vipetsc.lattice.cell import Reading, UnitCell, four_band
 
 COSTS = ("deflection", "group_velocity", "weighted")
+PAPER_CELL = (0.1, 0.5)  # the (lambda, eta) that the paper takes (SPEC 11, C10; Suppl. 3)
 DRIVEN = 2  # the band whose wave is to open and close the contacts; waves are to be fast from here upwards
-AT_REST = 1e-12  # of the product of two unit-norm displacements, which then have no phase
+# Product of two unit-norm displacements below which they have no phase: at the zone's border one of them vanishes by
+# symmetry, and comes out as a rounding error of either sign.
+AT_REST = 1e-12
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,7 @@ def search_cells(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: A
     frequency = []
     deflection = []
     speed = []
+    # In the order of the grid, into whose shape the lists are brought at the end.
     for one_lam, one_eta in itertools.product(lams, etas):
         sys.audit("vipetsc.step")
         cell = four_band(reading, one_lam, one_eta)

@@ -17,11 +17,10 @@ from vipetsc.io.folder import SEARCH, claimed, provenance
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.lattice import bloch
 from vipetsc.lattice.cell import Reading, four_band
-from vipetsc.paper.cell_costs import COSTS, CellSearch, search_cells, signed_deflection, unit_vectors
+from vipetsc.paper.cell_costs import COSTS, PAPER_CELL, CellSearch, search_cells, signed_deflection, unit_vectors
 from vipetsc.parallel import StopRequest, on_root
 
 logger = logging.getLogger(__name__)
-PAPER = (0.1, 0.5)  # the (lambda, eta) that the paper takes
 UNITS = {"deflection": "1", "group_velocity": "cells/s", "weighted": "cells/s"}
 BEST = ("optimum_lambda", "optimum_eta", "optimum_value")
 # Dimensions of the values of every cell of the grid, and of every cost's best cell.
@@ -44,7 +43,7 @@ LAYOUT = {
     "deflection": (GRID, "1", "largest |u3 - u2| sign(-u2 u3) on band 2 over kappa, unit-norm Bloch vectors"),
     "group_velocity": (GRID, "cells/s", "sum over bands 2 to 4 of the largest |group velocity|"),
     "weighted": (GRID, "cells/s", "group velocity times deflection"),
-    "paper_value": (OPTIMUM, "1", "the cost at the paper's lambda = {}, eta = {}".format(*PAPER)),
+    "paper_value": (OPTIMUM, "1", "the cost at the paper's lambda = {}, eta = {}".format(*PAPER_CELL)),
     "optimum_lambda": (OPTIMUM, "1", "lambda of the best cell that is out of phase"),
     "optimum_eta": (OPTIMUM, "1", "eta of the best cell that is out of phase"),
     "optimum_value": (OPTIMUM, "1", "cost of the best cell, in the units of the cost"),
@@ -83,12 +82,13 @@ def search_design(
 def _make_search(case: DesignCase, path: Path) -> None:
     """Write the search of ``case`` to ``path`` unless it is there; names a file that cannot be read."""
     try:
+        # Whole or absent: the file is written under another name, and takes this one when it is complete.
         with open_netcdf(path, "search", BEST):
             return
     except (OSError, ValueError) as error:
         # A missing file is the usual case; one that cannot be read deserves a word.
         if path.exists():
-            logger.warning("vipetsc: warning: %s; made again", error)
+            logger.warning("vipetsc: warning: %s; computed again", error)
 
     write_netcdf(path, _search(case))
 
@@ -130,7 +130,7 @@ def _search(case: DesignCase) -> xr.Dataset:
 
 def _paper_costs(reading: Reading, wavenumber: np.ndarray) -> list[float]:
     """The costs (cost) of the cell that the paper takes."""
-    cell = search_cells(reading, *PAPER, wavenumber)
+    cell = search_cells(reading, *PAPER_CELL, wavenumber)
     return [cell.cost(name).item() for name in COSTS]
 
 
@@ -167,7 +167,7 @@ def _table(data: xr.Dataset) -> str:
     lines = [
         f"four-band cell, {sizes['lambda']} x {sizes['eta']} cells, {sizes['wavenumber']} wavenumbers;"
         " u2 and u3 out of phase on band 2 at every wavenumber",
-        f"reading     cost            lambda     eta      value  at ({PAPER[0]:g}, {PAPER[1]:g})  unit",
+        f"reading     cost            lambda     eta      value  at ({PAPER_CELL[0]:g}, {PAPER_CELL[1]:g})  unit",
     ]
     for (i, reading), (j, cost) in product(enumerate(data["reading"].values), enumerate(COSTS)):
         lam, eta, value, paper = (data[name].values[i, j] for name in (*BEST, "paper_value"))

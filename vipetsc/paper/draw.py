@@ -45,6 +45,7 @@ def draw_paper(
 
     spent = comm.allreduce(time.process_time() - begin)
     if drawn:
+        # Only if all pictures are new is their cost that of this call alone.
         drawn_anew = len(undrawn) == sum(len(entry["pictures"]) for entry in record["figures"].values())
         if not drawn_anew:
             # The cost of pictures from earlier calls counts, too.

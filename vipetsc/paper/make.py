@@ -89,6 +89,7 @@ def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRe
     stop.check(comm)
     claims = on_root(comm, lambda: _conclude(plan, root, comm, tell, inputs["claims"]))
 
+    # Asked again: steps may have failed, and are then missing still.
     left = on_root(comm, lambda: part.left(root))
     failed = any(note.startswith("failed") for note in notes)
     return PaperResult(new_steps=new_steps, drawn=drawn, claims=claims, complete=not (left or failed), notes=notes)
@@ -201,6 +202,7 @@ def _figure_state(root: Path, figure: PaperFigure, entry: BuildRecord | None, in
     files = sum(path.exists() for path in paths)
     if not files:
         state = MISSING
+    # All formats of all pictures: a kill may leave a PNG without its PDF.
     elif files == len(paths) and entry["inputs"] == inputs:
         state = DONE
     else:

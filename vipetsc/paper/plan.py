@@ -199,6 +199,7 @@ class PaperStep:
 
         times: list[float] = []
         if state == BEGUN:
+            # Members that are done show the rate of this machine.
             times = [*Results(self.case, self.folder(root)).cpu_seconds.values()]
         rate = self.cost
         if times:
@@ -338,6 +339,7 @@ def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
     endings: list[str] = []
     for path in paths:
         with open_netcdf(path, "branch", ("kind", "residual", "ending")) as branch:
+            # Special points are located to their own tolerance; the residual of the branch is that of its steps.
             regular = branch["kind"].values == 0
             residuals.extend(branch["residual"].values[regular].tolist())
             remarks = [branch.attrs["ending"]]

@@ -22,9 +22,11 @@ from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED
 from vipetsc.paper.paper_figures import READINGS, PaperFigure, describe
 from vipetsc.studies.engines import COMPARED
 
-COLOURS = 256  # of a picture of lines in the page
-WIDTH = 1000  # pixels of a picture of maps
-QUALITY = 50  # of a picture of maps in WebP
+# One page holds some hundred pictures. Those of lines keep all pixels in few colours; those of maps, which are larger
+# so, are narrower and with losses that only an enlargement shows.
+COLOURS = 256
+WIDTH = 1000  # pixels
+QUALITY = 50  # of WebP
 ENCODED = re.compile(r'<img data-of="(\w+)" src="([^"]+)"')
 # What several claims do that each have a verdict.
 OF_SEVERAL = {HOLDS: "hold", IN_PART: "hold in part", FAILS: "do not hold", UNMEASURED: "not measured"}
@@ -116,6 +118,7 @@ def small(image: Image.Image) -> bytes:
     if image.width > WIDTH:
         narrow = image.resize((WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS)
     narrow.save(maps, "webp", quality=QUALITY, method=4)
+    # Which kind a picture is shows by which encoding is shorter.
     return min(lines.getvalue(), maps.getvalue(), key=len)
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-MOST_SPECIAL = 4  # points of a kind that are printed
+MOST_SPECIAL = 4  # points of a kind that are printed; the file has all
 # Headings of the special points of frequency responses, by their kinds.
 SPECIAL_POINTS = {
     "fold": "folds",
@@ -37,7 +37,7 @@ SPECIAL_POINTS = {
     "period-doubling": "period doubling",
     "branch-point": "branch points",
 }
-SHOW_EVERY = 0.5  # s between two lines of the live table
+SHOW_EVERY = 0.5  # s between two lines of the live table, at which each can be read
 
 
 def follow_modes(case: NnmCase, work: Work) -> Outcome:
@@ -249,6 +249,7 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
     stable = measure(curve, "unstable") == 0
     rows.append(("stable", f"{stable.sum()} of {len(stable)} points"))
     if options.infinite:
+        # The balance of energies is a check of the whole computation: it is no equation that was solved.
         error = np.nanmax(np.abs(measure(curve, "share").sum(axis=1) - 1))
         rows.append(("T + R + U + L - 1", f"{error:.1e}"))
     return rows

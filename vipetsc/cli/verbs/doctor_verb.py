@@ -12,7 +12,8 @@ from vipetsc.cli.verb import BAD_INPUT, DONE, PlainVerb
 from vipetsc.io.folder import provenance
 from vipetsc.parallel import StopRequest
 
-LOADING = 1.0  # s of the compiler's clock in which kernels that are there are loaded
+# s of the compiler's clock: kernels that are there are loaded in less, and to compile one takes more.
+LOADING = 1.0
 
 
 def doctor(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:

@@ -17,9 +17,9 @@ from vipetsc.io.atomic import remove_abandoned
 from vipetsc.io.folder import FolderError
 from vipetsc.parallel import StopRequest, on_root
 
-NARROWEST = 320  # pixels
-WIDEST = 3840
-FASTEST = 50.0  # largest number of frames per second of a GIF
+NARROWEST = 320  # pixels, at which the type can still be read
+WIDEST = 3840  # pixels of the largest screens
+FASTEST = 50.0  # frames per second of a GIF, which counts hundredths of a second: viewers slow down shorter frames
 MOVIE_FORMATS = "gif", "mp4"
 
 

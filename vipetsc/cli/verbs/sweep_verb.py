@@ -16,7 +16,7 @@ from vipetsc.io.read import outdated
 if TYPE_CHECKING:
     from vipetsc.studies.sweep import SweepResult
 
-MOST_FAILURES = 10  # that are printed
+MOST_FAILURES = 10  # that are printed; the index of the sweep has all
 
 
 def simulate_members(plan: Sweep, work: Work) -> Outcome:

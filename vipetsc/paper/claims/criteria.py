@@ -12,7 +12,8 @@ from math import inf, isfinite
 from typing import Any, SupportsFloat
 
 HOLDS, IN_PART, FAILS, UNMEASURED = "holds", "holds in part", "does not hold", "not measured"
-ROUNDING = 1e-9  # by which a measured number may miss its threshold
+# By which a measured number may miss its threshold: a count over a count, as 3/5, is not exact in binary.
+ROUNDING = 1e-9
 LAWS = ("hertz", "bilinear")
 
 # Constants of quantities: what is counted or measured, rather than what decides.
@@ -25,7 +26,6 @@ HIGH = 10.0  # N, the paper's high amplitude
 SEVERAL = 3  # the fewest sites that are several
 HALF_WIDTH = 0.02  # half-width of the band about a Bloch branch over the top edge of the pass bands
 NATIVE = (7, 8)  # wavenumber bins that the packet starts in (SPEC 11, C5)
-PAPER_CELL = (0.1, 0.5)  # (lambda, eta) of the paper (SPEC 11, C10; Suppl. 3)
 GRID = 0.1  # spacing of its grid
 LOW = 10  # times the floor: up to there the transfer has not set in
 COUNTED = ("band 1", "band 2", "band 3", "band 4", "gap 1", "gap 2")  # the parts that the paper filters (App. A3)
@@ -108,6 +108,7 @@ def verdict(criteria: Sequence[Criterion], value: Mapping[str, SupportsFloat | N
     It holds when every criterion is met, not at all when none is or a decisive one is not, and else in part; what
     was not measured keeps it from holding.
     """
+    # A number that was not measured misses its criterion, but does not fail it.
     missed = [c for c in criteria if not c.met(value.get(c.quantity))]
     failed = [c for c in missed if value.get(c.quantity) is not None]
     names = [c.quantity for c in missed]

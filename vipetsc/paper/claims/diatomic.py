@@ -134,6 +134,7 @@ def _on_branches(run: AnalysedMember) -> float:
     wavenumber, frequency, energy = run.arrays("wavenumber", "frequency", "dispersion")
     cell = run.case.lattice.unit_cell()
     branches = bloch(cell, wavenumber).frequency
+    # To the nearest of all branches: which one a new wave belongs to is not asked.
     distance = np.abs(frequency[None, :, None] - branches[:, None, :]).min(axis=2)
     return energy[distance <= HALF_WIDTH * pass_bands(cell)[-1].high].sum() / energy.sum()
 
@@ -210,6 +211,7 @@ def reconstruction(evidence: Evidence, reading: str, result: Measurement) -> Non
     cross = []
     for name, run in triple.runs.items():
         snapshot, error, between_bins = run.arrays("partition/snapshot", "partition/error", "partition/cross_share")
+        # While the drive acts the packet is cut off at the lattice's first cell, where wavelets have no neighbour.
         after = snapshot >= triple.duration
         largest.append(error[after].max())
         cross.append(between_bins[after].mean())

@@ -161,6 +161,7 @@ def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
     result.uncertainty |= {f"{fit}, {average} mean": straight[average] for average in AVERAGES[1:]}
     result.uncertainty["fewest points of a fit"] = min(c.points for c in primary)
 
+    # Of the points from the peak on, two or fewer are beyond it.
     late = sum(c.peak >= len(c.amplitude) - 3 for c in primary)
     if late:
         text = f"{late} of {len(primary)} curves have their peak among the three largest amplitudes"

@@ -87,6 +87,7 @@ class AmplitudeCurve:
 
         Up to the peak; NaN if none is so low before it.
         """
+        # Behind the peak the values fall again, and could be as low as before it.
         value = self.value[: self.peak + 1]
         before = np.nonzero(value <= low)[0]
         above = np.nonzero(value >= high)[0]

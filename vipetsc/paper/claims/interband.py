@@ -7,7 +7,8 @@ import numpy as np
 
 from vipetsc.io.read import select
 from vipetsc.lattice.modes import linear_modes
-from vipetsc.paper.claims.criteria import CLAIMS, COUNTED, GRID, LAWS, LOW, PAPER_CELL
+from vipetsc.paper.cell_costs import PAPER_CELL
+from vipetsc.paper.claims.criteria import CLAIMS, COUNTED, GRID, LAWS, LOW
 from vipetsc.paper.claims.evidence import AmplitudeCurve, AnalysedMember, Evidence, Measurement, MissingEvidence
 
 # Steps of the paper's plan.
@@ -15,7 +16,7 @@ STEP = "interband"
 AMPLITUDES = "interband-amplitudes"
 DESIGN = "design"
 SCATTER = "interband-scatter"
-FIELDS = 16  # random ones, for norms
+FIELDS = 16  # random ones, by which a Frobenius norm is estimated to a quarter: a bound needs its order of magnitude
 
 
 def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
@@ -56,6 +57,7 @@ def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 def _on_grid(values: np.ndarray) -> np.ndarray:
     """Indices of the multiples of ``GRID`` among ``values``; of all of them if there are fewer than two."""
+    # Values of a grid are rounded to twelve digits, and so are no exact multiples.
     multiples = np.nonzero(np.abs(values / GRID - np.round(values / GRID)) < 1e-6)[0]
     if multiples.size < 2:
         return np.arange(len(values))
@@ -228,9 +230,11 @@ def one_site(evidence: Evidence, reading: str, result: Measurement) -> None:
         short = _transfer(evidence, reading, law, sites=5, cycles=15)
         single = _transfer(evidence, reading, law, sites=1, cycles=30)
 
+        # Members that failed are missing from either curve.
         common, i, j = np.intersect1d(many.amplitude, short.amplitude, return_indices=True)
         correlation = np.nan
         if len(common) > 2:
+            # Of logarithms: the transfer spans decades, and its largest values would decide a correlation alone.
             correlation = np.corrcoef(np.log(many.value[i]), np.log(short.value[j]))[0, 1]
         peaks = (many.peak_amplitude, short.peak_amplitude)
         result.value |= {

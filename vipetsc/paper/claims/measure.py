@@ -11,7 +11,7 @@ from vipetsc.io.atomic import write_text
 from vipetsc.paper.claims.criteria import CLAIMS, UNMEASURED, verdict
 from vipetsc.paper.claims.evidence import Evidence, Measurement, MissingEvidence, Numbers
 
-DIGITS = 6  # significant ones of the numbers in claims.json
+DIGITS = 6  # significant ones of the numbers in claims.json: further ones depend on the machine
 
 
 def measure_claims(root: str | Path) -> list[dict[str, Any]]:
@@ -33,6 +33,7 @@ def measure_claims(root: str | Path) -> list[dict[str, Any]]:
 def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any]:
     """Row of ``claims.json`` for a claim, by its id, in one reading."""
     spec = CLAIMS[claim]
+    # By name, so that the table of claims says all about a claim, its measurement too.
     measure = resolve_name(f"vipetsc.paper.claims.{spec.measure}")
     result = Measurement()
     judgement = UNMEASURED
@@ -53,6 +54,7 @@ def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any
         judgement, missed = verdict(spec.criteria, result.value)
 
     reasons = result.reasons
+    # Where all or none are missed the verdict says it already.
     if 0 < len(missed) < len(spec.criteria):
         reasons = [f"not met: {' / '.join(missed)}", *reasons]
     return {

@@ -71,6 +71,8 @@ def _add_out_of_phase(branch: xr.Dataset, case: NnmCase, law: str, result: Measu
     result.uncertainty[f"energy of the last point (J), {law}"] = energy[last]
 
     if law == "bilinear":
+        # At high energy a bilinear contact is closed nearly all of the time, and the system is the one with its
+        # spring.
         limit = System.from_case(case).closed_frequencies()[-1] / (2 * np.pi)
         result.value["high-energy limit (Hz), bilinear"] = limit
         distance = abs(frequency[last] / limit - 1)
@@ -87,6 +89,7 @@ def _add_out_of_phase(branch: xr.Dataset, case: NnmCase, law: str, result: Measu
 
 def _add_in_phase(branch: xr.Dataset, law: str, result: Measurement) -> None:
     """Add tongues, special points and largest frequency of the in-phase branch; say where they differ from ``TRUE``."""
+    # A branch that was followed further has more tongues, which are not among those counted.
     passed = branch["energy"].values <= HIGHEST
     kind, tongue, frequency = (branch[name].values[passed] for name in ("kind", "resonance", "frequency"))
     counts = {name: int(np.sum(kind == KINDS.index(name))) for name in TRUE[law] if name != "tongues"}
