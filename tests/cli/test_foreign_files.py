@@ -43,7 +43,7 @@ def test_pictures_of_a_foreign_file_are_refused(in_process, tmp_path, name, cont
 
 
 @pytest.mark.slow
-def test_a_search_in_whose_place_a_foreign_file_lies_is_made_again(in_process, tmp_path):
+def test_a_search_in_whose_place_a_foreign_file_lies_is_computed_again(in_process, tmp_path):
     scenario = SCENARIOS["design"]
     out = tmp_path / "out"
     words = words_of(f"{scenario.words} {PLAIN}", prepare(scenario, tmp_path), out)
@@ -54,7 +54,7 @@ def test_a_search_in_whose_place_a_foreign_file_lies_is_made_again(in_process, t
         ended = in_process(*words)
         assert ended.returncode == 0, contents
         assert "design.h5" in ended.stderr
-        assert "made again" in ended.stderr
+        assert "computed again" in ended.stderr
 
 
 @pytest.mark.parametrize("kind", [ResultFileError, UnreadableFileError])
