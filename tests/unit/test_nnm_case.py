@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from typing import Any
 
 import pytest
 
@@ -141,6 +142,47 @@ def test_a_lattice_that_nothing_holds_is_not_pushed():
     table["contacts"] |= {"side": "plus"}
     with pytest.raises(CaseError, match="nothing holds this lattice"):
         NnmCase.from_table(table)
+
+
+def test_stops_to_ground_hold_symmetric_motions_alone():
+    """Between equal stops to ground a free lattice has no place of its own if other forces are not symmetric."""
+    sites = {"sites": [2, 4], "clearance": 1e-3, "each": {"pair": [[0, 3], [2, 3]], "side": ["both", "both"]}}
+    table: dict[str, Any] = {
+        "lattice": {"preset": "four-band", "cells": 8, "ends": "free"},
+        "contacts": sites,
+        "nnm": {"system": "chain", "modes": [5]},
+    }
+    NnmCase.from_table(table)
+
+    quadratic = {"springs[3].quadratic": {"cells": [2], "value": 1e5}}
+    with pytest.raises(CaseError, match="no place of their own"):
+        NnmCase.from_table(table | {"lattice": table["lattice"] | {"profiles": quadratic}})
+    sites["each"]["side"] = ["both", "plus"]
+    with pytest.raises(CaseError, match="no place of their own"):
+        NnmCase.from_table(table)
+    NnmCase.from_table(table | {"lattice": table["lattice"] | {"ends": "fixed"}})
+
+
+def test_a_contact_pressed_to_ground_holds_a_lattice():
+    """Its first mode is no rigid motion; so in a system of one's own."""
+    contacts = {"stiffness": 20.0, "clearance": 0.0, "side": "minus", "precompression": 0.02}
+    spring = {"start": 1, "end": 1, "stiffness": 1.0, "next_cell": True}
+    table: dict[str, Any] = {
+        "lattice": {"cells": 3, "ends": "free", "cell": {"masses": [1.0], "springs": [spring]}},
+        "contacts": contacts | {"sites": [1], "pair": [0, 1]},
+        "nnm": {"system": "chain", "modes": [1]},
+    }
+    NnmCase.from_table(table)
+    apart = {"stiffness": 20.0, "clearance": 0.02, "sites": [1], "pair": [0, 1]}
+    with pytest.raises(CaseError, match="rigid body"):
+        NnmCase.from_table(table | {"contacts": apart})
+
+    own = {
+        "masses": [1.0, 2.0],
+        "springs": [{"start": 1, "end": 2, "stiffness": 1.0}],
+        "contacts": [{"host": 0, "resonator": 1, "clearance": 0.0}],
+    }
+    NnmCase.from_table({"contacts": contacts, "nnm": {"system": "own", "modes": [1], "own": own}})
 
 
 def test_disorder_is_drawn_for_normal_modes():

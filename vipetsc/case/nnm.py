@@ -25,6 +25,7 @@ from vipetsc.case.nnm_checks import (
     check_shooting,
     check_size,
     check_start_sites,
+    is_held,
 )
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.case.resolve import (
@@ -154,7 +155,7 @@ class NnmCase(CaseFile):
         problems += check_start_sites(nnm, len(sites))
         problems += check_size(nnm, lattice, cell)
         problems += check_stiffness(contacts, bool(sites), valid)
-        rigid = int(lattice.ends != "fixed")  # nothing holds it
+        rigid = int(not is_held(lattice, contacts, cell, gaps))
         return problems + _check_modes(nnm, lattice.cells * cell.dofs, rigid, problems)
 
     def physics(self) -> tuple[Any, ...]:
@@ -240,7 +241,13 @@ def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], val
     yield from check_forced(nnm, None, masses)
     rigid = 0
     if not wrong:
-        group = connected_groups(masses + 1, tuple((s.start, s.end) for s in custom.springs))
+        joined = [(spring.start, spring.end) for spring in custom.springs]
+        # A contact that is pressed at rest is a spring of small motions.
+        gaps = gaps_of_sites(contacts, [pair.clearance for pair in custom.contacts])
+        for number, gap in enumerate(gaps):  # none where both sides have the clearance, and nothing is pressed
+            if min(gap) < 0:
+                joined.append((custom.contacts[number].host, custom.contacts[number].resonator))
+        group = connected_groups(masses + 1, tuple(joined))
         rigid = len(set(group)) - 1
     yield from _check_modes(nnm, masses, rigid, wrong)
 

@@ -126,12 +126,46 @@ def check_lattice(
     if not (sites or lattice.nonlinear_keys):
         yield Problem("contacts.sites", [], f"give cells from 1 to {lattice.cells}")
 
-    # Nothing but the stops acts on such a lattice from outside: their mean force moves it away.
-    pairs = pairs_of_sites(contacts.model_copy(update={"sites": sites}), cell, len(sites))
-    to_ground = [number for number, pair in enumerate(pairs) if pair.host < 0]
-    if lattice.ends != "fixed" and any(gaps[number][0] != gaps[number][1] for number in to_ground):
+    yield from _check_held(lattice, contacts, cell, gaps)
+
+
+def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> Iterator[Problem]:
+    """The problem of stops to ground that would have to hold a lattice, which moves freely between them.
+
+    ``gaps`` are the clearances in m of its sites on both sides.
+    """
+    to_ground = _gaps_to_ground(contacts, cell, gaps)
+    if not to_ground or is_held(lattice, contacts, cell, gaps):
+        return
+
+    fixed = 'use ends = "fixed", or equal stops on both sides'
+    if any(plus != minus for plus, minus in to_ground):
         remedy = "nothing holds this lattice, and a stop to ground that differs on its two sides pushes it away"
-        yield Problem("contacts.pair", contacts.pair, f'{remedy}; use ends = "fixed", or equal stops on both sides')
+        yield Problem("contacts.pair", contacts.pair, f"{remedy}; {fixed}")
+    # Symmetric motions pass the centre between the stops. Others have a mean, which small motions leave open.
+    elif any(plus != minus for plus, minus in gaps) or not _is_odd(lattice):
+        remedy = (
+            "nothing holds this lattice between its stops to ground, and its other forces are not symmetric, so that"
+        )
+        yield Problem("contacts.pair", contacts.pair, f"{remedy} small motions have no place of their own; {fixed}")
+
+
+def is_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> bool:
+    """Whether springs to the walls, or a contact that is pressed to the ground, hold a lattice at rest."""
+    return lattice.ends == "fixed" or any(min(gap) < 0 for gap in _gaps_to_ground(contacts, cell, gaps))
+
+
+def _gaps_to_ground(contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> list[tuple[float, float]]:
+    """Those of the clearances ``gaps`` that belong to contacts with the ground."""
+    # There are no pairs where all sites join the cell's own, of which none is the ground.
+    pairs = pairs_of_sites(contacts, cell, len(gaps))
+    return [gaps[number] for number, pair in enumerate(pairs) if pair.host < 0]
+
+
+def _is_odd(lattice: LatticeTable) -> bool:
+    """Whether the springs' forces change sign with the elongation: no spring of any cell has a quadratic part."""
+    varied = [key for key in lattice.nonlinear_keys if key.endswith('.quadratic"')]
+    return not varied and not any(spring.quadratic for spring in lattice.undamped_cell().springs)
 
 
 def check_method(nnm: NnmTable) -> Iterator[Problem]:
