@@ -31,9 +31,9 @@ class StopAfter(StopRequest):
         return self.left < 0
 
 
-def plan_of(folder: Path, changes: dict[str, Any], **options: Any) -> IdentifyCase:
-    """A fit of one clearance to a record of a few contacts, with ``changes`` of the record."""
-    table = lattice_table(time={"end": 0.009})
+def plan_of(folder: Path, changes: dict[str, Any], end: float = 0.009, **options: Any) -> IdentifyCase:
+    """A fit of one clearance to a record of a few contacts until ``end`` (s), with ``changes`` of the record."""
+    table = lattice_table(time={"end": end})
 
     def made() -> str:
         record = measured_table(folder, table, noise=0.01) | changes
@@ -53,7 +53,7 @@ def plan(tmp_path_factory):
 def single(tmp_path_factory):
     """A fit from one start with an initial state, whose derivatives the ranks divide, and its result of one rank."""
     changes = {"begin": 0.004, "initial": "estimate"}
-    plan = plan_of(tmp_path_factory.mktemp("single"), changes, profile=0, steps=3)
+    plan = plan_of(tmp_path_factory.mktemp("single"), changes, end=0.007, profile=0, steps=3)
     folder = tmp_path_factory.mktemp("single-whole")
     run_identification(plan, folder, MPI.COMM_SELF)
     return plan, datasets(folder / "identified.h5")

@@ -44,7 +44,7 @@ def runs_alike(folder: Path, case: Case) -> None:
 def test_same_bits_with_sites_on_the_borders(folder, ends, law):
     # On 2, 3 and 4 ranks, 24 cells are cut after 12; 8, 16; 6, 12, 18.
     sites = [6, 7, 12, 13, 16, 17]
-    case = small_case(lattice={"ends": ends}, contacts={"law": law, "sites": sites}, time={"end": 0.04})
+    case = small_case(lattice={"ends": ends}, contacts={"law": law, "sites": sites}, time={"end": 0.03})
     runs_alike(folder, case)
 
 
