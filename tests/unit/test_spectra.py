@@ -11,7 +11,6 @@ from vipetsc.lattice import Band, bloch, diatomic, four_band, pass_bands
 from vipetsc.spectra import (
     Dispersion,
     Parts,
-    band_energies,
     block_means,
     dispersion,
     front_arrival,
@@ -22,6 +21,7 @@ from vipetsc.spectra import (
     taper,
     wavenumber_content,
 )
+from vipetsc.spectra.cosine_squares import CosineSquares
 
 MASSES = (0.5, 2.0)
 
@@ -116,7 +116,7 @@ def test_part_energies_add_up_and_do_not_depend_on_blocks(monkeypatch):
     assert trapezoid(energy.sum(axis=0)) == pytest.approx(trapezoid(total), rel=1e-12)
 
     for memory in (1.0, 2e4):
-        monkeypatch.setattr("vipetsc.spectra.band_energies.COLUMNS", 6)
+        monkeypatch.setattr("vipetsc.spectra.band_energies.COLUMNS", 3)
         assert np.allclose(part_energies(velocity, MASSES, 0.1, edges, memory=memory).total, energy, rtol=1e-12)
 
     (middle,) = split(velocity, 0.1, edges[1:3])
@@ -162,21 +162,44 @@ def test_maps_of_parts_are_means_of_their_energy(nt, one, other, samples, cells,
     assert np.allclose(found.maps, [expected], rtol=1e-6, atol=1e-12 * energy.max() + 1e-300)
 
 
-def test_a_narrow_part_takes_few_times_and_a_wide_one_every_stride():
-    """Steps in time follow from a part's width, and a stride makes them fewer; a last, open part is coarser for it."""
-    narrow = band_energies._Cosines(640, 895)
-    wide = band_energies._Cosines(1100, 4400)
-    # Squares of 255 cosines need at least three times as many points.
-    assert 3 * 255 <= band_energies._fewest_steps(narrow, 4420, 1) < 1100
-    assert band_energies._fewest_steps(wide, 4420, 1) == 4420
-    assert band_energies._fewest_steps(wide, 4420, 10) < 460
+def test_a_part_takes_twice_as_many_points_as_it_has_cosines():
+    """Wherever they lie; a part without one takes a point and has no energy."""
+    for low in (0, 640, 4000):
+        part = CosineSquares.zeros(low, low + 255)
+        assert 2 * 255 < part.length <= 512 + 1
+        assert len(part.square) == part.length // 2 + 1
+    empty = CosineSquares.zeros(9, 8)
+    empty.add(np.ones((20, 3)), 1.0)
+    assert not empty.square.any()
+    assert not empty.cosines().amplitude.any()
 
+
+def test_a_last_wide_part_is_coarser_by_the_stride():
+    """What is above the bands is interpolated between every tenth sample; other parts stay exact."""
     velocity = noise((100, 3, 2))
     edges = [0.0, 20.0, np.inf]
     every = part_energies(velocity, MASSES, 0.1, edges, 1).total
     tenth = part_energies(velocity, MASSES, 0.1, edges, 10).total
     assert np.allclose(every[0], tenth[0], rtol=1e-12)
     assert not np.allclose(every[1], tenth[1], rtol=0.1)
+    # 99 steps become 10, which have the samples 0 and 99 in common.
+    assert np.allclose(every[1, [0, 99]], tenth[1, [0, 99]], rtol=1e-12)
+
+
+@settings(max_examples=30)
+@given(st.integers(2, 200), st.floats(0, 0.3), st.integers(2, 20), st.integers(0, 99))
+def test_an_open_part_at_strided_times_is_the_part_there(nt, low, stride, seed):
+    """At the few times that are samples, as it would be without a stride."""
+    edges = [0.0, low * np.pi / 0.1, np.inf]
+    velocity = noise((nt, 3, 2), seed)
+    every = part_energies(velocity, MASSES, 0.1, edges).total
+    strided = part_energies(velocity, MASSES, 0.1, edges, stride).total
+
+    last = nt - 1
+    steps = min(fft.next_fast_len(-(-last // stride), real=True), last)
+    times = np.arange(steps + 1) * last
+    both = times[times % steps == 0] // steps
+    assert np.allclose(strided[1, both], every[1, both], rtol=0, atol=1e-12 * every.max())
 
 
 def test_a_tone_stays_in_its_part():

@@ -8,7 +8,7 @@ start, which would leak about 1e-4 of the driven band's energy into all the othe
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,11 +16,12 @@ from scipy import fft
 from scipy.special import diric
 
 from vipetsc.lattice import Band
-from vipetsc.spectra.cosine_transform import cosine_transform
+from vipetsc.spectra.cosine_squares import Cosines, CosineSquares
+from vipetsc.spectra.cosine_transform import CosineTransform
 from vipetsc.spectra.pooling import block_means, blocks
 
 # Histories of masses that are transformed together. Those of 4,421 samples are 1 MB, the size of a core's cache: from
-# 16 to 128 the time is the same, with 8 it is a sixth more.
+# 30 to 100 the time is the same, with 16 it is a fifth more.
 COLUMNS = 32
 
 
@@ -93,138 +94,108 @@ def part_energies(
 ) -> PartEnergies:
     """Kinetic energies of every part, from ``velocity`` (t, cell, dof) in m/s; maps of the parts ``mapped``.
 
-    The energy of a part from the frequency low to high has frequencies up to high - low and between 2 low and 2 high.
-    It is computed at as few even times as tell these apart (the filtered spectrum is folded onto them), which gives it
-    at every sample. A last part that is too wide for that, the region above the bands, is taken at every ``stride``-th
-    and interpolated; it has no map. ``velocity`` may be stored; no more than ``memory`` bytes of it are read at once.
-    Maps are means over blocks of ``sizes`` (samples, cells).
+    Energies follow at every sample from as few values as the width of a part needs (see ``cosine_squares``). A last
+    part that is wide, the region above the bands, is taken at every ``stride``-th sample or so and interpolated; it has
+    no map. ``velocity`` may be stored; no more than ``memory`` bytes of it are read at once. Maps are means over blocks
+    of ``sizes`` (samples, cells).
     """
     nt, cells, dofs = velocity.shape
     last = nt - 1
-    bounds = np.searchsorted(np.pi * np.arange(last + 1) / (last * interval), edges)
-    parts = [_Cosines(int(low), int(high) - 1) for low, high in itertools.pairwise(bounds)]
-    steps = [_fewest_steps(part, last, stride=1) for part in parts[:-1]]
-    steps.append(_fewest_steps(parts[-1], last, stride))
+    bounds = np.searchsorted(np.pi * np.arange(nt) / (last * interval), edges)
+    exact = [CosineSquares.zeros(int(low), int(high) - 1) for low, high in itertools.pairwise(bounds)]
+    strided = None
+    if stride > 1 and 3 * (exact[-1].high - exact[-1].low) >= last:
+        strided = _StridedSquares(exact.pop().low, last, stride)
 
-    energies = [np.zeros(count + 1) for count in steps]
     maps = np.empty((len(mapped), -(-nt // sizes[0]), -(-cells // sizes[1])), np.float32)
-    weights = np.asarray(masses) / (8 * last**2)
+    weights = np.asarray(masses) / (2 * last**2)
+    transform = CosineTransform(nt, min(COLUMNS, cells))
     # Blocks hold whole columns of the maps.
     for block in blocks(maps.shape[2], 8 * dofs * nt * sizes[1], memory):
         held = np.asarray(velocity[:, block.start * sizes[1] : block.stop * sizes[1]])
-        of_cells = {number: np.zeros((steps[number] + 1, held.shape[1])) for number in mapped}
+        of_cells = {number: exact[number].of_columns(held.shape[1]) for number in mapped}
         # Mass by mass: the cells of one lie together where runs in memory hold them.
         for mass, first in itertools.product(range(dofs), range(0, held.shape[1], COLUMNS)):
             together = slice(first, first + COLUMNS)
-            spectrum = cosine_transform(held[:, together, mass])
+            spectrum = transform(held[:, together, mass])
             # The first and the last cosine are their own mirror images: their amplitudes count half.
             spectrum[[0, -1]] *= 0.5
-            for number, (energy, part) in enumerate(zip(energies, parts, strict=True)):
-                filtered = _folded(spectrum[part.low : part.high + 1], part.low, steps[number])
-                energy += weights[mass] * np.einsum("tc,tc->t", filtered, filtered)
+            for number, part in enumerate(exact):
                 if number in of_cells:
-                    of_cells[number][:, together] += weights[mass] * filtered**2
+                    of_cells[number].add_to_columns(spectrum, weights[mass], together)
+                else:
+                    part.add(spectrum, weights[mass])
+            if strided:
+                strided.add(spectrum, weights[mass])
 
         for row, number in enumerate(mapped):
-            columns = block_means(of_cells[number], sizes[1], 1)
-            maps[row, :, block] = _means_over_samples(columns, parts[number], last, sizes[0])
+            exact[number].add_columns_of(of_cells[number])
+            maps[row, :, block] = _means_over_samples(of_cells[number].cosines(), last, *sizes)
 
-    total = [_at_samples(energy, part, last) for energy, part in zip(energies, parts, strict=True)]
-    return PartEnergies(np.array(total), maps)
-
-
-class _Cosines(NamedTuple):
-    """The cosines ``low`` to ``high``, in half waves in the record, that a part lets through; none if high < low."""
-
-    low: int
-    high: int
+    total = _at_samples([part.cosines() for part in exact], last)
+    if strided:
+        total = np.vstack([total, strided.at_samples()])
+    return PartEnergies(total, maps)
 
 
-def _looks_like(wave: Any, steps: int) -> Any:
-    """The cosine (half waves in the record) that equals ``wave`` at ``steps`` + 1 even times."""
-    return steps - np.abs(wave % (2 * steps) - steps)
+class _StridedSquares:
+    """Sums of squares of signals that have all cosines from ``low`` on, at about every ``stride``-th of the samples.
 
-
-def _fewest_steps(part: _Cosines, most: int, stride: int) -> int:
-    """Fewest even steps, a fast length up to ``most``, that tell apart the cosines in the energy of a ``part``.
-
-    These are 0 to high - low and 2 low to 2 high (products of cosines). most/``stride`` where no number of steps below
-    ``most`` does.
+    ``last`` is the number of the last sample.
     """
-    width = part.high - part.low
-    low = 2 * part.low
-    high = 2 * part.high
-    steps = fft.next_fast_len(max(3 * width, 1), real=True)
-    if steps >= most:
-        if stride == 1:
-            return most
-        return min(fft.next_fast_len(-(-most // stride), real=True), most)
 
-    while steps < min(high, most):
-        # The cosines from low to high must not turn back within their range, nor fall on those up to ``width``.
-        monotonic = low // steps == max(high - 1, low) // steps
-        if monotonic and min(_looks_like(low, steps), _looks_like(high, steps)) > width:
-            break
-        steps = fft.next_fast_len(steps + 1, real=True)
-    return min(steps, most)
+    def __init__(self, low: int, last: int, stride: int) -> None:
+        self._low = low
+        self._last = last
+        self._steps = min(fft.next_fast_len(-(-last // stride), real=True), last)
+        self._sums = np.zeros(self._steps + 1)
 
+    def add(self, spectrum: np.ndarray, weight: float) -> None:
+        """Add the squares of signals with amplitudes ``spectrum`` (wave from 0, signal), ``weight`` times."""
+        signals = self._signals(spectrum)
+        self._sums += weight * np.einsum("tn,tn->t", signals, signals)
 
-def _folded(amplitudes: np.ndarray, low: int, steps: int) -> np.ndarray:
-    """Twice the sum (t', n) of the cosines ``low``, ... with ``amplitudes`` (k, n), at ``steps`` + 1 even times."""
-    folded = np.zeros((steps + 1, amplitudes.shape[1]))
-    end = low + len(amplitudes)
-    for start in range(low - low % steps, end, steps):
-        piece = amplitudes[max(start - low, 0) : start + steps - low]
-        first = max(low, start) - start
-        if start // steps % 2:  # every second piece runs backwards
-            piece = piece[::-1]
-            first = steps - first - len(piece) + 1
-        folded[first : first + len(piece)] += piece
-    folded[[0, -1]] *= 2.0
-    return cosine_transform(folded)
+    def _signals(self, spectrum: np.ndarray) -> np.ndarray:
+        """The signals (t', signal) at ``steps`` + 1 even times, where many cosines look alike and are added up."""
+        steps = self._steps
+        folded = np.zeros((steps + 1, spectrum.shape[1]))
+        for start in range(self._low - self._low % steps, len(spectrum), steps):
+            piece = spectrum[max(start, self._low) : start + steps]
+            first = max(self._low - start, 0)
+            if start // steps % 2:  # every second piece runs backwards
+                piece = piece[::-1]
+                first = steps - first - len(piece) + 1
+            folded[first : first + len(piece)] += piece
+        folded[1:-1] *= 0.5
+        return CosineTransform(*folded.shape)(folded)
+
+    def at_samples(self) -> np.ndarray:
+        """The sums at every sample, interpolated."""
+        return np.interp(np.linspace(0, self._steps, self._last + 1), np.arange(self._steps + 1), self._sums)
 
 
-def _at_samples(energy: np.ndarray, part: _Cosines, last: int) -> np.ndarray:
-    """Energy of a ``part`` at ``last`` + 1 even times, from those (t') of ``_fewest_steps``."""
-    steps = len(energy) - 1
-    width = part.high - part.low
-    if steps == last or width < 0:
-        return np.resize(energy, last + 1)
-    if 3 * width > steps and steps < 2 * part.high:  # too wide: cosines are not distinguished
-        return np.interp(np.linspace(0, steps, last + 1), np.arange(steps + 1), energy)
-
-    waves, amplitudes = _waves_of_energy(energy, part)
-    spread = np.bincount(_looks_like(waves, last), amplitudes, last + 1)
-    return np.maximum(_folded(spread[:, None], 0, last)[:, 0], 0.0)
+def _at_samples(energies: Sequence[Cosines], last: int) -> np.ndarray:
+    """The values (energy, sample) of ``energies`` of one column each at ``last`` + 1 even times, from 0 on."""
+    amplitudes = np.zeros((last + 1, len(energies)))
+    for column, energy in enumerate(energies):
+        # Waves look alike at the samples if they differ by a multiple of twice ``last``, or in their direction.
+        aliases = last - np.abs(energy.wave % (2 * last) - last)
+        amplitudes[:, column] = np.bincount(aliases, energy.amplitude[:, 0], last + 1)
+    amplitudes[1:-1] *= 0.5
+    return np.maximum(CosineTransform(*amplitudes.shape)(amplitudes).T, 0.0)
 
 
-def _waves_of_energy(energy: np.ndarray, part: _Cosines) -> tuple[np.ndarray, np.ndarray]:
-    """The cosines (wave) in the ``energy`` (t', ...) of a ``part`` at few even times, and half of their amplitudes."""
-    width = part.high - part.low
-    steps = len(energy) - 1
-    waves = np.union1d(np.arange(width + 1), np.arange(2 * part.low, 2 * part.high + 1))
-    amplitudes = fft.dct(energy, type=1, axis=0) / (2 * steps)
-    amplitudes[[0, -1]] *= 0.5
-    # Each amplitude at few times goes to the cosine of the energy that it stands for.
-    return waves, amplitudes[_looks_like(waves, steps)]
-
-
-def _means_over_samples(energy: np.ndarray, part: _Cosines, last: int, size: int) -> np.ndarray:
-    """Means over each ``size`` of ``last`` + 1 samples of the ``energy`` (t', cell) of a ``part`` at few even times."""
-    if part.high < part.low:
-        return np.zeros((-(-(last + 1) // size), energy.shape[1]))
-    if len(energy) == last + 1:
-        return block_means(energy, size, 0)
-
-    waves, amplitudes = _waves_of_energy(energy, part)
-    radians = np.pi * waves / last  # of a wave in a sample
-    first = np.arange(0, last + 1, size)
-    counts = np.minimum(size, last + 1 - first)
+def _means_over_samples(energy: Cosines, last: int, samples: int, cells: int) -> np.ndarray:
+    """Means of an ``energy`` (wave, cell) over blocks of ``samples``, of ``last`` + 1, and of ``cells``."""
+    amplitude = block_means(energy.amplitude, cells, 1)
+    radians = np.pi * energy.wave / last  # of a wave in a sample
+    first = np.arange(0, last + 1, samples)
+    counts = np.minimum(samples, last + 1 - first)
     # The mean of a cosine over even times is its value at their middle times Dirichlet's kernel.
     middles = np.cos(np.outer(first + (counts - 1) / 2, radians))
-    means = middles * diric(radians, size)
+    means = middles * diric(radians, samples)
     means[-1] = middles[-1] * diric(radians, counts[-1])
-    return np.maximum(2 * means @ amplitudes, 0.0)
+    return np.maximum(means @ amplitude, 0.0)
 
 
 def front_arrival(energy: np.ndarray) -> int:

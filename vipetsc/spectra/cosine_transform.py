@@ -1,4 +1,4 @@
-"""The cosine transform (DCT-I) of many columns, by real transforms of half the length of their even continuation.
+"""The cosine transform (DCT-I) of many columns, by complex transforms of half the length of their even continuation.
 
 Of samples x_0 to x_N the transform is F_m = (x_0 + (-1)^m x_N)/2 + sum of x_j cos(pi j m/N) over the j between. Let
 
@@ -10,6 +10,11 @@ The first term is even about N/2 and has a real transform, the second is odd and
 
 so that the odd F follow one from another, from F_1 on, which is summed. Their rounding grows as the square root of N
 (Press et al., Numerical Recipes, 3rd ed., 12.4.2).
+
+The y of two columns are the real and imaginary parts of one complex column with the transform Z; their transforms are
+(Z_k + conj Z_(N-k))/2 and (Z_k - conj Z_(N-k))/2i. That takes as long as a real transform of each where N has small
+factors alone, and half as long where it has a large one: such a transform is a convolution of complex numbers, even if
+its column is real (Bluestein 1970, IEEE Trans. Audio Electroacoust. 18, 451).
 """
 
 from functools import lru_cache
@@ -20,16 +25,33 @@ from scipy import fft
 from vipetsc.compiled import kernel
 
 
-def cosine_transform(columns: np.ndarray) -> np.ndarray:
-    """``scipy.fft.dct(columns, type=1, axis=0)`` of two rows or more (t, column): twice the F of each column."""
-    last = len(columns) - 1
-    count = columns.shape[1]
-    waves = _half_waves(last)
-    combined = np.empty((last, count))
-    out = np.zeros((last + 1, count))
-    _combine(columns, waves, combined, out)
-    _separate(fft.rfft(combined, axis=0, overwrite_x=True).view(float), out)
-    return out
+class CosineTransform:
+    """The transform of records of ``rows`` samples, two or more, up to ``most`` of them at a time.
+
+    It works in memory of its own, which takes less time than new memory for each call.
+    """
+
+    def __init__(self, rows: int, most: int) -> None:
+        last = rows - 1
+        self._waves = _half_waves(last)
+        self._combined = np.zeros((last, most + most % 2))
+        self._out = np.zeros((rows, most))
+
+    def __call__(self, columns: np.ndarray) -> np.ndarray:
+        """``scipy.fft.dct(columns, type=1, axis=0)`` of ``columns`` (t, column): twice the F of each column.
+
+        The array that is returned is filled anew by the next call.
+        """
+        count = columns.shape[1]
+        combined = self._combined[:, : count + count % 2]
+        # An odd number of columns has one of zeros as the partner of its last one.
+        combined[:, count:] = 0.0
+        out = self._out[:, :count]
+
+        _combine(columns, self._waves, combined, out)
+        transformed = fft.fft(combined.view(complex), axis=0, overwrite_x=True)
+        _separate(transformed.view(float), out)
+        return out
 
 
 @lru_cache(maxsize=32)
@@ -41,28 +63,32 @@ def _half_waves(last: int) -> np.ndarray:
 
 @kernel
 def _combine(columns: np.ndarray, waves: np.ndarray, combined: np.ndarray, out: np.ndarray) -> None:
-    """Fill ``combined`` (j, column) with twice y, and row 1 of ``out``, of zeros, with twice F_1."""
+    """Fill ``combined`` (j, column) with y, and row 1 of ``out`` with twice F_1."""
     last = columns.shape[0] - 1
     for c in range(columns.shape[1]):
         out[1, c] = columns[0, c] - columns[last, c]
-        combined[0, c] = columns[0, c] + columns[last, c]
+        combined[0, c] = 0.5 * (columns[0, c] + columns[last, c])
     for j in range(1, last):
         cosine = 2.0 * waves[0, j]
-        sine = 2.0 * waves[1, j]
+        sine = waves[1, j]
         for c in range(columns.shape[1]):
             here = columns[j, c]
             mirrored = columns[last - j, c]
             out[1, c] += cosine * here
-            combined[j, c] = (here + mirrored) - sine * (here - mirrored)
+            combined[j, c] = 0.5 * (here + mirrored) - sine * (here - mirrored)
 
 
 @kernel
-def _separate(pairs: np.ndarray, out: np.ndarray) -> None:
-    """Fill ``out`` from the transform of 2 y, real and imaginary parts in turn along the rows of ``pairs``."""
+def _separate(transformed: np.ndarray, out: np.ndarray) -> None:
+    """Fill ``out`` from the transform (k, column) of y: of each pair of columns its real and its imaginary part."""
     last = out.shape[0] - 1
-    for k in range(pairs.shape[0]):
+    for k in range(last // 2 + 1):
+        opposite = (last - k) % last
         for c in range(out.shape[1]):
-            out[2 * k, c] = pairs[k, 2 * c]
+            out[2 * k, c] = transformed[k, c] + transformed[opposite, c]
         if k > 0 and 2 * k < last:
-            for c in range(out.shape[1]):
-                out[2 * k + 1, c] = out[2 * k - 1, c] - pairs[k, 2 * c + 1]
+            # Of the first column of a pair the imaginary part is in the second one, and the other way round.
+            for c in range(0, out.shape[1], 2):
+                out[2 * k + 1, c] = out[2 * k - 1, c] - (transformed[k, c + 1] - transformed[opposite, c + 1])
+            for c in range(1, out.shape[1], 2):
+                out[2 * k + 1, c] = out[2 * k - 1, c] + (transformed[k, c - 1] - transformed[opposite, c - 1])

@@ -1,0 +1,82 @@
+"""Squares of sums of neighbouring cosines, as functions of time, from as few values as determine them.
+
+The sum v of a_k cos((l + k) theta) over k from 0 to W, with theta = pi t/T in a record of length T, is the real part of
+exp(i l theta) g, with g the sum of a_k exp(i k theta). Hence
+
+    v^2 = |g|^2 / 2 + Re[exp(2 i l theta) g^2] / 2,
+
+where |g|^2 has the frequencies from -W to W, and g^2 those from 0 to 2 W. Both follow from g at 2 W + 1 even points of
+the circle or more, wherever l lies: from one real transform of that length, since the a_k are real and half of the
+points are conjugates of the others. Sums over many signals are taken at these points; one transform of the sums gives
+the cosines of which the sum of all v^2 consists.
+"""
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from scipy import fft
+
+
+class Cosines(NamedTuple):
+    """A sum of cosines: ``wave`` (wave) in half waves in the record, and ``amplitude`` (wave, ...) of each."""
+
+    wave: np.ndarray
+    amplitude: np.ndarray
+
+
+class CosineSquares(NamedTuple):
+    """Weighted sums of squares of signals that have the cosines ``low`` to ``high``, in half waves in the record.
+
+    ``square`` and ``product`` (point, column) are the sums of |g|^2 and of g^2 at the points of half a circle of
+    ``length`` points. There is one column for all signals, or one for each. Without a cosine, high < low, all is 0.
+    """
+
+    low: int
+    high: int
+    length: int
+    square: np.ndarray
+    product: np.ndarray
+
+    @classmethod
+    def zeros(cls, low: int, high: int, columns: int = 1) -> Self:
+        """The sums of no signals."""
+        length = fft.next_fast_len(max(2 * (high - low) + 1, 1), real=True)
+        shape = (length // 2 + 1, columns)
+        return cls(low, high, length, np.zeros(shape), np.zeros(shape, complex))
+
+    def of_columns(self, columns: int) -> Self:
+        """The sums of no signals, of the same cosines, in so many ``columns``."""
+        return self.zeros(self.low, self.high, columns)
+
+    def add(self, spectrum: np.ndarray, weight: float) -> None:
+        """Add the squares of signals ``spectrum`` (wave from 0, signal), ``weight`` times, to one column."""
+        signals = self._signals(spectrum)
+        parts = signals.view(float)
+        self.square[:, 0] += weight * np.einsum("pn,pn->p", parts, parts)
+        self.product[:, 0] += weight * np.einsum("pn,pn->p", signals, signals)
+
+    def add_to_columns(self, spectrum: np.ndarray, weight: float, columns: slice) -> None:
+        """Add the squares as ``add`` does, of each signal to its own of the ``columns``."""
+        signals = self._signals(spectrum)
+        self.square[:, columns] += weight * (signals.real**2 + signals.imag**2)
+        self.product[:, columns] += weight * signals**2
+
+    def add_columns_of(self, other: Self) -> None:
+        """Add all columns of ``other`` to the one of these sums."""
+        self.square[:, 0] += other.square.sum(axis=1)
+        self.product[:, 0] += other.product.sum(axis=1)
+
+    def _signals(self, spectrum: np.ndarray) -> np.ndarray:
+        """The g (point, signal) of signals."""
+        return fft.rfft(spectrum[self.low : self.high + 1], self.length, axis=0)
+
+    def cosines(self) -> Cosines:
+        """The cosines (wave, column) of the sums."""
+        width = self.high - self.low
+        # Directions of |g|^2 are added up, but for 0, which is its own opposite.
+        of_squares = fft.irfft(self.square, self.length, axis=0)[: width + 1]
+        of_squares[:1] *= 0.5
+        of_products = fft.irfft(self.product, self.length, axis=0)[: max(2 * width + 1, 0)]
+
+        wave = np.concatenate([np.arange(len(of_squares)), 2 * self.low + np.arange(len(of_products))])
+        return Cosines(wave, np.concatenate([of_squares, 0.5 * of_products]))
