@@ -212,23 +212,30 @@ class ForceSeries:
         """
         if orders is None:
             orders = np.arange(-self.order, self.order + 1)
+        return self.jacobians(np.array([exponent]), orders)[0]
+
+    def jacobians(self, exponents: np.ndarray, orders: np.ndarray) -> np.ndarray:
+        """The ``jacobian`` at each of the ``exponents``, of ``orders``: (exponents, pairs, orders, orders)."""
         lag = orders[:, None] - orders + 2 * self.order  # index in the two-sided series from -2K to 2K
-        rate = 1j * orders + exponent
+        rate = 1j * orders + exponents[:, None]
         slopes = np.hstack([self._slopes[:, :0:-1].conj(), self._slopes])
         rates = np.hstack([self._rates[:, :0:-1].conj(), self._rates])
-        matrix = slopes[:, lag]
-        matrix += rates[:, lag] * rate
+        matrices = rates[:, lag] * rate[:, None, None, :]
+        matrices += slopes[:, lag]
 
         # The change of z'_minus by d_k, (i k + mu - z''/z') exp((i k + mu) phase), times the force that it causes.
         for pair, phase, bend, theta, weights in self._onsets:
-            decay = weights * np.exp(-exponent * (theta - phase))
-            out = np.zeros((2, self.order + 1), complex)
-            _transform(theta, np.ascontiguousarray([decay.real, decay.imag]), out)
-            positive = out[0] + 1j * out[1]
-            negative = (out[0] - 1j * out[1]).conj()
-            row = np.where(orders < 0, negative[np.abs(orders)], positive[np.abs(orders)])
-            matrix[pair] += np.outer(row, (rate - bend) * np.exp(1j * orders * phase))
-        return matrix
+            turns = np.exp(1j * orders * phase)
+            decays = weights * np.exp(-exponents[:, None] * (theta - phase))
+            # Real and imaginary parts of all exponents in one call, whose phasors are the same for every row.
+            out = np.zeros((2 * len(exponents), self.order + 1), complex)
+            _transform(theta, np.concatenate([decays.real, decays.imag]), out)
+            real, imaginary = np.split(out, 2)
+            positive = real + 1j * imaginary
+            negative = (real - 1j * imaginary).conj()
+            rows = np.where(orders < 0, negative[:, np.abs(orders)], positive[:, np.abs(orders)])
+            matrices[:, pair] += rows[:, :, None] * ((rate - bend) * turns)[:, None, :]
+        return matrices
 
 
 class SiteForces:

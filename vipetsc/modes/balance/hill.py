@@ -49,6 +49,7 @@ MOST_STEPS = 30
 STEP = 1e-4
 ACCURACY = 1e-10
 REAL = 1e-7  # |Im lambda| over Om of what is no complex pair is nearer to 0 or 1/2 than this
+ENTRIES = 1 << 17  # of the matrices whose determinants are taken at once
 LARGEST_LOG = 300.0  # of a determinant, which overflows beyond
 
 
@@ -136,13 +137,20 @@ class Hill:
             if jacobian is not None:
                 low = orders[np.abs(orders) <= KEPT]
             compliances = self._at(block, low, exponents.tolist())
-            for i, (mu, g) in enumerate(zip(exponents.tolist(), compliances, strict=True)):
+
+            # Many small determinants at once, but no more matrices than the processor's memory holds.
+            count = max(1, ENTRIES // (len(low) * len(acting)) ** 2)
+            for begin in range(0, len(exponents), count):
+                part = slice(begin, begin + count)
                 matrix = jacobian
                 if matrix is None:
-                    matrix = _flat(series.jacobian(mu, low)[acting])
+                    matrix = _flat(series.jacobians(exponents[part], low)[:, acting])
+                g = _of_pairs(np.array(compliances[part]), acting)
                 # As phase and logarithm: at large exponents the product of so many pivots overflows.
-                phase, log = np.linalg.slogdet(_plus_one(_of_pairs(g, acting), matrix))
-                out[i] *= phase * np.exp(min(log, LARGEST_LOG))
+                phases, logs = np.linalg.slogdet(_plus_one(g, matrix))
+                # One by one: products of complex arrays are rounded in another way on some processors.
+                for i, value in enumerate(phases * np.exp(np.minimum(logs, LARGEST_LOG)), begin):
+                    out[i] *= value
         return out
 
     def _acting(self, series: ForceSeries) -> np.ndarray:
@@ -301,30 +309,31 @@ class Hill:
 
 
 def _of_pairs(g: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """G (order, pair, pair) between some of the ``pairs``."""
-    if len(pairs) == g.shape[1]:
+    """G (..., order, pair, pair) between some of the ``pairs``."""
+    if len(pairs) == g.shape[-1]:
         return g
-    return g[:, pairs[:, None], pairs]
+    return g[..., pairs[:, None], pairs]
 
 
 def _flat(jacobian: np.ndarray) -> np.ndarray:
-    """J (pair, order, order) as a matrix (order pair, order pair)."""
-    pairs, rows, columns = jacobian.shape
-    out = np.zeros((rows, pairs, columns, pairs), jacobian.dtype)
-    for i, part in enumerate(jacobian):
-        out[:, i, :, i] = part
-    return out.reshape(rows * pairs, columns * pairs)
+    """J (..., pair, order, order) as a matrix (..., order pair, order pair)."""
+    *several, pairs, rows, columns = jacobian.shape
+    out = np.zeros((*several, rows, pairs, columns, pairs), jacobian.dtype)
+    for i in range(pairs):
+        out[..., i, :, i] = jacobian[..., i, :, :]
+    return out.reshape(*several, rows * pairs, columns * pairs)
 
 
 def _plus_one(g: np.ndarray, matrix: np.ndarray, one: float = 1.0) -> np.ndarray:
-    """1 + G J, G (order, pair, pair) being diagonal in the orders."""
-    count, pairs = g.shape[:2]
-    rows = matrix.reshape(count, pairs, -1)
+    """1 + G J of G (..., order, pair, pair), which is diagonal in the orders, and J (..., order pair, order pair)."""
+    count, pairs = g.shape[-3:-1]
+    rows = matrix.reshape(*matrix.shape[:-2], count, pairs, -1)
     # Products of matrices by BLAS pay for many pairs alone.
     if pairs <= FEW_PAIRS:
-        product = np.einsum("kij,kjn->kin", g, rows)
+        product = np.einsum("...kij,...kjn->...kin", g, rows)
     else:
         product = np.matmul(g, rows)
-    product = product.reshape(matrix.shape)
-    product[np.diag_indices(min(product.shape))] += one
+    product = product.reshape(*product.shape[:-3], count * pairs, -1)
+    diagonal = np.arange(min(product.shape[-2:]))
+    product[..., diagonal, diagonal] += one
     return product
