@@ -286,9 +286,10 @@ def on_ranks(vipetsc, in_process):
 def plain_pictures(monkeypatch):
     """Coarse pictures that are not laid out, which costs most: for tests of files, not of what is seen."""
     from vipetsc.figures import style
+    from vipetsc.figures.layout import remove_engine
 
     monkeypatch.setattr(style, "SCREEN", 80)
-    monkeypatch.setattr(style, "_lay_out", lambda figure: figure.set_layout_engine("none"))
+    monkeypatch.setattr(style, "_lay_out", remove_engine)
 
 
 @pytest.fixture

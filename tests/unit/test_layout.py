@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
+from PIL import Image
 
 from vipetsc.figures.layout import lay_out
-from vipetsc.figures.style import new_figure, rc_style
+from vipetsc.figures.style import new_figure, rc_style, save
 
 
 @pytest.mark.parametrize("wide", [False, True])
@@ -33,6 +34,24 @@ def test_axes_are_placed_as_by_the_layout_that_measures_everything_twice(wide):
         inches = np.abs(axes.get_position().get_points() - other.get_position().get_points()) * ours.get_size_inches()
         assert inches.max() < 0.02
         assert "get_tightbbox" not in vars(axes)
+
+
+def test_a_note_below_a_picture_leaves_the_picture_as_it_is(tmp_path):
+    """Colour bars too, whose frames are less than their place."""
+    pictures = []
+    for note in ("", "a note"):
+        with rc_style():
+            figure = new_figure(3.4, 2, "a heading")
+            axes = figure.subplots()
+            figure.colorbar(axes.imshow([[0.0, 1.0]]), ax=axes, label="energy (J)")
+            with Image.open(save(figure, tmp_path / "picture.png", note)) as picture:
+                pictures.append(np.asarray(picture.convert("RGB")))
+
+    plain, noted = pictures
+    assert len(noted) > len(plain)
+    # Edges of lines and letters may be in other fractions of a pixel.
+    differing = np.abs(noted[: len(plain)].astype(int) - plain).max(axis=2) > 64
+    assert differing.mean() < 0.01
 
 
 def test_text_is_measured_again_where_ticks_change(monkeypatch):

@@ -8,8 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
@@ -18,7 +20,36 @@ def lay_out(figure: Figure) -> None:
     """Place the axes of ``figure`` by its layout engine, which it loses: they stay where they are."""
     with _measured_once(figure):
         figure.get_layout_engine().execute(figure)
-    figure.set_layout_engine("none")
+    remove_engine(figure)
+
+
+def remove_engine(figure: Figure) -> None:
+    """Leave ``figure`` without a layout engine: its axes stay where they are."""
+    # The engine that "none" puts in place of another does nothing, but ``savefig`` draws a figure that has it twice.
+    # None stands for the engine of the settings, which are not asked here.
+    with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+        figure.set_layout_engine(None)
+
+
+def apply_aspects(figure: Figure) -> None:
+    """Give all axes of ``figure`` the frames that they are drawn with, before it is drawn."""
+    renderer = pixel_canvas(figure).get_renderer()
+    for axes in figure.get_axes():
+        _apply_aspect(axes, renderer)
+
+
+def pixel_canvas(figure: Figure) -> FigureCanvasAgg:
+    """The canvas of ``figure``, or a new one in place of one that draws no pixels, as a user's module may have it."""
+    canvas = figure.canvas
+    if not isinstance(canvas, FigureCanvasAgg):
+        canvas = FigureCanvasAgg(figure)
+    return canvas
+
+
+def _apply_aspect(axes: Axes, renderer: Any) -> None:
+    """Give ``axes`` the frame that their aspect and their locator, which colour bars have, leave of their place."""
+    locator = axes.get_axes_locator()
+    axes.apply_aspect(locator(axes, renderer) if locator else None)
 
 
 @contextmanager
@@ -46,8 +77,7 @@ class _Measurement:
 
     def __call__(self, renderer: Any, **options: Any) -> Bbox:
         """The box in pixels where the axes are now; arguments are those of ``Axes.get_tightbbox``."""
-        locator = self._axes.get_axes_locator()
-        self._axes.apply_aspect(locator(self._axes, renderer) if locator else None)
+        _apply_aspect(self._axes, renderer)
         frame = self._axes.get_window_extent(renderer).get_points()
 
         ticks = [axis.get_majorticklocs().tolist() for axis in (self._axes.xaxis, self._axes.yaxis)]
