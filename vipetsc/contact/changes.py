@@ -180,14 +180,19 @@ def _push(contacts: np.ndarray, i: int, b: np.ndarray, d: np.ndarray, s: float, 
 @allocating
 def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h: float) -> Extremes:
     """Extremes of site ``i`` in a step of ``h`` seconds between the motions ``start`` and ``end`` (sites, 3)."""
-    b, room = np.empty(6), np.empty(6)
+    b = np.empty(6)
+    room = np.empty(6)
     bernstein(start[i], end[i], h, b)
-    d = 5.0 * (b[1:] - b[:5]) / h
+    d = np.empty(5)
+    for k in range(5):
+        d[k] = 5.0 * (b[k + 1] - b[k]) / h
     side = side_of(contacts[i].mode)
 
     # Deepest at an end, or where side w' falls through zero inside.
     deepest = max(side * b[0], side * b[5])
-    recoil = side * (b[:5] - b[1:])
+    recoil = np.empty(5)
+    for k in range(5):
+        recoil[k] = side * (b[k] - b[k + 1])
     if recoil[0] < 0.0:
         turn = first_upcrossing(recoil)
         if turn <= 1.0:

@@ -74,48 +74,73 @@ def _halve(c: np.ndarray, left: np.ndarray) -> None:
     left[n - 1] = c[0]
 
 
+@kernel
+def _copy(source: np.ndarray, target: np.ndarray) -> None:
+    for i in range(source.size):
+        target[i] = source[i]
+
+
+@kernel
+def _may_turn_positive(c: np.ndarray) -> bool:
+    """Whether a coefficient is positive, or no number: a polynomial is no larger than the largest of them."""
+    may_turn = False
+    for coefficient in c:
+        may_turn |= not coefficient <= 0.0
+    return may_turn
+
+
+@kernel
+def _count_changes(c: np.ndarray) -> int:
+    """Changes of sign from one coefficient to the next, that of zero being negative: at least as many as roots."""
+    changes = 0
+    for i in range(c.size - 1):
+        changes += (c[i] <= 0.0) != (c[i + 1] <= 0.0)
+    return changes
+
+
 @allocating
 def first_upcrossing(b: np.ndarray) -> float:
     """Smallest s in [0, 1] at which the polynomial ``b`` (n <= 6,) turns positive; 2 if it never does."""
     # Nearly every call ends here: what follows allocates.
     if b[0] > 0.0:
         return 0.0
-    if b.max() <= 0.0:
+    if not _may_turn_positive(b):
         return 2.0
 
     n = b.size
-    stack = np.empty((_DEPTH + 2, 6))
+    stack = np.empty((_DEPTH + 2, n))
     low = np.empty(_DEPTH + 2)
     width = np.empty(_DEPTH + 2)
-    left, room = np.empty(6), np.empty(6)
-    stack[0, :n] = b
+    c = np.empty(n)
+    left = np.empty(n)
+    room = np.empty(6)
+    _copy(b, stack[0])
     low[0] = 0.0
     width[0] = 1.0
     top = 0
     while top >= 0:
-        c = stack[top, :n].copy()
+        _copy(stack[top], c)
         begin = low[top]
         size = width[top]
         top -= 1
 
         if c[0] > 0.0:
             return begin
-        if c.max() <= 0.0:
+        if not _may_turn_positive(c):
             continue
-        changes = np.sum((c[:-1] <= 0.0) != (c[1:] <= 0.0))
-        if changes == 1 and c[n - 1] > 0.0:
+        if c[n - 1] > 0.0 and _count_changes(c) == 1:
             return begin + size * _bisect(c, room)
         if size < _NARROWEST:
             return begin
 
         # The left half is on top: the right one is searched only if the left one has no crossing.
-        _halve(c, left[:n])
+        _halve(c, left)
         top += 1
-        stack[top, :n] = c
+        _copy(c, stack[top])
         low[top] = begin + 0.5 * size
         width[top] = 0.5 * size
         top += 1
-        stack[top, :n] = left[:n]
+        _copy(left, stack[top])
         low[top] = begin
         width[top] = 0.5 * size
     return 2.0
@@ -128,7 +153,10 @@ def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
         return first_upcrossing(b)
     # The polynomial without its value at 0, divided by s: the root at the start is gone, all others stay.
     n = b.size - 1
-    return first_upcrossing(b[1:] * n / np.arange(1, b.size))
+    quotient = np.empty(n)
+    for i in range(n):
+        quotient[i] = b[i + 1] * n / (i + 1)
+    return first_upcrossing(quotient)
 
 
 class Landing(NamedTuple):

@@ -65,7 +65,8 @@ def with_room(tracks: Tracks) -> Tracks:
         return tracks
     # Twice what is wanted: however many episodes there are, the log is copied a few times only.
     log = np.empty(2 * wanted, tracks.log.dtype)
-    log[:used] = tracks.log[:used]
+    for i in range(used):
+        log[i] = tracks.log[i]
     return Tracks(tracks.sites, log, tracks.closed)
 
 

@@ -27,18 +27,34 @@ ENERGY_SUMS = 5
 
 
 @kernel
+def _multiples(energy: float, unit: float) -> tuple[np.int64, np.int64]:
+    """An ``energy`` in J as a multiple of ``unit`` and one of unit/2^40."""
+    multiple = energy * (1.0 / unit)
+    whole = np.rint(multiple)
+    # Not finite or far beyond the scale: the guard sees a runaway energy.
+    is_small = abs(whole) < LARGEST
+    fine = np.rint((multiple - whole) * _FINE) if is_small else 0.0
+    return np.int64(whole if is_small else LARGEST), np.int64(fine)
+
+
+@kernel
 def _add(sums: np.ndarray, kind: int, energies: np.ndarray, unit: float) -> None:
-    """Add energies in J to row ``kind`` of ``sums`` (energy, 2) as multiples of ``unit`` and of unit/2^40."""
+    """Add energies in J to row ``kind`` of ``sums`` (energy, 2), as multiples of ``unit`` and of unit/2^40."""
     whole_sum = fine_sum = np.int64(0)
     for i in range(energies.size):
-        multiple = energies[i] * (1.0 / unit)
-        whole = np.rint(multiple)
-        # Not finite or far beyond the scale: the guard sees a runaway energy.
-        is_small = abs(whole) < LARGEST
-        whole_sum += np.int64(whole if is_small else LARGEST)
-        fine_sum += np.int64(np.rint((multiple - whole) * _FINE) if is_small else 0.0)
+        whole, fine = _multiples(energies[i], unit)
+        whole_sum += whole
+        fine_sum += fine
     sums[kind, 0] += whole_sum
     sums[kind, 1] += fine_sum
+
+
+@kernel
+def _add_one(sums: np.ndarray, kind: int, energy: float, unit: float) -> None:
+    """Add one ``energy`` as ``_add`` does."""
+    whole, fine = _multiples(energy, unit)
+    sums[kind, 0] += whole
+    sums[kind, 1] += fine
 
 
 @kernel
@@ -66,7 +82,8 @@ def _spring_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies
     energies[:] = 0.0
     if is_varied(lattice):
         add_squares(y, lattice, first, 0, lattice.stiffness, energies)
-        energies *= 0.5
+        for i in range(energies.size):
+            energies[i] *= 0.5
         return
 
     for s in range(lattice.springs.size):
@@ -99,10 +116,10 @@ def _contact_energy(site: Any, w: float) -> float:
 
 
 @njit(error_model="numpy")
-def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
-    """Kinetic, spring, contact energy, that dissipated in contacts and in dashpots, (5, 2): see ``_add``."""
+def measure(y: np.ndarray, lattice: LatticeRecord, unit: float, sums: np.ndarray) -> None:
+    """Put kinetic, spring, contact energy and losses of contacts and dashpots into ``sums`` (5, 2): see ``_add``."""
     shape = lattice.shape
-    sums = np.zeros((ENERGY_SUMS, 2), np.int64)
+    sums[:] = 0
     room = np.empty(min(CHUNK, shape.cells))
     for first in range(0, shape.cells, CHUNK):
         energies = room[: shape.cells - first]
@@ -113,24 +130,21 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float) -> np.ndarray:
             add_nonlinear_energies(y, lattice, first, energies)
         _add(sums, _SPRING, energies, unit)
 
-    elastic = np.empty(lattice.site_dofs.size)
     owned = 0
     for i in range(lattice.site_dofs.size):
         if lattice.site_dofs[i].ledger >= 0:
             w, _ = relative_motion(y, lattice.site_dofs, i)
-            elastic[owned] = _contact_energy(lattice.contacts[i], w)
+            _add_one(sums, _CONTACT, _contact_energy(lattice.contacts[i], w), unit)
             owned += 1
-    _add(sums, _CONTACT, elastic[:owned], unit)
     _add(sums, _DISSIPATED, y[shape.dissipated : shape.dissipated + owned], unit)
     if shape.damping >= 0:
         _add(sums, _DAMPING, y[shape.damping : shape.damping + shape.cells], unit)
-    return sums
 
 
-@njit(error_model="numpy")
+@kernel
 def add_energy(sums: np.ndarray, energy: float, unit: float) -> None:
     """Add an ``energy`` in J to the springs' in the ``sums`` of ``measure``."""
-    _add(sums, _SPRING, np.array([energy]), unit)
+    _add_one(sums, _SPRING, energy, unit)
 
 
 @dataclass(frozen=True)

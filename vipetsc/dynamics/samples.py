@@ -56,7 +56,7 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
     shape = samples.lattice.shape
     drives = samples.lattice.drives
     number = samples.number + k
-    samples.sums[k] = measure(y, samples.lattice, samples.unit)
+    measure(y, samples.lattice, samples.unit, samples.sums[k])
 
     for i in range(drives.rows.size):
         drive = drives.rows[i]
@@ -66,7 +66,8 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
             energy = wall_energy(drives, i, number * samples.interval, y[drive.target - shape.dofs * shape.cells])
             samples.work[k, drive.number] += energy
             add_energy(samples.sums[k], energy, samples.unit)
-    samples.losses[k] = y[shape.dissipated : shape.owned]
+    for i in range(samples.losses.shape[1]):
+        samples.losses[k, i] = y[shape.dissipated + i]
 
     # By the number in the run, not in the block: blocks may begin anywhere, and a resumed run records the same samples.
     if number % samples.stride == 0:
@@ -76,7 +77,18 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
     for i in range(samples.watched.size):
         for row in range(2 * shape.dofs):
             samples.motion[k, row, i] = y[row * shape.cells + samples.watched[i]]
-    return samples.sums[k, :, 0].max() < LARGEST and np.abs(samples.work[k]).max() < np.inf
+    return _is_finite(samples, k)
+
+
+@kernel
+def _is_finite(samples: Samples, k: int) -> bool:
+    """Whether all energies of sample ``k`` are numbers, and below where their sums saturate."""
+    finite = True
+    for i in range(samples.sums.shape[1]):
+        finite &= samples.sums[k, i, 0] < LARGEST
+    for i in range(samples.work.shape[1]):
+        finite &= abs(samples.work[k, i]) < np.inf
+    return finite
 
 
 @kernel

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel, njit
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.groups import Groups, contact_dofs
 from vipetsc.dynamics.propagator.series import StepSeries
@@ -271,6 +271,15 @@ def _expand_damped_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: 
     return may_touch
 
 
+@kernel
+def is_zero(row: np.ndarray) -> bool:
+    """Whether all numbers of a ``row`` are zero."""
+    zero = True
+    for value in row:
+        zero &= value == 0.0
+    return zero
+
+
 @njit(error_model="numpy")
 def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
     """Add to the owned cells ``out`` (2 mass, cell) the motion that forces within the step have caused at its end.
@@ -284,7 +293,7 @@ def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.nda
         return
 
     for i in range(moments.shape[0]):
-        if not moments[i].any():
+        if is_zero(moments[i]):
             continue
         dof = first + i
         for k in range(width):
@@ -312,7 +321,7 @@ def _apply_damped_impulses(dofs: DofTables, first: int, moments: np.ndarray, out
     rows, width, terms = dofs.rows.shape[1:]
     masses = rows // 2
     for i in range(moments.shape[0]):
-        if not moments[i].any():
+        if is_zero(moments[i]):
             continue
         table = dofs.table[first + i]
         for k in range(width):

@@ -14,7 +14,7 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel, njit
 from vipetsc.contact.tracker import Tracks
 from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.layout import Layout
@@ -66,6 +66,19 @@ class StepTables(NamedTuple):
     by_pairs: PairLosses
 
 
+@kernel
+def _complete(state: np.ndarray, states: States, ledger: np.ndarray, energies: np.ndarray, columns: np.ndarray) -> None:
+    """Put the ledger's energies in J, and the ghosts from the halo's ``columns``, behind the cells of the ``state``."""
+    k = states.rows * states.owned
+    for dof in ledger:
+        state[k] = energies[dof]
+        k += 1
+    for ghost in range(columns.shape[1] - states.ghosts, columns.shape[1]):
+        for row in range(states.ghost_rows):
+            state[k] = columns[row, ghost]
+            k += 1
+
+
 @njit(error_model="numpy")
 def take_steps(
     states: States, step: StepTables, halo: Halo, dofs: DofTables, clusters: Cluster, tracks: Tracks, samples: Samples
@@ -92,8 +105,7 @@ def take_steps(
         k = steps // states.parts - samples.number if steps % states.parts == 0 else -1
         is_sample = 0 <= k < samples.work.shape[0]
         if is_sample or steps == progress.last:
-            ghosts = halo.columns[: states.ghost_rows, halo.columns.shape[1] - states.ghosts :]
-            state[states.rows * owned :] = np.concatenate((clusters.energy[dofs.ledger], ghosts.T.flatten()))
+            _complete(state, states, dofs.ledger, clusters.energy, halo.columns)
         if is_sample:
             # Behind the drives' works the ledger has the losses of the owned sites.
             own_sites = dofs.ledger[samples.lattice.drives.rows.size :]

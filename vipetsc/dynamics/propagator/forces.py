@@ -16,9 +16,9 @@ from mpi4py import MPI
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel, njit
 from vipetsc.contact.changes import Extremes
-from vipetsc.contact.law import FREE, RESTING, impact_time
+from vipetsc.contact.law import impact_time
 from vipetsc.contact.tracker import (
     LIMITS,
     ImpactTracker,
@@ -81,21 +81,33 @@ def _switch(cluster: Cluster, tracks: Tracks, now: float) -> None:
     state = cluster.state[0]
     # Before the switch: an episode that ends takes its extremes along.
     _update_open_episodes(cluster, tracks)
-    was_free = (contacts["mode"] == FREE) | (np.abs(contacts["mode"]) == RESTING)
+    had_contact = np.empty(contacts.size, np.bool_)
+    for i in range(contacts.size):
+        had_contact[i] = in_episode(contacts[i].mode)
     state.switches += switch_sites(contacts, tracks, cluster.site_motion, cluster.energy, now)
-    is_free = (contacts["mode"] == FREE) | (np.abs(contacts["mode"]) == RESTING)
 
-    for i in np.flatnonzero(was_free & ~is_free):
-        duration = impact_time(contacts[i], abs(contacts[i].approach))
-        history = cluster.history[i]
-        history.onset = now
-        history.duration = duration
-        history.indentation = 0.0
-        history.force = 0.0
-        history.smallest_force = 0.0
-        state.length = min(state.length, cluster.first_substep * duration / cluster.interval)
-    if is_free.all():
+    all_free = True
+    for i in range(contacts.size):
+        if in_episode(contacts[i].mode):
+            all_free = False
+            if not had_contact[i]:
+                _begin_contact(cluster, i, now)
+    if all_free:
         state.length = 1.0
+
+
+@kernel
+def _begin_contact(cluster: Cluster, i: int, now: float) -> None:
+    """Begin the history of a contact of site ``i``, ``now`` in s; the next substep is no longer than suits it."""
+    duration = impact_time(cluster.contacts[i], abs(cluster.contacts[i].approach))
+    history = cluster.history[i]
+    history.onset = now
+    history.duration = duration
+    history.indentation = 0.0
+    history.force = 0.0
+    history.smallest_force = 0.0
+    state = cluster.state[0]
+    state.length = min(state.length, cluster.first_substep * duration / cluster.interval)
 
 
 @njit(error_model="numpy")

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel, njit
-from vipetsc.dynamics.propagator.clusters import DofTables
+from vipetsc.dynamics.propagator.clusters import DofTables, is_zero
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Stencil
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial
@@ -86,7 +86,8 @@ def add_free_losses(
     values = stencil.values
     to = stencil.blocks * cells
     places = stencil.rows * cells + stencil.offsets
-    after[:] = before
+    for cell in range(after.size):
+        after[cell] = before[cell]
     for first, stop in stencil.interior:
         for a in range(first, stop, LANES):
             # The last vector overlaps the one before; an interior has at least so many cells.
@@ -136,7 +137,7 @@ def loss_by_forces(free: FreeLosses, pairs: PairLosses, dofs: DofTables, c: int,
     total = np.empty(modes)
     for i in range(dofs.first[c], dofs.first[c + 1]):
         moments = pairs.moments[i]
-        if not moments.any():
+        if is_zero(moments):
             continue
 
         total[:] = 0.0

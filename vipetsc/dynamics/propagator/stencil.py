@@ -270,4 +270,5 @@ def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, o
             for k in range(rows.shape[1]):
                 for o in range(total.size):
                     total[o] += columns[row, column + k] * rows[row, k, o]
-        out[:, at] = total
+        for o in range(total.size):
+            out[o, at] = total[o]
