@@ -1,10 +1,10 @@
 """Work and precision of vipetsc's engines and of their peers, interleaved, in CPU time at equal error.
 
 The lattice is the four-band one of 300 cells with its five sites, A = 30 N, conservative; all solvers return the
-velocities every 2e-4 s, on one core. Then whole programs beside an earlier version, members of a sweep, the paper's
-budget (from where ``paper`` left it), scaling over cells and ranks with a model of many ranks, set-up and files of
-large lattices. Writes ``latest.json`` and pictures. The full bench takes about half an hour, ``--quick`` five minutes;
-``--large`` adds the whole program on a million cells (minutes).
+velocities every 2e-4 s, on one core. Then whole programs compared with an earlier version, members of a sweep, the
+paper's budget (from where ``paper`` left it), scaling over cells and ranks with a model of many ranks, set-up and files
+of large lattices. Writes ``latest.json`` and pictures. The full bench takes about half an hour, ``--quick`` five
+minutes; ``--large`` adds the whole program on a million cells (minutes).
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ import time
 from pathlib import Path
 
 # Before numpy is imported: every solver on one core.
+# BLAS starts its threads as numpy is imported, so that a later setting would change nothing.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import petsc4py
 
+# Without PETSc's signal handlers: they end the process by MPI_Abort, and peers that run then would be left behind.
 petsc4py.init(["bench", "-no_signal_handler"])
 
 from mpi4py import MPI
@@ -41,19 +43,24 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import provenance
 
 PARTS = ("precision", "whole", "programs", "members", "scaling", "builds")
+# What a machine lacks where a peer of that name is missing from the table.
 NEEDED = {
     "odeint": "g++ and libboost-dev",
     "ARKODE": "g++ and libsundials-dev",
     "TSRK": "mpicxx, pkg-config and petsc-dev",
-    "diffrax": "the environment that scripts/bench makes (packages diffrax and jax)",
+    "diffrax": "the environment that scripts/bench sets up (packages diffrax and jax)",
 }
 FULL = {
+    # A decade apart: errors fall by about a decade from one to the next, and the ratios are interpolated between
+    # them.
     "tolerances": [float(f"1e-{k}") for k in range(5, 14)],
+    # The median of five leaves out two rounds that another process disturbed.
     "rounds": 5,
     "cells": [300, 3000, 30_000, 100_000, 300_000, 10**6],
     "sizes": [(10**6, 1000), (10**6, 10**5), (10**7, 10**4)],
 }
 QUICK = {
+    # These span the errors from 1e-5 to 1e-9 at which solvers are compared.
     "tolerances": [1e-7, 1e-9, 1e-11, 1e-13],
     "rounds": 1,
     "cells": [300, 30_000, 100_000],
@@ -73,7 +80,7 @@ def options_from(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change the compared case")
     parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="where results go")
     parser.add_argument("--paper", type=Path, default=Path("runs/paper"), help="folder that `paper` left")
-    parser.add_argument("--baseline", default=BASELINE, metavar="COMMIT", help="the version beside which programs run")
+    parser.add_argument("--baseline", default=BASELINE, metavar="COMMIT", help="the earlier version of programs")
     parser.add_argument("--table", action="store_true", help="print the tables of the last results, no more")
     parser.add_argument("--write", action="store_true", help="write tables and picture of the results into the manual")
 
@@ -81,6 +88,7 @@ def options_from(arguments: list[str]) -> argparse.Namespace:
     if options.rounds is not None and options.rounds < 1:
         parser.error(f"--rounds {options.rounds}: must be at least 1")
     for key, value in (QUICK if options.quick else FULL).items():
+        # What the command line gives goes before what the mode means.
         if getattr(options, key, None) is None:
             setattr(options, key, value)
     return options
@@ -104,6 +112,7 @@ def measure(case: Case, options: argparse.Namespace) -> dict:
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         if "precision" in parts:
+            # Peers are built for each bench, by the compiler and for the processor that it reports.
             solvers = own_solvers() | peers(Path(folder))
             for name, needed in NEEDED.items():
                 if not any(solver.startswith(name) for solver in solvers):
@@ -115,6 +124,7 @@ def measure(case: Case, options: argparse.Namespace) -> dict:
         if "programs" in parts:
             found["programs"] = measured_programs(options)
         if "members" in parts:
+            # A round has four sweeps: three rounds are enough for a median.
             found["members"] = member_seconds(Path(folder), min(options.rounds, 3))
             found["paper"] = paper_budget(options.paper)
         if "scaling" in parts:

@@ -28,6 +28,7 @@ def with_tables(chapter: str, measured: str) -> tuple[str, list[str]]:
         titles = _titles(block) if is_table else ""
         if titles in found:
             placed.add(titles)
+            # The first two titles recognise a table: later ones, such as a commit, change from bench to bench.
             block = _with_goals(block, found[titles]) if titles == GOALS else found[titles]
         blocks.append(block)
 
@@ -37,6 +38,7 @@ def with_tables(chapter: str, measured: str) -> tuple[str, list[str]]:
 
 def _with_goals(before: str, measured: str) -> str:
     """The table of goals ``before`` with the rows of ``measured`` in place of those of the same names, or after all."""
+    # A dictionary keeps the order of the chapter's goals as their rows are replaced.
     rows = {_titles(row, columns=1): row for row in before.splitlines()}
     rows |= {_titles(row, columns=1): row for row in measured.splitlines()}
     return "\n".join(rows.values())

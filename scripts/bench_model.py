@@ -1,4 +1,4 @@
-"""A model of many ranks from what one and two ranks measured here; each assumption is stated beside the tables."""
+"""A model of many ranks from what one and two ranks measured here; each assumption is stated below the tables."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 
+# A core, a node, and sixteen nodes.
 RANKS = (1, 64, 1024)
 # A common cluster's network.
 LATENCY = 2e-6  # s a message
 BANDWIDTH = 10e9  # bytes/s a rank
+# A lattice's state of some MB, which caches still hold: with fewer cells a rank, messages cost a larger fraction.
 WEAK = 100_000  # cells a rank
+# On 1,024 ranks each has 10,000 of these, within the range that was measured here.
 STRONG = 10_000_000  # cells in all
 
 
@@ -34,7 +37,9 @@ class ScalingModel:
 
         self._cells = [row["cells"] for row in alone]
         self._seconds = [row["wall_ms"] / 1e3 for row in alone]
+        # From the largest lattice, which exceeds the caches; below 1 the ratio would be noise of the measurement.
         self.shared = max(1.0, 2 / paired[-1]["memory_speedup"])
+        # The most of all lengths: what a rank sends does not grow with its cells.
         self.messages = max(row["messages"] for row in paired)
         self.bytes = max(row["message_bytes"] for row in paired)
         self.reductions = max(row["reductions"] for row in paired)
@@ -42,6 +47,8 @@ class ScalingModel:
     def compute(self, cells: float) -> float:
         """Seconds of one rank for so many cells; beyond the measured ones, in proportion to them."""
         largest = self._cells[-1]
+        # In logarithms, since lengths and times span decades. Below the shortest lattice its time is a bound from
+        # above.
         within = np.exp(np.interp(np.log(min(cells, largest)), np.log(self._cells), np.log(self._seconds)))
         return float(within) * max(1.0, cells / largest) * self.shared
 
@@ -49,6 +56,7 @@ class ScalingModel:
         """Seconds that a rank sends, receives and reduces."""
         if ranks == 1:
             return 0.0
+        # With the neighbour to the left and then the one to the right: a rank inside the lattice has two.
         exchange = 2 * (self.messages * LATENCY + self.bytes / BANDWIDTH)
         return exchange + self.reductions * math.ceil(math.log2(ranks)) * LATENCY
 
@@ -68,6 +76,7 @@ def model_tables(rows: list[dict[str, Any]]) -> str:
     for engine in dict.fromkeys(row["engine"] for row in rows):
         try:
             model = ScalingModel(rows, engine)
+        # An engine that was not measured on two ranks has no row; the other one's is of use without it.
         except ValueError:
             continue
         weak = []

@@ -80,9 +80,11 @@ class Flight:
 
 def solve(case: Case) -> Solution:
     """The case by its own engine on one rank."""
+    # Peers return velocities alone: displacements would cost this side what they do not pay.
     output = case.output.model_copy(update={"fields": ["velocity"]})
     flight = Flight(case.model_copy(update={"output": output}), MPI.COMM_SELF)
     sampled, seconds = flight.velocities()
+    # PETSc's objects are freed by their ranks together, not when Python collects them.
     flight.engine.destroy()
     return Solution(sampled.reshape(flight.model.samples, -1), seconds)
 
@@ -101,6 +103,7 @@ def own_solvers() -> dict[str, Solver]:
     return {f"vipetsc {name}": with_engine(name) for name in engines()}
 
 
+# About a microsecond each: 20,000 take a fiftieth of a second, to which the clock's step is nothing.
 def right_hand_side_us(case: Case, evaluations: int = 20_000) -> float:
     """Microseconds of CPU that one right-hand side of the case costs through PETSc."""
     flight = Flight(_by_engine(case, "ts"), MPI.COMM_SELF)
@@ -109,5 +112,6 @@ def right_hand_side_us(case: Case, evaluations: int = 20_000) -> float:
     slope = state.duplicate()
     begin = time.process_time()
     for _ in range(evaluations):
+        # A time within the drive, so that its force is computed too.
         ts.computeRHSFunction(0.05, state, slope)
     return (time.process_time() - begin) / evaluations * 1e6

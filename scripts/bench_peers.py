@@ -31,9 +31,10 @@ BOOST = Path("/usr/include/boost/numeric/odeint.hpp")
 # The last one lets g++ vectorise odeint's sums over 13 stages: a quarter off fehlberg78's time.
 FLAGS = ("-O3", "-march=native", "-std=c++17", "-fopenmp-simd", "--param", "vect-max-version-for-alias-checks=100")
 ARKODE = Path("/usr/include/arkode/arkode_erkstep.h")
-# scripts/bench makes this environment: diffrax needs another numpy than Debian's.
+# scripts/bench sets up this environment: diffrax needs another numpy than Debian's.
 DIFFRAX = Path(__file__).parents[1] / ".venv-diffrax" / "bin" / "python"
 ONE_THREAD = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"}
+# A tolerance at which a peer takes longer has no row; the others are measured.
 PATIENCE = 300  # seconds that a peer may take for one solution
 
 RightHandSide = Callable[[float, np.ndarray], np.ndarray]
@@ -55,6 +56,7 @@ def parameters(model: Model) -> str:
     chain = model.chain
     contact = model.contact
     drive = model.drive
+    # Refused here rather than in four languages.
     if contact.restitution != 1 or chain.ends == "periodic":
         raise ValueError("the peers know conservative lattices with fixed or free ends only")
     if contact.law not in ("hertz", "bilinear"):
@@ -85,6 +87,7 @@ def petsc_flags() -> list[str]:
         command = ["pkg-config", *options, "PETSc"]
         return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
+    # Against another PETSc than ours a ratio would compare two PETScs.
     version = ".".join(map(str, PETSc.Sys.getVersion()))
     if ask("--modversion") != version:
         return []
@@ -167,6 +170,7 @@ def diffrax(folder: Path) -> Solver:
         except BrokenPipeError:
             pass  # it has ended: there will be no answer
         answer = running.stdout.readline()
+        # An empty line is the end of its output: the process has ended without an answer.
         if not answer:
             raise RuntimeError("diffrax failed")
         return _solution(output, model, json.loads(answer)["cpu_seconds"])
@@ -182,6 +186,7 @@ def scipys(right_hand_side: Callable[[Model], RightHandSide]) -> Solver:
         slope = right_hand_side(model)
         n = model.chain.masses().size
         times = np.arange(model.samples) * model.sample_interval
+        # One tolerance for displacements and one for velocities, as the engines have.
         atol = np.repeat(model.atol, n)
 
         begin = time.process_time()
@@ -271,6 +276,7 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
             f[n + driven] += amplitude * (1.0 - np.cos(phase / cycles)) * np.sin(phase) * inverse_mass[driven]
         return f
 
+    # Compiled now: compiling is no part of a solution's time.
     slope(0.0, np.zeros(2 * n))
     return slope
 

@@ -14,11 +14,14 @@ from vipetsc.case import Case
 
 # A ratio at an error below this many separations of the references would measure the references.
 MARGIN = 5
+# From what a picture shows to what a convergence study needs.
 ERRORS = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 
 
 def lattice_case(overrides: Iterable[str] = ()) -> Case:
     """The compared case: four-band, A = 30 N, conservative; it ends while solvers still agree after first contact."""
+    # Conservative, because the peers' laws are; up to 0.3 s, since rounding grows by every contact in a chaotic
+    # motion.
     given = ("drive.amplitude=30.0", "contacts.restitution=1.0", "time.sample_interval=2e-4", "time.end=0.3")
     return Case.load(overrides=[*given, *overrides])
 
@@ -35,8 +38,10 @@ def error(sampled: np.ndarray, exact: np.ndarray) -> float:
 
 def reference(solvers: Mapping[str, Solver], case: Case) -> tuple[np.ndarray, dict[str, Any]]:
     """Velocities by our ``ts`` at 1e-13, and how far others at the edge of double precision lie from them."""
+    # By ts, whose error falls with the tolerance down to rounding; the propagator shares no step with it.
     exact = solvers["vipetsc ts"](at_tolerance(case, 1e-13)).velocity
     tight = {"vipetsc ts": 3e-14}
+    # A solver by others confirms the reference; where none was built, one of SciPy's does.
     if "odeint dopri5" in solvers:
         tight["odeint dopri5"] = 1e-14
     else:
@@ -58,10 +63,13 @@ def work_precision(solvers: Mapping[str, Solver], case: Case, tolerances: Iterab
     rows: dict[tuple[str, float], dict] = {}
     for _ in range(rounds):
         for rtol in tolerances:
+            # The solvers are inside the loop over tolerances: what disturbs the machine for a minute disturbs all of
+            # them.
             for name, solver in solvers.items():
                 row = rows.setdefault((name, rtol), {"solver": name, "rtol": rtol, "error": None, "all": []})
                 try:
                     found = solver(at_tolerance(case, rtol))
+                # A solver may fail at the loosest tolerance and be compared at the others.
                 except RuntimeError as failure:
                     row["failure"] = str(failure)
                     continue
@@ -70,7 +78,9 @@ def work_precision(solvers: Mapping[str, Solver], case: Case, tolerances: Iterab
 
     for row in rows.values():
         row["seconds"] = statistics.median(row["all"]) if row["all"] else None
+    # Sorted by tolerance, so that the points of a solver join to a curve.
     table = sorted(rows.values(), key=lambda row: (list(solvers).index(row["solver"]), -row["rtol"]))
+    # Of all separations the largest: the reference is worth no more than the worst agreement.
     about["floor"] = MARGIN * max(about["separation"].values())
     ratios, spread = equal_error_ratios(table, [e for e in ERRORS if e >= about["floor"]])
     return {"reference": about, "rows": table, "ratios": ratios, "spread": spread}
@@ -84,6 +94,7 @@ def at_equal_error(points: Iterable[tuple[float, float]], wanted: float, bound: 
     """
     front: list[tuple[float, float]] = []
     for e, s in sorted(points):
+        # From the smallest error on, a point must cost less than the one before to stay.
         if not front or s < front[-1][1]:
             front.append((e, s))
     if not front or wanted < front[0][0] or (wanted > front[-1][0] and not bound):
@@ -95,6 +106,7 @@ def at_equal_error(points: Iterable[tuple[float, float]], wanted: float, bound: 
 def equal_error_ratios(rows: list[dict], wanted: list[float]) -> tuple[dict[str, float], dict[str, list[float]]]:
     """CPU time of each peer over that of each engine of ours, by name; median and extremes over the rounds."""
     names = list(dict.fromkeys(row["solver"] for row in rows))
+    # A row with fewer failed in some round, and has no ratio for it.
     rounds = max(len(row["all"]) for row in rows)
 
     def seconds(name: str, turn: int, wanted_error: float) -> float | None:

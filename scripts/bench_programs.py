@@ -1,4 +1,4 @@
-"""Whole programs as a user calls them, beside an earlier version: time from the prompt to the last picture.
+"""Whole programs as a user calls them, compared with an earlier version: time from the prompt to the last picture.
 
 Calls of the two versions alternate, each in a process of its own, so that both meet the same machine. The earlier
 version comes out of the repository's history; the package needs no build.
@@ -20,7 +20,9 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
+# The version before programs were made fast to start: the targets below are ratios to its times.
 BASELINE = "b03848f"
+# The slowest program, a first run of the earlier version, compiles for a minute; ten leave room for a slow machine.
 PATIENCE = 600  # seconds that one call may take
 
 # Six amplitudes, of which the lower ones touch nothing and the upper ones have many contacts.
@@ -51,6 +53,7 @@ class Program:
 
 PROGRAMS = {
     "help": Program("--help"),
+    # Targets are written as the seconds that were aimed at over those of the earlier version.
     "validate": Program("validate", target=0.7 / 1.6),
     "run without pictures, propagator": Program(
         "run --set time.engine=propagator --set output.figures=false --force --out {folder}/plain"
@@ -61,6 +64,7 @@ PROGRAMS = {
         "run --set time.engine=propagator --force --out {folder}/propagator", target=3.0 / 8.4
     ),
     "run with pictures, ts": Program("run --set time.engine=ts --force --out {folder}/ts", ranks=2, target=4.5 / 9.3),
+    # By CPU time: how many members run at once is a matter of the machine's cores.
     "sweep of six": Program("sweep {folder}/six.toml --force --out {folder}/six", target=2.2 / 4.3, by_cpu=True),
     "first run, with compilation, propagator": Program(
         "run --set time.engine=propagator --set output.figures=false --force --out {folder}/first",
@@ -84,6 +88,8 @@ class Version:
         environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX", "OMPI_UNIVERSE"))}
         environment["PYTHONPATH"] = str(self.source)
         if program.compiles:
+            # A folder of its own, emptied before, holds the machine code: kernels that a user's cache holds would not
+            # be compiled.
             kernels = self.folder / "kernels"
             shutil.rmtree(kernels, ignore_errors=True)
             environment["NUMBA_CACHE_DIR"] = str(kernels)
@@ -93,6 +99,7 @@ class Version:
         if program.ranks > 1:
             command = ["mpirun", "-n", str(program.ranks), *command]
 
+        # Of children that have ended; mpirun waits for its ranks, so that theirs are among them.
         before = _cpu_seconds_of_children()
         begin = time.perf_counter()
         ended = subprocess.run(
@@ -113,6 +120,7 @@ def _cpu_seconds_of_children() -> float:
 def unpack(commit: str, folder: Path) -> Path:
     """The package as it was at ``commit``, in a folder below ``folder``; raises RuntimeError without that commit."""
     source = folder / commit
+    # From an earlier bench; a commit does not change.
     if (source / "vipetsc").is_dir():
         return source
 
@@ -138,11 +146,14 @@ def programs(folder: Path, rounds: int, commit: str, names: Iterable[str]) -> li
     versions = {"before": Version(source, folder / "before"), "now": Version(ROOT, folder / "now")}
     for version in versions.values():
         version.folder.mkdir(parents=True, exist_ok=True)
+        # Each version has its folder: neither must find the results of the other, and resume them.
         (version.folder / "six.toml").write_text(SWEEP, encoding="utf-8")
 
     rows = []
     for name in names:
         program = PROGRAMS[name]
+        # A program that compiles is measured as a user meets it first: with empty caches, and once, since it takes a
+        # minute.
         first = 0 if program.compiles else 1
         turns = 1 if program.compiles else rounds
         measured: dict[str, list[tuple[float, float]]] = {label: [] for label in versions}
@@ -153,6 +164,7 @@ def programs(folder: Path, rounds: int, commit: str, names: Iterable[str]) -> li
                     if turn >= first:
                         measured[label].append(seconds)
         except (RuntimeError, subprocess.TimeoutExpired) as failure:
+            # A failure is a row of the table, and the other programs are measured.
             rows.append({"program": name, "ranks": program.ranks, "failure": str(failure)})
             continue
         rows.append({"program": name, "ranks": program.ranks, "baseline": commit} | _summary(measured))
@@ -163,6 +175,7 @@ def _summary(measured: dict[str, list[tuple[float, float]]]) -> dict:
     """Medians over the rounds of wall and CPU seconds, of their ratios, and the range of the ratios."""
     before = np.array(measured["before"])
     now = np.array(measured["now"])
+    # Ratios of calls that followed each other: the machine's speed changes over a bench, and cancels in them.
     ratios = now / before
     found = {}
     for column, kind in enumerate(("wall", "cpu")):
@@ -175,6 +188,7 @@ def _summary(measured: dict[str, list[tuple[float, float]]]) -> dict:
 
 def programs_table(rows: list[dict]) -> str:
     """The rows in Markdown."""
+    # Rows of failures have no baseline; all others have the same one.
     commit = next((row["baseline"] for row in rows if "baseline" in row), BASELINE)
     lines = [
         f"| program | ranks | wall s at {commit} | now | ratio (range) | CPU s at {commit} | now | ratio (range) |",

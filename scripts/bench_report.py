@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from vipetsc.figures import style
 from vipetsc.io.atomic import atomic_write
 
+# Circles are this package's engines, squares methods of order 5, triangles those of order 8, diamonds SciPy's.
 _LOOKS = {
     "vipetsc propagator": (style.VERMILION, "o", "-"),
     "vipetsc ts": (style.BLUE, "o", "-"),
@@ -56,6 +57,7 @@ def markdown(found: dict[str, Any]) -> str:
         "scaling": _scaling_table,
         "builds": _builds_table,
     }
+    # A bench of some parts has no tables of the others.
     sections = [part(found) for key, part in parts.items() if found.get(key)]
     sections += [model_tables(found.get("scaling", [])), target_table(found)]
     return "\n\n".join(filter(None, sections)) + "\n"
@@ -88,6 +90,7 @@ def processor() -> str:
 def _precision_table(found: dict[str, Any]) -> str:
     """CPU seconds at equal error, and ratios to the last engine of ours."""
     names = solver_names(found)
+    # The last one is the propagator, the faster of ours where it applies.
     engine = [name for name in names if name.startswith("vipetsc")][-1]
     reference = found["reference"]
     lines = [
@@ -116,7 +119,7 @@ def _reference_table(found: dict[str, Any]) -> str:
 
 
 def _seconds_and_ratio(seconds: float | None, ratio: float | None) -> str:
-    """An entry of the table: CPU seconds, with the ratio if it is known; "-" for none."""
+    """An entry of the table: CPU seconds, with the ratio if there is one; "-" for none."""
     if seconds is None:
         return "-"
     return f"{seconds:.3g} ({ratio:.3g})" if ratio else f"{seconds:.3g}"
@@ -143,6 +146,7 @@ def _paper_table(found: dict[str, Any]) -> str:
     """CPU time of the paper over all ranks, by stage, the longest first."""
     budget = found["paper"]
     lines = ["| stage of the paper | CPU s of all ranks |", "|---|---|", f"| all | {sum(budget.values()):.0f} |"]
+    # The longest first: it is where time can be saved.
     for stage, seconds in sorted(budget.items(), key=lambda item: -item[1]):
         lines.append(f"| {stage} | {seconds:.0f} |")
     return "\n".join(lines)
@@ -192,6 +196,7 @@ def _power(value: float) -> str:
 def draw(found: dict[str, Any], folder: Path) -> list[Path]:
     """``work-precision.png`` and ``scaling.png`` in ``folder``, each where it was measured."""
     pictures = {"rows": ("work-precision", work_precision_figure), "scaling": ("scaling", scaling_figure)}
+    # Rows of failures have no numbers that could be drawn.
     found = found | {"scaling": [row for row in found.get("scaling", []) if "failure" not in row]}
     paths = []
     for key, (name, make) in pictures.items():
@@ -213,7 +218,7 @@ def work_precision_figure(found: dict[str, Any]) -> Figure:
             colour, marker, line = _LOOKS.get(name, _OTHER)
             axes.loglog(*points.T, line, color=colour, marker=marker, ms=3, label=name)
 
-    # Errors below the distance of the references cannot be told from theirs.
+    # Errors below the distance of the references cannot be distinguished from theirs.
     floor = max(found["reference"]["separation"].values())
     left = min(axes.get_xlim()[0], floor / 5)
     axes.axvspan(left, floor, color=style.PALE, lw=0)
@@ -242,6 +247,7 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
             right.semilogx(cells, [r["peak_gib_a_rank"] for r in rows], line, color=colour, marker=marker, ms=3)
 
     _limit(left, found["scaling"])
+    # From zero, so that heights compare as memory does.
     right.set_ylim(0, 1.15 * max(row["peak_gib_a_rank"] for row in found["scaling"]))
     left.set_ylabel("wall time per 2e-4 s of model time (ms)")
     right.set_ylabel("peak memory a rank (GiB)")
@@ -254,6 +260,7 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
 
 def _limit(axes: Axes, rows: list[dict]) -> None:
     """The time in which one rank's memory reads and writes the state once."""
+    # The bound is one of the machine: the rows of either engine give the same line.
     first = [r for r in rows if r["ranks"] == 1 and r["engine"] == rows[0]["engine"]]
     limit = [r["wall_ms"] * r["fraction_of_bandwidth_limit"] for r in first]
     axes.loglog([r["cells"] for r in first], limit, ":", color=style.GREY, label="memory alone, 1 rank")

@@ -18,6 +18,7 @@ from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 
 WORKER = Path(__file__).with_name("bench_worker.py")
+# A lattice that the machine cannot hold swaps instead of failing; the others are measured in some seconds each.
 PATIENCE = 300  # seconds that one measurement may take
 MOST_TS_CELLS = 300_000  # beyond which `ts` takes minutes and shows nothing more
 
@@ -33,6 +34,7 @@ def on_ranks(ranks: int, task: str, **arguments: object) -> dict:
         raise RuntimeError(f"{task} on {ranks} ranks took more than {PATIENCE} s") from error
     if ended.returncode:
         raise RuntimeError(f"{task} on {ranks} ranks failed: {ended.stderr.strip()[-2000:]}")
+    # The last line: libraries may print before it.
     return json.loads(ended.stdout.strip().splitlines()[-1])
 
 
@@ -41,9 +43,11 @@ def scaling(cells: Iterable[int], rounds: int) -> list[dict]:
     rows = []
     for engine in engines():
         for n in cells:
+            # Its time is in proportion to the cells from 30,000 on.
             if engine == "ts" and n > MOST_TS_CELLS:
                 continue
             try:
+                # A pair at a time: a lattice that two ranks cannot hold must not cost the rows of the shorter ones.
                 rows += _pair(engine, n, rounds)
             except RuntimeError as failure:
                 rows.append({"engine": engine, "cells": n, "ranks": 0, "failure": str(failure)})
@@ -90,7 +94,9 @@ def whole_runs(folder: Path, rounds: int) -> dict[str, float]:
         for engine, found in seconds.items():
             overrides = [f"time.engine={engine}"]
             if turn == 0:
+                # The warm-up loads the compiled kernels; a hundredth of a second is enough for that.
                 overrides.append("time.end=0.01")
+            # With force, since every round writes to the folder of the one before.
             result = simulate(Case.load(overrides=overrides), folder / f"whole-{engine}", MPI.COMM_SELF, force=True)
             if turn:
                 found.append(result.statistics["cpu_seconds"])

@@ -1,4 +1,4 @@
-"""What a bench must show: a few named numbers beside their targets, from ``latest.json`` alone."""
+"""What a bench must show: a few named numbers and their targets, from ``latest.json`` alone."""
 
 from __future__ import annotations
 
@@ -50,13 +50,17 @@ def _scaling(rows: list[dict[str, Any]]) -> list[Target]:
     for cells in (10**5, 10**6):
         one = rows_by_case.get(("propagator", cells, 1))
         if one:
+            # A method that passes over the state three times an interval reaches a third of the limit.
             fraction = one["fraction_of_bandwidth_limit"]
             found.append(Target(f"propagator: fraction of the memory's limit at {cells:,} cells", fraction, 0.3))
         two = rows_by_case.get(("propagator", cells, 2), {})
         if "speedup" in two:
+            # Two ranks share a memory, which gains less than twice by a second core; of that gain nine tenths must
+            # arrive.
             gain = two["speedup"] / two["memory_speedup"]
             found.append(Target(f"gain of a second rank over that of bare memory at {cells:,} cells", gain, 0.9))
 
+    # At 300 cells a rank has little to compute: messages must not cost more than a second rank saves.
     two = rows_by_case.get(("propagator", 300, 2), {})
     if "speedup" in two:
         found.append(Target("two ranks against one at 300 cells (times as fast)", two["speedup"], 1.0))
@@ -71,6 +75,7 @@ def _whole_programs(rows: list[dict[str, Any]]) -> list[Target]:
     measured = []
     for row in rows:
         program = PROGRAMS[row["program"]]
+        # A failed program has no time; its row in the table of programs says so.
         if "failure" in row or program.target is None:
             continue
         kind = "cpu" if program.by_cpu else "wall"
@@ -81,6 +86,7 @@ def _whole_programs(rows: list[dict[str, Any]]) -> list[Target]:
 
 def _studies(found: dict[str, Any]) -> list[Target]:
     """CPU time of a sweep's member, and of the whole paper."""
+    # A member of either kind when targets were set; the paper's two largest stages are sweeps of such members.
     most = {"four-band": 0.35, "diatomic": 0.25}
     measured = []
     for kind, seconds in found.get("members", {}).items():
@@ -92,7 +98,7 @@ def _studies(found: dict[str, Any]) -> list[Target]:
 
 
 def table(found: dict[str, Any]) -> str:
-    """The numbers beside their targets in Markdown; empty if none was measured."""
+    """The numbers and their targets in Markdown; empty if none was measured."""
     measured = targets(found)
     if not measured:
         return ""

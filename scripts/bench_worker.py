@@ -14,6 +14,7 @@ from typing import Any
 
 import petsc4py
 
+# Without PETSc's handlers a failure ends as an exception of Python, of which the bench reports the last lines.
 petsc4py.init(["bench", "-no_signal_handler"])
 
 from mpi4py import MPI
@@ -66,6 +67,7 @@ def triad(a: np.ndarray, b: np.ndarray, c: np.ndarray, s: float) -> None:
         a[i] = b[i] + s * c[i]
 
 
+# Three arrays of 64 MB each exceed every cache of a processor's last level, so that the memory itself is measured.
 def bandwidth(size: int = 8_000_000, turns: int = 12) -> float:
     """GB/s of a triad on all ranks at once, the best of ``turns``, 24 bytes an element as STREAM counts."""
     a = np.zeros(size)
@@ -73,6 +75,7 @@ def bandwidth(size: int = 8_000_000, turns: int = 12) -> float:
     c = np.ones(size)
     # The first call compiles, and touches the memory.
     triad(a, b, c, 0.5)
+    # The best, as in STREAM: other processes can only take from the bandwidth.
     best = np.inf
     for _ in range(turns):
         COMM.Barrier()
@@ -90,10 +93,12 @@ def peak() -> float:
 
 def flight(engine: str, cells: int, intervals: int) -> dict:
     """Milliseconds a sample interval of a lattice of ``cells``, once a short burst has reached its full strength."""
+    # Three cycles end soon, and a window of nine cells keeps what is recorded small at every length.
     case = lattice_case([f"lattice.cells={cells}", f"time.engine={engine}", "drive.cycles=3", "output.window=[1, 9]"])
     comm = Counting(COMM)
     moving = Flight(case, comm)
     model = moving.model
+    # At rest the engines have less to do: ts takes its longest steps there.
     first = round(model.drive.duration / 3 / model.sample_interval)
     moving.advance(0, first)
     COMM.Barrier()
@@ -124,10 +129,12 @@ def counted(moving: Flight, comm: Counting, done: int, intervals: int) -> dict[s
     Messages are what PETSc's log has of its scatters, reductions those of its steps and those over ``comm``; ms are
     those of this rank's ``EVENTS``.
     """
+    # Only now: the log would slow down the steps that were timed before.
     PETSc.Log.begin()
 
     def logged() -> np.ndarray:
         events = [PETSc.Log.Event(name).getPerfInfo() for name in EVENTS]
+        # PETSc counts since the start of the log, hence the difference of two readings below.
         scatter, step = events[:2]
         traffic = scatter["numMessages"], scatter["messageLength"], step["numReductions"] + comm.reductions
         return np.array([*traffic, *(1e3 * event["time"] for event in events)])
@@ -177,7 +184,9 @@ def build(cells: int, sites: int) -> dict:
 
 def _spread(cells: int, sites: int) -> Case:
     """A lattice with evenly spread sites that nothing reaches in three samples."""
+    # Away from the ends, the first of which is driven.
     places = np.linspace(cells // 10, cells - cells // 10, sites).round().astype(int).tolist()
+    # "auto" would choose by size; the same writer at every size lets rows be compared.
     writer = "parallel" if h5py.get_config().mpi else "gather"
     table = {
         "name": "build",

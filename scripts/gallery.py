@@ -1,4 +1,4 @@
-"""The pictures of the manual's gallery: the commands of its pages are run as they stand, their figures made small.
+"""The pictures of the manual's gallery: its pages' commands are run as they stand, their figures kept small.
 
     python scripts/gallery.py [--folder FOLDER] [PAGE ...]
 
@@ -19,11 +19,13 @@ import time
 from pathlib import Path
 
 from PIL import Image
+from small_pictures import save_small
 
 ROOT = Path(__file__).parents[1]
 INDEX = ROOT / "vipetsc/manual/gallery.md"
+# Figures of runs are 1400 pixels wide; at 900 they have 60 % of the bytes.
 WIDTH = 900  # pixels
-COLOURS = 200
+# The gallery is part of the package that users install: these bounds keep it to a few MB.
 MOST = {".png": 125_000, ".gif": 1_500_000}  # bytes
 
 
@@ -47,16 +49,16 @@ def pictures(page: Path) -> list[Path]:
 
 
 def make_small(source: Path, target: Path) -> None:
-    """Copy a picture, a PNG in ``COLOURS``, ``WIDTH`` pixels wide; raises ValueError for one too large."""
+    """Copy a picture, a PNG in few colours and ``WIDTH`` pixels wide; raises ValueError for one too large."""
+    most = MOST[source.suffix]
     if source.suffix == ".png":
-        image = Image.open(source).convert("RGB")
-        height = round(image.height * min(WIDTH / image.width, 1))
-        image = image.resize((min(WIDTH, image.width), height), Image.Resampling.LANCZOS)
-        image.quantize(COLOURS, dither=Image.Dither.NONE).save(target, optimize=True)
-    else:
-        shutil.copyfile(source, target)
-    if target.stat().st_size > MOST[source.suffix]:
-        raise ValueError(f"{target}: {target.stat().st_size} bytes")
+        save_small(Image.open(source), target, WIDTH, most)
+        return
+
+    # A GIF is written in few colours already.
+    shutil.copyfile(source, target)
+    if target.stat().st_size > most:
+        raise ValueError(f"{target}: {target.stat().st_size} bytes, more than {most}")
 
 
 def make(page: Path, folder: Path) -> None:
@@ -64,6 +66,7 @@ def make(page: Path, folder: Path) -> None:
     for words in commands(page):
         # This interpreter, whatever `python` is on the path.
         command = [sys.executable if word == "python" else word for word in words]
+        # A command that fails ends all: pictures of a run before it would pass for new ones.
         subprocess.run(command, cwd=folder, check=True)
     for target in pictures(page):
         run, figure = target.name.split(".", 1)
@@ -75,10 +78,11 @@ def main(arguments: list[str] | None = None) -> None:
     all_pages = pages()
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("page", nargs="*", default=list(all_pages), help=f"{', '.join(all_pages)}; all if left out")
-    parser.add_argument("--folder", type=Path, help="where runs are made and stay; a temporary one if left out")
+    parser.add_argument("--folder", type=Path, help="where runs are kept; a temporary one if left out")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.folder or Path(scratch)
+        # Commands name case files below runs/; results there are left out, so that every one is computed.
         shutil.copytree(ROOT / "runs", folder / "runs", ignore=shutil.ignore_patterns("*.h5"), dirs_exist_ok=True)
         for name in options.page:
             begin = time.monotonic()

@@ -22,6 +22,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
+# The tests' records and tables are used, and tests are no part of the installed package.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.conftest import run_of
@@ -45,13 +46,15 @@ def work_of(table: dict[str, Any]) -> Identification:
     return Identification(plan, read_records(plan), StopRequest())
 
 
-def made_record(table: dict[str, Any], folder: Path, noise: float = 0.0, seed: int = 1) -> dict[str, Any]:
-    """A record of the points of ``table``, made by the propagator."""
+def computed_record(table: dict[str, Any], folder: Path, noise: float = 0.0, seed: int = 1) -> dict[str, Any]:
+    """A record of the points of ``table``, computed by the propagator."""
     run = run_of(Case.from_table(table))
     values = run["points/velocity"].values
+    # Noise is relative to the root mean square of each sensor's record, over its whole length.
     sizes = np.sqrt(np.mean(values**2, axis=0))
     values = values + noise * sizes * np.random.default_rng(seed).standard_normal(values.shape)
     path = folder / f"{table['name']}-{seed}.csv"
+    # With 17 digits a double is read as it was written: without noise the record has no error of its own.
     np.savetxt(path, np.column_stack([run["time"].values, values]), delimiter=",", fmt="%.17g")
     sensors = [
         {"quantity": "velocity", "column": column, "cell": point["cell"], "mass": point.get("mass", 1)}
@@ -68,17 +71,19 @@ def exact(folder: Path) -> None:
         for sensor in example["identify"]["records"][0]["sensors"]
     ]
     contacts = example["contacts"] | {"clearance": list(CLEARANCES), "stiffness": STIFFNESS, "restitution": 0.7}
+    # A tolerance far below the default, so that the record's own error bounds no parameter.
     time = {"end": 0.04, "sample_interval": 2.5e-4, "engine": "propagator", "rtol": 1e-12}
     table = {key: example[key] for key in ("lattice", "drive")}
     table |= {"name": "truth", "contacts": contacts, "time": time, "output": {"points": points}}
 
+    # Alternately too large and too small: a common factor would be the easier start.
     factors = np.array([1.3, 0.7, 1.3, 0.7, 1.3])
     unknowns = [
         {"quantity": "clearance", "of": "each", "bounds": [3e-4, 5e-3], "start": (factors * CLEARANCES).tolist()},
         {"quantity": "stiffness", "bounds": [5e5, 5e7], "start": 0.7 * STIFFNESS},
         {"quantity": "restitution", "bounds": [0.3, 1.0], "start": 0.91},
     ]
-    work = work_of(identify_table(table, made_record(table, folder), unknowns=unknowns))
+    work = work_of(identify_table(table, computed_record(table, folder), unknowns=unknowns))
     record = work.fit(0)
     windows, z = work.placed(record)
     truth = [*CLEARANCES, STIFFNESS, 0.7]
@@ -119,6 +124,7 @@ def derivatives(folder: Path, picture: Path) -> None:
 
 def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float, float, float]]:
     """Impacts, the largest derivative in m/s, its relative error, and that of a predicted change, over windows."""
+    # Differences over h = 1e-5 lose five digits: with runs to 1e-13 they keep eight.
     table = lattice_table(time={"end": 0.06, "rtol": 1e-13}, contacts={"restitution": restitution})
     unknowns = [{"quantity": "clearance", "of": [[1]], "bounds": [1e-4, 2e-3], "start": 5e-4}]
     work = work_of(identify_table(table, measured_table(folder, table), unknowns=unknowns))
@@ -132,6 +138,7 @@ def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float
         case = work.plan.case_of([work.plan.parameters[0].from_coordinate(z[0] + step)])
         return np.asarray(run_of(case)["points/velocity"].values)
 
+    # Of the error, h^4 from the formula and 1e-13 / h from the runs, neither is above 1e-8 at this step.
     h = 1e-5
     differences = np.zeros_like(slopes)
     for steps, weight in ((-2, 1), (-1, -8), (1, 8), (2, -1)):
@@ -140,11 +147,14 @@ def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float
 
     rows = []
     times = misfit.records[0].times
+    # Evenly in logarithms, since derivatives grow as powers or exponentials of the number of impacts.
     for impacts in np.unique(np.geomspace(1, len(onsets) - 1, 16).astype(int)):
+        # Up to the next impact, before which the number is the one that is printed.
         window = times < onsets[impacts]
         largest = float(np.abs(slopes[window]).max())
         error = float(np.abs(slopes - differences)[window].max()) / largest if largest else 0.0
         missed = float(np.abs(1e-3 * slopes - change)[window].max() / np.abs(change)[window].max())
+        # Before the clearance is first touched nothing depends on it, and a relative error has no meaning.
         if largest:
             rows.append((int(impacts), largest, error, missed))
     return rows
@@ -174,18 +184,18 @@ def length(folder: Path, seeds: int) -> None:
     truth = np.array([4e-4, 0.7])
     print("length  impacts  standard errors                actual errors")
     for duration in (0.5, 1.0, 2.0, 4.0):
-        # The first second, in which the drive rises, is left out: it tells more than a second of the steady state.
+        # The first second, in which the drive rises, is left out: it constrains more than a second of the steady state.
         end = 1.0 + duration
         timed = table | {"time": {"end": end, "sample_interval": 2e-3, "engine": "propagator", "rtol": 1e-12}}
         found = []
         for seed in range(1, seeds + 1):
-            record = made_record(timed, folder, noise=0.02, seed=seed) | {"begin": 1.0}
+            record = computed_record(timed, folder, noise=0.02, seed=seed) | {"begin": 1.0}
             work = work_of(identify_table(timed, record, unknowns=unknowns))
             fit = work.fit(0)
             windows, z = work.placed(fit)
             found.append(windows.misfit.values(z) / truth - 1)
-        known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(2)))
-        stated = known.errors * [p.slope(x) for p, x in zip(work.plan.parameters, z, strict=True)] / truth
+        uncertainty = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(2)))
+        stated = uncertainty.errors * [p.slope(x) for p, x in zip(work.plan.parameters, z, strict=True)] / truth
         actual = np.sqrt(np.mean(np.square(found), axis=0))
         print(
             f"{duration:5.1f} s {fit['windows'][-1]['impacts']:8d}  {100 * stated[0]:.4f} % {100 * stated[1]:.4f} %"

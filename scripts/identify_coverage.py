@@ -2,7 +2,7 @@
 
     python scripts/identify_coverage.py [--noise 0.01 0.02 0.05] [--seeds 50] [--end 0.014]
 
-Records of a four-band lattice with three sites and three sensors are made by the propagator, with normal noise over
+Records of a four-band lattice with three sites and three sensors are computed by the propagator, with normal noise over
 their size; three clearances and the restitution are fitted from starts about 30 % off. Prints, for each noise, the
 fraction of 90 % intervals with the truth in them, and the root mean square of the errors.
 """
@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+# The tests' records and tables are used, and tests are no part of the installed package.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.identified import identify_table, lattice_table, measured_table
@@ -44,13 +45,16 @@ def row(table: dict, noise: float, seeds: int, folder: Path) -> str:
 
     inside = []
     errors = []
+    # A record, and so its noise, for each seed; the lattice stays.
     for seed in range(seeds):
         plan = IdentifyCase.from_table(identify_table(table, measured_table(folder, table, noise=noise, seed=seed)))
         work = Identification(plan, read_records(plan), StopRequest())
         windows, z = work.placed(work.fit(0))
-        known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
+        uncertainty = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
+        # Errors are compared in the coordinates of the fit, logarithms for positive quantities, in which intervals
+        # are symmetric.
         expected = [p.to_coordinate(value) for p, value in zip(plan.parameters, truth, strict=True)]
-        inside.append(np.abs(z - expected) < quantile(0.9) * known.errors)
+        inside.append(np.abs(z - expected) < quantile(0.9) * uncertainty.errors)
         errors.append(z - expected)
     size = 100 * np.sqrt(np.mean(np.square(errors), axis=0))
     each = " ".join(f"{100 * value:.0f}" for value in np.mean(inside, axis=0))

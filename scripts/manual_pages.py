@@ -75,6 +75,7 @@ def write_sources(folder: Path, packages: list[str]) -> None:
     tables = "".join(contents(title, names) for title, names in listed.items())
     put(folder / "index.md", index + tables, CHAPTERS)
     start = (ROOT / "README.md").read_text(encoding="utf-8")
+    # In a table of contents the package's name says nothing; the page says what to do first.
     put(folder / f"{START}.md", start.replace("# vipetsc", "# Get going", 1), ROOT)
     for name in WRITTEN:
         put(folder / f"{name}.md", chapter(name), CHAPTERS)
@@ -173,6 +174,7 @@ def interface(package: Path) -> str:
         if path != first:
             module = dotted(path)
             lines += [f"## {module}", ""]
+        # An empty directive: names that follow belong to this module, and links lead to it.
         lines += [f":::{{py:module}} {module}", ":::", ""]
         lines += [prose(tree), ""]
         for node in public(tree):
@@ -214,6 +216,7 @@ def described(node: Named, depth: int = 6) -> Iterator[str]:
 
 def prose(node: Named | ast.Module) -> str:
     """A docstring as Markdown: its headings are bold words, what looks like a tag is text."""
+    # A heading within a docstring would enter the page's table of contents.
     text = re.sub(r"(?m)^(.+)\n-{3,}$", r"**\1**\n", ast.get_docstring(node) or "")
     text = text.replace("::\n", ":\n")
     parts = re.split(r"(``.*?``|^ {4}.*$)", text, flags=re.M | re.S)
@@ -232,6 +235,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     folder = options.folder.resolve()
     source = folder / "source"
+    # A page whose chapter was removed would stay in the index.
     shutil.rmtree(source, ignore_errors=True)
     write_sources(source, options.python)
     add_static(folder)

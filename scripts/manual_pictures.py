@@ -1,4 +1,4 @@
-"""The pictures of the chapters theory and read-pictures and of the notebooks, drawn by the package and made small.
+"""The pictures of the chapters theory and read-pictures and of the notebooks, drawn by the package and kept small.
 
     python scripts/manual_pictures.py [--folder FOLDER]
 
@@ -26,6 +26,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
+from small_pictures import save_small
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
@@ -37,10 +38,13 @@ from vipetsc.lattice import Contact
 
 PICTURES = ROOT / "vipetsc/manual/pictures"
 NOTEBOOKS = ROOT / "vipetsc/manual/notebooks"
+# The width of a page's column; at 1520 pixels the pictures have twice the bytes.
 WIDTH = 760  # pixels
-COLOURS = 255
+# The largest, that of phases, has 48 kB; a picture beyond the bound has been drawn at another size.
 MOST = 60_000  # bytes
+# Half of the largest approach velocity in the built-in run.
 SPEED = 2.0  # m/s, of the impact that is drawn
+# The step is of first order: 4,000 leave 4e-4 of the force, a fifth of a line's width in the picture.
 STEPS = 4000  # of that impact
 # Figures of runs: the file in the manual, and where it is among the results.
 DRAWN = {
@@ -83,6 +87,7 @@ def impact(contact: Contact, mass: float, clearance: float) -> tuple[np.ndarray,
     rate = SPEED
     indentation = [0.0]
     force = [0.0]
+    # An impact with loss takes longer than the elastic one, of which a step is 2 / STEPS.
     for _ in range(2 * STEPS):
         pressed = float(contact.elastic_force(x) * contact.dissipation_factor(rate, SPEED))
         # Velocity before displacement: this order keeps the energy of an elastic impact bounded.
@@ -119,6 +124,7 @@ def contact_law(case: Case) -> Figure:
     left.legend(loc="upper left")
     left.set_title(f"(a) One impact at {SPEED:g} m/s")
 
+    # From 0.06: the factor flores is defined above a restitution of 0.05.
     asked = np.linspace(0.06, 1, 95)
     for factor, colour in (("paper", style.BLUE), ("flores", style.ORANGE), ("exact", style.BLACK)):
         effective = [Contact("hertz", 1.0, r, factor=factor).effective_restitution for r in asked]
@@ -157,18 +163,6 @@ def named_cell(run: xr.Dataset) -> Figure:
     return figure
 
 
-def save_small(image: Image.Image, target: Path) -> None:
-    """Save a picture as a PNG of few colours, at most ``WIDTH`` wide; raises ValueError for one too large."""
-    image = image.convert("RGB")
-    height = round(image.height * min(WIDTH / image.width, 1))
-    image = image.resize((min(WIDTH, image.width), height), Image.Resampling.LANCZOS)
-    # By coverage rare colours stay: those of lines and of the ends of scales.
-    few = image.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    few.save(target, optimize=True)
-    if target.stat().st_size > MOST:
-        raise ValueError(f"{target}: {target.stat().st_size} bytes")
-
-
 def drawn(folder: Path, draw: Callable[[], Figure]) -> Image.Image:
     """The picture of a figure, drawn in the package's style."""
     path = folder / "drawn.png"
@@ -186,17 +180,19 @@ def draw_notebook(notebook: Path, folder: Path) -> None:
                 continue
 
             with contextlib.redirect_stdout(nowhere):
+                # In one namespace, since each cell uses the names of those before.
                 exec(compile("".join(cell["source"]), f"{notebook.name}, cell {number}", "exec"), names)
             if plt.get_fignums():
                 plt.savefig("cell.png", dpi=style.SCREEN)
+                # Otherwise the next cell would show this picture once more.
                 plt.close("all")
-                save_small(Image.open("cell.png"), PICTURES / f"notebook-{notebook.stem}-{number}.png")
+                save_small(Image.open("cell.png"), PICTURES / f"notebook-{notebook.stem}-{number}.png", WIDTH, MOST)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Make the runs, draw, and write the pictures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--folder", type=Path, help="where results are made; a temporary one if left out")
+    parser.add_argument("--folder", type=Path, help="for results; a temporary one if left out")
     options = parser.parse_args(arguments)
 
     with tempfile.TemporaryDirectory() as temporary:
@@ -206,10 +202,10 @@ def main(arguments: list[str] | None = None) -> int:
         for verb, *settings in COMMANDS:
             subprocess.run([sys.executable, "-m", "vipetsc", verb, "--quiet", *settings], cwd=folder, check=True)
         for name, path in DRAWN.items():
-            save_small(Image.open(folder / path), PICTURES / f"{name}.png")
+            save_small(Image.open(folder / path), PICTURES / f"{name}.png", WIDTH, MOST)
         with open_run(folder / "four-band/run.h5") as run:
-            save_small(drawn(folder, lambda: named_cell(run)), PICTURES / "cell.png")
-            save_small(drawn(folder, lambda: contact_law(Case.of(run))), PICTURES / "contact-law.png")
+            save_small(drawn(folder, lambda: named_cell(run)), PICTURES / "cell.png", WIDTH, MOST)
+            save_small(drawn(folder, lambda: contact_law(Case.of(run))), PICTURES / "contact-law.png", WIDTH, MOST)
         for notebook in sorted(NOTEBOOKS.glob("*.ipynb")):
             draw_notebook(notebook, folder)
     return 0

@@ -39,7 +39,9 @@ from vipetsc.studies.prediction_runs import SITE
 from vipetsc.studies.recorded_runs import run_in_memory
 from vipetsc.studies.response import FIRST_LINE, TOP, Burst, SiteResponse, SiteResponses, in_contact, unit_phase
 
+# A standard deviation from nine runs is uncertain by a quarter.
 SCATTER = np.linspace(-0.01, 0.01, 9)  # relative amplitudes of the runs that show the scatter
+# Each goes half of the distance: after 30 of them 1e-9 of it is left.
 ROUNDS = 30  # iterations of the third harmonics
 
 
@@ -80,6 +82,7 @@ class Budget:
     def _run(self, amplitude: float, contacts: dict[str, object] | None = None) -> xr.Dataset:
         """A run under ``amplitude`` of which the cells of the sites are kept."""
         sites = self.case.model().chain.sites
+        # Files count cells from 1; the last site's contact may be with the cell after it.
         output = {"window": [min(sites) + 1, max(sites) + 2]}
         case: Case = self.case.varied(without=("output",), drive={"amplitude": amplitude}, output=output)
         if contacts:
@@ -94,6 +97,8 @@ class Budget:
         """The waves that arrive in a run under ``amplitude``, and the times of contact."""
         run = self._run(amplitude)
         burst = self.burst
+        # Above the last band waves do not travel, and the matrix of compliances is close to diagonal and small: not
+        # divided by.
         carried = burst.omega < TOP * burst.bands[-1].high
         w = np.array([burst.spectrum(column) for column in self._motion(run).displacement.T])
         free = amplitude * np.array([burst.spectrum(column) for column in self.linear.displacement.T])
@@ -103,6 +108,7 @@ class Budget:
 
         network = self.network
         waves = [_at(network.time, burst.time, row) for row in arriving]
+        # A site that touched nothing remains False throughout.
         on = np.zeros((len(waves), len(network.time)), bool)
         # Contact goes on over the drive's period, in which a site touches on both sides.
         period = 2 * np.pi / burst.drive
@@ -123,6 +129,8 @@ class Budget:
             touching = in_contact(z, release) & network.during if on is None else on
             force = self.sites.at(z).third * np.abs(waves) * unit_phase(waves) ** 3 * touching
             sent = network._sent(network.received3, force) * network.centre
+            # Half of each step: the sites' third harmonics drive each other, and whole steps may swing about the
+            # solution.
             third = third + 0.5 * (network._solve(network.between3, -1.0 * touching, sent, third) - third)
 
         energies = network._energies(Arriving(waves, third, touching), self.sites, change=0.0, amplitude=0.0)
@@ -131,9 +139,11 @@ class Budget:
     def scatter(self, amplitude: float) -> Fractions:
         """Standard deviations of runs near ``amplitude``: of log10 of the upper bands, and of the dissipated part."""
         modes = ModalParts.of(self.case.model().chain).modes
+        # The mode at the band's edge belongs to it, whatever its rounding.
         above = modes.frequency > self.burst.bands[int(self.data.attrs["drive_band"])].low * (1 - 1e-9)
         rows = []
         for change in SCATTER:
+            # Only the first and the last sample: the energy at the end is what is compared.
             output = {"stride": self.case.model().samples - 1}
             case = self.case.varied(without=("output",), drive={"amplitude": amplitude * (1 + change)}, output=output)
             run, result = run_in_memory(case, MPI.COMM_SELF, StopRequest())

@@ -4,7 +4,7 @@ Numba optimises each function together with all that it calls, translates it int
 by which Python can call it. Its caller then links the optimised code and does the same again: what lies n calls deep is
 optimised and translated n times, and most of it is never called by Python. A ``Kernel`` comes to its callers as it was
 lowered. It is optimised once, as part of a kernel that Python calls, and the optimiser may put it in place of its
-calls there as before. Compiled code computes the same numbers either way.
+calls there as before. The order of compilation changes no number.
 """
 
 from collections.abc import Callable

@@ -243,7 +243,7 @@ class StopRequest:
                 raise EndedError
             yield
         except Exception:
-            # A library that is left halfway may raise an error of its own on the way out.
+            # A library that is left halfway may raise an error of its own as it is left.
             if self.requested:
                 raise EndedError from None
             raise

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+# JAX computes in single precision unless it is set before the first array.
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_platforms", "cpu")
 
@@ -41,6 +42,7 @@ class Lattice:
         self.cells, self.dofs, self.walls = map(int, numbers(3, "lattice"))
         samples, interval = numbers(2, "sampling")
         self.scale, self.rate = numbers(2, "scale")
+        # With times in units of the drive's, accelerations have the factor rate^2, which goes into the masses.
         self.masses = np.array(numbers(self.dofs, "masses")) * self.rate**2
         self.couplings = [numbers(4) for _ in range(int(numbers(1, "couplings")[0]))]
         hertz, stiffness, host, resonator = numbers(4, "contact")
@@ -64,6 +66,7 @@ class Lattice:
     def derivative(self, t: jax.Array, y: jax.Array, _: None) -> jax.Array:
         """Time derivative of y (displacement or velocity, mass, cell)."""
         u = y[0]
+        # Cells of zeros beyond the ends are fixed walls; at free ends their springs are left out below.
         outside = jnp.pad(u, ((0, 0), (1, 1)))
         pulls = [jnp.zeros(self.cells) for _ in range(self.dofs)]
         for mass, offset, other, stiffness in self.couplings:
@@ -111,10 +114,14 @@ def main(output: str) -> None:
         text = "\n".join(words_in(path))
         if text not in compiled:
             lattice = Lattice(path)
+            # By the content, since every case is handed over in a file of the same name.
             compiled[text] = lattice, lattice.solver()
+            # A first solution at loose tolerances compiles; tolerances are arguments, so that others need no
+            # compilation.
             jax.block_until_ready(compiled[text][1](1e-3, 1e-4))
         lattice, solve = compiled[text]
         begin = time.process_time()
+        # JAX returns before it has computed: without the wait only the call would be timed.
         found = jax.block_until_ready(solve(float(rtol), float(atol)))
         seconds = time.process_time() - begin
         (np.asarray(found.ys) * lattice.scale * lattice.rate).tofile(output)

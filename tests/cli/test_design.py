@@ -80,7 +80,7 @@ def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, in_process, ca
     second_call = in_process("design", case, "--out", out)
     assert second_call.returncode == 0
     assert second_call.stdout.splitlines()[:8] == done.stdout.splitlines()[:8]
-    # Complete: nothing is made again.
+    # Complete: nothing is computed again.
     assert modified(out) == written
 
     before = numbers(out / "design.h5")

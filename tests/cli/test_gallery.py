@@ -67,7 +67,7 @@ def test_every_case_is_valid_and_some_run_in_small(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("width", "size"), [(300, (300, 200)), (1800, (900, 100))])
-def test_a_picture_is_made_small(width, size, tmp_path):
+def test_a_picture_is_scaled_down(width, size, tmp_path):
     """A picture is scaled to 900 pixels at most, and one that is still too large is refused."""
     Image.effect_noise((width, 200), 5).convert("RGB").save(tmp_path / "a.png")
     gallery.make_small(tmp_path / "a.png", tmp_path / "b.png")

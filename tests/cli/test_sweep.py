@@ -81,7 +81,7 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
     assert "contains another sweep: drive.cycles = 5 there, 6 here; replace it with --force" in changed.stderr
 
 
-def test_a_member_is_made_again_whole_by_its_name_or_number(in_process, case, tmp_path):
+def test_a_whole_member_is_run_again_by_its_name_or_number(in_process, case, tmp_path):
     """Its run has what its record says, be it simulated or scaled, and measures are the same bits."""
     out = tmp_path / "out"
     changes = set_words("sweep.drive.amplitude=[0.3, 20.0]", "sweep.contacts.sites=[1]")
@@ -186,7 +186,7 @@ def test_bad_sweeps_write_nothing(in_process, case, tmp_path, value):
 
 @pytest.mark.mpirun
 def test_full_fields_on_request(vipetsc, in_process, case, tmp_path):
-    """With sweep.fields a member keeps its run and analysis; one that a kill cut off is made again."""
+    """With sweep.fields a member keeps its run and analysis; one that a kill cut off is run again."""
     out = tmp_path / "out"
     one = set_words("sweep.fields=true", "sweep.drive.amplitude=[1.0]", "sweep.contacts.sites=[2]")
     ended = vipetsc(2, "sweep", case, "--out", out, *one)

@@ -328,7 +328,7 @@ def test_the_worst_or_the_mean_over_amplitudes_of_the_mean_over_what_scatters():
 
 @pytest.mark.parametrize("error", [MemoryError("Unable to allocate 1.00 TiB"), OSError(28, "full"), CaseError([])])
 def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
-    """A run that fails otherwise has a record and is not made again; this one is asked for both times."""
+    """A run that fails otherwise has a record and is not repeated; this one is asked for both times."""
     asked = []
 
     def work(key):

@@ -219,8 +219,8 @@ def test_a_search_is_done_when_its_file_has_its_case(searched):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
-def test_a_step_that_fails_is_told_and_what_was_cut_is_made_again(searched, tmp_path):
-    """A step's failure is noted and costs no other step; files that were cut off are made again to the same bits."""
+def test_a_failed_step_is_reported_and_cut_files_are_computed_again(searched, tmp_path):
+    """A step's failure is noted and costs no other step; cut files are computed again to the same bits."""
     plan, _ = searched
     root = tmp_path / "paper"
     step = plan.steps[0]

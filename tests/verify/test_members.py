@@ -124,7 +124,7 @@ def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
 
 @pytest.mark.slow
 def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
-    """The run keeps what the case asks for, the analysis is that of all samples; damaged files are made again."""
+    """The run keeps what the case asks for, the analysis is that of all samples; damaged files are computed again."""
     table = TABLE | {"sweep": {"fields": True, "drive": {"amplitude": [60.0]}}}
     thin = {"fields": ["velocity"], "window": [5, 9], "every": 4, "stride": 3}
     assert run_sweep(Sweep.from_table(table), tmp_path / "all").complete

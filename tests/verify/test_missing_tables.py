@@ -1,4 +1,4 @@
-"""A branch's table that is missing is made again from its HDF5 file, to the same bytes."""
+"""A branch's table that is missing is written again from its HDF5 file, to the same bytes."""
 
 from mpi4py import MPI
 
@@ -10,7 +10,7 @@ from vipetsc.modes.branches.follow import follow_all
 pytestmark = pytest.mark.parallel(1)
 
 
-def test_a_table_that_was_removed_is_made_again(tmp_path):
+def test_a_table_that_was_removed_is_written_again(tmp_path):
     case = nfrc_case(harmonics=3, restitutions=[0.7], range=[0.5, 0.52])
     (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
     assert curve.complete

@@ -124,7 +124,7 @@ def read_measured(record: RecordTable) -> Measured:
     values = np.column_stack(
         [columns[f"sensors[{number}].column"] * sensor.factor for number, sensor in enumerate(record.sensors, 1)]
     )
-    # Cut only after the times are known to be even: the interval of a short part would be less exact.
+    # Cut only after the times were found even: the interval of a short part would be less exact.
     times = _times(record, columns.get("time"), len(values))
     for key, sign in (("begin", -1.0), ("end", 1.0)):
         limit = getattr(record, key)

@@ -15,7 +15,7 @@ TITLES = {"deflection": "Deflection", "group_velocity": "Group velocity", "weigh
 LABELS = {"deflection": "max w (1)", "group_velocity": "Σ max |v$_g$| (cells/s)", "weighted": "cost (cells/s)"}
 SYMBOLS = {"lambda": "λ", "eta": "η"}
 MASSES = ("$u_1$", "$u_2$", "$u_3$, negative if out of phase with $u_2$", "$u_4$")
-LINES = 10  # values of the parameter that is followed: neighbouring colours of the scale can be told apart
+LINES = 10  # values of the parameter that is followed: neighbouring colours of the scale can be distinguished
 # Frequencies are shown up to this many times the highest one of the best cell: some cells of the grid have bands
 # that are many times higher, and would press all others together.
 HEADROOM = 1.9

@@ -27,7 +27,7 @@ SPECIAL = {
     3: ("period doubling", "^", 3.8),
     4: ("branch point", "s", 3.2),
 }
-LEAST_FRACTION = 1e-3  # of the energy: below it a line cannot be told from that of zero
+LEAST_FRACTION = 1e-3  # of the energy: below it a line looks like that of zero
 
 
 def frequency_response(paths: Sequence[Path]) -> Figure:

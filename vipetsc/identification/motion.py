@@ -26,7 +26,7 @@ class MotionError(RuntimeError):
 
 
 class MotionCoefficients(NamedTuple):
-    """What a model's equations of motion are made of, in arrays that can be differenced.
+    """The coefficients of a model's equations of motion, in arrays that can be differenced.
 
     ``masses`` (n,) in kg; ``stiffness`` and ``damping`` (entry,) in N/m and N s/m, over the pattern ``first`` (n + 1,)
     and ``columns`` (entry,) of both; ``sites`` (site,) of dtype ``SITE``; ``gains`` (drive,) of the drives, in N.

@@ -120,7 +120,7 @@ def _make_parts(
 
 def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: bool) -> None:
     """Add the CPU time in s that each rank spent on ``steps`` to the record; of steps computed ``afresh`` only this."""
-    # Ranks share steps: each has spent a part of their time.
+    # Several ranks work on a step: each has spent a part of its time.
     spent = Counter[str]()
     for from_rank in comm.allgather(steps):
         spent.update(from_rank)

@@ -1,4 +1,4 @@
-"""The options ``[analysis]`` of a run, and whether it was measured with them; known without loading any measure."""
+"""The options ``[analysis]`` of a run, and whether it was measured with them; loads no measure."""
 
 import json
 import tomllib

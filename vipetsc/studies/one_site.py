@@ -245,14 +245,14 @@ class ScatteringRuns:
     def _outcome(self, record: Record) -> dict[str, Any]:
         """Fractions and times of one run by name: the fields of ``ScatteringOutcome``, "near" and "episodes"."""
         band = self.setting.band
-        share = (np.array(record["energy"]) - self.reference) / self.arrived
+        fraction = (np.array(record["energy"]) - self.reference) / self.arrived
         # The reference holds the whole wave: against it nothing is left where nothing is touched, and T = 1 there.
-        share[band, FORWARD] += 1
+        fraction[band, FORWARD] += 1
         return {
-            "share": share,
-            "transmitted": share[band, FORWARD],
-            "reflected": share[band, BACKWARD],
-            "upper": share[band + 1 :].sum(),
+            "share": fraction,
+            "transmitted": fraction[band, FORWARD],
+            "reflected": fraction[band, BACKWARD],
+            "upper": fraction[band + 1 :].sum(),
             "dissipated": record.get("dissipated", 0.0) / self.arrived,
             "contact": record.get("contact", 0.0) / self.arrived,
             "dashpots": record.get("dashpots", 0.0) / self.arrived,

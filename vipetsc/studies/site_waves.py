@@ -1,6 +1,6 @@
 r"""Waves at the site of an infinite lattice with dashpots: their energies by band and direction, as they pass the site.
 
-Energies at the end of a run would lack what dashpots take on the way there, which differs from wave to wave. Here they
+Energies at the end of a run would lack what dashpots take before, which differs from wave to wave. Here they
 are those that flow past the site. The lattice is linear but for the force f of the contact on its two masses, so that
 the waves at the site are those of the drive and those that f sends out, exactly: with u = a phi lambda^n of a wave at
 the real frequency omega (``lattice.damped``), |lambda| < 1 in its direction, and a force F(t),
@@ -167,7 +167,7 @@ class SiteWaves:
 
     @property
     def decay(self) -> float:
-        """Rate in 1/s at which signals are made to decay, less the imaginary part of their frequencies."""
+        """Rate in 1/s of the signals' decay: less the imaginary part of their frequencies."""
         return DECAY / (self.padded * self.setting.interval)
 
     @cached_property

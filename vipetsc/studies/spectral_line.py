@@ -35,7 +35,7 @@ class SpectralLine:
 
     @property
     def decay(self) -> float:
-        """Rate in 1/s at which envelopes are made to decay, less the imaginary part of all frequencies."""
+        """Rate in 1/s of the envelopes' decay: less the imaginary part of all frequencies."""
         return DECAY / self.length
 
     def forward(self, a: np.ndarray) -> np.ndarray:

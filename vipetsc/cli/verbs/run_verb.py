@@ -182,7 +182,7 @@ def run_table(result: "Result", faster: str = "") -> str:
     """Ending and statistics of a run; ``faster`` names a faster alternative."""
     numbers = result.statistics
     if numbers["engine"] == "propagator":
-        method = f"{numbers['method']}, {numbers['bandwidth']} cells each way, exact to {numbers['truncation']:.1g}"
+        method = f"{numbers['method']}, {numbers['bandwidth']} cells to each side, exact to {numbers['truncation']:.1g}"
         steps = f"{numbers['steps']} linear ({method}), {numbers['substeps']} with forces"
     else:
         steps = f"{numbers['steps']} accepted, {numbers['rejected']} rejected ({numbers['method']})"
