@@ -194,6 +194,12 @@ class EnergyMeter:
         self.unit = float(2.0 ** (np.floor(np.log2(scale)) - 36))
         self.largest = self.unit * LARGEST
 
+    def sums(self, y: np.ndarray) -> np.ndarray:
+        """What ``measure`` gives of the rank's part ``y`` of a state, ghosts up to date: (5, 2)."""
+        sums = np.zeros((ENERGY_SUMS, 2), np.int64)
+        measure(y, self.lattice, self.unit, sums)
+        return sums
+
     def total(self, sums: np.ndarray, work: np.ndarray) -> Energies:
         """Energies over all ranks: ``sums`` (sample, energy, 2) of ``measure``, ``work`` (sample, drive) in J.
 

@@ -9,7 +9,6 @@ import numpy as np
 from vipetsc.case import CaseError, Model
 from vipetsc.case.case_file import Problem
 from vipetsc.case.initial import file_hash
-from vipetsc.dynamics.energies import ENERGY_SUMS, measure
 from vipetsc.dynamics.observers import Setup
 from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.io.names import path_named
@@ -33,8 +32,7 @@ def set_in_motion(setup: Setup) -> None:
     with state.localForm() as local:
         y = local.array
         site_dofs = meter.lattice.site_dofs
-        sums = np.zeros((ENERGY_SUMS, 2), np.int64)
-        measure(y, meter.lattice, meter.unit, sums)
+        sums = meter.sums(y)
         relative = [relative_motion(y, site_dofs, i) for i in range(len(layout.contacts))]
 
     # A site between two ranks comes from both, with the same bits.
