@@ -152,7 +152,8 @@ class SortedRows(NamedTuple):
 def sort_over_ranks(comm: MPI.Comm, rows: np.ndarray, keys: Sequence[str]) -> SortedRows:
     """Sort the ``rows`` of all ranks by their ``keys`` and divide them anew; all ranks must call it.
 
-    Parts are about equally large; rows that agree in the first key stay together.
+    ``rows`` (row,) have the ``keys`` as fields. Parts are about equally large; rows that agree in the first key stay
+    together.
     """
 
     def in_order(table: np.ndarray) -> np.ndarray:

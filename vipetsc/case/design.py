@@ -32,7 +32,7 @@ class EtaTable(GridTable):
     last: Annotated[float, Field(gt=0, le=1)] = 1.0
 
     def values(self) -> np.ndarray:
-        """The values below 1."""
+        """The values (eta,) below 1, where the host has mass."""
         eta = super().values()
         return eta[eta < 1]
 

@@ -80,7 +80,7 @@ def _arrays(chain: Chain, start: int, stop: int) -> dict[str, np.ndarray]:
 
 
 def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[dict[str, np.ndarray], list[Problem]]:
-    """Arrays of all cells without Rayleigh damping, by their names in ``Variation``, and what is wrong with them."""
+    """Arrays (cell, ...) without Rayleigh damping, by their names in ``Variation``, and what is wrong with them."""
     arrays = _arrays(Chain(cell, lattice.cells), 0, lattice.cells)
     problems: list[Problem] = []
 

@@ -242,7 +242,7 @@ def _site_count(table: Table) -> int:
 
 
 def coordinate(values: Iterable[Any]) -> np.ndarray:
-    """The values of a key as an array: numbers where they all are ("5pi/9" too), else their text."""
+    """The values of a key as an array (value,): numbers where they all are ("5pi/9" too), else their text."""
     read = [number(value) for value in values]
     if all(type(value) in (int, float) for value in read):
         return np.array(read)

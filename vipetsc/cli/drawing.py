@@ -150,7 +150,10 @@ def reading(pictures: Pictures, folders: Sequence[Path]) -> Iterator[None]:
 
 
 def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None = None) -> None:
-    """Check the requested pictures, and compute measures that are missing or older than their run; on one rank."""
+    """Check the requested pictures, and compute measures that are missing or older than their run; on one rank.
+
+    Raises FolderError for an unknown picture, before any file is written.
+    """
     from vipetsc.figures.registry import figure_names
 
     try:

@@ -15,7 +15,7 @@ UNSTABLE = 1.0 + 1e-6  # with a Floquet multiplier of a larger modulus an orbit 
 
 
 def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Return energies and frequencies, ``FINE`` for each step: cubic Hermite curves through points and tangents.
+    """Return energies and frequencies (point,), ``FINE`` a step: cubic Hermite curves through points and tangents.
 
     The curves are those of ln E and ln f, each over its range, and their parameter is the length of the chord. Where a
     contact grazes, the branch may have a corner: one curve ends there and the next begins with a tangent of its own.

@@ -50,7 +50,7 @@ def power_text(value: float) -> str:
 
 
 def has_room(positions: np.ndarray, texts: Sequence[str], length: float, is_horizontal: bool) -> bool:
-    """Return whether labels ``texts`` at ``positions`` that span ``length`` inches of an axis stand apart."""
+    """Return whether labels ``texts`` at ``positions`` (label,) that span ``length`` inches of an axis stand apart."""
     if len(positions) < 2:
         return True
     order = np.argsort(positions)

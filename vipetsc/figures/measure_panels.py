@@ -137,7 +137,7 @@ class MeasurePage:
         self.body.supylabel("\n".join(wrap(y, int(LETTERS * self.figure.get_figheight()))))
 
     def finish_curves(self, x: SweptAxis, values: np.ndarray, common: CommonAxes | None = None) -> Figure:
-        """Label and scale the axes of all panels of curves, whose ``values`` these are, and write the legend.
+        """Label and scale the axes of all panels of curves, whose ``values`` (...) these are, and write the legend.
 
         With pages of other sweeps the axes are ``common`` to all.
         """
@@ -281,7 +281,7 @@ def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray,
 
 
 def draw_samples(page: MeasurePage, seeds: np.ndarray, series: Sequence[Curve]) -> Figure:
-    """Draw every sample over its seed, with mean and band of each of ``series``, which the legend names."""
+    """Draw every sample over its seed (sample,), with mean and band of each of ``series``, named in the legend."""
     (axes,) = page.panels
     for curve in series:
         look = curve.look
@@ -294,7 +294,7 @@ def draw_samples(page: MeasurePage, seeds: np.ndarray, series: Sequence[Curve]) 
 
 
 def cell_edges(positions: np.ndarray, scale: str) -> np.ndarray:
-    """Return the edges of the cells of a map about rising ``positions``, halfway between them on the ``scale``."""
+    """Return the edges (n + 1,) of a map's cells about rising ``positions`` (n,), halfway on the ``scale``."""
     if scale == "log":
         return np.exp(cell_edges(np.log(positions), "linear"))
     middles = 0.5 * (positions[1:] + positions[:-1])

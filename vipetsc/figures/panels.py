@@ -138,7 +138,7 @@ def mark_sites(
 ) -> None:
     """Draw triangles at the edge at the ``recorded_sites``, and dotted lines as well if these are few.
 
-    ``along`` is the axis of the cells, "x" or "y".
+    ``along`` is the axis of the cells, "x" or "y"; sites out of the range of ``cells`` (cell,) are left out.
     """
     sites = recorded_sites(run, cells)
     edge = np.full(len(sites), 0.02)

@@ -303,7 +303,7 @@ def _mark_stops(axes: Axes, stops: list[float]) -> None:
 
 
 def refined(u: np.ndarray, v: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return displacement, velocity and time on a finer grid, so that fast turns at the stops are not polygons."""
+    """Return ``u`` and ``v`` (time, ...) and time (time,) on a finer grid: fast turns at stops are no polygons."""
     if len(time) < 2:
         return u, v, time
     sample = np.arange((len(time) - 1) * REFINE + 1) / REFINE
@@ -314,7 +314,7 @@ def refined(u: np.ndarray, v: np.ndarray, time: np.ndarray) -> tuple[np.ndarray,
 
 
 def centre_axes(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
-    """Set limits symmetric about zero that hold ``x`` and ``y`` with a margin."""
+    """Set limits symmetric about zero that hold ``x`` and ``y``, of any shape (...), with a margin."""
     for set_limits, values in ((axes.set_xlim, x), (axes.set_ylim, y)):
         reach = 1.07 * np.abs(values).max() or 1.0
         set_limits(-reach, reach)

@@ -168,7 +168,7 @@ class AmplitudeSeries(NamedTuple):
         return figure, grid
 
     def snapshot_times(self) -> np.ndarray:
-        """Return four times in s, from the linear wave: midway to the first site, at it, past the last, near the end.
+        """Return times (4,) in s, from the linear wave: midway to the first site, at it, past the last, near the end.
 
         The packet's middle leaves the driven cell when half the burst is over.
         """

@@ -129,7 +129,7 @@ class SweptAxis(NamedTuple):
 
     @property
     def positions(self) -> np.ndarray:
-        """The numbers along the axis, or the numbers of its categories from 0."""
+        """The numbers (value,) along the axis, or the numbers of its categories from 0."""
         number = self.first_number
         if number is None:
             return np.arange(self.size, dtype=float)
@@ -163,7 +163,7 @@ def _swept_key(values: xr.DataArray, case: dict[str, Any]) -> SweptKey:
 
 
 def even_scale(values: np.ndarray) -> str:
-    """Return the scale, "linear" or "log", on which ``values`` lie more evenly."""
+    """Return the scale, "linear" or "log", on which ``values`` (value,) lie more evenly."""
     ordered = np.unique(values)
     # Two values are even on both scales.
     if len(ordered) < 3 or ordered[0] <= 0 or ordered[-1] < LEAST_RATIO * ordered[0]:

@@ -337,7 +337,7 @@ def _draw_fractions(axes: Axes, curve: TransferCurve) -> str:
 
 
 def draw_parts(axes: Axes, x: ArrayLike, names: ArrayLike, energies: Iterable[np.ndarray]) -> None:
-    """Draw a curve for each part: a colour for each pass band, grey dashes for each gap and for what lies above."""
+    """Draw each part's curve (x,): a colour for each pass band, grey dashes for each gap and for what lies above."""
     gap_dashes = cycle(GAPS)
     for name, energy in zip(np.atleast_1d(names), energies, strict=True):
         band = style.band_number(name)

@@ -129,14 +129,14 @@ class GrowingWindows:
         return Fit(z, self.deviance(z), windows, self.misfit.noise.copy())
 
     def deviance(self, z: np.ndarray) -> float:
-        """Minus twice the logarithm of the likelihood but for a constant: fits with other noise can be compared."""
+        """Minus twice the log-likelihood at ``z`` (coordinate,) but for a constant, by which fits can be compared."""
         total = self.cost(z, self.last)
         for record, noise in zip(self.misfit.records, self.misfit.noise, strict=True):
             total += 2 * len(record.times) * float(np.sum(np.log(noise)))
         return total
 
     def cost(self, z: np.ndarray, ends: Sequence[float]) -> float:
-        """The sum of squares of the residuals over the noise, and of the prior of initial states."""
+        """The sum of squares at ``z`` (coordinate,) of residuals over the noise, and of the initial states' prior."""
         data = self.misfit.residuals(z, ends)
         return float(np.sum(data**2)) + float(np.sum((self.misfit.prior() @ z) ** 2))
 
@@ -242,7 +242,7 @@ class GrowingWindows:
         return ends
 
     def onsets(self, z: np.ndarray, number: int) -> np.ndarray:
-        """The onsets in s of the model's contacts in a record, from its first sample on."""
+        """The onsets (episode,) in s of the model's contacts in a record, from its first sample on."""
         try:
             onsets = self.misfit.respond(z, number, self.last[number]).episodes["onset"]
         except (CaseError, MotionError):
@@ -328,7 +328,7 @@ class GrowingWindows:
     def solve(
         self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision = FINAL
     ) -> np.ndarray:
-        """The coordinates with the least squares over a window, by a trust region within the bounds."""
+        """The coordinates (coordinate,) with the least squares over a window, by a trust region within the bounds."""
         number = self._solutions
         self._solutions += 1
         if number < len(self._solved):

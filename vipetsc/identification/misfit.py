@@ -29,7 +29,7 @@ Job = Callable[[], np.ndarray]
 
 
 def one_by_one(jobs: Sequence[Job]) -> list[np.ndarray]:
-    """The values of all ``jobs``, which this rank computes alone."""
+    """The values of all ``jobs``, arrays (...) each, which this rank computes alone."""
     return [job() for job in jobs]
 
 
@@ -79,7 +79,7 @@ class Misfit:
         return len(self.plan.parameters)
 
     def case(self, z: np.ndarray) -> Case:
-        """The case at the coordinates ``z``; raises CaseError if it is impossible."""
+        """The case at the coordinates ``z`` (coordinate,); raises CaseError if it is impossible."""
         return self._case_of(tuple(self.values(z).tolist()))
 
     def values(self, z: np.ndarray) -> np.ndarray:
@@ -87,7 +87,7 @@ class Misfit:
         return np.array([p.from_coordinate(x) for p, x in zip(self.plan.parameters, z[: self.count], strict=True)])
 
     def offset(self, z: np.ndarray, number: int) -> float:
-        """The time in s of the record ``number``'s clock at which its drive begins."""
+        """The time in s of the record ``number``'s clock at which its drive begins, at ``z`` (coordinate,)."""
         offset = self.plan.options.records[number].offset
         if not isinstance(offset, list):
             return offset
@@ -137,8 +137,8 @@ class Misfit:
     ) -> RecordedMotion:
         """The motion of record ``number`` up to its time ``end``, with derivatives by its ``columns`` of ``active``.
 
-        It is that of the masses ``watched``, by default those of the sensors, at every ``stride``-th sample. Raises
-        CaseError, MotionError.
+        It is that of the masses ``watched`` (mass,), by default those of the sensors, at every ``stride``-th sample.
+        Raises CaseError, MotionError.
         """
         table = self.plan.options.records[number]
         model = self.plan.record_case(self.case(z), number).model()
@@ -202,7 +202,7 @@ class Misfit:
         return float(self.records[number].times[0]) - offset
 
     def times(self, z: np.ndarray, number: int, end: float) -> np.ndarray:
-        """The samples' times in s since the beginning of the drive, up to the record's time ``end``."""
+        """The samples' times (time,) in s since the beginning of the drive, up to the record's time ``end``."""
         times = self.records[number].times
         return np.asarray(times[times <= end] - self.offset(z, number))
 
@@ -310,5 +310,5 @@ class Misfit:
         return np.eye(self.size)[self.count :] / WIDTH
 
     def whole_jacobian(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray:
-        """The ``jacobian`` by all coordinates, with the rows of the ``prior`` behind those of data."""
+        """The ``jacobian`` (residual, coordinate), with the rows of the ``prior`` behind those of data."""
         return np.vstack([self.jacobian(z, ends, range(self.size)), self.prior()])

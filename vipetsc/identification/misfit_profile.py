@@ -36,7 +36,7 @@ class MisfitProfile(NamedTuple):
     along: np.ndarray
 
     def outwards(self, number: int, middle: float, side: Side) -> np.ndarray:
-        """The numbers of the places of a parameter on one ``side`` of the coordinate ``middle``, nearest first.
+        """The numbers (place,) of a parameter's places on one ``side`` of the coordinate ``middle``, nearest first.
 
         A place at the middle itself counts as one above it.
         """
@@ -63,7 +63,7 @@ def profile_about(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitP
 def profile_costs(
     windows: GrowingWindows, z: np.ndarray, profile: MisfitProfile, number: int, side: Side
 ) -> list[float]:
-    """The least costs at the places of parameter ``number`` on one ``side`` of the fit ``z``, nearest place first."""
+    """The least costs at a parameter's places on one ``side`` of the fit ``z`` (coordinate,), nearest place first."""
     held = z.copy()
     slope = profile.along[number]
     costs = []

@@ -92,7 +92,8 @@ class MotionState(NamedTuple):
 def difference(y: np.ndarray, ends: np.ndarray, i: int, first: int, j: int) -> float:
     """Entry of column ``j`` of ``y``, from row ``first`` on, at the second end of the pair ``i`` less at the first one.
 
-    Of a site these are resonator and host. An end of -1, ground or wall, has an entry of zero.
+    ``ends`` are (pair, 2) rows of ``y`` (row, column): host and resonator of a site. An end of -1, ground or wall, has
+    an entry of zero.
     """
     value = 0.0
     if ends[i, 1] >= 0:

@@ -108,6 +108,8 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
 def load_arrays(path: Path, wanted: Collection[str] | None = None, copy: bool = True) -> dict[str, np.ndarray]:
     """Load the arrays ``wanted``, else all, that ``save_arrays`` wrote; without a ``copy`` each is read when used.
 
+    They have the shapes with which they were saved.
+
     Raises OSError that names the file.
     """
     try:

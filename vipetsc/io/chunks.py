@@ -118,7 +118,7 @@ def ranges(numbers: np.ndarray) -> np.ndarray:
 
 
 def joined(output: Chunks, names: Collection[str]) -> dict[str, np.ndarray]:
-    """The arrays ``names`` of rank 0, all chunks one after the other."""
+    """The arrays ``names`` (sample, ...) of rank 0, all chunks one after the other."""
     chunks = [output.read(number, 0, names) for number in range(output.count)]
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in names}
 
@@ -170,14 +170,14 @@ def parts_to_copy(output: Chunks, number: int, wanted: Collection[str]) -> Itera
 
 
 def read_log(output: Chunks) -> np.ndarray:
-    """The episodes in the parts that fall to this rank, in no order."""
+    """The episodes (episode,) in the parts that fall to this rank, in no order; fields as in ``impacts``."""
     # Unsorted: episodes of several ranks are sorted once, when all are read.
     parts = [part for number in range(output.count) for part in parts_to_copy(output, number, ["impacts"])]
     return np.concatenate([part["impacts"] for part in parts])
 
 
 def log_columns(log: np.ndarray, first: int = 0) -> Arrays:
-    """The variables of the episodes ``log``, which are in order and come after ``first`` others."""
+    """The variables of the episodes ``log`` (episode,), which are in order and come after ``first`` others."""
     names = log.dtype.names or ()
     columns: dict[str, np.ndarray] = {"episode": np.arange(first, first + len(log)) + 1}
     for name in names:

@@ -28,8 +28,9 @@ CHECKSUM = "checksum"
 def kept_arrays(kind: str, content: Iterable[bytes], compute: Callable[[], Arrays]) -> dict[str, np.ndarray]:
     """The arrays that ``compute`` gives, from an earlier call with the same ``content`` if they are still kept.
 
-    ``kind`` names what they are. They are not taken over from other hosts and other versions of this package, numpy and
-    SciPy, whose last digits may differ. A cache that cannot be read or written is no error.
+    ``kind`` names what they are; shapes and bits are those of ``compute``. They are not taken over from other hosts and
+    other versions of this package, numpy and SciPy, whose last digits may differ. A cache that cannot be read or
+    written is no error.
     """
     versions = f"{kind} {vipetsc.__version__} {np.__version__} {scipy.__version__} {platform.node()}"
     digest = hashlib.sha256(versions.encode())

@@ -56,7 +56,7 @@ class CosineSquares(NamedTuple):
         self.product[:, 0] += weight * np.einsum("pn,pn->p", signals, signals)
 
     def add_to_columns(self, spectrum: np.ndarray, weight: float, columns: slice) -> None:
-        """Add the squares as ``add`` does, of each signal to its own of the ``columns``."""
+        """Add the squares of signals (wave, signal) as ``add`` does, of each to its own of the ``columns``."""
         signals = self._signals(spectrum)
         self.square[:, columns] += weight * (signals.real**2 + signals.imag**2)
         self.product[:, columns] += weight * signals**2

@@ -12,12 +12,12 @@ def blocks(count: int, size: float, memory: float) -> Iterator[slice]:
 
 
 def block_sums(values: np.ndarray, size: int, axis: int) -> np.ndarray:
-    """Sums of each ``size`` consecutive ``values`` along ``axis``; the last block may be shorter."""
+    """Sums of each ``size`` consecutive ``values`` along ``axis``, (..., block, ...); the last may be shorter."""
     return np.add.reduceat(values, np.arange(0, values.shape[axis], size), axis=axis)
 
 
 def block_means(values: np.ndarray, size: int, axis: int) -> np.ndarray:
-    """Means of each ``size`` consecutive ``values`` along ``axis``; the last block may be shorter."""
+    """Means of each ``size`` consecutive ``values`` along ``axis``, (..., block, ...); the last may be shorter."""
     shape = [1] * values.ndim
     shape[axis] = -1
     counts = block_sums(np.ones(values.shape[axis]), size, 0)

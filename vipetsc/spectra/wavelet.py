@@ -101,7 +101,7 @@ def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | Non
 
     X = sqrt(kc/kappa) IFFT[FFT(signal) Psi(kc eta/kappa)] on the line padded to ``length``, by default
     ``padded_length`` of the lowest node. The lattice is its first ``cells`` columns; the rest is needed to
-    invert it: columns from the end on count backwards from cell 0.
+    invert it: columns from the end on count backwards from cell 0. Raises ValueError if ``length`` is less than that.
     """
     kappa = np.asarray(kappa, dtype=float)
     cells = signal.shape[-1]
@@ -185,7 +185,8 @@ def partition(velocity: np.ndarray, masses: ArrayLike, mean_over: int = 0) -> Pa
     """Partition the kinetic energy of ``velocity``, (t, cell) or (t, cell, dof) in m/s, by wavenumber bins.
 
     ``masses`` in kg, (dof) or a scalar. A few snapshots at a time are held, so ``velocity`` may be an HDF5
-    dataset. The energies in space-time are kept as means over ``mean_over`` cells, if that is not 0.
+    dataset. The energies in space-time are kept as means over ``mean_over`` cells, if that is not 0. Raises ValueError
+    if there is not one mass for each column of the velocity.
     """
     mass_list = np.atleast_1d(np.asarray(masses, dtype=float))
     nt, cells = velocity.shape[:2]

@@ -31,9 +31,9 @@ class Design:
 
 
 class OptimumSearch:
-    """The ``designs`` tried so far, on one rank; 0 is the case to begin with, 1 the start if that differs.
+    """The ``designs`` tried so far, on one rank; 0 is the case to begin with, 1 the ``start`` if that differs.
 
-    ``asked`` are those that are not judged yet, by ``objective``, the runs of all designs.
+    ``asked`` are those that are not judged yet, by ``objective``, the runs of all designs; ``start`` is (dimension,).
     """
 
     def __init__(self, plan: OptimiseCase, objective: ObjectiveRuns, sampler: Sampler, start: np.ndarray) -> None:

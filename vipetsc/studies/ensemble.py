@@ -320,7 +320,7 @@ def _fits(data: Variables, along: str) -> Variables:
 
 
 def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict[str, float]:
-    """The entries of ``FIT`` for one curve over ``amplitude`` in N, a fit from its peak on; NaN where there is none."""
+    """The entries of ``FIT`` for one curve (amplitude,) over amplitudes in N, fitted from its peak on; else NaN."""
     row = dict.fromkeys(FIT, np.nan)
     valid = np.isfinite(curve)
     # The sign of the amplitude is a phase of the drive: the size orders the curve.

@@ -127,7 +127,10 @@ class Identification:
         solved: Sequence[Sequence[float]] = (),
         keep: Callable[[int, np.ndarray], None] = lambda number, z: None,
     ) -> Record:
-        """The record of the fit from the start of that ``number``; ``solved`` and ``keep`` as of GrowingWindows."""
+        """The record of the fit from the start of that ``number``; ``solved`` and ``keep`` as of GrowingWindows.
+
+        Coordinates are (coordinate,), those of parameters before those of initial states.
+        """
         start = self.starts()[number]
         windows = self._windows(solved, keep)
         fit = windows.fit(start)
@@ -150,7 +153,7 @@ class Identification:
         }
 
     def placed(self, record: Record) -> tuple[GrowingWindows, np.ndarray]:
-        """A fit with the noise of a ``record``, and the record's coordinates."""
+        """A fit with the noise of a ``record``, and the record's coordinates (coordinate,)."""
         windows = self.windows()
         windows.misfit.noise = [np.array(noise) for noise in record["noise"]]
         return windows, np.array(record["coordinates"])

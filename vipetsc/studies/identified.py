@@ -38,7 +38,10 @@ MOST_NUMBERS = 20_000_000
 def identified_values(
     windows: GrowingWindows, z: np.ndarray, fits: list[Record], best: int, profile: tuple[np.ndarray, np.ndarray]
 ) -> dict[str, Any]:
-    """All values by name in ``LAYOUT``; ``fits`` are the records of the starts, ``profile`` coordinates and costs."""
+    """All values by name in ``LAYOUT``, at the best fit's coordinates ``z`` (coordinate,).
+
+    ``fits`` are the records of the starts, ``profile`` coordinates and costs (parameter, place).
+    """
     jacobian = windows.misfit.whole_jacobian(z, windows.last)
     uncertainty = uncertainty_of(marginal_jacobian(jacobian, windows.misfit.count))
     values = _parameter_values(windows, z, uncertainty)

@@ -229,7 +229,7 @@ class ScatteringRuns:
         return [*dict.fromkeys((z * (1 + width * spread)).tolist())]
 
     def outcomes(self, z: float) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Mean and deviation over the runs at the point ``z`` of the wave's fractions and times, by name."""
+        """Mean and deviation over the runs at the point ``z``: by name, "share" (band, direction), others numbers."""
         untouched = {"energy": self.reference}
         records = [self.records[run] for run in self.jittered(z)] or [untouched]
         rows = [self._outcome(record) for record in records]

@@ -72,7 +72,7 @@ def largest_between(
 ) -> float:
     """Largest of w and -w at or between samples at ``times``, over the ``gaps`` of both sides; at least 0.
 
-    It is that of the cubic through ``w`` with slopes ``rate``.
+    It is that of the cubic through ``w`` (time,) in m with slopes ``rate`` (time,) in m/s.
     """
     # With the rates that the run has, the cubic is of fourth order in the interval: a sample misses a peak by the
     # second.

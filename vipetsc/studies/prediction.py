@@ -198,7 +198,7 @@ def _sums(bands: np.ndarray, driven: int) -> dict[str, np.ndarray]:
 
 
 def errors(values: dict[str, np.ndarray]) -> dict[str, float]:
-    """Errors of a prediction, judged by simulations with contacts.
+    """Errors of a prediction with ``values`` (amplitude,) by name, judged by simulations with contacts.
 
     Root mean square and worst, in decades, of the energies of upper and other bands; worst of the fractions dissipated
     in contacts and in dashpots.

@@ -70,7 +70,7 @@ class Records(NamedTuple):
 
 
 def amplitudes_of(case: PredictCase, linear: Record) -> np.ndarray:
-    """The amplitudes in N, in rising order."""
+    """The amplitudes (amplitude,) in N, in rising order."""
     if case.predict.amplitudes:
         return np.unique(case.predict.amplitudes)
     onset = 1 / max(linear["reached"])

@@ -86,7 +86,7 @@ def in_contact(z: np.ndarray, release: np.ndarray) -> np.ndarray:
 
 
 def unit_phase(c: np.ndarray) -> np.ndarray:
-    """c/|c|; 0 where c is."""
+    """c/|c| of complex numbers ``c`` (...); 0 where c is."""
     return c / np.maximum(np.abs(c), TINY)
 
 
@@ -127,7 +127,7 @@ class Burst:
         self.c = self.envelope(self.linear, drive, FIRST_LINE * drive)
 
     def spectrum(self, w: np.ndarray) -> np.ndarray:
-        """Fourier transform of ``w`` at ``omega`` - i decay."""
+        """Fourier transform (omega,) of a signal ``w`` (time,) at ``omega`` - i decay."""
         return np.asarray(np.fft.rfft(w * np.exp(-self.decay * self.time), self.padded))
 
     def envelope(self, spectrum: np.ndarray, middle: float, half: float) -> np.ndarray:
@@ -298,7 +298,7 @@ class SiteResponse(NamedTuple):
         )
 
     def at(self, z: np.ndarray) -> ContactState:
-        """State of a site in contact at ``z``."""
+        """State of a site in contact at the amplitudes ``z`` (...), over the clearance."""
         x = np.log(np.maximum(z, LOWEST))
         return ContactState(
             fundamental=self._interpolated(x, self.fundamental),

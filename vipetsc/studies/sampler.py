@@ -53,7 +53,7 @@ class CmaEs:
         self._search = CMAEvolutionStrategy([0.0] * len(self._centre), self._step, options)
 
     def ask(self) -> np.ndarray:
-        """The next generation."""
+        """The next generation (design, dimension), each coordinate in [0, 1]."""
         self._asked = self._search.ask()
         unbounded = self._centre + np.array(self._asked) @ self._directions.T
         self._points = 1 - np.abs(1 - unbounded % 2)  # mirrored at 0 and 1
@@ -88,7 +88,7 @@ class Nsga2:
         self._search.setup(self._problem, termination=NoTermination(), seed=seed)
 
     def ask(self) -> np.ndarray:
-        """The next generation."""
+        """The next generation (design, dimension), each coordinate in [0, 1]."""
         self._asked = self._search.ask()
         return np.array(self._asked.get("X"), float)
 

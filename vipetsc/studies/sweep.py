@@ -314,7 +314,7 @@ def is_whole(path: Path, lost: list[str]) -> bool:
 def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[str]]:
     """Write ``ensemble.h5``, once no member is missing, and ``index.json``; how the members ended, and warnings.
 
-    What is there stays as it is unless it is of other results, or ``afresh``.
+    The endings are (member,). A file that is there stays unless it is of other results, or ``afresh``.
     """
     plan = results.plan
     folder = results.folder

@@ -139,7 +139,10 @@ def damping_report(numbers: dict[str, Any]) -> str:
 
 
 def modes_report(case: Case, options: argparse.Namespace, folder: Path, comm: MPI.Comm) -> str:
-    """The linear modes of ``--modes`` as text on rank 0, which writes them; empty if none are requested."""
+    """The linear modes of ``--modes`` as text on rank 0, which writes them; empty if none are requested.
+
+    Raises CaseError for options that do not fit together.
+    """
     if options.modes is None:
         if options.near is not None:
             raise CaseError([Problem("--near", options.near, "gives the frequency for --modes; give both options")])

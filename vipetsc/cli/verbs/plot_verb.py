@@ -24,7 +24,7 @@ MOVIE_FORMATS = "gif", "mp4"
 
 
 def positive(text: str) -> float:
-    """A positive, finite number."""
+    """The positive, finite number in ``text``; raises ArgumentTypeError for another."""
     value = float(text)
     if not 0 < value < float("inf"):
         # argparse prints the text of this exception; that of a ValueError it hides.
@@ -33,7 +33,7 @@ def positive(text: str) -> float:
 
 
 def window(text: str) -> tuple[int, int]:
-    """First and last of ``A:B``."""
+    """First and last cell of ``A:B``, from 1; raises ArgumentTypeError for another text."""
     first, separator, last = text.partition(":")
     if not (separator and first.isdigit() and last.isdigit()):
         raise argparse.ArgumentTypeError(f"{text} is not of the form A:B, the first and the last cell, from 1")
@@ -57,7 +57,10 @@ OF_MOVIES: dict[str, Argument] = {
 
 
 def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Draw the pictures of result folders again, or render a movie of a run."""
+    """Draw the pictures of result folders again, or render a movie of a run.
+
+    Raises FolderError where the folders do not have what the options ask for.
+    """
     pictures, folders = on_root(comm, lambda: pictures_of(options.path))
     # A folder can be plotted while another command works in it, and is therefore not locked.
     on_root(comm, lambda: remove_abandoned(folders[0] / "figures"))
@@ -116,7 +119,8 @@ def film(
 ) -> tuple[list[Path], str]:
     """Render a movie of the run in ``folder``, in ``formats``; ``options`` by their names in `Shot`; on one rank.
 
-    Returns the files, and which format could not be written and why. Nothing is written on bad input.
+    Returns the files, and which format could not be written and why. Raises FolderError before anything is
+    written where ``folder`` holds no run, or the options do not fit it.
     """
     from vipetsc.figures import movie, movie_frames
     from vipetsc.figures.style import rc_style

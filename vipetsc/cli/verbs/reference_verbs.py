@@ -16,7 +16,7 @@ from vipetsc.parallel import StopRequest, on_root
 
 
 def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Print a chapter of the manual as plain text, or a list of them."""
+    """Print a chapter of the manual as plain text, or a list of them; raises CaseError for an unknown topic."""
     if options.topic is None:
         echo(comm, on_root(comm, contents))
         echo(comm, "vipetsc manual TOPIC prints one")

@@ -250,7 +250,10 @@ def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
 
 
 def measure_where_missing(folders: Sequence[Path]) -> None:
-    """Check that a folder holds a finished run, and measure it if its measures are missing or older than the run."""
+    """Check that a folder holds a finished run, and measure it if its measures are missing or older than the run.
+
+    Raises FolderError where there is no run or it has not ended.
+    """
     from vipetsc.studies.analysis_options import is_measured
 
     (folder,) = folders

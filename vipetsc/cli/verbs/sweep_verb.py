@@ -63,7 +63,10 @@ def sweep_table(result: "SweepResult") -> str:
 
 
 def relate_to_branches(folders: Sequence[Path]) -> None:
-    """Check that folders hold finished sweeps or branches, and lay the sweeps over the branches."""
+    """Check that folders hold finished sweeps or branches, and lay the sweeps over the branches.
+
+    Raises FolderError for a folder that does not.
+    """
     from vipetsc.studies.backbone import relate_folders
 
     # All folders are checked before a file is written into one of them.

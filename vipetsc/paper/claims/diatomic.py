@@ -71,7 +71,10 @@ class AmplitudeTriple:
 
 
 def optical_ridge(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C1: distance of the linear run's spectral ridge from the optical branch, in bins (Fig. 2)."""
+    """C1: distance of the linear run's spectral ridge from the optical branch, in bins (Fig. 2).
+
+    Raises MissingEvidence where results lack what is measured.
+    """
     triple = AmplitudeTriple(evidence, reading, "dispersion")
     if triple.low.episodes:
         raise MissingEvidence(f"the run at {triple.low.amplitude:g} N is not linear: {triple.low.episodes} contacts")
@@ -94,7 +97,10 @@ def optical_ridge(evidence: Evidence, reading: str, result: Measurement) -> None
 
 
 def linear_content(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C2: part of the energy that changes its wavenumber between drive and far end at low amplitude (Fig. 2)."""
+    """C2: part of the energy that changes its wavenumber between drive and far end at low amplitude (Fig. 2).
+
+    Raises MissingEvidence where results lack what is measured.
+    """
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content")
     model = triple.low.case.model()
     time, content = triple.low.arrays("time", "wavenumber_content")
@@ -177,7 +183,10 @@ def _reflected_fraction(triple: AmplitudeTriple, run: AnalysedMember) -> Fractio
 
 
 def native_bins(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C5: part of the packet in its own wavenumber bins before it meets a site (Fig. 4)."""
+    """C5: part of the packet in its own wavenumber bins before it meets a site (Fig. 4).
+
+    Raises MissingEvidence where results lack what is measured.
+    """
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "partition")
     # At the largest speed in the band, so that no part of the packet has met the site.
     arrival = triple.distance / max_group_velocity(triple.low.case.lattice.unit_cell(), OPTICAL)[2]

@@ -131,7 +131,10 @@ def _list_fits(result: Measurement, configurations: list[EntropyDecay], sites: s
 
 
 def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C8: rise, peak and decay at every wavenumber from 2 pi/9 to 7 pi/9 (Suppl., Fig. S2)."""
+    """C8: rise, peak and decay at every wavenumber from 2 pi/9 to 7 pi/9 (Suppl., Fig. S2).
+
+    Raises MissingEvidence where results lack what is measured.
+    """
     ensemble = evidence.ensemble(SPREAD)
     if "wavenumber" not in ensemble.coords:
         raise MissingEvidence(f"{SPREAD} does not vary the wavenumber")

@@ -58,7 +58,7 @@ class AnalysedMember:
         return float("nan")
 
     def arrays(self, *names: str) -> tuple[np.ndarray, ...]:
-        """Variables of the analysis by name."""
+        """Variables of the analysis by name, each with its shape (...) in the file."""
         return tuple(self.analysis[name].values for name in names)
 
 
@@ -116,7 +116,7 @@ class Evidence(ExitStack):
         self._open = cache(lambda path, needs: self.enter_context(open_netcdf(path, "file of results", needs)))
 
     def path(self, *parts: str) -> Path:
-        """A file below ``root``, noted down."""
+        """A file below ``root``, noted down; raises MissingEvidence where there is none."""
         name = "/".join(parts)
         if not (self.root / name).exists():
             raise MissingEvidence(f"{name} is missing")
@@ -135,7 +135,7 @@ class Evidence(ExitStack):
     def select(self, step: str, reading: str, **wanted: Any) -> xr.Dataset:
         """The members of a sweep over rising amplitude, in one reading and with the coordinates ``wanted``.
 
-        Of an axis that is not named the first value is taken.
+        Of an axis that is not named the first value is taken. Raises MissingEvidence if the sweep has no such members.
         """
         ensemble = self.ensemble(step)
         wanted = {"reading": reading} | wanted
@@ -156,7 +156,7 @@ class Evidence(ExitStack):
         return members.isel({axis: 0 for axis in axes(members) if axis != "amplitude"}).sortby("amplitude")
 
     def runs(self, step: str, reading: str, *needs: str, **wanted: Any) -> list[AnalysedMember]:
-        """The members of ``select`` with their analyses, which must hold ``needs``."""
+        """The members of ``select`` with their analyses; raises MissingEvidence where one lacks any of ``needs``."""
         members = self.select(step, reading, **wanted)[["member", "contact_episodes"]]
         runs = []
         for i in range(members.sizes["amplitude"]):

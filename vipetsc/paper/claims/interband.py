@@ -20,7 +20,10 @@ FIELDS = 16  # random ones, by which a Frobenius norm is estimated to a quarter:
 
 
 def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C10: the best (lambda, eta) of the search, on the paper's grid and on all of it (Suppl. 3, Fig. S3)."""
+    """C10: the best (lambda, eta) of the search, on the paper's grid and on all of it (Suppl. 3, Fig. S3).
+
+    Raises MissingEvidence where results lack what is measured.
+    """
     search = evidence.open(DESIGN, "design.h5")
     readings = list(map(str, search["reading"].values))
     costs = list(map(str, search["cost"].values))
@@ -130,7 +133,10 @@ def _add_scatter(evidence: Evidence, reading: str, law: str, sites: int, result:
 
 
 def medium_most(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C12: energy of the upper bands at medium over low and high amplitude (Figs. 7, 8, S6)."""
+    """C12: energy of the upper bands at medium over low and high amplitude (Figs. 7, 8, S6).
+
+    Raises MissingEvidence where results lack what is measured.
+    """
     for law in LAWS:
         curve = AmplitudeCurve(evidence.select(AMPLITUDES, reading, law=law), "ibtet")
         if len(curve.amplitude) < 3:
@@ -188,7 +194,8 @@ def split_errors(run: AnalysedMember) -> dict[str, float]:
     The means over the record agree for any complete split without overlap (Parseval). Over a period of the drive they
     agree where no motion straddles an edge; judged in the inner part of the record, a burst away from its ends, where
     the filters see less than a period. The energy must be divided between the parts as in an independent spectrum, the
-    space-time one, and lie in those that the paper counts.
+    space-time one, and lie in those that the paper counts. Raises MissingEvidence for a
+    record that has no inner part.
     """
     names = ("bands/sample", "bands/edges", "bands/energy", "bands/total", "frequency", "dispersion")
     time, edges, energy, total, frequency, dispersion = run.arrays(*names)

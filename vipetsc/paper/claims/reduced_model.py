@@ -29,7 +29,10 @@ TRUE = {
 
 
 def branches(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C15: slope, folds and stability over regions I-IV of the out-of-phase branch (Fig. 11)."""
+    """C15: slope, folds and stability over regions I-IV of the out-of-phase branch (Fig. 11).
+
+    Raises MissingEvidence where results lack what is measured.
+    """
     for law in LAWS:
         step = f"nnm-{law}"
         if reading != "printed":
@@ -109,7 +112,10 @@ def _largest(values: np.ndarray) -> float | None:
 
 
 def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C16: power law of the transfer in region III compared with that of the branch's slope (Figs. 12, S7, S8)."""
+    """C16: power law of the transfer in region III compared with that of the branch's slope (Figs. 12, S7, S8).
+
+    Raises MissingEvidence where results lack what is measured.
+    """
     relation = evidence.open(INTERBAND, "backbone.h5")
     left_out = [str(text) for text in np.atleast_1d(relation.attrs.get("left_out", []))]
     curves = sorted({str(name).partition("/")[0] for name in relation.variables if str(name).startswith(f"{reading}-")})
@@ -151,7 +157,10 @@ def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None
 
 
 def portraits(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C17: regimes of host and resonator at the only site of the lattice (Suppl., Figs. S4, S5)."""
+    """C17: regimes of host and resonator at the only site of the lattice (Suppl., Figs. S4, S5).
+
+    Raises MissingEvidence where results lack what is measured.
+    """
     for law in LAWS:
         runs = evidence.runs(ONE_SITE, reading, law=law)
         host, resonator, above = zip(*(pair_motion(evidence, run) for run in runs), strict=True)
