@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from mpi4py import MPI
 
 from vipetsc.cli.messages import echo
+from vipetsc.figures.loading import load_matplotlib
 from vipetsc.figures.second_process import SecondProcess
 from vipetsc.io.errors import is_disk_full
 from vipetsc.io.folder import FolderError
@@ -99,6 +100,7 @@ def draw_pictures(
             drawn_ahead = pictures.unmeasured
         second.ask(pictures.source, folders, divided=True, formats=formats, newest=newest, omit=drawn_ahead)
 
+    load_matplotlib()
     from vipetsc.figures.registry import draw
     from vipetsc.figures.sweep_members import Files
 

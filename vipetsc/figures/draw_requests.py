@@ -1,5 +1,6 @@
 """What the process of ``SecondProcess`` does: it draws what is asked for, one request after the other."""
 
+import gc
 import json
 import os
 import socket
@@ -10,6 +11,8 @@ from threading import Thread
 from typing import Any
 
 from vipetsc.figures.common_turns import CommonTurns
+from vipetsc.figures.loading import load_matplotlib
+from vipetsc.process import collect_seldom
 
 
 def serve(turns: int) -> None:
@@ -17,12 +20,15 @@ def serve(turns: int) -> None:
 
     ``turns`` is the descriptor of the file of turns.
     """
+    collect_seldom()
     channel = socket.socket(fileno=0)
     requests: SimpleQueue[str] = SimpleQueue()
     Thread(target=_receive, args=(channel, requests), daemon=True).start()
     # Before the first request, as the process that asks is still computing.
+    load_matplotlib()
     from vipetsc.figures.registry import draw
 
+    gc.freeze()
     while True:
         request = json.loads(requests.get())
         options = request["options"]
