@@ -72,6 +72,7 @@ class ScipyLattice:
             for k, speed in closed.items():
                 stop = self.stops[k]
                 depth = max(stop.side * (rows[k] @ y[:n]) - stop.gap, 0.0)
+                # The speed at the onset, which stays until the contact ends.
                 ratio = stop.side * (rows[k] @ y[n:]) / speed
                 pressure = stop.stiffness * depth**stop.exponent * (1 + 1.5 * (1 - stop.restitution) * ratio)
                 total = total - stop.side * pressure * rows[k]
@@ -89,6 +90,7 @@ class ScipyLattice:
                     return float(stop.side * (rows[k] @ y[:n]) - stop.gap)
 
                 beyond.terminal = True
+                # An open stop waits for its onset, a closed one for its separation.
                 beyond.direction = -1 if k in closed else 1
                 events.append(beyond)
             solution = solve_ivp(
@@ -96,10 +98,12 @@ class ScipyLattice:
                 (t, times[-1]),
                 y,
                 "DOP853",
+                # Far below what the tests compare, so that their tolerances are the package's alone.
                 rtol=1e-11,
                 atol=1e-15,
                 events=events,
                 dense_output=True,
+                # Events are looked for once a step: a longer one could miss a short contact.
                 max_step=2e-4,
             )
             inside = (times >= t) & (times <= solution.t[-1])
@@ -108,11 +112,13 @@ class ScipyLattice:
                 samples[inside] = values
                 accelerations[inside] = [rates(at, y)[n:] for at, y in zip(times[inside], values, strict=True)]
             t = float(solution.t[-1])
+            # Started anew at each change: the force's derivative jumps there.
             y = solution.y[:, -1].copy()
             for k, found in enumerate(solution.t_events):
                 if found.size and k in closed:
                     del closed[k]
                 elif found.size:
+                    # The approach velocity of this contact.
                     closed[k] = float(self.stops[k].side * (rows[k] @ y[n:]))
                     impacts += 1
         return np.stack([samples[:, :n], samples[:, n:], accelerations]), impacts

@@ -41,6 +41,7 @@ def version_of(monkeypatch):
     def put(name: str, version: str | None) -> None:
         module = NAMED[name].module or name
         if version is None:
+            # With None in its place Python refuses to import the module.
             monkeypatch.setitem(sys.modules, module, None)
         else:
             monkeypatch.setattr(importlib.import_module(module), "__version__", version)
@@ -68,6 +69,7 @@ def test_a_package_that_is_too_old(version_of, name, version, remedy):
 
 
 def test_doctor_ends_with_2_where_the_program_cannot_work(in_process, version_of):
+    # One package too old and one missing: both are named in the last line.
     version_of("xarray", "2024.9.0")
     version_of("cma", None)
     ended = in_process("doctor")
@@ -82,12 +84,14 @@ def test_a_package_that_is_newer_than_any_tried(version_of):
     check = check_package(NAMED["petsc4py"])
     assert not check.fault
     assert "newer than 3.26, the latest tested version" in check.note
+    # A patch of the latest, the oldest and a candidate are no newer.
     for version in ("3.26.9", "3.18.5", "3.26.0rc1"):
         version_of("petsc4py", version)
         assert check_package(NAMED["petsc4py"]).text == version
 
 
 def test_this_machine_has_no_fault():
+    # The suite runs here, so that every package must be found good.
     faults = [check for check in map(check_package, PACKAGES) if check.fault]
     assert faults == []
 
@@ -101,6 +105,7 @@ def test_scalars_other_than_real_doubles(scalar):
 
 
 def test_one_mpi_for_all():
+    # Two of them in one process: petsc4py and mpi4py of different builds crash at the first call that both make.
     ours, other = loaded_libraries(MPI_LIBRARY), "/opt/mpich/lib/libmpi.so.12"
     assert len(ours) == 1
     assert not check_mpi(ours, 2, {"OMPI_COMM_WORLD_SIZE": "2"}).fault
@@ -111,6 +116,7 @@ def test_one_mpi_for_all():
 
 @pytest.mark.parametrize("launcher", ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE"])
 def test_a_launcher_of_another_mpi(launcher):
+    # The launcher's variable says four, and this MPI sees one: each process would write the same files.
     check = check_mpi([], 1, {launcher: "4"})
     assert "started 4 processes, but mpi4py sees 1" in check.fault
 
@@ -125,19 +131,23 @@ def test_a_blas_that_is_slow_is_named():
     ):
         assert BLAS_LIBRARY.fullmatch(library)
         assert check_blas([library]) == ("BLAS", library, "", "")
+    # Of this machine either form is right.
     assert loaded_libraries(BLAS_LIBRARY) or check_blas([]).value == "within numpy"
 
 
 def test_what_the_program_can_do_without_is_no_fault(monkeypatch):
+    # Without parallel HDF5 rank 0 writes, without mpirun one rank runs.
     monkeypatch.setattr(h5py, "get_config", lambda: SimpleNamespace(mpi=False))
     monkeypatch.setattr(installation.shutil, "which", lambda name: None)
     for check in (installation.check_parallel_hdf5(2), installation.check_mpirun()):
         assert check.note and not check.fault
+    # Its second value is whether the program can run.
     assert doctor_table(MPI.COMM_SELF)[1]
 
 
 def test_the_oldest_versions_are_those_of_the_package():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    # Two lists of one thing, in different languages: here they are held equal.
     wanted = {line.split(",")[0] for line in project["dependencies"]}
     assert {f"{package.name}>={package.oldest}" for package in PACKAGES} == wanted
 
@@ -145,6 +155,7 @@ def test_the_oldest_versions_are_those_of_the_package():
 def test_a_library_that_does_not_load_is_named():
     """pydantic stands for one that the program wants before it can call ``doctor``."""
     code = (
+        # In a process of its own, because this one has imported everything.
         "import sys; sys.argv = ['vipetsc']; sys.modules['pydantic'] = None;"
         " from vipetsc.__main__ import main; sys.exit(main(['doctor']))"
     )
@@ -156,6 +167,7 @@ def test_a_library_that_does_not_load_is_named():
 
 def test_doctor_compiles_kernels_where_it_is_asked_to(in_process, monkeypatch):
     """With --compile the last line says how long that took, or that all are there; without it nothing is compiled."""
+    # Compiling takes minutes, and is replaced by the time that it reports.
     took = [83.0]
     monkeypatch.setattr(first_calls, "compile_kernels", lambda comm: took[0])
     ended = in_process("doctor", "--compile")
@@ -180,5 +192,6 @@ def test_after_that_a_run_compiles_nothing(vipetsc, tmp_path):
         small = set_words("lattice.cells=40", "contacts.sites=[6]", "time.end=0.02", "output.figures=false")
         ended = vipetsc(0, "run", *small, "--set", f"time.engine={engine}", "--out", tmp_path / engine)
         assert ended.returncode == 0, ended.stderr
+        # A run announces that it compiles; with all kernels there it must not.
         assert "compiling" not in ended.stderr
         assert "compiled" not in ended.stdout

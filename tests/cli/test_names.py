@@ -15,6 +15,7 @@ from tests.conftest import clean_environment
 from tests.faults.scenarios import SCENARIOS, prepare, words_of
 from vipetsc.io.names import path_named, readable
 
+# Without the last two Python would replace the locale by UTF-8 itself.
 C_LOCALE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 TINY = """
 [lattice]
@@ -33,6 +34,7 @@ figures = false
 [sweep.drive]
 amplitude = [1.0, 2.0]
 """
+# A byte that UTF-8 does not have becomes a lone surrogate, which no file can be written with.
 NO_TEXT = os.fsdecode(b"no\xfftext")
 
 
@@ -41,6 +43,7 @@ def by_shell(tmp_path):
     """Call the program in a folder of its own, in a locale that has but ASCII."""
 
     def call(*words: str | bytes) -> subprocess.CompletedProcess:
+        # In a process: the locale is read once, at its start.
         command = [sys.executable, "-m", "vipetsc", *words]
         environment = clean_environment() | C_LOCALE
         return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, timeout=100, check=False)
@@ -50,8 +53,10 @@ def by_shell(tmp_path):
 
 def test_names_of_the_system_are_readable():
     assert readable("grün") == "grün"
+    # As Python hands over the name in a locale of ASCII.
     assert readable(os.fsencode("grün").decode("ascii", "surrogateescape")) == "grün"
     assert readable(NO_TEXT) == "no\ufffdtext"
+    # Would raise with a surrogate left.
     readable(NO_TEXT).encode()
 
 
@@ -77,10 +82,12 @@ def test_an_ascii_locale_takes_names_in_utf_8(by_shell, tmp_path, verb):
     assert ended.returncode == 0, ended.stderr.decode()
     assert b"Traceback" not in ended.stderr
     assert (tmp_path / "runs/λ/case.toml").read_text(encoding="utf-8").startswith('name = "λ"')
+    # As bytes, since in this test's own locale subprocess might encode them otherwise.
     again = by_shell(verb, "größe.toml".encode(), "--out", "hülle".encode(), "--log", "größe.log".encode())
     assert again.returncode == 0, again.stderr.decode()
     name = "run.h5" if verb == "run" else "ensemble.h5"
     with h5py.File(tmp_path / "hülle" / name) as file:
+        # HDF5 stores text as UTF-8: a surrogate in it would have failed.
         assert file.attrs["command"] == f"vipetsc {verb} größe.toml --out hülle --log größe.log"
 
 
@@ -93,6 +100,7 @@ def test_a_folder_may_have_bytes_that_are_no_text(in_process, monkeypatch, tmp_p
     out = tmp_path / NO_TEXT
     for words in filter(None, (scenario.before, scenario.words)):
         call = words_of(words, case, out)
+        # The recorded command is that of the process.
         monkeypatch.setattr(sys, "argv", ["vipetsc", *call])
         ended = in_process(*call, "--set", "output.figures=false") if words.startswith("run") else in_process(*call)
         assert ended.returncode == 0, ended.stderr
@@ -114,6 +122,7 @@ def test_samples_may_lie_in_a_folder_whose_name_is_no_text(in_process, tmp_path)
     (folder / "case.toml").write_text(f'{TINY}\n[drive.samples]\nfile = "samples.csv"\n'.replace("cycles = 3", ""))
     ended = in_process("validate", "case.toml", "--set", "drive.waveform=samples", cwd=folder)
     assert "surrogates" not in ended.stderr
+    # Whether such a case is valid is not the question: that it ends without a traceback is.
     assert ended.returncode in (0, 2)
 
 
@@ -126,6 +135,7 @@ def test_a_marker_that_is_no_text_is_another_case(in_process, tmp_path):
     ended = in_process("run", case, "--out", out)
     assert ended.returncode == 2
     assert "contains another run: name = \ufffd there, tiny here" in ended.stderr
+    # No TOML at all.
     (out / "case.toml").write_bytes(b"\x89HDF")
     assert "its case.toml cannot be read" in in_process("run", case, "--out", out).stderr
     assert in_process("run", case, "--out", out, "--force").returncode == 0
@@ -147,6 +157,7 @@ def test_tables_in_tables_without_end_are_refused(in_process, tmp_path, verb, te
     path.write_text(text)
     ended = in_process(verb, path)
     assert ended.returncode == 2
+    # By the program's own limit, or by Python's parser, which gives up first.
     assert "levels deep" in ended.stderr or "recursion depth" in ended.stderr
 
 
@@ -159,6 +170,7 @@ def test_changes_without_end_are_refused(in_process, change):
 
 @pytest.mark.slow
 def test_a_backend_of_windows_is_of_no_matter(vipetsc, tmp_path):
+    # Matplotlib reads the variable as it is imported, and would fail on a backend that it does not have.
     ended = vipetsc(0, "bands", "--out", tmp_path, env=clean_environment() | {"MPLBACKEND": "foo"})
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "bands.png").exists()

@@ -22,7 +22,9 @@ from vipetsc.lattice import Contact
 from vipetsc.lattice.drive import Pieces
 
 EXAMPLE = CHAPTER.parents[1] / "examples/own-law.toml"
+# In 1/m^2: at an indentation of 1 mm the stop is 40 % stiffer than the linear one.
 RATE = 4e5
+# The chapter's own text, so that what it says of a sweep is run.
 SWEEP = re.compile(r"^```toml\n(\[sweep\].*?)^```$", flags=re.M | re.S)
 CASE = f"""
 [plugins]
@@ -68,6 +70,7 @@ def out(folder, tmp_path_factory) -> Path:
     from vipetsc.cli.main import main
 
     out = tmp_path_factory.mktemp("results") / "out"
+    # From another current folder: paths of modules count from the case file.
     assert main(["run", str(folder / "case.toml"), "--out", str(out), "--quiet"], {}) == 0
     return out
 
@@ -77,12 +80,14 @@ def test_a_run_uses_and_records_the_parts(folder, out):
     with open(out / "run.h5") as run:
         case = Case.of(run)
         law = case.model().contact
+        # Otherwise the law and the measure would not have been used.
         assert len(run["impacts/onset"]) > 4
         longest = float((run["impacts/separation"] - run["impacts/onset"]).max())
     with open(out / "analysis.h5") as analysis:
         assert float(analysis["longest_contact"]) == longest
         assert analysis["longest_contact"].attrs["units"] == "s"
     assert law == Contact("hardening", 2e5, restitution=0.6, factor="herbert-mcwhannell", parameters=(RATE,))
+    # Herbert and McWhannell's factor, 6 (1 - r)/[(2 r - 1)^2 + 3], at r = 0.6.
     assert law.damping == pytest.approx(6 * 0.4 / (0.2**2 + 3))
 
     parts = case.plugins.parts
@@ -93,6 +98,7 @@ def test_a_run_uses_and_records_the_parts(folder, out):
         record = parts[kind][name]
         assert record.module == str(folder / file)
         assert record.sha256 == hashlib.sha256((folder / file).read_bytes()).hexdigest()
+    # An empty page has less.
     assert (out / "figures/kinetic.png").stat().st_size > 5000
 
     summary = json.loads((out / "summary.json").read_text())
@@ -114,6 +120,7 @@ def test_a_registered_measure_is_exported(out):
 
 def test_validate_lists_the_parts_that_a_case_uses(folder, in_process):
     """Each part has a row with its kind, its module and the version; a law that the case does not use has none."""
+    # With the factor of the package, so that the module of factors registers one that this case does not use.
     shown = in_process("validate", folder / "case.toml", "--set", "contacts.damping=exact").stdout
     rows = re.findall(r"^  (\w+) +(\S+), registered by (\S+?)(?:, version (\S+))?$", shown, flags=re.M)
     assert {(kind, name): (module, version) for kind, name, module, version in rows} == {
@@ -131,6 +138,7 @@ def test_the_waveform_is_the_formula(folder):
     waveform = Case.load(folder / "case.toml").model().drive
     assert isinstance(waveform, Pieces)
     t = np.linspace(0.002, 0.018, 33)
+    # Ricker's wavelet (1 - 2 p) exp(-p) with the frequency of its largest component.
     phase = (1000.0 * (t - 0.01) / 2) ** 2
     assert waveform.force(t) == pytest.approx(500.0 * (1 - 2 * phase) * np.exp(-phase), abs=1e-2)
 
@@ -145,13 +153,15 @@ def edited_copy(out: Path, target: Path, before: str, after: str) -> Path:
     return target
 
 
-def test_results_of_another_source_are_not_gone_on_with(folder, out, tmp_path, in_process):
+def test_results_of_another_source_are_not_continued(folder, out, tmp_path, in_process):
     """A folder whose law has another hash is refused by a sentence with the hash, and stays as it is."""
     digest = hashlib.sha256((folder / "stops.py").read_bytes()).hexdigest()
+    # A hash that no file has stands for that of an earlier source.
     old = edited_copy(out, tmp_path / "old", digest, "0" * 64)
     ended = in_process("run", folder / "case.toml", "--out", old, "--resume")
     assert ended.returncode == 2
     assert f"plugins.parts.law.hardening.sha256 = {'0' * 16}... there, {digest[:16]}... here" in ended.stderr
+    # Refused before anything was written; the lock, whose name begins with a dot, may stay.
     assert {path.name for path in old.iterdir() if path.name[0] != "."} == {"case.toml", "run.h5"}
 
 
@@ -159,6 +169,7 @@ def test_a_changed_source_is_warned_of_where_results_are_read(folder, out, caplo
     """Reading a case with another hash warns once and names the part."""
     digest = hashlib.sha256((folder / "factors.py").read_bytes()).hexdigest()
     text = (out / "case.toml").read_text().replace(digest, "0" * 64)
+    # Twice, and one warning: a sweep reads the case of every member.
     for _ in range(2):
         assert Case.from_toml(text).plugins.parts["dissipation"]["herbert-mcwhannell"].sha256 == digest
     warned = [line for line in caplog.messages if "has changed" in line]
@@ -170,6 +181,7 @@ def test_a_changed_source_is_warned_of_where_results_are_read(folder, out, caplo
 
 def test_a_source_that_changes_within_a_process_is_refused(folder, tmp_path):
     """Python has imported the earlier source: its results would be recorded with the hash of the later one."""
+    # Under a name of its own, since names are registered for the whole process.
     (tmp_path / "stop.py").write_text((folder / "stops.py").read_text().replace('"hardening"', '"changing"'))
     table = {"plugins": {"modules": [str(tmp_path / "stop.py")]}}
     Case.from_table(table)
@@ -184,6 +196,7 @@ def test_a_source_that_changes_within_a_process_is_refused(folder, tmp_path):
 )
 def test_results_need_the_modules_of_their_physics(out, file, needed, caplog):
     """Results whose law or waveform is not there are not read; a module of measures or figures alone may be missing."""
+    # Changed in the text, because the file is needed by the other tests.
     text = (out / "case.toml").read_text().replace(f"/{file}", f"/gone-{file}")
     if needed:
         with pytest.raises(CaseError, match=rf"gone-{file}, which registers parts of this case"):
@@ -204,6 +217,7 @@ def test_moved_results_take_the_module_of_the_current_folder(folder, out, monkey
 
 def test_names_are_those_of_the_modules_that_a_case_names(folder):
     """A part that another case has imported is unknown in a case that does not name its module."""
+    # Imports all modules: their names are then in the process, but not in the next case.
     Case.load(folder / "case.toml")
     others = [str(folder / name) for name in ("factors.py", "pulses.py")]
     with pytest.raises(CaseError, match="'hardening': must be 'hertz', 'bilinear' or 'power'; plugins"):
@@ -216,6 +230,7 @@ def test_the_schema_of_a_case_has_the_names_of_its_modules(folder, in_process):
     """``schema CASE`` allows the registered names, the schema of all cases does not."""
     table = tomllib.loads(CASE)
     jsonschema.validate(table, json.loads(in_process("schema", folder / "case.toml").stdout))
+    # The schema of all cases has the package's laws alone.
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(table, json_schema())
 
@@ -244,6 +259,7 @@ def test_a_module_that_cannot_be_used_is_refused(source, sentence, tmp_path, in_
     if source is not None:
         (tmp_path / "part.py").write_text(source)
     (tmp_path / "case.toml").write_text('[plugins]\nmodules = ["part.py"]\n')
+    # By the program for the exit code, and below in Python for the sentence.
     ended = in_process("run", tmp_path / "case.toml", "--out", tmp_path / "out")
     assert ended.returncode == 2
     assert "1 problem\n  plugins.modules[1] = " in ended.stderr
@@ -299,6 +315,7 @@ def test_a_sweep_varies_laws_and_their_parameters(folder):
     assert (ensemble["longest_contact"] > 0).all()
     linear, little, hardened, unhardened = ensemble["ibtet"].values
     assert unhardened == pytest.approx(linear, rel=1e-6)
+    # Far above rounding, and in order: the parameter reaches the kernel.
     assert abs(hardened / linear - 1) > abs(little / linear - 1) > 1e-4
     assert "[plugins.parts.law.hardening]" in ensemble.attrs["case"]
 

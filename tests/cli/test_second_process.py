@@ -21,6 +21,7 @@ from vipetsc.figures.common_turns import CommonTurns
 from vipetsc.figures.second_process import SecondProcess
 
 pytestmark = pytest.mark.parallel(1)
+# Drawn from run.h5 alone, and therefore possible before the measures are there.
 WITHOUT_MEASURES = {"phase.png", "unit_cell.png", "impacts.png", "ledger.png"}
 
 
@@ -76,6 +77,7 @@ def test_two_processes_draw_what_one_draws(run, tmp_path):
         # A folder without results: that a request fails ends nothing.
         second.ask("run", [tmp_path])
         assert second.drawn() is None
+        # It waits for the next request.
         assert second._process.poll() is None
 
     assert [path.name for path in drawn] == [path.name for path in expected]
@@ -112,6 +114,7 @@ def test_earlier_measures_keep_pictures_from_being_drawn_ahead(tmp_path):
 
 def test_a_second_process_that_was_killed_has_drawn_nothing(tmp_path):
     with SecondProcess() as second:
+        # As the system does where memory is short.
         second._process.kill()
         second._process.wait()
         second.ask("run", [tmp_path])
@@ -152,7 +155,9 @@ def test_two_processes_take_each_turn_once():
             subprocess.Popen(words, stdout=subprocess.PIPE, text=True, pass_fds=(file,)) as second,
         ):
             taken = [[int(word) for word in process.communicate()[0].split()] for process in (first, second)]
+        # Every turn once, whichever process took it.
         assert sorted(taken[0] + taken[1]) == list(range(4000))
+        # The count is in the file, so that a third reader continues it.
         assert next(CommonTurns(file)) == 4000
     finally:
         os.close(file)

@@ -58,6 +58,7 @@ fields = true
 [sweep.drive]
 frequency = [800.0, 900.0, 1000.0]
 """
+# What a sweep with the measure transfer shows without being asked.
 PAGES = ("bands_share", "contact_episodes", "dissipated_fraction", "ibtet", "largest_force", "upper_share_at_end")
 
 
@@ -81,6 +82,7 @@ def drawn(folder: Path) -> set[str]:
     paths = list((folder / "figures").glob("*"))
     names = {path.name for path in paths}
     for path in paths:
+        # So that the next test of the same sweep sees its own pictures alone.
         path.unlink()
     return names
 
@@ -89,6 +91,7 @@ def drawn(folder: Path) -> set[str]:
 def test_every_measure_has_a_page_over_the_keys_that_vary(burst):
     assert main(["plot", str(burst)]) == 0
     keys = "contacts.clearance-contacts.restitution"
+    # Parts of the energy have a page each band.
     assert drawn(burst) == {f"{name}-over-{keys}{'-band' * (name == 'bands_share')}.png" for name in PAGES}
 
 
@@ -112,6 +115,7 @@ def test_a_measure_asked_for_by_name_is_drawn_alone(burst, name):
 def test_a_figure_that_cannot_be_drawn_is_refused(burst, name, message, capsys):
     assert main(["plot", str(burst), "--fig", name]) == 2
     assert message in capsys.readouterr().err
+    # Refused before anything was drawn.
     assert drawn(burst) == set()
 
 
@@ -122,6 +126,7 @@ def test_an_own_cell_under_a_harmonic_drive_has_pages_over_its_frequency(tmp_pat
     assert main(["plot", str(out)]) == 0
     names = drawn(out)
     assert {"ibtet-over-drive.frequency.png", "contact_episodes-over-drive.frequency.png"} <= names
+    # Members with fields have pages of their own, named by their case.
     for frequency in (800, 900, 1000):
         assert f"transfer-hertz-2-sites-drive.frequency-{frequency}-rad-s-12N.png" in names
     assert not [name for name in names if "calibrated" in name or "cycles" in name]
@@ -129,6 +134,7 @@ def test_an_own_cell_under_a_harmonic_drive_has_pages_over_its_frequency(tmp_pat
 
 @pytest.mark.slow
 def test_what_is_zero_for_every_member_is_said_and_drawn_on_request(tmp_path, capsys):
+    # Clearances of metres: nothing touches.
     out = sweep(tmp_path, BURST, "sweep.contacts.clearance=[1.0, 2.0, 3.0]")
     assert main(["plot", str(out)]) == 0
     assert (
@@ -141,6 +147,7 @@ def test_what_is_zero_for_every_member_is_said_and_drawn_on_request(tmp_path, ca
 
 @pytest.mark.slow
 def test_branches_that_a_figure_does_not_show_are_named(burst, tmp_path):
+    # An empty folder stands for one with branches.
     (sentence,) = left_out(PICTURES, [burst, tmp_path], Files(), ["ibtet"])
     assert sentence == f"ibtet: without the branches of {tmp_path}; --fig ibtet_backbone draws both"
 

@@ -16,6 +16,7 @@ from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.parallel import StoppedError, StopRequest, divided, on_root
 from vipetsc.studies.identification import run_identification
 
+# Two starts and two places of a profile: fewer jobs than three ranks, and more than one.
 OPTIONS = {"starts": 2, "profile": 2, "steps": 4}
 
 
@@ -35,12 +36,13 @@ def plan_of(folder: Path, changes: dict[str, Any], end: float = 0.009, **options
     """A fit of one clearance to a record of a few contacts until ``end`` (s), with ``changes`` of the record."""
     table = lattice_table(time={"end": end})
 
-    def made() -> str:
+    def written() -> str:
         record = measured_table(folder, table, noise=0.01) | changes
         unknowns = [{"quantity": "clearance", "of": [[1]], "bounds": [2e-4, 8e-4], "start": 6e-4}]
+        # As text, which rank 0 hands to the others: each would write a record of its own.
         return IdentifyCase.from_table(identify_table(table, record, unknowns=unknowns, **options)).to_toml()
 
-    return IdentifyCase.from_toml(on_root(MPI.COMM_WORLD, made))
+    return IdentifyCase.from_toml(on_root(MPI.COMM_WORLD, written))
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +54,7 @@ def plan(tmp_path_factory):
 @pytest.fixture(scope="module")
 def single(tmp_path_factory):
     """A fit from one start with an initial state, whose derivatives the ranks divide, and its result of one rank."""
+    # A state has many coordinates, whose derivatives are the jobs that ranks divide.
     changes = {"begin": 0.004, "initial": "estimate"}
     plan = plan_of(tmp_path_factory.mktemp("single"), changes, end=0.007, profile=0, steps=3)
     folder = tmp_path_factory.mktemp("single-whole")
@@ -106,6 +109,7 @@ def test_no_window_that_was_solved_is_solved_again(folder, single, monkeypatch):
         solved.append(len(arguments[1]))
         return solution
 
+    # Windows from the record are taken without this function.
     monkeypatch.setattr(GrowingWindows, "_solve", counted)
     for resume in (False, True):
         with pytest.raises(StoppedError):
@@ -114,6 +118,7 @@ def test_no_window_that_was_solved_is_solved_again(folder, single, monkeypatch):
     assert before >= 2
     run_identification(plan, folder, MPI.COMM_WORLD, resume=True)
     lines = (folder / "identified-runs.jsonl").read_text().splitlines()
+    # Each record of a window stands for one solution.
     assert len(solved) == sum(" window " in line for line in lines) > before
     assert_same_bits(datasets(folder / "identified.h5"), whole)
     MPI.COMM_WORLD.Barrier()
@@ -132,7 +137,9 @@ def test_jobs_are_divided_and_their_first_failure_is_that_of_all():
 
     jobs = [lambda number=number: job(number) for number in range(2)]
     assert divided(comm, jobs) == [0, 1]
+    # Every rank has all values, and has computed its own alone.
     assert computed == [number for number in range(2) if number % comm.size == comm.rank]
+    # The first failure by number, not by time: all ranks raise the same one.
     with pytest.raises(ArithmeticError, match="job 2"):
         divided(comm, [lambda number=number: job(number) for number in range(5)])
     comm.Barrier()

@@ -59,6 +59,7 @@ def rows_with(index, row):
 )
 def test_bad_data_are_one_clear_error(tmp_path, rows, key, part):
     problems = problems_of(record_in(written(tmp_path, rows)))
+    # No other key: one bad row must not be reported as several problems.
     assert list(problems) == [f"identify.records[1].{key}"]
     assert part in problems[f"identify.records[1].{key}"]
 
@@ -217,6 +218,7 @@ def test_sides_and_dashpots_to_the_ground_go_into_the_case(tmp_path):
     ]
     plan = IdentifyCase.from_table(identify_table(base, record, unknowns=unknowns))
     assert [parameter.name for parameter in plan.parameters] == ["clearance_minus 1+2", "grounding 3"]
+    # Values that neither the case nor the start has.
     model = plan.case_of([7e-4, 2e-3]).model()
     assert model.gaps == ((5e-4, 7e-4), (4e-4, 7e-4), (3e-4, 9e-4))
     assert model.chain.cell.grounding == (0.0, 0.0, 2e-3, 0.0)
@@ -231,6 +233,7 @@ def test_coordinates_and_values_are_inverse(tmp_path):
     for parameter in plan.parameters:
         z = parameter.to_coordinate(parameter.start)
         assert parameter.from_coordinate(z) == pytest.approx(parameter.start)
+        # Central differences of coordinates of order one: their error, h^2, is below the tolerance.
         h = 1e-6
         slope = (parameter.from_coordinate(z + h) - parameter.from_coordinate(z - h)) / (2 * h)
         assert parameter.slope(z) == pytest.approx(slope, rel=1e-6)

@@ -24,7 +24,9 @@ from vipetsc.figures.style import rc_style, save
 from vipetsc.figures.sweep_members import Labels
 from vipetsc.figures.swept_axes import SweptAxis, even_scale
 
+# Six values in equal ratios: a curve on a logarithmic axis.
 AMPLITUDES = {"drive.amplitude": [1.0, 2.0, 4.0, 8.0, 16.0, 32.0]}
+# Two values are too few for an axis, and become curves; three are enough for a map.
 RESTITUTIONS = {"contacts.restitution": [0.3, 0.9]}
 CLEARANCES = {"contacts.clearance": [2e-4, 5e-4, 1e-3, 2e-3]}
 THREE = {"contacts.restitution": [0.3, 0.6, 0.9]}
@@ -47,10 +49,12 @@ def ensemble_of(*axes: dict[str, list], drive: dict[str, Any] | None = None, par
     coords = {}
     for dim, axis in zip(dims, axes, strict=True):
         for path, values in axis.items():
+            # The dimension has the key's last part as its name, as in ensembles, and its path is an attribute.
             about = {"long_name": path, "units": "1"}
             coords[path.rpartition(".")[2]] = xr.Variable(dim, coordinate(values), about)
 
     shape = [len(next(iter(axis.values()))) for axis in axes]
+    # Every member has a value of its own: one drawn at another's place would be seen.
     number = np.arange(prod(shape)).reshape(shape)
     about = {"units": "1", "long_name": "inter-band energy transfer"}
     data = {
@@ -60,6 +64,7 @@ def ensemble_of(*axes: dict[str, list], drive: dict[str, Any] | None = None, par
         "contact_episodes": (dims, number.astype(float), {"units": "1", "long_name": "contact episodes"}),
         "ibtet": (dims, 0.01 * (number + 1.0), about),
     }
+    # Values fall by decades from part to part, so that a curve shows whose it is.
     if parts:
         fractions = np.stack([10.0**-part * (number + 1.0) for part in range(parts)], axis=-1)
         names = ["below", *(f"band {part}" for part in range(1, parts))]
@@ -121,6 +126,7 @@ def test_two_values_of_a_key_are_two_curves_of_their_own_colour_and_name():
 
 def test_the_ring_is_at_the_largest_value():
     ensemble = ensemble_of(RESTITUTIONS, AMPLITUDES)
+    # Away from the end of the curves, where the rising values would have the ring anyway.
     ensemble["ibtet"][0, 3] = 5.0
     (axes,) = panels(only(ensemble))
     (ring,) = [line for line in axes.lines if line.get_markerfacecolor() == "none"]
@@ -134,15 +140,18 @@ def test_two_numbers_are_a_map_with_contours_and_its_largest_marked(turned):
     figure = only(ensemble)
     (axes,) = panels(figure)
     (mesh,) = [shape for shape in axes.collections if isinstance(shape, QuadMesh)]
+    # The key with more values is along x, whichever comes first in the case.
     expected = ensemble["ibtet"].transpose("restitution", "clearance")
     np.testing.assert_allclose(np.reshape(mesh.get_array(), (3, 4)), expected)
     assert len(axes.collections) > 1  # contours
+    # The ring is the only line, at the last member, whose value is the largest.
     assert {tuple(line.get_xydata()[0]) for line in axes.lines} == {(2e-3, 0.9)}
     assert [text.get_text() for text in axes.get_xticklabels()] == ["0.0002", "0.0005", "0.001", "0.002"]
     assert "over contacts.clearance (m) and contacts.restitution" in title(figure)
 
 
 def test_a_map_over_falling_values_shows_each_at_its_place():
+    # A mesh needs rising positions: values that fall are turned with their members.
     falling = {"contacts.clearance": CLEARANCES["contacts.clearance"][::-1]}
     (axes,) = panels(only(ensemble_of(falling, THREE)))
     mesh = axes.collections[0]
@@ -162,6 +171,7 @@ def test_words_and_lists_are_curves_and_panels_with_their_values():
 def test_categories_alone_are_ticks():
     (axes,) = panels(only(ensemble_of(SITES)))
     assert [text.get_text() for text in axes.get_xticklabels()] == ["[9]", "[9, 20]", "[4, 30]"]
+    # A line between categories would suggest values between them.
     assert all(line.get_linestyle() == "None" for line in axes.lines)
 
 
@@ -169,12 +179,14 @@ def test_keys_that_vary_together_are_named_together():
     together = {"contacts.sites": [[9], [9, 20], [9]], "drive.cycles": [4, 4, 6]}
     figure = only(ensemble_of(together, AMPLITUDES))
     assert legend(figure)[1] == "contacts.sites [9, 20], drive.cycles 4"
+    # Keys in a zip are one axis, whose curves need the values of both.
     pairs = {"drive.frequency": [900.0, 1000.0, 1100.0], "drive.cycles": [3, 4, 5]}
     labels = [text.translate(BLANKS) for text in legend(only(ensemble_of(pairs, AMPLITUDES)))]
     assert labels[1] == "drive.frequency 1000 rad/s, drive.cycles 4"
 
 
 def test_what_does_not_vary_stands_nowhere():
+    # An axis of one value says nothing that distinguishes a page.
     figure = drawn(ensemble_of({"contacts.law": ["hertz"]}, {"lattice.reading": ["printed"]}, AMPLITUDES))
     (stem,) = figure
     assert stem == "ibtet-over-drive.amplitude"
@@ -199,6 +211,7 @@ def test_a_study_of_too_many_pages_is_cut_through_its_largest_value():
     figures = drawn(
         ensemble_of(*wide, {"drive.band": list(range(1, 9))}, {"contacts.radius": [1.0, 2.0, 3.0, 4.0, 5.0]})
     )
+    # Otherwise the study would be drawn whole, and nothing be tested.
     assert MOST_PAGES < 4**3
     (figure,) = figures.values()
     assert "through the largest value: " in title(figure)
@@ -208,6 +221,7 @@ def test_bands_are_curves_of_their_own_and_other_parts_stay_out():
     ensemble = ensemble_of(AMPLITUDES, parts=4)
     figure = only(ensemble, "bands/share")
     assert legend(figure) == ["band 1", "band 2", "band 3"]
+    # Several curves of one member have no common largest value.
     assert "largest" not in title(figure)
     (axes,) = panels(figure)
     np.testing.assert_allclose(curves(axes)[0].get_ydata(), ensemble["bands/share"][:, 1])
@@ -218,6 +232,7 @@ def test_samples_are_a_mean_and_a_band():
     figure = only(ensemble)
     (axes,) = panels(figure)
     (band,) = axes.collections
+    # By xarray's own quantiles of the members.
     low, high = (ensemble["ibtet"].quantile(end, dim="seed").values for end in (0.05, 0.95))
     edges = band.get_paths()[0].vertices
     assert edges[:, 1].min() == pytest.approx(low.min())
@@ -252,6 +267,7 @@ def test_a_value_that_is_not_finite_is_no_largest():
 def test_what_cannot_be_drawn_has_a_reason():
     ensemble = ensemble_of(AMPLITUDES)
     assert reason_without_page(ensemble, "ibtet", by_name=True) == ""
+    # Zeros are left out of a study's pages, and drawn for who asks for them by name.
     zero = ensemble.assign(ibtet=0 * ensemble["ibtet"])
     assert reason_without_page(zero, "ibtet", by_name=False) == "0 for every member"
     assert reason_without_page(zero, "ibtet", by_name=True) == ""
@@ -263,6 +279,7 @@ def test_what_cannot_be_drawn_has_a_reason():
 
 def test_measures_are_what_is_measured_of_every_member():
     ensemble = ensemble_of(LAWS, AMPLITUDES, parts=3)
+    # Neither a value of every member nor one number of a member: both are no measure of the pages.
     ensemble["fits/ibtet/exponent"] = ("law", [1.0, 2.0])
     ensemble["entropy/history"] = (("law", "amplitude", "snapshot"), np.ones((2, 6, 9)))
     assert measures_of(ensemble) == ["contact_episodes", "ibtet", "bands/share"]
@@ -283,11 +300,12 @@ def test_units_are_those_of_the_manual(path, unit):
     assert unit_of(path, {}) == unit
 
 
-def test_values_are_told_apart_in_few_digits():
+def test_values_are_distinguished_in_few_digits():
     (axis,) = SweptAxis.all_of(ensemble_of({"drive.frequency": [1000.0, 1000.5, 1100.0]}))
     assert axis.value_texts == ["1000", "1000.5", "1100"]
     (axis,) = SweptAxis.all_of(ensemble_of({"drive.frequency": [600.0, 1000.0, 1100.0]}))
     assert axis.value_texts == ["600", "1000", "1100"]
+    # Lists too long to print differ at their ends alone.
     long = [[*range(40)], [*range(41)]]
     (axis,) = SweptAxis.all_of(ensemble_of({"contacts.sites": long}))
     assert len(set(axis.texts)) == 2
@@ -298,6 +316,7 @@ def test_values_are_told_apart_in_few_digits():
 def test_a_logarithmic_axis_has_three_labels_at_least(low, ratio):
     ticks = log_ticks(low, low * ratio)
     assert 3 <= len(ticks) <= 10
+    # Ticks are rounded, so that the outermost ones may lie beyond by a rounding.
     assert low * 0.999 <= min(ticks)
     assert max(ticks) <= low * ratio * 1.001
 
@@ -316,6 +335,7 @@ def test_edges_of_a_map_lie_between_its_positions():
 def test_scales_follow_the_spacing():
     assert even_scale(np.geomspace(1, 100, 7)) == "log"
     assert even_scale(np.linspace(1, 100, 7)) == "linear"
+    # A negative value has no logarithm.
     assert even_scale(np.array([-1.0, 1.0, 10.0])) == "linear"
 
 

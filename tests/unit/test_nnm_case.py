@@ -173,6 +173,7 @@ def test_a_contact_pressed_to_ground_holds_a_lattice():
         "nnm": {"system": "chain", "modes": [1]},
     }
     NnmCase.from_table(table)
+    # The same stop, which the mass does not touch at rest.
     apart = {"stiffness": 20.0, "clearance": 0.02, "sites": [1], "pair": [0, 1]}
     with pytest.raises(CaseError, match="rigid body"):
         NnmCase.from_table(table | {"contacts": apart})
@@ -197,7 +198,9 @@ def test_disorder_is_drawn_for_normal_modes():
 
     (first, _), (second, _) = case.gaps()
     assert first != second
+    # Four standard deviations.
     assert first == pytest.approx(1e-3, rel=0.2)
+    # The masses were drawn, too.
     assert not case.chain().is_uniform()
     assert NnmCase.from_toml(case.to_toml()) == case
 

@@ -26,6 +26,7 @@ TABLE = {
     "lattice": {
         "cells": 24,
         "cell": OWN_CELL,
+        # Keys with dots and brackets of their own, which a path must not split.
         "profiles": {"masses[1]": {"first": 4e-3, "last": 4e-3}, "springs[1].stiffness": {"first": 1e4, "last": 2e4}},
     },
     "contacts": {"law": "hertz", "stiffness": 1e7, "sites": [6, 12, 14], "clearance": 1e-4, "restitution": 0.7},
@@ -53,6 +54,7 @@ def test_every_key_has_its_place_in_a_design():
         }
     )
     values = {
+        # A list of all sites gives one variable a site; a choice is the number of its value, from 1.
         "lattice.cell.springs[2].damping": 0.4,
         "lattice.profiles.springs[1].stiffness.last": 3e4,
         "contacts.each.restitution[1]": 0.4,
@@ -76,8 +78,11 @@ def test_every_key_has_its_place_in_a_design():
     }
     more = [{"frequency": 900.0, "cell": 5, "amplitude": 0.3}]
     expected["drive"] = TABLE["drive"] | {"cycles": 7, "more": more}
+    # Searches take the faster engine where the case names none.
     expected["time"]["engine"] = "auto"
+    # By the hash of the case: it covers every key, those that must not have changed among them.
     assert case_id(design) == case_id(type(design).from_table(expected | {"name": "design"}))
+    # A float would be refused by the schema, or change the hash.
     assert type(design.drive.cycles) is int
 
 
@@ -92,10 +97,13 @@ def test_the_case_is_the_start_and_survives_the_unit_cube():
         contacts={"damping": "paper"},
     )
     values = plan.begin()
+    # Choices are numbered: "paper" is the second of its list. Sites without a list of their own have the single
+    # value.
     assert values.tolist() == [1e-4] * 3 + [1e7] * 3 + [2, 3]
     assert np.allclose(plan.space.from_unit(plan.space.to_unit(values)), values, rtol=1e-12)
     design = plan.design(values)
     assert {*design.model().laws} == {plan.base.model().contact}
+    # The models and not the cases, since the design has lists where the case has single values.
     assert design.model().chain == plan.base.model().chain
 
 
@@ -124,8 +132,10 @@ def test_choices_and_whole_numbers_have_equal_parts_of_the_cube():
     choice = Variable("law", "contacts.law", 1, 3, "choice", 1, choices=("a", "b", "c"))
     whole = Variable("cycles", "drive.cycles", 2, 5, "whole", 3)
     grid = np.linspace(0, 1, 3001)
+    # A fine grid, so that the parts are measured to 1/3000.
     numbers = np.array([choice.from_unit(x) for x in grid])
     assert [np.mean(numbers == n) for n in (1, 2, 3)] == pytest.approx([1 / 3] * 3, abs=1e-3)
+    # A choice holds in its third of the cube, 1/6 to either side of its middle.
     for near in (-0.16, 0.0, 0.16):
         found = [choice.in_case(choice.from_unit(choice.to_unit(n) + near)) for n in (1, 2, 3)]
         assert found == ["a", "b", "c"]
@@ -135,7 +145,7 @@ def test_choices_and_whole_numbers_have_equal_parts_of_the_cube():
 
 @pytest.mark.slow
 def test_a_search_of_mixed_kinds_finds_the_best_of_each():
-    """A function of a real number, a whole number and a choice, with its least value known, is minimised."""
+    """A function of a real number, a whole number and a choice, with a given least value, is minimised."""
     kinds = [
         Variable("x", "x", 1e-3, 1e3, "log", 1e-2),
         Variable("n", "n", 1, 30, "whole", 3),
@@ -143,11 +153,13 @@ def test_a_search_of_mixed_kinds_finds_the_best_of_each():
     ]
     space = SearchSpace({}, kinds)
     steps = np.array([variable.step for variable in kinds])
+    # From far off: x at 1/200 of its best value, n at 3 rather than 21, and the worst but one of the choices.
     search = CmaEs(space.to_unit(space.begin()), steps, np.eye(3), 0.3, seed=1, population=None)
 
     best = np.inf, None
     for _ in range(60):
         values = [space.from_unit(point) for point in search.ask()]
+        # The sum of three valleys, each with its least value at a place that can be read off.
         losses = [np.log10(x / 2) ** 2 + 0.05 * (n - 21) ** 2 + kinds[2].choices[int(c) - 1] for x, n, c in values]
         search.tell(np.array(losses)[:, None])
         best = min(best, (min(losses), values[int(np.argmin(losses))]), key=lambda pair: pair[0])
@@ -186,6 +198,7 @@ def test_a_search_of_mixed_kinds_finds_the_best_of_each():
 def test_what_is_wrong_with_a_key_is_one_problem_with_its_path(variables, key, message):
     with pytest.raises(CaseError) as error:
         plan_of(variables)
+    # One: no problem may be reported by two checks, or cause others.
     (problem,) = error.value.problems
     assert problem.key == f"optimise.variables.{key}"
     assert message in str(problem)
@@ -203,6 +216,7 @@ def test_an_amplitude_that_varies_is_that_of_the_runs():
     variables = {"drive": {"amplitude": {"log": [1.0, 10.0]}}}
     plan = plan_of(variables)
     assert plan.design(np.array([7.0])).drive.amplitude == 7.0
+    # An objective at amplitudes of its own replaces the one that varies.
     with pytest.raises(CaseError, match=r"would take the place of drive\.amplitude"):
         plan_of(variables, optimise={"objective": [{"measure": "entropy", "amplitudes": [2.0]}]})
 
@@ -217,6 +231,7 @@ def test_keys_with_dots_are_found_and_changed():
         ("list[1].a", 6),
         ("new.b.c", 7),
     ):
+        # No problem was found on the path.
         assert put(table, path, value) == []
         assert value_at(table, path) == value
 
@@ -225,6 +240,7 @@ def test_keys_with_dots_are_found_and_changed():
         "list": [{"a": 6}],
         "new": {"b": {"c": 7}},
     }
+    # Beyond a list, of no table, and a key of a list: none has a value, none is an error.
     assert value_at(table, "list[2].a") is value_at(table, "no.such") is value_at(table, "list.a") is None
 
 

@@ -39,6 +39,7 @@ def style():
 
 def transfer_of(restitution: float) -> np.ndarray:
     """A transfer that falls as 1/A^2 from the onset on, larger by the restitution."""
+    # The exponent does not depend on the restitution, the height does: curves are distinguished by it.
     falling = restitution * (ONSET / AMPLITUDES) ** 2
     return np.where(AMPLITUDES < ONSET, 1e-8, falling)
 
@@ -73,6 +74,7 @@ def test_curves_of_two_values_of_a_key_are_both_laid_over_the_branch(tmp_path, m
     branch.mkdir()
     write_branch(branch, largest=1e7)
     initiation = Initiation(amplitude=ONSET, energy=ONSET**2, onset=ONSET)
+    # The onset is found in a run, of which there is none here.
     monkeypatch.setattr(backbone, "initiation_of", lambda folder, case: initiation)
     assert relate_folders([sweep, branch]) == [sweep / "backbone.h5"]
 
@@ -103,6 +105,7 @@ def member_of(folder: str, amplitude: float, restitution: float) -> MemberRun:
         np.outer(np.arange(1.0, 6.0), np.ones(9)),
         {"wavenumber": np.linspace(0, np.pi, 5), "frequency": np.linspace(0, 3000.0, 9)},
     )
+    # The warning of each run carries its name, by which it is found on the page.
     about = {"warnings": json.dumps([f"the run {folder}"])}
     analysis = xr.Dataset({"dispersion": spectrum, "ibtet": 0.01 * amplitude})
     varied = f"contacts.restitution {restitution}"
@@ -155,6 +158,7 @@ def test_one_member_alone_has_a_page_of_its_name(monkeypatch):
 
 
 def test_a_page_of_more_lone_members_goes_on_on_the_next(monkeypatch):
+    # Two a page instead of the usual number, so that three members suffice.
     monkeypatch.setattr(transfer, "MOST_PANELS", 2)
     members = [member_of(letter, 10, restitution) for letter, restitution in zip("abc", (0.5, 0.7, 0.9), strict=True)]
     stems = [page.stem for page in dispersions(monkeypatch, *members)]

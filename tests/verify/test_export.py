@@ -31,6 +31,7 @@ FAST = {"time": {"end": 0.03, "engine": "propagator"}, "lattice": {"cells": 16}}
 def folder(tmp_path_factory):
     """A short run with contacts, whose fields are those of a window, every second cell and every third sample."""
     path = tmp_path_factory.mktemp("run")
+    # Strides in time and space differ from 1, so that a reference that ignores them is seen.
     simulate(small_case(**FAST, output={"window": [3, 15], "every": 2, "stride": 3}), path)
     export.write_xdmf(path)
     return path
@@ -51,6 +52,7 @@ def slab(item: ElementTree.Element, folder) -> np.ndarray:
         assert sizes(source) == list(dataset.shape)
         assert source.get("NumberType") == "Float"
         assert int(source.get("Precision")) == dataset.dtype.itemsize
+        # A reader fails on a slab that leaves its dataset.
         assert all(start + (count - 1) * stride < dataset.shape)
         part = dataset[tuple(slice(a, a + n * s, s) for a, n, s in zip(start, count, stride, strict=True))]
     return part.reshape(sizes(item))

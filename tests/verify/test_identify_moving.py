@@ -36,9 +36,12 @@ def chain_record(path, start: np.ndarray, speed: np.ndarray, times: np.ndarray, 
     """Write the motion of a chain of four masses with a stop and dashpots; returns the state (2, mass) at its begin."""
     stiffness, damping = chain_matrices(4, 4e4, 3.0)
     stop = Stop(resonator=2, host=-1, gap=4e-4, stiffness=2e6, exponent=1.0, restitution=0.8)
+    # By SciPy: a record of this package's own integrator would hide an error that both have.
     lattice = ScipyLattice(np.full(4, 0.25), stiffness, damping, (stop,), force=lambda t: np.zeros(4))
     motion, impacts = lattice.motion(times, start, speed, start=0.0)
+    # Fewer would not determine stiffness and restitution apart.
     assert impacts > 4
+    # Milliseconds, g and a clock of its own, as laboratories store them.
     columns = np.column_stack([1e3 * (times + clock), motion[0, :, 0], motion[1, :, 3], motion[2, :, 1] / 9.81])
     np.savetxt(path, columns, delimiter=";", header="ms;u1;v4;a2", comments="", fmt="%.17g")
     return motion[:2, 0]
@@ -72,6 +75,7 @@ def chain_table(path, **record: Any) -> dict[str, Any]:
 def test_a_displaced_lattice_tells_its_stop_and_its_initial_state(tmp_path):
     """Free decay after an unknown release, from another integrator: parameters and the whole state to 1e-6."""
     times = np.arange(0.0, 0.15, 1 / 2000)
+    # The offset in the case is half a second off: with no drive the clock must not matter.
     begin = chain_record(tmp_path / "decay.csv", np.array([3e-3, 0.0, 0.0, 0.0]), np.zeros(4), times, clock=7.5)
     found = results_of(tmp_path / "out", chain_table(tmp_path / "decay.csv", offset=7.0, initial="estimate"))
 
@@ -79,6 +83,7 @@ def test_a_displaced_lattice_tells_its_stop_and_its_initial_state(tmp_path):
     assert found["initial/displacement"].values == pytest.approx(begin[0], abs=1e-8)
     assert found["initial/velocity"].values == pytest.approx(begin[1], abs=1e-5)
     assert found["initial/cell"].values.tolist() == [1, 2, 3, 4]
+    # Every direction of the initial state is measured, and none left to its prior.
     assert (found["initial/singular"].values > 2).all()
     assert found.attrs["warnings"] == "[]"
 
@@ -92,20 +97,24 @@ def test_a_struck_lattice_begins_as_the_case_says(tmp_path):
     chain_record(tmp_path / "strike.csv", np.zeros(4), np.array([0.0, 1.1, 0.0, 0.0]), times, clock=-2.0)
     strike = {"cell": 2, "velocity": 1.1}
     table = chain_table(tmp_path / "strike.csv", offset=-2.0, begin=-1.92, initial=strike)
+    # A first window with one impact, which begins after the record's own beginning.
     table["identify"]["impacts"] = 1
     found = results_of(tmp_path / "out", table)
     assert found["value"].values == pytest.approx([4e-4, 2e6, 0.8, 3.0], rel=1e-6)
+    # No state was estimated: the case states it.
     assert found.sizes["moving"] == 0
 
 
 def shaken_record(path, window: tuple[float, float]) -> dict[str, Any]:
     """Write accelerations of a row of masses, shaken by its left frame, with unlike stops on both sides; its table."""
     count, stiffness, mass, amplitude, frequency = 4, 4e4, 0.25, 4e-4, 250.0
+    # Ten periods, the default of a harmonic drive.
     ramp = 10 * 2 * np.pi / frequency
 
     def force(t: float) -> np.ndarray:
         s = min(t / ramp, 1.0)
         forces = np.zeros(count)
+        # A frame that moves by U acts on the first mass as the force k U.
         forces[0] = stiffness * amplitude * (10 * s**3 - 15 * s**4 + 6 * s**5) * np.sin(frequency * t)
         return forces
 
@@ -119,6 +128,7 @@ def shaken_record(path, window: tuple[float, float]) -> dict[str, Any]:
     motion, _ = lattice.motion(times, np.zeros(count), np.zeros(count), start=0.0)
     with h5py.File(path, "w") as file:
         used = times >= window[0]
+        # A clock that began 100 s earlier, as data loggers have.
         file["daq/clock"] = times[used] + 100.0
         file["daq/g"] = motion[2][used][:, [0, 2, 3]] / 9.81
     sensors = [
@@ -151,6 +161,7 @@ def shaken_record(path, window: tuple[float, float]) -> dict[str, Any]:
 
 def test_a_record_that_begins_while_the_lattice_is_shaken(tmp_path):
     """Base motion, accelerations in HDF5, other stops on the two sides: all come back with the unknown state."""
+    # After the ramp has ended, in the midst of impacts.
     table = shaken_record(tmp_path / "daq.h5", window=(0.27, 0.36))
     table["identify"]["records"][0]["initial"] = "estimate"
     found = results_of(tmp_path / "out", table)
@@ -173,6 +184,7 @@ def test_a_stop_that_the_lattice_does_not_meet(tmp_path):
     truth = {"clearance 1": 2e-4, "clearance_minus 1": 1.5e-4, "clearance_minus 2": 3e-4, "grounding": 3.0}
     assert {name: named[name] for name in truth} == pytest.approx(truth, rel=1e-6)
     at_least = found["at_least"].values[found["parameter"].values.tolist().index("clearance 2")]
+    # The largest approach of the record is just below the clearance, which is all that the record says of it.
     assert 5.5e-4 < at_least < 6e-4
 
 
@@ -199,6 +211,7 @@ def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size
     jacobian = misfit.jacobian(z, ends, every)
     # An onset before the record is logged at 0.
     assert np.sum(misfit.respond(z, 0, 1.0).episodes["onset"] == 0) == touching
+    # Of a five-point formula: its error h^4 and that of the runs over h are both below the tolerance.
     h = 1e-4
     for column, p in enumerate(every):
         expected = np.zeros(len(jacobian))

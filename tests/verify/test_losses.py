@@ -75,6 +75,7 @@ def test_free_decay_takes_the_loss(shot):
     branch, _ = shot
     shooting = ShootingMethod(lossy_case(), MPI.COMM_SELF).shooting
     lattice = independent_lattice()
+    # The independent lattice gets the losses that the branch's conservative motion has not.
     damped = replace(
         lattice,
         damping=OF_MASS * np.diag(lattice.masses) + OF_STIFFNESS * lattice.stiffness,
@@ -82,6 +83,7 @@ def test_free_decay_takes_the_loss(shot):
     )
     point = branch.regular()[-1]
     u, v = sample_orbit(shooting, point, samples=40)
+    # The comparison begins where all contacts are open.
     begin = int(np.flatnonzero(np.all(shooting.system.gaps(u) < 0, axis=1))[0])
 
     motion, impacts = damped.motion(np.array([point.period]), u[begin], v[begin], 0.0)
@@ -117,8 +119,10 @@ def test_lattices_without_matrices_lose_what_orbits_lose(law, stiffness, side, o
     point = method.assess(method.lattice, breather)
     dense = ShootingMethod(case("dense"), MPI.COMM_SELF)
     expected = with_loss(dense.shooting, dense.dissipation, breather)
+    # Without dashpots, for the fraction of the loss that is the contacts'.
     by_contacts = with_loss(dense.shooting, dense.dissipation._replace(damping=csr_matrix((28, 28))), breather)
 
+    # Both must count: a branch that loses one of them would pass otherwise.
     assert 0.1 < by_contacts.loss / expected.loss < 0.95
     assert point.loss == pytest.approx(expected.loss, rel=2e-7)
     assert point.force == pytest.approx(expected.force, rel=2e-7)
@@ -137,7 +141,9 @@ def test_a_linear_mode_of_a_lattice_without_matrices_has_its_damping_ratio():
     point = method.assess(method.lattice, method.start(method.lattice, 4))
 
     omega = 2 * np.pi / point.period
+    # Rayleigh's damping ratio of a mode.
     assert point.damping_ratio == pytest.approx((1.0 / omega + 1e-6 * omega) / 2, rel=1e-11)
+    # In quadrature a force F does the work pi F a on the amplitude a.
     assert point.force == pytest.approx(point.loss / (np.pi * abs(point.x[3 * 2 + 1])), rel=1e-11)
 
 
@@ -205,6 +211,7 @@ def test_dashpots_of_a_system_of_ones_own_take_what_those_of_a_lattice_take(meth
     ]
     first, second = (follow_all(NnmCase.from_table(table), None, MPI.COMM_SELF)[0] for table in cases)
 
+    # The branch passes from linear motion into contact.
     assert first.points[-1].episodes == 1
     assert first.points[0].damping_ratio == pytest.approx(0.06 / (2 * 2 * np.pi * first.points[0].frequency), rel=1e-9)
     for of_lattice, of_own in zip(first.points, second.points, strict=True):
@@ -232,6 +239,8 @@ def test_the_force_holds_a_steady_state_in_quadrature(damping):
     nfrc = {"source": "force", "over": "amplitude", "range": [1e-3, 1.0], "harmonics": 63}
     forced = NfrcCase.from_table(TWO_MASSES | {"lattice": lattice, "drive": drive, "nfrc": nfrc})
     states = SteadyStates(forced, 1.0, 2 * np.pi / motion.period)
+    # From the free motion as guess, at its frequency.
     xi = resonance(states, method.motions.balance(motion.order).unpack(motion.x))
 
+    # The branch's force is of first order in the damping: the error falls with it.
     assert xi[-1] * states.parameter.scale == pytest.approx(motion.force, rel=damping)

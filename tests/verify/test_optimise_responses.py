@@ -1,4 +1,4 @@
-"""Searches by frequency responses: an absorber whose best values are known, and the files of a small search."""
+"""Searches by frequency responses: an absorber with best values in closed form, and the files of a small search."""
 
 from __future__ import annotations
 
@@ -40,10 +40,12 @@ TABLE: dict[str, Any] = {
             ],
         },
     },
+    # Never reached: the responses are those of a linear system, which is solved by hand below.
     "contacts": {"law": "bilinear", "stiffness": 20.0, "sites": [1], "pair": [0, 1], "clearance": 40.0},
     "drive": {"waveform": "harmonic", "amplitude": 1.0, "frequency": 1.0},
     "time": {"end": 10.0},
     "output": {"points": [{"name": "mass", "cell": 1}]},
+    # One harmonic is exact for a linear motion.
     "nfrc": {"source": "force", "over": "frequency", "range": [0.75, 1.2], "fixed": [1.0], "harmonics": 1},
     "optimise": {
         "budget": 5,
@@ -76,10 +78,13 @@ def measured(case: NfrcCase, **table: Any) -> list[float]:
 def test_the_peak_is_least_at_the_absorber_of_den_hartog():
     """Frequency 1/(1 + mu), damping (3 mu/(8 (1 + mu)^3))^(1/2): a peak of (1 + 2/mu)^(1/2), larger on all sides."""
     frequency = 1 / (1 + RATIO)
+    # Den Hartog's damping ratio refers to the absorber's mass times twice the frequency of the main one, here 1.
     damping = 2 * RATIO * np.sqrt(3 * RATIO / (8 * (1 + RATIO) ** 3))
     (least,) = measured(absorber(RATIO * frequency**2, damping))
+    # The damping equalises the two peaks only to first order in the mass ratio.
     assert least == pytest.approx(np.sqrt(1 + 2 / RATIO), rel=2e-3)
 
+    # The peak depends on the damping less than on the frequency: its factor is cubed to show.
     for factor in (0.94, 1.06):
         assert measured(absorber(factor * RATIO * frequency**2, damping))[0] > 1.02 * least
         assert measured(absorber(RATIO * frequency**2, factor**3 * damping))[0] > 1.005 * least
@@ -88,6 +93,7 @@ def test_the_peak_is_least_at_the_absorber_of_den_hartog():
 def test_peaks_and_gaps_are_those_of_the_equations_of_motion():
     """The largest value, that of a part of the range, and widths below a level, of curves at two forces."""
     case = absorber(0.045, 0.01, fixed=[1.0, 2.0], largest_step=0.05)
+    # Far finer than the curve's points, so that the tolerances are those of the interpolation between them.
     grid = np.linspace(0.75, 1.2, 200_001)
     exact = displacement(grid, 0.045, 0.01)
     assert measured(case) == pytest.approx([exact.max(), 2 * exact.max()], rel=1e-4)
@@ -95,6 +101,7 @@ def test_peaks_and_gaps_are_those_of_the_equations_of_motion():
     assert measured(case, part=[0.95, 1.02])[0] == pytest.approx(exact[inside].max(), rel=2e-3)
 
     for level in (4.0, 6.5):
+        # Places where the exact curve crosses the level, and the end of the range.
         below = np.append(np.flatnonzero(np.diff((exact < level).astype(int))), len(grid) - 1)
         edges = np.append(0, below)
         widths = [grid[b] - grid[a] for a, b in itertools.pairwise(edges) if exact[(a + b) // 2] < level]
@@ -114,6 +121,7 @@ def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
     _, folder, summary = searched
     found = datasets(folder / "optimum.h5")
     best = int(found["comparison/number"][1])
+    # No run in addition to the responses: the objective needs none.
     assert "5 designs, 5 frequency responses; 0 designs failed" in summary
     assert found["value"][best, 0] == found["value"].min()
 
@@ -125,6 +133,7 @@ def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
     values = curve["peak_displacement"].values[:, 0]
     length = np.append(0.0, np.cumsum(steps))
     whole = CurvePart(curve["frequency"].values, values, length, curve["kind"].values == 0)
+    # To the bit, since the case file must stand for the design.
     assert largest_response([whole], 0.75, 1.2) == found["value"][best, 0]
 
     # The file of the search has the same curve for its picture.
@@ -138,6 +147,7 @@ def test_an_interrupted_search_goes_on_to_the_same_bits(searched, tmp_path):
     plan, folder, _ = searched
     records = (folder / "optimum-runs.jsonl").read_bytes()
     (tmp_path / "case.toml").write_bytes((folder / "case.toml").read_bytes())
+    # Cut in the middle of a record, as a kill leaves it.
     (tmp_path / "optimum-runs-0.jsonl").write_bytes(records[: len(records) // 2])
     run_search(plan, tmp_path, MPI.COMM_SELF, resume=True)
     assert_same_bits(datasets(tmp_path / "optimum.h5"), datasets(folder / "optimum.h5"))
@@ -158,6 +168,7 @@ def test_the_pictures_of_responses_have_a_panel_for_them_alone(searched):
 
 def test_a_curve_that_ends_early_is_a_design_that_fails(tmp_path):
     """Its reason is the sentence of the curve, and runs of the same search are measured all the same."""
+    # Four points reach only a part of the range.
     table = with_sections(TABLE, {"nfrc": {"points": 5}, "time": {"end": 20.0}})
     table["optimise"] |= {"budget": 2, "curve": [1.0]}
     table["optimise"]["constraint"] = [{"measure": "peak_displacement/mass", "at_most": 100.0}]
@@ -173,6 +184,7 @@ def test_a_curve_that_turns_back_has_no_states_on_a_part_of_its_range(monkeypatc
     """It ends at the beginning of the range: a peak beyond would not be seen, so the design fails."""
     case = absorber(0.05, 0.01, largest_step=0.3)
     [curve] = follow_all(case, None, MPI.COMM_SELF)
+    # From a curve that exists: one that turns back by itself would need an impact.
     there_and_back = replace(curve, points=[*curve.points, *curve.points[::-1]], ending="reached the end")
     monkeypatch.setattr(response_objective, "follow_all", lambda *arguments, **options: [there_and_back])
     with pytest.raises(RuntimeError, match=r"r1-1: turned back and reached the end, without states up to 1\.2"):

@@ -27,6 +27,7 @@ SHAKEN = {
     "name": "shaken",
     "lattice": {
         "cells": 24,
+        # So strong that the motion settles within the run, and steady amplitudes exist.
         "damping": {"mass": 60.0, "stiffness": 2e-5},
         "cell": {
             "masses": [0.01, 0.004],
@@ -47,6 +48,7 @@ SHAKEN = {
 def swept(tmp_path_factory):
     """A sweep over amplitude and frequency in which contacts begin: its plan, its folder, its result."""
     folder = tmp_path_factory.mktemp("shaken")
+    # The lower amplitude touches nothing, so that its members are scaled from the linear run; the upper one impacts.
     axes = {"drive": {"amplitude": [0.25, 3.0], "frequency": [300.0, 900.0]}, "measures": ["motion"]}
     plan = Sweep.from_table(SHAKEN | {"sweep": axes})
     return plan, folder, run_sweep(plan, folder, MPI.COMM_SELF)
@@ -55,9 +57,11 @@ def swept(tmp_path_factory):
 def test_members_have_the_measures_of_single_runs(swept):
     """Whether a member was simulated or scaled from the linear run, it has the numbers of a run of its case."""
     plan, folder, result = swept
+    # Otherwise one of the two origins of a member would not be tested.
     assert {COMPLETE, SCALED} == set(result.status.ravel().tolist())
     ensemble = open_ensemble(folder)
     of_points = {name for name in measures_of(["base", "tip"], [("base", "tip")]) if "base" in name or "tip" in name}
+    # Counted by hand: a measure that is lost would otherwise go unnoticed.
     assert len(of_points) == 23
     assert "ibtet" not in ensemble
 
@@ -75,6 +79,7 @@ def test_members_have_the_measures_of_single_runs(swept):
             assert value == pytest.approx(
                 np.atleast_1d(single[name].values)[: value.size].reshape(value.shape), abs=tolerance, nan_ok=True
             ), name
+    # A force of zero everywhere would agree as well.
     assert ensemble["largest_force"].values.max() > 0.1
     assert ensemble["largest_force"].attrs["units"] == "N"
 

@@ -34,6 +34,7 @@ pytestmark = pytest.mark.parallel(1)
 MASS = 2.0
 SPRING = 3.0
 STOP = 40.0
+# In m, as the clearances: the contact opens where the mass has gone back by so much.
 DEPTH = 0.1
 EXPONENTS = {"bilinear": 1.0, "hertz": 1.5}
 
@@ -54,11 +55,13 @@ def exact_period(energy: float, law: str) -> float:
         # u = begin + (stop - begin) sin^2 phi: the root of the speed at both ends leaves the integrand smooth.
         def slowness(phi: float) -> float:
             u = begin + (stop - begin) * np.sin(phi) ** 2
+            # Rounding may leave a negative kinetic energy at the ends.
             speed = np.sqrt(2 * max(energy - potential(u, law), 1e-300) / MASS)
             return float((stop - begin) * np.sin(2 * phi) / speed)
 
         return quad(slowness, 0, np.pi / 2, epsabs=0, epsrel=1e-9, limit=200)[0]
 
+    # In two pieces, since the force is not smooth where the contact opens.
     if low < -DEPTH:
         return 2 * (time(low, -DEPTH) + time(-DEPTH, high))
     return 2 * time(low, high)
@@ -77,8 +80,10 @@ def test_a_pressed_mass_has_its_exact_period(law):
     opening = potential(-DEPTH, law)
     for side in (1, -1):
         system = pressed_mass(law, side)
+        # For small motions the contact is a spring of its slope at the depth.
         assert system.linear_modes()[0] == pytest.approx(np.sqrt((SPRING + slope) / MASS))
         problem = Shooting(Dop853Flow(system), MAPS["half"])
+        # Far below the energy at which the contact opens: the branch passes through it.
         start = linear_start(problem, 0, opening / 100)
         steps = Continuation(problem, start, NnmTable(points=26, largest_step=0.3, first_step=0.1))
 
@@ -89,7 +94,9 @@ def test_a_pressed_mass_has_its_exact_period(law):
             assert point.period == pytest.approx(exact_period(point.energy, law), rel=1e-8)
             assert point.episodes == (point.energy > opening)
             last = point
+        # Well beyond, where the contact is open for most of the period.
         assert last.energy > 30 * opening
+        # Grazing once: the energy is that of the potential at the depth.
         assert [p.energy for p in opened] == pytest.approx([opening], rel=1e-10)
 
 
@@ -169,12 +176,14 @@ def test_grains_have_the_modes_of_a_chain_of_springs(grains):
     assert problem.system.linear_modes()[0] == pytest.approx(exact, rel=1e-12)
     # Towards small amplitudes the branch tends to it, by a tenth of the depth to 1 %.
     assert 2 * np.pi * points[0].frequency == pytest.approx(exact[1], rel=1e-2)
+    # Hertz's law is nonlinear at any amplitude: an orbit of the linearised chain would have the exact frequency.
     assert points[0].frequency != pytest.approx(exact[1] / (2 * np.pi), rel=1e-5)
 
 
 def test_orbits_of_grains_return_by_scipy(grains):
     """Before contacts open and after, an orbit comes back after its period by equations of its own."""
     problem, points = grains
+    # Otherwise no contact would have opened, and half of the test be missing.
     assert points[-1].episodes >= 2
     for point in (points[4], points[-1]):
         start = np.append(point.x, 0 * point.x)
@@ -183,11 +192,13 @@ def test_orbits_of_grains_return_by_scipy(grains):
             (0.0, point.period),
             start,
             method="DOP853",
+            # An orbit that is unstable magnifies the integration's error within the period.
             rtol=1e-11,
             atol=1e-15,
         )
         end = motion.y[:, -1]
         assert np.abs(end[:BEADS] - point.x).max() < 1e-6 * np.abs(point.x).max()
+        # It starts from rest, and must be at rest again.
         kinetic = BEAD * end[BEADS:] @ end[BEADS:] / 2
         assert kinetic < 1e-10 * point.energy
     u, v = sample_orbit(problem, points[-1])
@@ -202,6 +213,7 @@ def test_grains_condensed_onto_their_contacts_move_as_orbits(grains):
     condensed = Condensed.from_case(case)
     system = problem.system
     omega, shapes = system.linear_modes()
+    # Of 0.8 of the energy at which a contact opens: the next points pass it.
     amplitude = np.sqrt(2 * 0.8 * system.grazing_energy(1)) / omega[1]
     start = condensed.motions.from_mode(system.contact_rows @ shapes[:, 1] * amplitude, float(omega[1]))
     point = [start, *Continuation(condensed.motions, start, case.nnm.model_copy(update={"points": 6}))][-1]
@@ -217,6 +229,7 @@ def test_grains_condensed_onto_their_contacts_move_as_orbits(grains):
 def corrected(problem: Any, u: np.ndarray, period: float) -> Any:
     """The orbit to which a ``problem`` of shooting corrects a motion from rest at ``u``."""
     frame = problem.frame_at("relative", u, period, np.empty(0))
+    # The amplitude is held, and the period is free.
     row = np.append(u / np.linalg.norm(u), 0.0)
     attempt = frame.solve(frame.xi, row, row @ frame.xi)
     assert attempt.converged
@@ -254,6 +267,7 @@ def test_the_state_at_rest_is_that_of_a_run():
         row = np.zeros(nnm.dofs)
         row[[joint.host, joint.resonator]] = -1.0, 1.0
         rest -= joint.stiffness * np.outer(row, row)
+    # To the bit: both come from the same law at the same depth.
     assert np.abs(rest).max() == 0
     assert np.all(nnm.forces(np.zeros(nnm.dofs)) == 0)
     assert nnm.energy(np.zeros(nnm.dofs), np.zeros(nnm.dofs)) == 0
@@ -299,9 +313,11 @@ def test_shooting_without_matrices_finds_the_orbit_of_pressed_sites(opening):
 
     flow = Dop853Flow(system)
     start = np.append(orbit.x, 0 * orbit.x)
+    # Velocities vary by the frequency more than displacements.
     change = np.random.default_rng(1).standard_normal(len(start)) * np.repeat([1.0, OPENING], len(u))
     moved = lattice.flow.gather(lattice.arc(orbit.x, orbit.period).move(lattice.flow.scatter(change[None])))[0]
     expected = flow.arc(start, orbit.period / 2, orbit.period).sensitivity @ change
+    # Displacements and velocities apart, since their sizes differ by a factor of 8,000.
     for half in (slice(0, len(u)), slice(len(u), None)):
         assert np.abs(moved - expected)[half].max() < 1e-6 * np.abs(expected[half]).max()
 

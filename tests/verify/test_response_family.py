@@ -96,6 +96,7 @@ def test_a_family_is_read_back_and_goes_on(family):
     assert [curve.name for curve in again.every_curve()] == [curve.name for curve in curves]
     assert again.physics() == case.physics()
     more = family_case({"contacts": {"clearance": [0.8, 0.7]}, MASS: [1.0, 1.1]}, points=5)
+    # The number of points is no physics: a folder may be continued with more.
     assert more.physics() == case.physics()
     assert other_physics() != case.physics()
 

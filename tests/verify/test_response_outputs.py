@@ -27,6 +27,7 @@ from vipetsc.modes.response.steps import first_state
 
 pytestmark = pytest.mark.parallel(1)
 
+# Samples of a period, over which the trapezoidal rule's transform is exact for all harmonics that matter.
 SAMPLES = 1024
 
 
@@ -42,6 +43,7 @@ def curve(tmp_path_factory) -> Path:
 def test_outputs_are_those_of_the_motion_by_time_integration():
     """A period of SciPy's from a state in contact: peaks, first harmonics, phases, forces of the stop and the walls."""
     frequency = 1.25
+    # So many that the truncation is below the tolerances, but for accelerations, whose harmonics fall most slowly.
     options = {"source": "force", "over": "amplitude", "range": [0.2, 0.3], "fixed": [frequency], "harmonics": 121}
     states = SteadyStates(NfrcCase.from_table(TWO_MASSES | {"nfrc": options, "output": OUTPUT}), 1.0, frequency)
     state = first_state(states)
@@ -55,6 +57,7 @@ def test_outputs_are_those_of_the_motion_by_time_integration():
     rate = rate_of(states, frequency, 0.2)
     begin = np.concatenate([u.ravel(), v.ravel()])
     y = solve_ivp(rate, (0, period), begin, "DOP853", t_eval=times, rtol=1e-10, atol=1e-12, max_step=period / 100).y
+    # From the equations: differences of sampled velocities would be less exact than what they check.
     acceleration = np.array([rate(t, column)[2:] for t, column in zip(times, y.T, strict=True)]).T
 
     for name, history in (("displacement", y[:2]), ("velocity", y[2:]), ("acceleration", acceleration)):
@@ -65,6 +68,7 @@ def test_outputs_are_those_of_the_motion_by_time_integration():
     lag = -np.degrees(np.angle(np.fft.rfft(y[:2])[:, 1])) % 360
     np.testing.assert_allclose(outputs["lag"], lag, atol=0.01)
 
+    # The rig's stop: 20 N/m beyond 0.8 m.
     force = 20.0 * np.maximum(y[0] - 0.8, 0)
     assert outputs["largest_force"] == pytest.approx(force.max(), rel=1e-4)
     assert outputs["first_force"] == pytest.approx(np.abs(np.fft.rfft(force)[1]) / (SAMPLES / 2), rel=1e-3)
@@ -90,10 +94,12 @@ def test_walls_hold_the_masses_that_are_tied_to_them():
     states = SteadyStates(NfrcCase.from_table(table), 1.0, 0.2)
     outputs = states.measured(first_state(states).xi).outputs
 
+    # Nothing touches, so that the state is the solution of linear equations.
     chain = states.case.model().chain
     dynamic = chain.stiffness_matrix().toarray() + 0.9j * chain.damping_rows(0, 3).toarray()
     u = np.linalg.solve(dynamic - 0.81 * np.diag(chain.masses()), 0.2 * np.eye(6)[2])
     assert outputs["first_displacement"] == pytest.approx(abs(u[3]), rel=1e-9)
+    # Spring and dashpot at the wall, at 0.9 rad/s.
     expected = abs(1.5 + 0.9j * 0.05) * np.abs([u[1], u[4]])
     np.testing.assert_allclose(outputs["first_wall_force"], expected, rtol=1e-9)
 
@@ -107,6 +113,7 @@ def test_a_lossy_stop_has_the_same_force_on_either_side():
         case = NfrcCase.from_table(TWO_MASSES | {"contacts": contacts, "nfrc": options, "output": OUTPUT})
         states = SteadyStates(case, 0.6, 1.25)
         forces.append(states.measured(first_state(states).xi).outputs["largest_force"][0])
+    # Zero on both sides would agree as well.
     assert forces[0] > 1
     assert forces[1] == pytest.approx(forces[0], rel=1e-8)
 
@@ -156,6 +163,7 @@ def test_files_name_the_masses(curve):
 def test_a_curve_with_outputs_goes_on_to_the_same_bits(curve, tmp_path):
     (path,) = curve.glob("branch-*.h5")
     case = NfrcCase.from_toml(read_branch(path).case)
+    # Half of the curve, which the same command then continues.
     few = case.model_copy(update={"nfrc": case.nfrc.model_copy(update={"points": 3})})
     follow_all(few, tmp_path, MPI.COMM_SELF)
     table = (tmp_path / path.name).with_suffix(".csv")

@@ -65,6 +65,7 @@ def test_it_comes_to_the_state_of_the_curve_over_the_frequency(key, low, high, t
     (by_frequency,) = follow_all(NfrcCase.from_table(changed | {"nfrc": options}), tmp_path, MPI.COMM_SELF)
     ends = [curve.points[-1].measured for curve in (by_key, by_frequency)]
     assert ends[0].episodes > 0
+    # To the bit: a curve ends on its range.
     assert ends[0].frequency == ends[1].frequency == FREQUENCY
     np.testing.assert_allclose(ends[0].harmonics, ends[1].harmonics, atol=1e-10)
     assert ends[0].unstable == ends[1].unstable
@@ -79,7 +80,9 @@ def test_newtons_method_converges_quadratically():
         frame = states.frame(start)
         attempt = frame.correct(start.xi + 0.05 * start.tangent + 1e-2 * np.sin(np.arange(len(start.xi))), 0.05)
         assert attempt.converged
+        # From where the quadratic terms are the largest ones.
         first, second, third, *_ = (residual for residual in attempt.history if residual < 0.1)
+        # The second term is the error of the column by differences.
         assert second < 30 * first**2 + 1e-9 * first
         assert third < 30 * second**2 + 1e-9 * second
 
@@ -96,6 +99,7 @@ def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are
         value = float(point.measured.outputs["parameter"])
         inner = states.states_at(value)
         assert inner.forces.contacts[0].plus == value
+        # Unknowns are in units of the clearance, which varies along the curve.
         xi = np.append(point.xi[:-1] * states.clearance / inner.clearance, 0.2 / inner.parameter.scale)
         state = np.concatenate([part.ravel() for part in motion_at(inner, xi, np.arange(2))])
         end = after_a_period(inner, Response(xi=xi), state)
@@ -103,6 +107,7 @@ def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are
         grows = np.abs(multipliers(inner, Response(xi=xi), state)) > 1.001
         assert point.measured.unstable == np.count_nonzero(grows)
         unstable.add(point.measured.unstable)
+    # Otherwise only stable states were tried.
     assert len(unstable) > 1
     folds = parameter_values(curve)[curve.is_kind("fold")]
     values = parameter_values(curve)

@@ -19,6 +19,7 @@ from vipetsc.modes.response.steps import first_state
 from vipetsc.modes.response.swept import _sweep
 
 FORCE = {"waveform": "harmonic", "amplitude": 0.3, "frequency": 1.0, "cell": 1}
+# A negative amplitude acts in antiphase: signs must survive.
 BEYOND = {"waveform": "harmonic", "amplitude": -0.6, "frequency": 1.0, "cell": 2}
 LEFT = {"waveform": "harmonic", "amplitude": 0.1, "frequency": 1.0, "end": "left"}
 RIGHT = LEFT | {"end": "right", "amplitude": 0.25}
@@ -27,6 +28,7 @@ RIGHT = LEFT | {"end": "right", "amplitude": 0.25}
 def rig(*drives: dict[str, Any], **nfrc: Any) -> NfrcCase:
     """The rig of two masses with these drives, at the amplitude of the first one."""
     first, *more = drives
+    # Curves have a positive amplitude, whose sign is a phase of the drive.
     table = with_sections(TWO_MASSES, {"nfrc": {"fixed": [abs(first["amplitude"])]} | nfrc})
     return NfrcCase.from_table(table | {"drive": first | ({"more": more} if more else {}), "output": OUTPUT})
 
@@ -50,6 +52,7 @@ def linear_phasors(*drives: dict[str, Any]) -> np.ndarray:
     return phasors(states.measured(first_state(states).xi).outputs)
 
 
+# So far that nothing touches: the states are linear.
 FAR = {"contacts": TWO_MASSES["contacts"] | {"clearance": 1e3}}
 
 
@@ -62,6 +65,7 @@ def test_without_contact_drives_are_superposed(drives):
     """Displacements and forces on the walls are sums of those of each drive alone, at its own amplitude."""
     together = linear_phasors(*drives)
     alone = sum(np.sign(drive["amplitude"]) * linear_phasors(drive) for drive in drives)
+    # The phase counts from the first drive, whose sign therefore turns all.
     np.testing.assert_allclose(together * np.sign(drives[0]["amplitude"]), alone, rtol=1e-9)
 
 
@@ -79,15 +83,18 @@ def test_two_forces_on_one_mass_are_one():
 @pytest.mark.parametrize("drives", [(FORCE, BEYOND), (LEFT, FORCE)], ids=["forces", "wall and force"])
 def test_states_with_contact_repeat_themselves_in_time(drives):
     """SciPy's motion from a steady state is back after a period; the loads have the ratios of the case."""
+    # Large enough for contact.
     larger = [drive | {"amplitude": 4 * drive["amplitude"]} for drive in drives]
     states = states_of(rig(*larger, range=[1.45, 2.0]))
     ratio = drives[1]["amplitude"] / drives[0]["amplitude"]
+    # A wall acts through its spring of 1.5 N/m.
     weights = [1.0, ratio] if drives[0] is FORCE else [1.5, ratio]
     assert driven_points(states.case).weights.tolist() == pytest.approx(weights)
 
     point: Response = first_state(states)
     assert states.measured(point.xi).episodes > 0
     state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(2))])
+    # What the harmonics that were left out leave.
     assert np.abs(after_a_period(states, point, state) - state).max() < 2e-4 * np.abs(state).max()
 
 

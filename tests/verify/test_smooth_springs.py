@@ -1,4 +1,4 @@
-"""Frequency responses of lattices whose springs are not linear: Duffing's oscillator, chains, and a stop beside."""
+"""Frequency responses of lattices whose springs are not linear: Duffing's oscillator, chains, one with a stop."""
 
 from __future__ import annotations
 
@@ -67,7 +67,9 @@ def test_its_first_harmonic_is_that_of_duffings_oscillator(duffing):
     _, states, points = duffing
     case = states.case.model_copy(update={"nfrc": states.options.model_copy(update={"harmonics": 1})})
     one = SteadyStates(case, 1.0, 0.1)
+    # States of the whole curve, both sides of the folds among them, as guesses for one harmonic.
     for point in points[::8]:
+        # The mass moves as the first spring's end, so that its harmonics are those of the elongation.
         guess = point.measured.outputs["spring_harmonics"] + 1j * point.measured.outputs["spring_harmonics_imaginary"]
         p = states.drive(point.xi[-1])[0] / one.parameter.scale
         xi = one.at(np.append(one.balance.pack(guess[:, :2]) / one.clearance, p), p)
@@ -87,12 +89,14 @@ def test_its_states_come_back_after_a_period_and_are_stable_as_their_multipliers
         assert error < 1e-6
         assert regular[number].measured.unstable == growing
         unstable.add(growing)
+    # Otherwise no state between the folds was among those that were tried.
     assert unstable == {0, 1}
 
 
 def test_its_folds_are_those_of_the_response_with_one_harmonic(duffing):
     """The response turns at its peak, and where the frequency right of the backbone is least; to 1 %."""
     _, states, points = duffing
+    # Third harmonics, which one harmonic leaves out, move the folds by less than 1 %.
     a = np.linspace(1e-3, 1.5, 20001)
     # Of a there are two frequencies, left and right of the backbone, up to the peak where they meet.
     with np.errstate(invalid="ignore"):
@@ -130,6 +134,7 @@ def test_a_stop_beside_a_nonlinear_spring():
     assert measured.largest.shape == measured.closed.shape == (1,)
     assert measured.outputs["largest_elongation"].shape == (3,)
     error, _ = misses(states, point)
+    # Harmonics of a bilinear contact fall as k^-4 alone: with 41 of them so much is left.
     assert error < 1e-3
 
 
@@ -144,6 +149,7 @@ def test_walls_feel_the_whole_force_of_their_springs():
     outputs = states.measured(xi).outputs
     phases = np.linspace(0, 2 * np.pi, 2001)
     u = np.array([motion_at(states, xi, np.arange(2), phase)[0].ravel() for phase in phases])
+    # The elongation of the right wall's spring is the last mass's displacement, reversed.
     z = np.stack([u[:, 0], -u[:, 1]], axis=1)
     force = z + 0.5 * z**2 + 2.0 * z**3
     np.testing.assert_allclose(outputs["largest_wall_force"], np.abs(force).max(axis=0), rtol=1e-4)
@@ -193,6 +199,7 @@ def test_files_and_pictures_have_the_springs(duffing, tmp_path):
         "largest_elongation/1.1",
     ]
     assert len(draw("branches", [folder])) == 1
+    # Between two walls the mass stretches one spring as it shortens the other.
     np.testing.assert_allclose(*points[10].measured.outputs["largest_elongation"])
 
 
@@ -204,6 +211,7 @@ def test_a_curve_over_a_cubic_coefficient(tmp_path):
     (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
     first, last = (curve.points[i].measured.outputs["spring_harmonics"][0, 1] for i in (0, -1))
     assert first == pytest.approx((0.1 / (1 - 0.64 + 0.08j)).real, rel=1e-3)
+    # A spring that hardens moves the resonance away from this frequency, which lies below it.
     assert last < first
 
     with pytest.raises(CaseError, match="begin at another value"):

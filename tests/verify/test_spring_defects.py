@@ -45,7 +45,9 @@ TABLE: dict[str, Any] = {
     },
     "contacts": {"sites": []},
     "drive": {"amplitude": 0.0},
+    # Near two of the three springs; the waves reach the third, at the wall, within the run.
     "initial": {"kind": "velocity", "cell": 7, "velocity": 3.0},
+    # Tolerances far below those of the comparisons, so that these measure the equations, not the steps.
     "time": {"end": 0.02, "sample_interval": 2e-4, "engine": "ts", "rtol": 1e-12, "atol": 1e-14},
     "output": {"figures": False, "points": [{"name": "near", "cell": 6, "mass": 2}, {"name": "last", "cell": CELLS}]},
 }
@@ -63,12 +65,14 @@ def forces_and_energy(u: np.ndarray) -> tuple[np.ndarray, float]:
     forces = np.zeros(len(u))
     energy = 0.0
     for cell in range(CELLS + 1):
+        # Cell 0 is the left wall, whose only spring is the one to the first cell.
         springs = [(1, 2 * cell - 2, 2 * cell)]
         if cell:
             springs.append((2, 2 * cell - 2, 2 * cell - 1))
         for number, start, end in springs:
             q, c = TERMS.get((cell, number), (0.0, 0.0))
             k = STIFFNESS[number - 1]
+            # Walls do not move.
             z = (u[end] if end < len(u) else 0.0) - (u[start] if start >= 0 else 0.0)
             pull = k * z + q * z**2 + c * z**3
             energy += k * z**2 / 2 + q * z**3 / 3 + c * z**4 / 4
@@ -83,6 +87,7 @@ def forces_and_energy(u: np.ndarray) -> tuple[np.ndarray, float]:
 def run(request):
     """The run by each engine."""
     run = run_of(changed(time=TABLE["time"] | {"engine": request.param}))
+    # A refused engine would be replaced by the other one, and pass.
     assert run.attrs["statistics"]["engine"] == request.param
     return run
 
@@ -91,6 +96,7 @@ def run(request):
 def exact(run) -> np.ndarray:
     """Displacements before velocities (time, 2 mass) by SciPy, from the run's first sample on."""
     masses = np.tile(MASSES, CELLS)
+    # The file's own first sample: how a velocity becomes an initial state is tested elsewhere.
     begin = np.concatenate([run[name].values[0].ravel() for name in ("displacement", "velocity")])
 
     def rate(_: float, y: np.ndarray) -> np.ndarray:
@@ -108,6 +114,7 @@ def test_the_motion_is_that_of_scipy(run, exact):
 def test_the_motion_of_identification_is_that_of_scipy(run, exact):
     """Without a parameter, which has no springs in single cells; to the tolerance of its steps."""
     model = changed().model()
+    # No column of derivatives: only the motion itself is compared.
     begin = MotionBegin(time=0.0, state=exact[0], slopes=np.zeros((4 * CELLS, 0)))
     watched = np.arange(2 * CELLS)
     coefficients = MotionCoefficients.of(model)
@@ -122,6 +129,7 @@ def test_its_energy_is_that_of_the_springs_and_is_conserved(run):
     stiffness = changed().model().chain.stiffness_matrix()
     linear = [row @ (stiffness @ row) / 2 for row in u]
     np.testing.assert_allclose(run["energy/spring"], energies, rtol=1e-12)
+    # Otherwise a run that drops the nonlinear terms would pass.
     assert np.abs(energies - linear).max() > 0.05 * energies.max()
     total = run["energy/kinetic"] + run["energy/spring"]
     np.testing.assert_allclose(total, total[0], rtol=1e-9)
@@ -130,6 +138,7 @@ def test_its_energy_is_that_of_the_springs_and_is_conserved(run):
 def test_points_accelerate_by_the_springs_that_they_have(run):
     u = run["displacement"].values.reshape(len(run["time"]), -1)
     forces = np.array([forces_and_energy(row)[0] for row in u])
+    # Mass 2 of cell 6 and mass 1 of cell 12.
     expected = forces[:, [11, 22]] / [MASSES[1], MASSES[0]]
     np.testing.assert_allclose(run["points/acceleration"], expected, atol=1e-9 * np.abs(expected).max())
 
@@ -137,6 +146,7 @@ def test_points_accelerate_by_the_springs_that_they_have(run):
 def test_the_file_says_which_springs_differ(run):
     assert run["lattice/cubic"].values[5].tolist() == [0.0, 4e9]
     assert run["lattice/quadratic"].values[8].tolist() == [-2e6, 0.0]
+    # What does not differ from cell to cell is not stored by cell.
     assert "lattice/stiffness" not in run
     assert Case.from_toml(run.attrs["case"]).model().chain == changed().model().chain
 
@@ -152,6 +162,7 @@ def test_equal_lists_are_the_lattice_of_equal_cells(term):
     zeros = {f"springs[{number}].{term}": {"cells": others, "value": 0.0} for number in (1, 2)}
     cell = {"masses": list(MASSES), "springs": springs}
 
+    # In a ring, since with walls the list gives the last spring to the right wall, and the cell does to both.
     equal = [run_of(changed(lattice=RING | lattice)) for lattice in ({"cell": cell}, {"profiles": lists})]
     alone = [
         run_of(changed(lattice=RING | lattice)) for lattice in ({"cell": cell, "profiles": zeros}, {"profiles": few})
@@ -159,6 +170,7 @@ def test_equal_lists_are_the_lattice_of_equal_cells(term):
     for first, second in (equal, alone):
         for name in ("displacement", "velocity", "energy/kinetic", "energy/spring"):
             assert first[name].values.tobytes() == second[name].values.tobytes()
+    # Otherwise the terms would have no effect, and all would be equal.
     assert not np.array_equal(equal[0]["displacement"], alone[0]["displacement"])
 
 
@@ -169,6 +181,7 @@ def test_places_are_those_of_the_profile():
     assert [(place.law.quadratic, place.law.cubic) for place in places] == [TERMS[key] for key in sorted(TERMS)]
     assert [(place.start, place.end) for place in places] == [(10, 11), (16, 18), (22, -1)]
     assert not chain.is_linear
+    # Quadratic terms distinguish the directions.
     assert not chain.is_odd
 
 
@@ -178,6 +191,7 @@ def test_what_is_linear_is_that_of_equal_cells():
     plain = changed(lattice={"profiles": None}).model().chain
     assert chain.linearised() == plain
     assert plain.is_linear and plain.linearised() is plain
+    # The same object: modes are computed once for lattices with equal linear parts.
     assert linear_modes(chain) is linear_modes(plain)
     assert chain.mean_cell(0, CELLS) == plain.cell
     assert np.flatnonzero(chain.differs).tolist() == [5, 8, CELLS - 1]
@@ -189,6 +203,7 @@ def test_the_system_of_normal_modes_has_the_springs():
     system = System.from_case(NnmCase.from_table(table | {"nnm": nnm}))
     u = 1e-3 * np.random.default_rng(1).standard_normal(2 * CELLS)
     forces, energy = forces_and_energy(u)
+    # The system's forces stand on the left side of the equations of motion.
     np.testing.assert_allclose(system.forces(u), -forces, rtol=1e-10, atol=1e-10 * np.abs(forces).max())
     assert system.energy(u, 0 * u) == pytest.approx(energy, rel=1e-12)
     assert not system.odd
@@ -201,6 +216,7 @@ def test_steady_states_come_back_after_a_period():
     options = {"source": "force", "over": "amplitude", "range": [6.0, 8.0], "fixed": [900.0], "harmonics": 15}
     table = {"name": "defects", "lattice": lattice, "contacts": {"sites": []}, "drive": drive, "time": {"end": 0.1}}
     case = NfrcCase.from_table(table | {"nfrc": options})
+    # With quadratic springs the motion has a mean and even harmonics, which a symmetric series lacks.
     assert case.nfrc.symmetric is False
     states = SteadyStates(case, 1.0, 900.0)
     point = first_state(states)
@@ -217,6 +233,7 @@ def test_scattered_coefficients_are_drawn_cell_by_cell():
     cubic = changed(lattice=lattice, disorder=disorder).model().chain.spring_terms(0, CELLS).cubic
     assert np.all(cubic[:, 0] == 0.0)
     assert len(np.unique(cubic[:, 1])) == CELLS
+    # Twelve draws have a deviation that is uncertain by a fifth.
     assert np.std(cubic[:, 1] / 4e9) == pytest.approx(0.1, rel=0.5)
 
 
@@ -235,6 +252,7 @@ SITES = {"law": "bilinear", "stiffness": 1e5, "sites": [3], "clearance": 1e-4}
 )
 def test_refusals(kind: type[CaseFile], sections: dict[str, Any], key: str, reason: str):
     table = TABLE | {"contacts": SITES} | sections
+    # Each verb's case has sections of its own; those that it does not have would be a problem of their own.
     readable = {name: value for name, value in table.items() if value is not None and name in kind.keywords()}
     with pytest.raises(CaseError) as caught:
         kind.from_table(readable)

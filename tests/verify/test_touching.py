@@ -72,10 +72,12 @@ def run_complete(case: Case) -> xr.Dataset:
     memory = RunMemory(MPI.COMM_SELF)
     result = simulate(case, memory)
     assert result.complete, result.sentence
+    # A refused engine would be replaced by the other one, and be compared with itself.
     assert result.statistics["engine"] == case.time.engine
 
     run = memory.dataset
     stored = run["energy/kinetic"] + run["energy/spring"] + run["energy/contact"] + run["energy/dissipated"]
+    # A contact that were entered or left at the wrong instant would open the balance.
     assert np.abs(run["energy/work"] - stored).max() < 1e-8 * run["energy/work"].max()
     return run
 
@@ -126,6 +128,7 @@ def difference(run: xr.Dataset, expected: np.ndarray) -> float:
 @pytest.mark.parametrize("pair", [[1, 2], [0, 1]], ids=["masses", "ground"])
 def test_a_stop_without_clearance_is_that_of_an_independent_solver(engine, law, side, pair):
     run = run_complete(sprung_case(engine, **law, side=side, pair=pair))
+    # Mass 0 is the ground.
     host, resonator = (2 * (SITE - 1) + mass - 1 if mass else -1 for mass in pair)
     stop = Stop(host, resonator, 1 if side == "plus" else -1, law["stiffness"], EXPONENTS[law["law"]])
     expected = integrate(chain_stiffness(), [stop], DRIVE, run["time"].values)
@@ -160,6 +163,7 @@ def test_with_a_floor_a_touching_stop_dissipates_alike_in_both_engines():
     runs = [run_complete(sprung_case(engine, **lossy)) for engine in ("ts", "propagator")]
     found, expected = (run["displacement"].values for run in runs)
     assert np.abs(found - expected).max() < 1e-8 * np.abs(expected).max()
+    # Displacements alone would not show a loss that is booked wrongly.
     losses = [run["energy/dissipated"].values[-1] for run in runs]
     assert losses[0] > 0 and losses[0] == pytest.approx(losses[1], rel=1e-6)
 
@@ -175,6 +179,7 @@ def test_a_loss_in_a_contact_that_touches_at_rest_is_refused(each):
 
 
 def test_a_touching_site_that_nothing_presses_is_not_said_to_be_unreached():
+    # So weak that the contact's force is below all tolerances.
     case = sprung_case().varied(time={"end": 1e-3, "sample_interval": 2e-4}, drive={"amplitude": 1e-30})
     memory = RunMemory(MPI.COMM_SELF)
     result = simulate(case, memory)

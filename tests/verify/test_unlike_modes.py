@@ -46,12 +46,15 @@ def mass_between_stops(plus: float, minus: float) -> System:
 
 def time_on_one_side(energy: float, clearance: float) -> float:
     """Time in s from the middle to rest on the side of a stop at ``clearance``, piece by piece in closed form."""
+    # Rates of the mass alone, and with the stop's spring in addition.
     slow = np.sqrt(SPRING / MASS)
     fast = np.sqrt((SPRING + STOP) / MASS)
     amplitude = np.sqrt(2 * energy / SPRING)
     if amplitude <= clearance:
         return np.pi / 2 / slow
+    # In contact the motion is harmonic about another place.
     middle = STOP * clearance / (SPRING + STOP)
+    # The kinetic energy with which it arrives there.
     at_stop = energy - SPRING * clearance**2 / 2
     reach = np.sqrt((clearance - middle) ** 2 + 2 * at_stop / (SPRING + STOP))
     return float(np.arcsin(clearance / amplitude) / slow + np.arccos((clearance - middle) / reach) / fast)
@@ -62,6 +65,7 @@ def test_a_mass_with_stops_that_differ_has_its_period_in_closed_form(plus, minus
     """Shooting over half a period gives the exact period of a stop on one side, and of stops at two distances."""
     system = mass_between_stops(plus, minus)
     problem = Shooting(Dop853Flow(system), MAPS["half"])
+    # At 0.8 of the energy at which the nearer stop is grazed.
     start = linear_start(problem, 0, 0.4 * SPRING * 0.1**2)
     points = [start, *Continuation(problem, start, NnmTable(points=60, largest_step=0.3, first_step=0.1))]
 
@@ -74,6 +78,7 @@ def test_a_mass_with_stops_that_differ_has_its_period_in_closed_form(plus, minus
 def test_free_masses_with_a_stop_between_them_move_about_their_centre():
     """Two masses that nothing holds are one of their reduced mass, and their centre stays where it is."""
     pair = ContactPair(0, 1, 0.1, Contact("bilinear", STOP), np.inf)
+    # Their reduced mass is MASS.
     system = System.assemble([MASS * 3, MASS * 1.5], [(0, 1, SPRING)], [pair])
     problem = Shooting(Dop853Flow(system), MAPS["half"])
     start = linear_start(problem, 1, 0.4 * SPRING * 0.1**2)
@@ -111,12 +116,14 @@ def test_the_other_side_has_the_mirrored_orbits():
 
     start = linear_start(problem, 3, 2e-4)
     points = list(Continuation(problem, start, case.nnm))
+    # Contacts on several sites and sides, or the mirror would have little to mirror.
     assert points[-1].episodes >= 3
     for point in points[::10]:
         frame = mirrored.frame_at("relative", -point.x, point.period)
         assert np.abs(frame.residual(frame.xi)).max() < 1e-12
         arc = mirrored.arc(-point.x, point.period)
         assert arc.episodes == point.episodes
+        # The third column is the side of each change.
         assert np.array_equal(arc.events[:, 2], -problem.arc(point.x, point.period).events[:, 2])
 
 
@@ -132,6 +139,7 @@ def test_orbits_of_a_lattice_that_differs_everywhere_return_by_scipy(unlike_bran
     """Integrated by SciPy from equations of its own, an orbit comes back after its period."""
     problem, branch = unlike_branch
     lattice = independent_lattice()
+    # One orbit near the first contacts, and the last one.
     for number in (40, 60):
         point = branch.regular()[number]
         u, v = sample_orbit(problem, point, samples=40)
@@ -139,6 +147,7 @@ def test_orbits_of_a_lattice_that_differs_everywhere_return_by_scipy(unlike_bran
         begin = int(np.flatnonzero(np.all(problem.system.gaps(u) < 0, axis=1))[0])
         motion, impacts = lattice.motion(np.array([point.period]), u[begin], v[begin], 0.0)
 
+        # An orbit without impacts would return by the linear equations alone.
         assert impacts >= 3
         assert np.abs(motion[0, -1] - u[begin]).max() < 1e-8 * np.abs(u).max()
         assert np.abs(motion[1, -1] - v[begin]).max() < 1e-8 * np.abs(v).max()
@@ -152,6 +161,7 @@ def test_motions_condensed_onto_unlike_sites_are_those_of_shooting(unlike_branch
     case = unlike_case(method="condensed", points=12, truncation=1e-6, largest_step=0.2)
     problem = condensed_system(system, case.nnm)
     omega, shapes = system.linear_modes()
+    # The linear mode at the energy of the branch's contacts.
     z = system.contact_rows @ shapes[:, 3] * np.sqrt(2 * 2.1e-4) / omega[3]
     start = problem.from_mode(z, float(omega[3]))
     point = list(Continuation(problem, start, case.nnm))[-1]
@@ -161,6 +171,7 @@ def test_motions_condensed_onto_unlike_sites_are_those_of_shooting(unlike_branch
     assert system.energy(u, 0 * u) == pytest.approx(point.energy, rel=1e-6)
     frame = shooting.frame_at("relative", u, point.period)
     row = np.append(u / np.linalg.norm(u), 0.0)
+    # Its amplitude is held, period and shape are free.
     attempt = frame.solve(frame.xi, row, row @ frame.xi)
     assert attempt.converged
     x, period = frame.chart.decode(attempt.xi)
@@ -174,6 +185,7 @@ def one_sided():
     chain = breather_chain()
     stops = [Stops(four_band_contact("hertz"), CLEARANCE, np.inf)]
     system = System.from_chain(chain, stops, dense=False)
+    # Half a period: with a stop on one side the motion has no symmetry within it.
     problem = LatticeShooting(system, chain, MAPS["half"], MPI.COMM_SELF, 1e-12, 12)
     return chain, stops, problem.breather(OMEGA)
 
@@ -199,6 +211,7 @@ def test_bloch_waves_and_all_modes_give_the_same_breather_on_one_side(one_sided)
     assert first.x == pytest.approx(second.x, abs=1e-10 * np.abs(first.x).max())
     assert first.energy == pytest.approx(shot.energy, rel=1e-5)
     u = np.concatenate(list(state_of(by_modes, second, chain.cell.dofs).values()))
+    # The phase of a state is free up to half a period.
     assert min(np.abs(u - shot.x).max(), np.abs(u + shot.x).max()) < 1e-4 * np.abs(u).max()
 
 
@@ -217,5 +230,6 @@ def test_a_breather_begins_at_the_site_that_is_asked_for():
     assert np.abs(far.x).argmax() // chain.cell.dofs == sites[1]
     assert np.abs(near.x).argmax() // chain.cell.dofs == sites[0]
     assert system.contact_rows[1] @ far.x == pytest.approx(2 * (system.contact_rows[0] @ near.x), rel=1e-6)
+    # A linear stop has no length of its own: all scales with the clearance.
     assert far.energy == pytest.approx(4 * near.energy, rel=1e-6)
     assert opposite.x == pytest.approx(-far.x, abs=1e-9 * np.abs(far.x).max())

@@ -156,7 +156,10 @@ def shown_bins(wavenumber: float, count: int, shown: int = SHOWN) -> list[int]:
     position = wavenumber * count / np.pi
     driven = min(int(position), count - 1)
     above = driven + 1 < count and (position - driven >= 0.5 or driven == 0)
-    pair = driven, driven + 1 if above else driven - 1
+    # The neighbour on the side of the wavenumber: the packet, which has a width, reaches over into it.
+    pair = driven, driven - 1
+    if above:
+        pair = driven, driven + 1
 
     # Each of the pair that is missing takes the place of the nearest bin that is not of the pair.
     bins = [round(number) for number in np.linspace(0, count - 1, min(shown, count))]

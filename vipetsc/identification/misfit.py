@@ -57,8 +57,12 @@ class Misfit:
         dofs = base.lattice.unit_cell().dofs
         self.watched = []
         for table in plan.options.records:
-            masses = [0 if s.cell is None else (s.cell - 1) * dofs + (s.mass or 1) - 1 for s in table.sensors]
-            self.watched.append(np.array(masses))
+            # A sensor of the drive's force has no mass: the first one holds its place.
+            masses = np.zeros(len(table.sensors), int)
+            for i, sensor in enumerate(table.sensors):
+                if sensor.cell is not None:
+                    masses[i] = (sensor.cell - 1) * dofs + (sensor.mass or 1) - 1
+            self.watched.append(masses)
 
         self.states: dict[int, InitialState] = {}
         self.size = len(plan.parameters)

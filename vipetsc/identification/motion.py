@@ -164,7 +164,10 @@ def respond(
 
     ends = np.zeros((len(sites), 2), np.int64)
     for row, cell, pair in zip(ends, chain.sites, chain.contact_pairs, strict=True):
-        row[0] = cell * chain.cell.dofs + pair.host if pair.host >= 0 else -1
+        # The ground has no row of the motion.
+        row[0] = -1
+        if pair.host >= 0:
+            row[0] = cell * chain.cell.dofs + pair.host
         row[1] = (cell + pair.next_cell) % chain.cells * chain.cell.dofs + pair.resonator
     lattice = Lattice(
         inverse_mass=1 / coefficients.masses,

@@ -105,7 +105,10 @@ def pressed_contacts(model: Model) -> list[Joint]:
     for site, cell, pair, law, stops in rows:
         pressed = -min(stops)
         if pressed > 0:
-            host = site * dofs + pair.host if pair.host >= 0 else -1
+            # The ground has no row of the stiffness matrix.
+            host = -1
+            if pair.host >= 0:
+                host = site * dofs + pair.host
             joints.append(Joint(host, cell * dofs + pair.resonator, float(law.elastic_slope(pressed))))
     return joints
 

@@ -186,7 +186,10 @@ def is_proportional(case: Case) -> bool:
 
 def signed_factor(case: Case) -> float:
     """Ratio of the motion of ``case`` before its first contact to that of its linear run."""
-    return case.drive.amplitude / REFERENCE if is_proportional(case) else 1.0
+    # Otherwise the linear run has the case's own amplitude: an initial motion or a second drive is not scaled by it.
+    if not is_proportional(case):
+        return 1.0
+    return case.drive.amplitude / REFERENCE
 
 
 def factor(case: Case) -> float:

@@ -49,7 +49,9 @@ class PairMotion(NamedTuple):
             for column, pair in zip(columns, pairs, strict=True):
                 w = field[:, (column + pair.next_cell) % field.shape[1], pair.resonator]
                 # The ground does not move.
-                relative.append(w - field[:, column, pair.host] if pair.host >= 0 else w)
+                if pair.host >= 0:
+                    w = w - field[:, column, pair.host]
+                relative.append(w)
             motions.append(np.stack(relative, axis=1))
         displacement, velocity = motions
         return cls(time=run["time"].values, displacement=displacement, velocity=velocity)

@@ -136,9 +136,10 @@ def _predicted(
     onset = 1 / max(linear["reached"])
     untouched = np.array(linear["bands"]) / linear["work"]
     losses = network.losses
-    absorbed_before = losses.absorbed_without_contacts() / linear["work"] if losses else 0.0
+    absorbed_before = 0.0
     rows: dict[str, list[Any]] = {"bands": [], "dissipated": [], "z": [], "change": []}
     if losses:
+        absorbed_before = losses.absorbed_without_contacts() / linear["work"]
         rows["dashpots"] = []
     if losses and losses.has_ends:
         rows["absorbed"] = []

@@ -66,9 +66,14 @@ def fastest_wave(cell: UnitCell, omega: float, pair: Pair) -> TravellingWave | N
 
     number, kappa, speed = max(waves, key=lambda wave: wave[2])
     vector = bloch(cell, kappa).vectors[:, number - 1]
-    # Bloch's factor of the next cell; the ground does not move.
-    resonator = vector[pair.resonator] * (np.exp(1j * kappa) if pair.next_cell else 1.0)
-    relative = abs(resonator - (vector[pair.host] if pair.host >= 0 else 0.0))
+    w = vector[pair.resonator]
+    # The next cell moves as this one does, times Bloch's factor.
+    if pair.next_cell:
+        w = w * np.exp(1j * kappa)
+    # The ground does not move.
+    if pair.host >= 0:
+        w = w - vector[pair.host]
+    relative = abs(w)
     return TravellingWave(
         band=number - 1, wavenumber=kappa, speed=speed, power_per_area=speed * omega**2 / (2 * max(relative, TINY) ** 2)
     )

@@ -68,7 +68,10 @@ class Ring:
     def wall_peak(self) -> float:
         """Largest w in m of the linear wave at the site's distance from the case's wall, which moves by 1 m."""
         setting = self.setting
-        cell = setting.distance + 1 if self.case.drive.end == "left" else setting.cells - setting.distance
+        # A ring has no wall: the waves come from the one of the case's lattice, here as long as the ring.
+        cell = setting.distance + 1
+        if self.case.drive.end == "right":
+            cell = setting.cells - setting.distance
         case = self.case.varied(
             without=("output",),
             lattice={"cells": setting.cells, "absorbing": None},

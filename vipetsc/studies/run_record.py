@@ -43,5 +43,8 @@ def steady_drive(case: Case) -> SteadyDrive | None:
     if drive.kind != "harmonic" or not drive.amplitude or not drive.frequency:
         return None
     ramp = drive.ramp or 0.0
-    stop = np.inf if drive.duration is None else drive.duration - ramp
+    stop = np.inf
+    if drive.duration is not None:
+        # It falls over a ramp as long as the first one.
+        stop = drive.duration - ramp
     return SteadyDrive(frequency=drive.frequency, start=ramp, stop=stop)

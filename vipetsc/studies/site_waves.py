@@ -118,7 +118,9 @@ class SiteWaves:
                 flux = flux / abs(factor)
             # Factors are those to the next higher cell: to the next one in its direction, a wave to lower cells has
             # the inverse.
-            outwards = factor if wave == higher else 1 / factor
+            outwards = factor
+            if wave == lower:
+                outwards = 1 / factor
             directions.append(SentWave(by_site=site[wave], by_drive=drive[wave], factor=outwards, flux=flux))
         if self.setting.towards < 0:
             directions.reverse()
