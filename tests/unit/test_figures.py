@@ -62,6 +62,7 @@ def travelling_wave(cells: np.ndarray, time: np.ndarray) -> dict[str, np.ndarray
     """Displacements and velocities (t, cell, dof) of a packet at 430 cells/s and 1023 rad/s, of 1 mm."""
     x = cells[None, :, None]
     t = time[:, None, None]
+    # Of the second band of the built-in cell, so that measures of its bands have something to show.
     phase = 1.8 * x - 1023.0 * t + 0.3 * np.arange(4)
     envelope = np.exp(-(((x - 430 * t) / 5) ** 2))
     return {"displacement": 1e-3 * envelope * np.cos(phase), "velocity": 1.023 * envelope * np.sin(phase)}
@@ -80,6 +81,7 @@ def impacts(episodes: int) -> dict[str, np.ndarray]:
         "force": values,
         "loss": values,
     }
+    # A contact that is closed as the run ends has no separation.
     table["separation"][-1:] = np.nan
     return table
 
@@ -95,6 +97,7 @@ def write_run(path: Path, shape: RunShape = WHOLE) -> None:
             data = file.create_dataset(name, data=values)
             data.attrs["units"] = units
             if not dims:
+                # As the store does: xarray takes the names of dimensions from HDF5's scales.
                 data.make_scale(name)
             for axis, dim in enumerate(dims):
                 data.dims[axis].attach_scale(file[dim])
@@ -116,6 +119,7 @@ def write_run(path: Path, shape: RunShape = WHOLE) -> None:
         energy = np.minimum(time / time[-1], 0.5)
         for name in ("kinetic", "spring", "contact", "dissipated"):
             put(f"energy/{name}", energy, "J", "time")
+        # Half of it is dissipated, so that no curve lies on the axis.
         put("energy/work", 2 * energy, "J", "time")
         put("energy/dissipated_by_site", np.zeros((SAMPLES, len(shape.sites))), "J", "time", "site")
         put("sites/cell", np.array(shape.sites, int), "1", "site")
@@ -169,6 +173,7 @@ def measured(request, tmp_path_factory):
 
 def assert_not_blank(path: Path) -> None:
     image = imread(path)[..., :3]
+    # A page of one colour has none.
     assert image.std() > 0.005
     # Nothing is cut off: the outermost pixels belong to the page.
     edge = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
@@ -192,6 +197,7 @@ def test_every_figure_is_drawn_from_every_shape_of_run(measured, name):
 
 def test_what_cannot_be_drawn_is_said(measured):
     folder, shape = measured
+    # Exactly these: a reason without a cause would keep a picture from being drawn.
     assert reasons_without_pictures("run", [folder], Files()) == WITHOUT.get(shape, {})
 
 
@@ -223,6 +229,7 @@ def test_the_analysis_opens_in_plain_xarray_and_agrees_with_the_run(tmp_path):
     write_run(tmp_path / "run.h5")
     measure_run(tmp_path)
     with h5py.File(tmp_path / "run.h5") as run:
+        # From the velocities of the file, by the formula.
         kinetic = kinetic_energy(run["velocity"][...], four_band().masses)
 
     with xarray.open_dataset(tmp_path / "analysis.h5", engine="h5netcdf") as data:
@@ -248,6 +255,7 @@ def test_ranks_divide_the_figures_among_them(tmp_path):
     write_run(tmp_path / "run.h5")
     written = []
     for rank in range(2):
+        # Every second picture, as the ranks of a run of two.
         paths = draw("run", [tmp_path], formats=("pdf",), turns=count(rank, 2))
         written += [path.name for path in paths]
     drawable = {*figure_names("run")} - {*reasons_without_pictures("run", [tmp_path], Files())}
@@ -270,6 +278,7 @@ def test_a_file_that_is_no_run_is_not_measured(tmp_path):
         file["x"] = 1
     with pytest.raises(ValueError, match="not a run"):
         measure_run(tmp_path)
+    # Half of an analysis would be taken for the whole one.
     assert not (tmp_path / "analysis.h5").exists()
 
 
@@ -277,6 +286,7 @@ def test_a_lone_mass_is_drawn_with_what_its_contacts_join():
     """Of beads the next one, of a mass on the ground the ground: neither cell is blank."""
     cell = UnitCell(masses=(0.01,), springs=(), host=0, resonator=0)
     texts = []
+    # -1 is the ground.
     for pairs in ((), (Pair(0, 0, next_cell=True),), (Pair(-1, 0),)):
         with rc_style():
             axes = new_figure(5, 2).subplots()
@@ -345,6 +355,7 @@ def test_warnings_about_a_run_stand_below_its_pictures_each_once(tmp_path):
     wide = "a sentence that is wider than the picture " * 4
     # Lines are about 0.16 inches high: three at least, and not more than four where there are many.
     assert height_with_warnings(tmp_path, ["one", wide, "one"]) >= plain + 3 * 0.15 * SCREEN
+    # They differ in letters: sentences that differ in numbers alone are counted, and stand once.
     many = [f"warning {chr(number)}" for number in range(300, 600)]
     assert height_with_warnings(tmp_path, many) <= plain + 4 * 0.17 * SCREEN
 
@@ -363,6 +374,7 @@ def test_a_note_leaves_the_picture_above_it_as_it_is(tmp_path):
             pixels.append(imread(save(figure, tmp_path / f"{number}.png"))[..., :3])
     plain, noted = pixels
     assert len(noted) > len(plain)
+    # The strip is added below; nothing above it moves.
     np.testing.assert_array_equal(noted[: len(plain)], plain)
 
 

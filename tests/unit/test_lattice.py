@@ -32,6 +32,7 @@ def cells(draw):
     positive = st.floats(0.1, 10)
     mass = st.integers(0, n - 1)
     masses = tuple(draw(st.lists(positive, min_size=n, max_size=n)))
+    # The line connects the masses: one that nothing holds would move by itself.
     springs = [Spring(i, i + 1, draw(positive)) for i in range(n - 1)]
     for _ in range(draw(st.integers(1, 2))):
         springs.append(Spring(draw(mass), draw(mass), draw(positive), next_cell=True))
@@ -70,6 +71,7 @@ def test_pass_bands_and_gaps_are_the_published_ones(cell, edges):
 
 
 def test_published_drive_frequencies_and_speeds():
+    # The wavenumber that the paper drives.
     optical = bloch(diatomic(), 5 * np.pi / 9)
     assert optical.frequency[1] == pytest.approx(5520.026, abs=1e-3)
     assert optical.group_velocity[1] == pytest.approx(1587, abs=0.5)
@@ -87,6 +89,7 @@ def test_the_stiffness_of_a_contact_is_hertzs():
 
 def test_long_waves_travel_at_the_static_speed():
     """At kappa = 0 the speed is the square root of the cell's stiffness in series over its mass."""
+    # The springs from one cell to the next, one after the other.
     series = 1 / (1 / 2e4 + 2 / 1e4)
     assert bloch(four_band(), 0.0).group_velocity[0] == pytest.approx(np.sqrt(series / 0.015), rel=1e-6)
     assert bloch(diatomic(), 0.0).group_velocity[0] == pytest.approx(np.sqrt(9e4 / 0.09), rel=1e-6)
@@ -95,6 +98,7 @@ def test_long_waves_travel_at_the_static_speed():
 @pytest.mark.parametrize("cell", [four_band(), four_band("calibrated"), diatomic()])
 def test_waves_at_a_frequency_lie_on_the_branch(cell):
     _, frequency, speed = max_group_velocity(cell, 2)
+    # One wave: bands do not overlap at this frequency.
     ((band, kappa, found),) = waves_at(cell, frequency)
     assert band == 2
     assert found == pytest.approx(speed, rel=1e-6)
@@ -111,6 +115,7 @@ def test_no_wave_travels_in_a_gap(cell):
 @given(cells(), st.floats(-np.pi, np.pi))
 def test_stiffness_is_hermitian_and_not_negative(cell, kappa):
     k = cell.stiffness_matrix(kappa)
+    # To the bit, as eigh reads one triangle alone.
     assert np.array_equal(k, k.conj().T)
     assert np.linalg.eigvalsh(k).min() > -1e-9 * np.abs(k).max()
     # A cell that moves as a whole stretches nothing, and waves to the left are as those to the right.
@@ -142,6 +147,7 @@ def test_a_periodic_chain_has_the_bloch_frequencies(cell, n):
     chain = Chain(cell, n, "periodic")
     root = 1 / np.sqrt(chain.masses())
     squared = np.linalg.eigvalsh(chain.stiffness_matrix().toarray() * root[:, None] * root)
+    # The wavenumbers that fit on a ring of n cells.
     expected = np.sort(bloch(cell, 2 * np.pi * np.arange(n) / n).frequency.ravel() ** 2)
     assert np.allclose(squared, expected, atol=1e-8)
 
@@ -152,6 +158,7 @@ def test_fixed_ends_are_free_ones_with_springs_to_walls(cell, n):
     fixed = Chain(cell, n, "fixed").stiffness_matrix().toarray()
     free = Chain(cell, n, "free").stiffness_matrix().toarray()
     assert np.array_equal(fixed, fixed.T)
+    # Moved as a whole, a free chain stretches nothing.
     assert np.allclose(free.sum(axis=1), 0, atol=1e-9)
 
     walls = np.zeros(n * cell.dofs)
@@ -167,6 +174,7 @@ def test_a_springs_slope_and_energy_are_derivative_and_integral_of_its_force():
     z = np.linspace(-2e-3, 2e-3, 9)
     h = 1e-6
 
+    # Central differences, exact for a cubic but for h^2 of its third derivative.
     slope = (spring.nonlinear_force(z + h) - spring.nonlinear_force(z - h)) / (2 * h)
     force = (spring.nonlinear_energy(z + h) - spring.nonlinear_energy(z - h)) / (2 * h)
     assert spring.nonlinear_slope(z) == pytest.approx(slope, rel=1e-5, abs=1e-4)
@@ -182,6 +190,8 @@ def test_a_spring_is_linear_without_further_terms_and_odd_without_a_quadratic_on
 
 
 def test_cell_problems_are_all_named():
+    # A spring from a mass to itself, one to a mass that is not there and of negative stiffness, a contact of one
+    # mass.
     springs = (Spring(0, 0, 1.0), Spring(0, 5, -1.0))
     keys = {key for key, _ in cell_problems((1.0, -1.0), springs, 1, 1)}
     assert keys == {"masses[2]", "springs[1]", "springs[2].stiffness", "springs[2]", "contact", "springs"}
@@ -202,6 +212,7 @@ def test_a_cell_with_a_problem_is_refused():
 def test_a_burst_begins_and_ends_at_rest_and_peaks(envelope, peak):
     """The paper's window 1 - cos has the peak 2, Hann's half of it."""
     burst = ToneBurst(3.0, 100.0, 30, envelope)
+    # 30 cycles at 100 rad/s.
     assert burst.duration == pytest.approx(0.6 * np.pi)
 
     t = np.linspace(-0.1, burst.duration + 0.1, 200_001)
@@ -225,6 +236,7 @@ def test_the_scale_of_the_wave_is_linear_in_the_drive():
 def test_the_scale_of_the_wave_is_that_of_the_mass_that_is_driven():
     """By Green's function of the whole lattice, for lattices and drives that differ in one thing each."""
     burst = ToneBurst(2.0, 1206.34, 30)
+    # A complex frequency gives the waves the length of the burst.
     omega = 1206.34 * (1 - 1j / 30)
     cell = four_band()
     for chain in (Chain(cell, 12), Chain(cell, 12, "free"), Chain(diatomic(), 12), Chain(cell, 13)):
@@ -288,6 +300,7 @@ def test_a_fast_separation_pulls_unless_it_is_clipped_or_the_approach_has_a_floo
     assert contact.dissipation_factor(-1.0, 0.1) < 0
     assert Contact("hertz", 1e6, 0.7, adhesion="clip").dissipation_factor(-1.0, 0.1) == 0
     floored = Contact("hertz", 1e6, 0.7, approach_floor=0.5)
+    # The floor takes the sign of the approach: c/0.5 = 0.9, against the approach.
     assert floored.dissipation_factor(1.0, -1e-12) == pytest.approx(1 - 0.9)
 
 
@@ -299,4 +312,5 @@ def test_the_wave_of_a_long_ring_is_that_of_a_short_one(cells):
 
     ring = Chain(four_band("calibrated"), cells, "periodic")
     assert ring.wave_scale(burst) == pytest.approx(short, rel=1e-6)
+    # A ring has no first cell.
     assert ring.wave_scale(burst, cell=cells // 3) == pytest.approx(short, rel=1e-6)

@@ -29,6 +29,7 @@ TABLE = search_table(40, [10, 20, 30], contacts={"clearance": {"first": 2e-4, "l
 
 def test_designs_of_other_cells_keep_smooth_parts_and_dashpots():
     """A design that changes a spring's stiffness keeps the spring's other numbers, and the other springs."""
+    # Each differs from its default, so that one which is lost is seen.
     parts = {"quadratic": -2e6, "cubic": 3e9, "damping": 0.5}
     springs = [
         {"start": 1, "end": 1, "stiffness": 4e3, "next_cell": True} | parts,
@@ -95,6 +96,7 @@ def test_what_is_wrong_with_a_search_is_named(changes, message):
     with pytest.raises(CaseError) as error:
         plan(*changes)
     assert message in str(error.value)
+    # One: a wrong key must not bring problems of others that depend on it.
     assert len(error.value.problems) == 1
 
 
@@ -105,6 +107,7 @@ def test_all_problems_come_at_once(tmp_path):
     options = BOUNDS | {"variables": BOUNDS["variables"] | wrong}
     path.write_text(tomli_w.dumps(TABLE | {"optimise": options}))
 
+    # A user's file is read by the second one, which does not know the verb.
     for load in (OptimiseCase.load, load_every):
         with pytest.raises(CaseError) as error:
             load(path)
@@ -124,12 +127,13 @@ def test_the_case_as_text_gives_the_same_search():
 
 
 def test_the_start_is_the_case():
-    """The first design is the case itself, and its values survive the way into the unit cube and back."""
+    """The first design is the case itself, and its values survive the map into the unit cube and back."""
     search = plan("optimise.variables.sites=[2, 39]", "optimise.variables.restitution=[0.0, 1.0]")
 
     values = search.begin()
 
     assert case_id(search.design(values)) == case_id(search.base)
+    # Bounds are logarithms: values return to rounding, not to the bit.
     assert np.allclose(search.space.from_unit(search.space.to_unit(values)), values, rtol=1e-12)
 
 
@@ -158,6 +162,7 @@ def test_a_profile_is_log_spaced_and_a_cell_takes_its_masses_and_springs():
 @pytest.mark.slow
 @settings(max_examples=60)
 @given(
+    # Beyond the cube too, since samplers may step over its edge.
     point=st.lists(st.floats(-0.2, 1.2), min_size=3, max_size=3),
     # The whole lattice, just the three cells that are needed, three at its end, and a part of it.
     bounds=st.sampled_from([(1, 40), (7, 9), (38, 40), (5, 30)]),
@@ -182,6 +187,7 @@ class Bowl:
         self.fails = fails
 
     def runs(self, case):
+        # One run a design, at 1 N and of the first sample.
         return {(1.0, 0): case}
 
     def judge(self, case):
@@ -192,7 +198,7 @@ class Bowl:
 
 
 class Recorder(CmaEs):
-    """CMA-ES that keeps what it is told."""
+    """CMA-ES that keeps the losses it is given."""
 
     def __init__(self, *arguments, **options):
         super().__init__(*arguments, **options)
@@ -217,12 +223,14 @@ def recorder(plan):
 @pytest.mark.slow
 def test_a_search_spends_its_budget_and_keeps_the_best():
     """A search makes as many designs as its budget allows, the case first, and compares the best one with it."""
+    # Enough for three variables to come within 5 % of the least value.
     small = plan("optimise.budget=200")
     search = OptimumSearch(small, Bowl(), recorder(small), small.begin())
 
     spend(search)
 
     assert len(search.designs) == 200
+    # The same object: the case is not built anew from its values.
     assert search.designs[0].case is small.base
     compared = search.compared()
     assert compared["case"] == 0
@@ -236,7 +244,7 @@ def fails_where_first_clearance_is_large(case):
     return case.contacts.clearance[0] > 2e-4
 
 
-def test_a_design_that_fails_or_cannot_be_is_told_to_be_worst_and_the_search_goes_on():
+def test_failed_and_impossible_designs_are_reported_as_worst_and_the_search_goes_on():
     """The sampler learns the losses as they are, and of failed and impossible designs more than the worst so far."""
     small = plan("optimise.budget=60")
     sampler = recorder(small)
@@ -256,6 +264,7 @@ def test_a_design_that_fails_or_cannot_be_is_told_to_be_worst_and_the_search_goe
 
     failed = np.isnan(search.losses()[:, 0])
     assert len(search.designs) == 60
+    # Some designs are impossible, others fail, and others succeed.
     assert 0 < len(impossible) < failed.sum() < 60
     reasons = {design.reason for design in search.designs if design.case and np.isnan(design.losses[0])}
     assert reasons == {"1 N: stalled"}
@@ -267,6 +276,7 @@ def test_a_design_that_fails_or_cannot_be_is_told_to_be_worst_and_the_search_goe
         losses = search.losses()[first:last]
         bad = np.isnan(losses)
         assert np.array_equal(told[~bad], losses[~bad])
+        # CMA-ES ranks designs: any number above all others says "worst".
         assert np.all(told[bad] > np.nanmax(search.losses()[:last]))
         first = last
 
@@ -292,8 +302,10 @@ def test_the_runs_of_a_design_are_its_amplitudes_times_what_scatters():
     assert [*runs] == [(2.0, 0), (2.0, 1), (5.0, 0), (5.0, 1), (9.0, 0), (9.0, 1)]
     assert {run.drive.amplitude for run in runs.values()} == {2.0, 5.0, 9.0}
     clearance = {key: run.contacts.clearance for key, run in runs.items()}
+    # The second sample has the seed after that of the case.
     drawn = Deviation(relative=0.01).draw(np.array(small.base.contacts.clearance), 8, "clearance")
     assert clearance[5.0, 1] == drawn.tolist() != small.base.contacts.clearance
+    # A sample has the same lattice at all amplitudes, so that these can be compared.
     assert clearance[5.0, 1] == clearance[2.0, 1] != clearance[5.0, 0]
 
 
@@ -320,6 +332,7 @@ def test_the_worst_or_the_mean_over_amplitudes_of_the_mean_over_what_scatters():
     assert losses == pytest.approx([-0.2, 0.4])
     assert reason == ""
 
+    # One of four runs: a mean over the others would favour designs that fail.
     records[case_id(runs[5.0, 1])] = {"reason": "stalled"}
     losses, _, _, reason = GivenRecords(small, records).judge(small.base)
     assert np.isnan(losses).all()
@@ -338,7 +351,9 @@ def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
     def recorded() -> RecordedRuns:
         return RecordedRuns("small-runs", tmp_path, MPI.COMM_SELF, StopRequest()).read()
 
+    # The second call stands for the command after memory or disk was freed.
     for _ in range(2):
+        # All become one error, which ends the study.
         with pytest.raises(OSError, match=r"Unable|full|0 problem"):
             recorded().make(["stalls", "short"], work, failures=True)
 

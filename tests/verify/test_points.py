@@ -33,6 +33,7 @@ def shaken(engine: str) -> Case:
     table = {
         "lattice": {"cells": 24, "cell": DIATOMIC, "damping": {"mass": 60.0, "stiffness": 2e-5}},
         "drive": {"waveform": "harmonic", "amplitude": FORCE, "frequency": FREQUENCY, "cell": 2},
+        # Free vibrations have decayed by then to about 1e-8.
         "time": {"end": 0.6, "engine": engine},
         "output": {"fields": [], "points": [BASE, TIP], "transmission": [["base", "tip"]]},
     }
@@ -43,6 +44,7 @@ def shaken(engine: str) -> Case:
 def steady_run(request):
     """The run of ``shaken`` by either engine."""
     run = run_of(shaken(request.param))
+    # A refused engine would be replaced by the other one.
     assert json.loads(json.dumps(run.attrs["statistics"]))["engine"] == request.param
     return run
 
@@ -55,6 +57,7 @@ def test_steady_amplitudes_are_those_of_the_complex_compliance(steady_run):
     force = np.zeros(len(stiffness))
     force[2] = FORCE
     dynamic = stiffness + 1j * FREQUENCY * damping - FREQUENCY**2 * np.diag(chain.masses())
+    # Mass 1 of cell 2, mass 2 of cell 6.
     expected = np.abs(np.linalg.solve(dynamic, force))[[2, 11]]
 
     measured = analyse(steady_run)
@@ -69,6 +72,7 @@ def test_steady_amplitudes_are_those_of_the_complex_compliance(steady_run):
 
 def test_what_has_not_settled_has_a_drift_and_no_amplitude(steady_run):
     """A drift above the tolerance, or a record too short for three windows, gives NaN and a sentence."""
+    # Below rounding: no record meets it.
     strict = AnalysisTable.model_validate({"steady_tolerance": 1e-14})
     measured = analyse(steady_run, ["motion"], options=strict)
     assert np.isnan(measured["steady_velocity/tip"])
@@ -105,10 +109,12 @@ def test_peak_and_rms_are_those_of_the_samples(steady_run):
 def test_transmission_by_part_is_that_of_each_frequency():
     """Cosines of the transform itself fall into one part each; a part without the source has no value."""
     count = 400
+    # At the middles of samples, where the cosine transform has its nodes.
     phase = np.pi * (np.arange(count) + 0.5) / count
     interval = 1e-3
     frequencies = np.pi * np.array([20, 60]) / (count * interval)
     source = np.cos(20 * phase) + 3 * np.cos(60 * phase)
+    # Half of the one tone, twice of the other in antiphase.
     receiver = 0.5 * np.cos(20 * phase) - 6 * np.cos(60 * phase)
     edges = [0.0, 0.5 * frequencies.sum(), 2 * frequencies[1], np.inf]
 
@@ -165,6 +171,7 @@ def test_the_force_is_the_law_at_the_samples(impacts):
     log = {name: impacts[f"impacts/{name}"].values for name in ("site", "side", "onset", "separation", "force")}
     log["approach"] = impacts["impacts/approach_velocity"].values
     for k, site in enumerate(log["site"] - 1):
+        # Negated, since a contact that has not ended has NaN, which is not above any time.
         inside = (time >= log["onset"][k]) & ~(time > log["separation"][k])
         side = log["side"][k]
         x = side * motion["displacement"][inside, site] - model.chain.clearances[site]
@@ -173,6 +180,7 @@ def test_the_force_is_the_law_at_the_samples(impacts):
 
     largest = log["force"].max()
     assert np.abs(force - expected).max() < 1e-8 * largest
+    # A force of zero would agree with a law that is never evaluated.
     assert np.count_nonzero(force) > 100
     # Samples miss the largest force of an impact, by little where they are this fine.
     sampled = np.abs(force).max()
@@ -188,6 +196,7 @@ def test_the_acceleration_is_that_of_the_equation_of_motion(impacts):
     u = impacts["displacement"].values.reshape(samples, -1)
     v = impacts["velocity"].values.reshape(samples, -1)
     total = -(chain.stiffness_matrix() @ u.T).T - (chain.damping_rows(0, chain.cells) @ v.T).T
+    # By a formula of this test's own.
     total[:, 0] += [_burst(model.drive, t) for t in impacts["time"].values]
     for column, site in enumerate(chain.sites):
         force = impacts["sites/force"].values[:, column]
@@ -246,7 +255,9 @@ def test_velocities_change_by_the_accelerations(table):
     v = run["points/velocity"].values
     dt = float(run["time"][1])
 
+    # Of fourth order: at these intervals 1e-6 of the velocity is left.
     change = dt / 3 * (a[:-2] + 4 * a[1:-1] + a[2:])
+    # Every point moves.
     assert np.abs(a).max(axis=0).min() > 0
     assert np.abs(v[2:] - v[:-2] - change).max() < 1e-6 * np.abs(v).max()
 
@@ -255,6 +266,7 @@ def test_records_of_points_do_not_depend_on_what_else_is_kept(tmp_path, monkeypa
     """A window and strides leave the points' bits; points leave those of all else; a stopped run has the same."""
     time = {"end": 0.03, "engine": "propagator"}
     whole = small_case(time=time, output=IMPACTS["output"])
+    # Points out of the window and between its cells are recorded all the same.
     thin = small_case(time=time, output=IMPACTS["output"] | {"window": [3, 15], "every": 3, "stride": 4})
     plain = small_case(time=time)
     for name, case in (("whole", whole), ("thin", thin), ("plain", plain)):
@@ -269,6 +281,7 @@ def test_records_of_points_do_not_depend_on_what_else_is_kept(tmp_path, monkeypa
     }.items()
 
     assert np.count_nonzero(runs["whole"]["sites/force"]) > 0
+    # Several chunks, so that the run is stopped between two of them.
     monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 40)
     assert simulate(whole, tmp_path / "stopped", stop=StopAt(2)).resumable
     assert simulate(whole, tmp_path / "stopped").complete
@@ -285,6 +298,7 @@ def test_export_writes_histories_forces_and_numbers(tmp_path):
     export.write_curves(tmp_path)
 
     def read(name: str) -> pd.DataFrame:
+        # The default parser of pandas loses the last bit.
         return pd.read_csv(tmp_path / "curves" / name, float_precision="round_trip")
 
     with open_run(tmp_path / "run.h5") as run:

@@ -22,6 +22,7 @@ from vipetsc.studies.prediction_runs import LINEAR, SITE, Records, amplitudes_of
 from vipetsc.studies.recorded_runs import RecordedRuns
 from vipetsc.studies.response import BINS, SiteResponse, SiteResponses, in_contact
 
+# Two ramps that meet: its spectrum is smooth and lies within the band.
 CHIRP = {"waveform": "chirp", "bandwidth": 300.0, "duration": 0.09, "ramp": 0.045}
 
 
@@ -55,7 +56,7 @@ class Prediction(NamedTuple):
 
 @pytest.fixture(scope="module")
 def prediction(tmp_path_factory) -> Prediction:
-    """A small prediction, for which all runs were prediction."""
+    """A small prediction, for which all runs were simulated."""
     folder = tmp_path_factory.mktemp("prediction")
     case = prediction_case()
     return Prediction(folder, case, predict(case, folder))
@@ -67,10 +68,11 @@ def composed_from(case: PredictCase, linear: dict[str, Any], answers: list[dict[
 
 
 @pytest.mark.slow
-def test_energy_is_whole_and_no_share_is_negative(prediction):
+def test_energy_is_whole_and_no_fraction_is_negative(prediction):
     data = prediction.data
 
     predicted = data["predicted/bands"].sum("band") + data["predicted/dissipated"]
+    # What is neither in a band nor dissipated would be missing from the sum.
     np.testing.assert_allclose(predicted, 1, atol=1e-12)
     assert float(data["predicted/bands"].min()) >= 0
     # At the end of a simulation the contacts hold a little.
@@ -80,6 +82,7 @@ def test_energy_is_whole_and_no_share_is_negative(prediction):
 
 def test_below_the_onset_the_run_is_linear(prediction):
     data = prediction.data
+    # The first amplitude is below the onset, all others above.
     assert data["amplitude"][0] < data.attrs["onset_amplitude"] < data["amplitude"][1]
 
     np.testing.assert_allclose(data["predicted/bands"][0], data["simulated/bands"][0], atol=1e-9)
@@ -92,6 +95,7 @@ def test_the_small_prediction_is_near_the_simulation(prediction):
 
     assert data.attrs["rms_upper"] < 0.15
     assert data.attrs["worst_dissipated"] < 0.05
+    # The iteration between the sites has converged.
     assert float(data["predicted/change"].max()) < 1e-3
 
 
@@ -101,6 +105,7 @@ def test_the_first_contact_is_exact(prediction, factor, touches):
     # A case has no sections of other verbs.
     del table["law"]
     del table["predict"]
+    # 1e-4 below and above the predicted onset.
     table["drive"]["amplitude"] = factor * prediction.data.attrs["onset_amplitude"]
 
     _, result = simulated(Case.from_table(table))
@@ -114,9 +119,11 @@ def test_one_site_alone_is_what_its_run_gave(prediction):
     clearance = prediction.case.law.clearance
     site = prediction.site()
     contacts = {"sites": [200], "clearance": [clearance]}
+    # So long that no wave comes back from its ends within the run.
     long = prediction_case(lattice={"cells": 400}, contacts=contacts, time={"end": 0.75})
     network = Network(long.model())
 
+    # Points above the onset, over the whole range of z.
     for record in answers[6::4]:
         amplitude = record["z"] * clearance / np.abs(network.linear).max()
         outcome = network.compose(amplitude, SiteResponses((site,), np.zeros(1, int)))
@@ -130,6 +137,7 @@ def test_without_loss_nothing_is_lost(prediction):
     """Records of r = 1 dissipate nothing, and neither does what is composed of them."""
     linear, answers = prediction.records()
     for record in answers:
+        # Row 6 has the powers that are lost.
         record["sums"][6] = [0.0] * BINS
         record["totals"][0] = 0.0
 
@@ -141,6 +149,7 @@ def test_without_loss_nothing_is_lost(prediction):
 
 def test_the_order_of_the_sites_in_the_file_does_not_matter(prediction):
     linear, answers = prediction.records()
+    # The same lattice with its sites in another order.
     swapped = prediction_case(contacts={"sites": [70, 40], "clearance": [1.8e-3, 2e-3]})
 
     first = composed_from(prediction.case, linear, answers)
@@ -151,6 +160,7 @@ def test_the_order_of_the_sites_in_the_file_does_not_matter(prediction):
 
 def test_a_site_that_nothing_reaches_changes_nothing(prediction):
     linear, answers = prediction.records()
+    # A clearance of a metre is never closed.
     more = prediction_case(contacts={"sites": [40, 70, 100], "clearance": [2e-3, 1.8e-3, 1.0]})
 
     data = composed_from(more, linear | {"reached": [*linear["reached"], 1e-4]}, answers)
@@ -191,11 +201,13 @@ def test_equal_values_in_lists_are_one_kind(prediction):
 
     data = composed_from(listed, linear, answers)
 
+    # To the bit: a list of equal values is no other lattice.
     np.testing.assert_array_equal(data["predicted/bands"], prediction.data["predicted/bands"])
 
 
 def test_contact_goes_on_until_release():
     """Contact begins above z = 1 and ends where z falls below the release, which differs from site to site."""
+    # Up through the onset, down through either release, and up again without reaching the onset.
     z = np.array([[0.9, 1.1, 0.9, 0.41, 0.39, 0.9]] * 2)
 
     is_in_contact = in_contact(z, np.array([0.4, 0.6]))
@@ -214,10 +226,11 @@ def test_the_release_is_where_the_last_contact_of_a_run_ended(prediction):
     np.testing.assert_allclose(release, [record["release"] for record in answers])
 
 
-def test_runs_that_are_there_are_not_made_again(prediction, tmp_path, monkeypatch):
+def test_finished_runs_are_not_repeated(prediction, tmp_path, monkeypatch):
     (tmp_path / "prediction-runs.jsonl").write_bytes((prediction.folder / "prediction-runs.jsonl").read_bytes())
     (tmp_path / "case.toml").write_text(prediction.case.to_toml())
-    monkeypatch.setattr(RecordedRuns, "run_in_memory", lambda *_: pytest.fail("a run was made"))
+    # Any run at all fails the test.
+    monkeypatch.setattr(RecordedRuns, "run_in_memory", lambda *_: pytest.fail("a run was started"))
 
     again = predict(prediction.case, tmp_path)
 
@@ -254,12 +267,13 @@ def test_what_cannot_be_predicted_is_refused_before_any_run(sections, key):
 
 @pytest.mark.slow
 def test_the_wave_of_a_moved_wall_is_predicted_as_simulated(tmp_path):
-    """A wall moved by U acts as a force k U on the mass beside it; amplitudes are in m."""
+    """A wall moved by U acts as a force k U on the mass next to it; amplitudes are in m."""
     moved = prediction_case(
         contacts={"restitution": 0.7}, drive={"end": "left"}, predict={"amplitudes": [5e-4, 2e-3], "points": 16}
     )
     model = moved.model()
     [spring] = model.drives
+    # The same force on the same mass, without the wall.
     forced = prediction_case(contacts={"restitution": 0.7}, drive={"cell": 1, "mass": spring.mass + 1})
     np.testing.assert_allclose(Network(model).linear, spring.stiffness * Network(forced.model()).linear, rtol=1e-12)
 
@@ -282,6 +296,7 @@ def test_the_wave_of_a_pulse_that_is_no_burst_is_that_of_the_linear_run():
     time = network.time[network.during]
     for site, envelope in zip(case.model().chain.sites, network.linear, strict=True):
         u = run["displacement"].values[:, site]
+        # The network has times of its own, between the run's samples.
         w = CubicSpline(run["time"].values, u[:, cell.resonator] - u[:, cell.host])(time)
         predicted = (envelope[network.during] * np.exp(1j * network.om * time)).real
         np.testing.assert_allclose(predicted, w, atol=0.03 * np.abs(w).max())
@@ -313,11 +328,13 @@ def test_a_ring_is_predicted_as_simulated(tmp_path):
     amplitudes = {"amplitudes": [30.0, 120.0]}
     ring = {"lattice": {"ends": "periodic"}, "contacts": {"restitution": 0.7}}
     case = prediction_case(**ring, predict=amplitudes)
+    # On the ring turned by half, the drive sends its wave over the joint.
     turned = ring | {"contacts": {"restitution": 0.7, "sites": [10, 100], "clearance": [1.8e-3, 2e-3]}}
     beyond = prediction_case(**turned, drive={"cell": 61}, predict=amplitudes)
     np.testing.assert_allclose(
         Network(beyond.model()).linear, Network(case.model()).linear[::-1], rtol=1e-9, atol=1e-12
     )
+    # Until the wave has gone round the ring is a lattice without ends.
     assert not any("second time" in text for text in case.warnings())
     assert any("second time" in text for text in prediction_case(**ring, time={"end": 1.0}).warnings())
 

@@ -54,9 +54,10 @@ def exact_linear(case: Case) -> np.ndarray:
     # Rounding leaves a rigid motion a frequency, which would be divided by.
     omega[omega < 1e-6 * omega.max()] = 0.0
     driven_dof = model.drive_cell * model.chain.cell.dofs + model.drive_mass
+    # The force's projection on each mode.
     push = modes[driven_dof] * root[driven_dof] * drive.window_amplitude
 
-    # [1 - cos(Om t/Nc)] sin(Om t) is a tone and two of half its size beside it.
+    # [1 - cos(Om t/Nc)] sin(Om t) is a tone and two of half its size at either side of it.
     tones = [(1.0, drive.frequency)]
     for sign in (1, -1):
         tones.append((-0.5, drive.frequency * (1 + sign / drive.cycles)))
@@ -65,6 +66,7 @@ def exact_linear(case: Case) -> np.ndarray:
         """Displacements and velocities (2, mode) while the drive acts."""
         return sum(weight * push * np.array(response_to_tone(omega, tone, t)) for weight, tone in tones)
 
+    # After the drive every mode swings freely from here.
     x_end, v_end = driven(drive.duration)
     velocities = []
     for t in np.arange(model.samples) * model.sample_interval:
@@ -97,8 +99,10 @@ def test_a_linear_run_is_the_modal_solution(ends, lattice, drive, time):
 
     run, result = simulated(case)
 
+    # Eigenvalues of 200 masses are exact to about this much.
     assert relative(run["velocity"].values - exact, exact) < 1e-11
     assert result.statistics["engine"] == "propagator"
+    # The bound of the terms that were dropped: not zero, since something was.
     assert 0 < result.statistics["truncation"] < 1e-14
     assert result.statistics["ledger_error"] < 1e-12
 
@@ -108,10 +112,12 @@ def assert_engines_agree(case: Case, velocity: float = 1e-7, onset: float = 1e-9
 
     Returns the propagator's statistics.
     """
+    # Far below the default, so that the difference is the propagator's error.
     theirs, stepped = simulated(with_engine(case, "ts", rtol=1e-12))
     ours, result = simulated(with_engine(case, "propagator"))
 
     assert result.statistics["engine"] == "propagator"
+    # Counts first: with a contact more or less, arrays could not be compared.
     for name in ("episodes", "switches", "floored", "clipped"):
         assert result.statistics[name] == stepped.statistics[name], name
 
@@ -122,6 +128,7 @@ def assert_engines_agree(case: Case, velocity: float = 1e-7, onset: float = 1e-9
     for name in ("force", "loss", "indentation", "approach_velocity"):
         values = theirs[f"impacts/{name}"].values
         largest = np.abs(values).max()
+        # Of grazing contacts all are small, and relative errors large.
         np.testing.assert_allclose(ours[f"impacts/{name}"], values, rtol=1e-4, atol=1e-6 * largest)
 
     exact = theirs["velocity"].values
@@ -157,6 +164,7 @@ def assert_engines_agree(case: Case, velocity: float = 1e-7, onset: float = 1e-9
 def test_agrees_with_the_time_stepper(lattice, contacts, drive, time):
     case = small_case(lattice=lattice, contacts=contacts, drive=drive, time=time)
 
+    # Otherwise two linear runs were compared.
     assert assert_engines_agree(case)["episodes"] > 5
 
 
@@ -259,6 +267,7 @@ def test_auto_takes_it_where_it_suits():
 def test_a_stopped_run_goes_on_to_the_same_bits(folder, monkeypatch, looks, contacts, damping):
     # Blocks of 49 samples of 24 cells: the run of 251 samples can stop between six of them.
     monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 24 * 49)
+    # At the driven end, alone, and as neighbours, whose contacts are solved together.
     sites = {"sites": [1, 6, 12, 13]}
     case = small_case(time={"engine": "propagator"}, contacts=sites | contacts, lattice={"damping": damping or None})
     straight = simulate(case, folder / "straight")
@@ -284,6 +293,7 @@ def test_no_onset_is_missed(coefficients, length, clearance):
 
     onset = first_onset(jet, create_contacts(Contact("hertz", 1.0), [clearance])[0], length)
 
+    # Onsets are located to rounding of the polynomial.
     limit = clearance * (1 + 1e-9)
     if onset > length:
         assert w.max() <= limit
@@ -323,6 +333,7 @@ def test_rows_near_an_end_turn_into_the_stencil(interval):
 @st.composite
 def cases(draw) -> Case:
     """Small lattices of random cells, ends, sites, drives and sample intervals."""
+    # Few masses and cells: an example takes a second by the other engine.
     dofs = draw(st.integers(2, 3))
     masses = [draw(st.floats(0.002, 0.02)) for _ in range(dofs)]
     stiffness = st.floats(2e3, 3e4)
@@ -356,7 +367,7 @@ def cases(draw) -> Case:
     }
     case = Case.from_table(table)
 
-    # Clearances that the wave reaches, and samples that the bands allow, are known only of a resolved case.
+    # Clearances that the wave reaches, and samples that the bands allow, follow only from a resolved case.
     clearance = case.model().scale * draw(st.floats(0.05, 1.0))
     nyquist = np.pi / pass_bands(case.lattice.unit_cell())[-1].high
     table["contacts"]["clearance"] = clearance

@@ -34,6 +34,7 @@ WHOLE = {
 }
 CURVES = {
     "name": "curves",
+    # Curves need no fields: samples are measured as they come, and few are kept.
     "output": {"stride": 4},
     "sweep": {
         "measures": ["entropy"],
@@ -129,7 +130,7 @@ def test_no_figure_is_offered_where_its_data_lack(whole, curves):
         assert list(FIGURES[name].function(Sweeps([whole], Files()))) == []
 
 
-def test_suffixes_tell_figures_apart(curves):
+def test_suffixes_distinguish_figures(curves):
     names = [drawing.stem for drawing in FIGURES["entropy_history"].function(Sweeps([curves], Files()))]
     assert names == ["calibrated-4pi-9", "calibrated-5pi-9", "printed-4pi-9", "printed-5pi-9"]
 
@@ -155,6 +156,7 @@ def test_amplitudes_have_common_scales_and_show_what_was_measured(whole):
         largest = 0.0
         for image, folder, amplitude in zip(images, members(whole), (0.1, 2.0, 20.0), strict=True):
             with h5py.File(folder / "analysis.h5") as file:
+                # Energies grow as the square: over it, three amplitudes can have one scale.
                 expected = file[name][...].T / amplitude**2
             np.testing.assert_allclose(image.get_array(), expected, rtol=1e-12)
             largest = max(largest, expected.max())
@@ -165,6 +167,7 @@ def test_amplitudes_have_common_scales_and_show_what_was_measured(whole):
     for axes in panels[6:]:
         for branch in range(2):
             kappa, frequency = axes.lines[branch].get_data()
+            # The branches are of the linear lattice, and not measured.
             assert axes.lines[branch].is_dashed()
             np.testing.assert_allclose(1e3 * frequency, bloch(cell, np.pi * kappa).frequency[:, branch])
 
@@ -182,6 +185,7 @@ def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
 
     for axes in panels.flat:
         black = next(line for line in axes.lines if to_rgba(line.get_color()) == (0, 0, 0, 1))
+        # In units of pi a cell.
         np.testing.assert_allclose(black.get_ydata(), 5 / 9, rtol=1e-9)
     for row in panels:
         assert len({axes.texts[0].get_text() for axes in row}) == 1
@@ -196,6 +200,7 @@ def test_wavelets_mark_the_driven_wavenumber_at_the_same_times(whole):
         # The second one is taken when the packet is halfway to the first site.
         assert times[1] - times[0] == pytest.approx(0.5 * (site - 1) / wave.speed)
         snapshot = int(np.argmin(np.abs(field_time(run) - times[1])))
+        # The diatomic cell's first mass is the host.
         host = run["velocity"][snapshot, :, 0].values
     kappa = np.pi * np.arange(1, 121) / 120
     expected = np.abs(transform(host, kappa, KC)[:, :CELLS]) / 20.0
@@ -217,6 +222,7 @@ def test_partition_shows_seven_bins_and_all_colours(whole):
         np.testing.assert_array_equal(image.get_array(), field[b].T)
 
     (band,) = [axes for axes in figure.axes if "Band 2" in axes.get_title(loc="left")]
+    # The thick ones are the bins, coloured as their panels.
     segments = [line for line in band.lines if line.get_linewidth() == 3]
     for line, colour in zip(segments, bin_colours(12), strict=True):
         np.testing.assert_allclose(to_rgba(line.get_color()), colour)
@@ -293,6 +299,7 @@ def test_entropy_curves_and_error_bars_are_the_ensembles(curves, entropy_figures
         np.testing.assert_allclose(line.get_xdata(), curves["amplitude"].values)
         np.testing.assert_allclose(line.get_ydata(), normalised(raw))
         assert to_rgba(line.get_color()) == to_rgba(COLOURS[average])
+        # A bar reaches from below to above by the error each.
         halves = [0.5 * np.ptp(segment[:, 1]) for segment in sticks.get_segments()]
         np.testing.assert_allclose(halves, 0.99 * error / np.ptp(raw))
 
@@ -328,6 +335,7 @@ def test_entropy_fits_are_the_ensembles(curves, entropy_figures, average, column
 
 
 def test_some_configuration_has_a_power_law(curves):
+    # Otherwise the test of the fits never sees one.
     assert np.isfinite(curves["fits/entropy/energy_weighted/factor"]).any()
 
 
@@ -365,6 +373,7 @@ def test_entropy_maps_leave_quiet_cells_blank(whole):
         above_threshold = weight > LEAST_WEIGHT * weight.max()
         np.testing.assert_array_equal(shown[above_threshold], local[above_threshold])
         assert np.isnan(shown[~above_threshold]).all()
+        # Otherwise no cell is quiet, and blank ones were not tested.
         assert (~above_threshold).any()
 
         lines = {line.get_label(): line for line in over.lines}
@@ -382,6 +391,7 @@ def test_entropy_history_is_an_image_over_amplitude(curves):
         row = select(curves, **fixed)
         expected = row["entropy/history"].values
         np.testing.assert_array_equal(np.reshape(mesh.get_array(), expected.shape), expected)
+        # As vectors, a PDF of it would have a polygon for each cell of the mesh.
         assert mesh.get_rasterized()
 
         # The onset by the linear wave lies below the first amplitude with contact.
