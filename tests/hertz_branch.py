@@ -1,4 +1,4 @@
-"""A made-up branch of the reduced model with Hertz's law, as files of studies hold it."""
+"""An invented branch of the reduced model with Hertz's law, as files of studies hold it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cases and records of the verb ``identify``, made by the engines, for several test modules."""
+"""Cases and records of the verb ``identify``, computed by the engines, for several test modules."""
 
 from __future__ import annotations
 

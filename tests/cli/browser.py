@@ -42,13 +42,18 @@ class Browser:
 
     def __init__(self, folder: Path) -> None:
         with socket.socket() as free:
+            # Port 0 asks the system for a free one.
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
         self.home = folder
         self.base = f"http://127.0.0.1:{port}"
         log = (folder / "driver.log").open("w")
         self.driver = subprocess.Popen(
-            ["chromedriver", f"--port={port}"], stdout=log, stderr=log, start_new_session=True
+            # A session of its own, by which all its processes are found.
+            ["chromedriver", f"--port={port}"],
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
         )
         self.sessions: list[str] = []
 
@@ -61,9 +66,11 @@ class Browser:
             try:
                 with urllib.request.urlopen(request, timeout=60) as answer:
                     return json.load(answer)["value"]
+            # An answer of the driver, which listens: a refusal is not repeated.
             except urllib.error.HTTPError:
                 raise
             except OSError:
+                # A driver that has ended will never listen.
                 if time.monotonic() > deadline or self.driver.poll() is not None:
                     raise
                 time.sleep(0.1)
@@ -118,7 +125,9 @@ class Browser:
         numbers = []
         for path in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
+                # After the last bracket: the name of a program may have blanks and brackets itself.
                 zombie, session = (path / "stat").read_text().rpartition(")")[2].split()[0:4:3]
+                # A browser may leave the session; its command has the folder of the profile.
                 started_here = os.fsencode(self.home) in (path / "cmdline").read_bytes()
                 if zombie != "Z" and (int(session) == self.driver.pid or started_here):
                     numbers.append(int(path.name))
@@ -134,6 +143,7 @@ class Browser:
         while self.processes() and time.monotonic() < deadline:
             time.sleep(0.05)
         for number in self.processes():
+            # It may have ended since it was listed.
             with suppress(ProcessLookupError):
                 os.kill(number, signal.SIGKILL)
         self.driver.wait()

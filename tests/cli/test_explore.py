@@ -68,7 +68,7 @@ def shown(tmp_path_factory):
 
 @pytest.mark.browser
 @NEEDED
-def test_a_map_tells_the_value_of_its_colour(shown):
+def test_a_map_shows_the_value_of_its_colour(shown):
     """The page shows the value that the colour under the pointer stands for, or the bound that it lies beyond."""
     (area, _), read_off = shown
     # Middles of cells, which are five pixels of the picture wide and two or three of the screen.

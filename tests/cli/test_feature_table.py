@@ -59,7 +59,7 @@ def words_of(column: Column, case: Path) -> list[str]:
 
 
 def put_case(column: Column, feature: Feature, folder: Path) -> Path:
-    """Write the case of a column with a feature into ``folder``, which is made; returns its path."""
+    """Write the case of a column with a feature into ``folder``, which is created; returns its path."""
     folder.mkdir(exist_ok=True)
     path = folder / "case.toml"
     path.write_text(tomli_w.dumps(column.table(feature)), encoding="utf-8")

@@ -46,7 +46,7 @@ def test_every_study_has_a_page_a_command_and_small_pictures():
 
 
 def test_every_case_is_valid_and_some_run_in_small(tmp_path, monkeypatch):
-    """Every case that a page's commands name is valid; runs and branches are made in small, as the pages go on."""
+    """Every case that a page's commands name is valid; runs and branches are computed in small, as the pages go on."""
     shutil.copytree(ROOT / "runs", tmp_path / "runs", ignore=shutil.ignore_patterns("*.h5", "*.png"))
     monkeypatch.chdir(tmp_path)
     # In the order of the pages: the run of a breather begins with an orbit of the branch before it.

@@ -1,4 +1,4 @@
-"""What is told where: --quiet, --verbose, --log and the help of every verb; a bar on a terminal, lines elsewhere."""
+"""What is printed where: --quiet, --verbose, --log and the help of every verb; a bar on a terminal, lines elsewhere."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ STAMP = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3}"
 def test_every_verb_has_an_example_that_it_takes(in_process):
     """The example in each verb's help is understood by the parser, and its case file exists."""
     for verb in VERBS.values():
+        # Without what the shell does with the output.
         words = shlex.split(verb.example.partition(" > ")[0])
         options = _parser().parse_args(words)
         assert options.verb == verb.name
@@ -43,7 +44,7 @@ def test_every_verb_has_an_example_that_it_takes(in_process):
     assert "example: vipetsc law runs/examples/law.toml" in shown.stdout
 
 
-def test_quiet_tells_nothing_but_warnings(in_process, tmp_path):
+def test_quiet_prints_warnings_alone(in_process, tmp_path):
     """--quiet leaves warnings and refusals on stderr, and what a verb is called for on stdout."""
     ended = in_process("run", *TINY, "--out", tmp_path / "run", "--quiet")
     assert ended.returncode == 0
@@ -58,7 +59,7 @@ def test_quiet_tells_nothing_but_warnings(in_process, tmp_path):
     assert "GB per rank" in in_process("validate", "--quiet").stdout
 
 
-def test_the_log_holds_all_that_is_told_with_its_time(in_process, tmp_path):
+def test_the_log_holds_all_messages_with_their_times(in_process, tmp_path):
     """The log has results and warnings with their times, whatever is printed, and later calls add to it."""
     log = tmp_path / "run.log"
     first = in_process("run", *TINY, "--out", tmp_path / "run", "--log", log, "--quiet")
@@ -68,8 +69,10 @@ def test_the_log_holds_all_that_is_told_with_its_time(in_process, tmp_path):
 
     second = in_process("run", *TINY, "--out", tmp_path / "run", "--set", "drive.amplitude=3", "--log", log)
     assert second.returncode == 2
+    # A log is added to: it holds the history of a folder.
     assert log.read_text().startswith(text)
     assert re.search(rf"^{STAMP} WARNING vipetsc: .*contains another run", log.read_text(), flags=re.M)
+    # A handler that is left would write later calls of this process to the log.
     assert not logging.getLogger("vipetsc").handlers
 
 
@@ -95,7 +98,7 @@ def test_what_ends_a_verb_stands_in_its_log(in_process, tmp_path, monkeypatch):
     assert re.search(rf"^{STAMP} CRITICAL vipetsc: the disk is on fire", (tmp_path / "log").read_text(), flags=re.M)
 
 
-def test_verbose_tells_phases_and_statistics(in_process, tmp_path):
+def test_verbose_prints_phases_and_statistics(in_process, tmp_path):
     """--verbose prints the phases of its own call and the integrator's statistics; the next call is as before."""
     ended = in_process("run", *TINY, "--out", tmp_path / "run", "--verbose")
     for text in ("set-up four-band", "claim ", "analyse", 'statistics {"samples": 101'):
@@ -109,6 +112,7 @@ def test_verbose_tells_phases_and_statistics(in_process, tmp_path):
 def test_a_bar_on_a_terminal_unless_quiet(monkeypatch, quiet, bar):
     """On a terminal progress is a bar, which --quiet leaves out."""
     outer, inner = pty.openpty()
+    # A new terminal has no width, and a bar on it no length.
     termios.tcsetwinsize(inner, (24, 80))
 
     with os.fdopen(inner, "w") as terminal:
@@ -132,6 +136,7 @@ def test_a_bar_on_a_terminal_unless_quiet(monkeypatch, quiet, bar):
 def test_lines_elsewhere_come_every_five_seconds(monkeypatch, caplog):
     """Where stderr is no terminal, progress of 20 s is a line every five seconds of the clock."""
     now = [0.0]
+    # A clock of the test's own, which goes as it says.
     monkeypatch.setattr(reports.time, "monotonic", lambda: now[0])
     with caplog.at_level(logging.INFO, logger="vipetsc"):
         progress = Progress(MPI.COMM_SELF, 20.0, "s")

@@ -55,6 +55,7 @@ def test_a_branch_leaves_its_files_and_its_picture_and_is_not_computed_twice(vip
     assert second.stdout == done.stdout.rpartition("  /")[0].rpartition("\n")[0] + "\n"
     assert modified(out) == written
 
+    # No HDF5 at all, as after a full disk.
     (out / "branch-out-of-phase.h5").write_text("cut")
     assert in_process("nnm", case, "--out", out).returncode == 0
     assert modified(out).keys() == written.keys()
@@ -96,6 +97,7 @@ def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
     """A branch whose steps become too short ends with exit code 1, the key to change, and its points in the file."""
     out = tmp_path / "out"
 
+    # So large a smallest step that the fold cannot be passed.
     done = vipetsc(2, "nnm", case, "--out", out, "--set", "nnm.smallest_step=1e-3")
 
     assert done.returncode == 1
@@ -136,6 +138,7 @@ def test_an_error_of_one_rank_ends_all_that_follow_a_branch_together(vipetsc, tm
     (tmp_path / "fails.py").write_text(FAILS_ON_RANK_1)
     (tmp_path / "chain.toml").write_text(CHAIN)
     paths = f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '.')}"
+    # Ranks that wait for each other would do so for ever.
     options = {"module": "fails", "env": clean_environment() | {"PYTHONPATH": paths}, "timeout": 100}
 
     done = vipetsc(2, "nnm", tmp_path / "chain.toml", "--out", tmp_path / "out", **options)

@@ -1,4 +1,4 @@
-"""What the program tells about itself: chapters, the schema of case files beside their validator, completion."""
+"""What the program says of itself: chapters, the schema of case files against their validator, completion."""
 
 from __future__ import annotations
 
@@ -50,6 +50,7 @@ def test_schema_and_texts_have_the_keys_of_the_validator():
     # The schema of a sweep also has the sections whose keys may vary.
     varied = set(schema["$defs"]["SweepTable"]["properties"]) & set(SECTIONS)
     expected = validator | {"SweepTable": validator["SweepTable"] | varied}
+    # In both directions: no key without a schema, and no schema of a key that was removed.
     assert {name: set(item.get("properties", {})) for name, item in schema["$defs"].items()} == expected
 
     with_keys = {name: names for name, names in (validator | {"CaseFile": {"name"}}).items() if names}
@@ -64,6 +65,7 @@ def test_the_chapter_on_keys_has_those_of_the_validator():
         shown.setdefault(path, set()).update(re.findall(r"^\| `(\w+)` \|", text, flags=re.M))
     for section, table in SECTIONS.items():
         assert shown[section] == validator[table.__name__], section
+    # Counted as well: a key that stands twice would be lost in the sets.
     assert sum(map(len, shown.values())) == sum(map(len, validator.values()))
 
 
@@ -85,6 +87,7 @@ def validator_of(schema: str) -> jsonschema.protocols.Validator:
     """Return the validator of a schema, which is valid itself; most case files have the same one."""
     table = json.loads(schema)
     kind = jsonschema.validators.validator_for(table)
+    # A schema with a mistake of its own might accept everything.
     kind.check_schema(table)
     return kind(table)
 
@@ -96,6 +99,7 @@ def validator_of(schema: str) -> jsonschema.protocols.Validator:
         "lattice.cells = 0",
         "lattice.ends = 'loose'",
         "drive.wavenumber = '5p/9'",
+        # Beyond pi.
         "drive.wavenumber = 4.0",
         "contacts.sites = [1.5]",
         "contacts.restitution = 1.5",
@@ -133,6 +137,7 @@ def test_bash_completes_verbs_options_and_files(in_process, tmp_path):
 
     def completed(*words: str) -> set[str]:
         line = f"COMP_WORDS=({' '.join(words)} '') COMP_CWORD={len(words)}; COMP_WORDS[-1]="
+        # The variables that bash sets when the tabulator is pressed.
         asked = f"{script}\n{line}\n_shtab_vipetsc; printf '%s\\n' \"${{COMPREPLY[@]}}\""
         ended = subprocess.run(["bash", "-c", asked], cwd=tmp_path, capture_output=True, text=True, check=False)
         return set(ended.stdout.split())
@@ -183,6 +188,7 @@ def test_messages_in_the_chapter_on_trouble_are_the_programs():
     quoted = [
         quote for table in tables for row in table.splitlines() for quote in re.findall("`([^`]+)`", row.split("|")[1])
     ]
+    # A pattern that finds nothing would let everything pass.
     assert len(quoted) > 20
 
     # A message may go on in a further string.

@@ -84,7 +84,7 @@ def test_no_file_takes_the_number_of_a_closed_stream(tmp_path):
     assert "Bad file descriptor" in ended.stderr
 
 
-def test_closed_streams_are_no_failure_where_nothing_is_told(by_shell, tmp_path):
+def test_closed_streams_are_no_failure_where_nothing_is_printed(by_shell, tmp_path):
     ended = by_shell((*TINY, "--quiet"), "<&- >&- 2>&-")
     assert ended.returncode == 0
     assert (tmp_path / "out/run.h5").exists()

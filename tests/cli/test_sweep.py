@@ -178,7 +178,7 @@ def test_a_member_that_does_not_come_out_is_recorded(in_process, case, tmp_path)
 
 @pytest.mark.parametrize("value", ["sweep.drive.amplitud=[1.0]", "sweep.feilds=true", "sweep.drive.amplitude=[0.0]"])
 def test_bad_sweeps_write_nothing(in_process, case, tmp_path, value):
-    """An unknown key and an amplitude that is impossible end with exit code 2, and no folder is made."""
+    """An unknown key and an amplitude that is impossible end with exit code 2, and no folder is created."""
     ended = in_process("sweep", case, "--out", tmp_path / "out", "--set", value)
     assert ended.returncode == 2, ended.stdout
     assert not (tmp_path / "out").exists()

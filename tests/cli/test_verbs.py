@@ -183,7 +183,7 @@ def test_only_sweeps_and_branches_share_a_page(tmp_path):
         pictures_of(folders)
 
 
-def test_a_folder_that_holds_nothing_known_is_taken_for_a_run(tmp_path):
+def test_a_folder_without_results_is_taken_for_a_run(tmp_path):
     """An empty folder is looked at as a run, whose missing file is then named."""
     assert pictures_of([tmp_path])[0].source == "run"
 

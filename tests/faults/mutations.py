@@ -66,7 +66,7 @@ KeyPath = tuple[Any, ...]
 
 @dataclass(frozen=True)
 class Mutation:
-    """A spoilt case file: its ``text``, the case it was made from, what was done to it."""
+    """A spoilt case file: its ``text``, the case it was written from, what was done to it."""
 
     parent: str
     changes: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Tiny cases of every verb: what is called, with what before it, and how two outcomes are told to be the same."""
+"""Tiny cases of every verb: what is called, with what before it, and how two outcomes are compared."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ springs = [
 ]
 smooth = [{ start = 0, end = 1, cubic = 0.5 }]
 """
-# The two ways of following motions of a lattice: by the harmonics of its sites, and by shooting on all ranks together.
+# Both methods that follow motions of a lattice: by harmonics of its sites, and by shooting on all ranks together.
 CONDENSED = """
 [lattice]
 preset = "four-band"
@@ -286,7 +286,7 @@ def unreadable(folder: Path) -> list[str]:
     """Return the files of results in ``folder`` that are not whole, each with the error."""
     broken = []
     for path in sorted(folder.rglob("*")):
-        # Hidden files and parts are on their way to become results.
+        # Hidden files and parts will become results.
         if any(part.startswith(".") for part in path.relative_to(folder).parts):
             continue
         try:

@@ -29,8 +29,8 @@ STOPPED = 75
 # What a call may end with; mpirun, which a kill or the signal itself may end, has codes of its own.
 CODES = {"sigterm": {0, STOPPED}, "sigkill": {128 + signal.SIGKILL}}
 OF_MPIRUN = {"sigterm": {128 + signal.SIGTERM, 1}, "sigkill": {-signal.SIGKILL}}
-# An exception may be dealt with: a file that cannot be read may be another's, or made again, and the linear run of a
-# sweep whose own job failed is made by the first member that needs it.
+# An exception may be dealt with: a file that cannot be read may be another's, or written again, and the linear run of a
+# sweep whose own job failed is simulated by the first member that needs it.
 CODES_AT_PHASES = {"read": {0, 1, 2}, "member": {0, 1}}
 Task = dict[str, Any]
 Record = dict[str, Any]

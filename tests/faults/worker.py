@@ -70,7 +70,7 @@ class Worker:
         words = words_of(scenario.words, self._case(scenario), out)
         if task["do"] == "trial":
             self._meet_the_fault(task, words, out, self._before(scenario))
-            # Another worker calls again: this one may have a signal on its way.
+            # Another worker calls again: a signal may still reach this one.
             if "delay" in task:
                 raise SystemExit(0)
 

@@ -162,7 +162,7 @@ def test_where_energy_is_counts_with_the_masses_of_each_cell(folder):
 
 @pytest.mark.parallel([1, 2])
 def test_contacts_that_are_pressed_at_rest_are_springs_of_small_motions(folder):
-    """Of the slope 3/2 k d^(1/2) of Hertz's force: in a cell, to the ground, around a ring; an open one has none."""
+    """Of the slope 3/2 k d^(1/2) of Hertz's force: in a cell, to the ground, across a joint; an open one has none."""
     pressed = 1e-4
     contacts = {
         "sites": [3, 7, 12, 9],

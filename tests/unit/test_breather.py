@@ -81,6 +81,7 @@ def test_a_mass_between_two_stops_has_its_period_in_closed_form():
             quarter += np.arccos((clearance - middle) / (amplitude - middle)) / fast
         assert point.frequency == pytest.approx(1 / (4 * quarter), rel=3e-7)
         assert point.energy == pytest.approx(energy, rel=1e-6)
+    # Far in contact, where the harmonics are many.
     assert points[-1].elongations[0] > 2 * clearance
 
 
@@ -93,6 +94,7 @@ def test_a_cubic_spring_has_the_period_of_elliptic_functions():
         frequency = np.sqrt(1 + a**2) / (4 * ellipk(a**2 / (2 * (1 + a**2))))
         assert point.frequency == pytest.approx(frequency, rel=1e-9)
         assert point.energy == pytest.approx(a**2 / 2 + a**4 / 4, rel=1e-9)
+    # Where the cubic force exceeds the linear one.
     assert points[-1].elongations[0] > 1
 
 
@@ -154,6 +156,7 @@ def test_moments_are_the_compliance_far_above_the_bands(ends, sites):
 
 def breather_of_two_sites(signs: list[int]) -> Point:
     """The breather at 4000 rad/s of a chain with contacts in cells 29 and 32, mirror images of one another."""
+    # The middle of the lattice is between them, so that they are equal.
     chain = Chain(four_band("calibrated"), 60, "fixed", (28, 31), (CLEARANCE, CLEARANCE))
     control = NnmTable(truncation=1e-6, tolerance=1e-11)
     forces = SiteForces([Stops.both(HERTZ, CLEARANCE)] * 2)
@@ -235,6 +238,7 @@ def test_a_branch_is_stored_with_states_and_a_table_and_drawn(tmp_path):
 @pytest.mark.slow
 def test_a_stopped_branch_is_resumed_to_the_same_energies(tmp_path):
     stop = StopRequest()
+    # Before it begins: the first point is kept, and the branch stopped after it.
     stop.requested = True
     (begun,) = followed(chain_case(), tmp_path / "stopped", stop=stop)
     assert begun.ending.startswith("stopped on request after point 1")
@@ -313,6 +317,7 @@ def test_options_that_do_not_go_together_are_refused(nnm, message):
 def test_multipliers_of_the_whole_of_a_long_lattice_are_refused():
     case = breather_case(system="condensed", points=1, truncation=1e-7)
     table = case.model_dump(by_alias=True, exclude_none=True)
+    # Of four masses each: one more than the bound of 40,000 masses allows.
     table["lattice"] |= {"cells": 10_001}
     NnmCase.from_table(table)
 

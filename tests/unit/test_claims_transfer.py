@@ -115,7 +115,7 @@ def test_scatter_is_printed_with_the_maxima_and_decides_nothing(tmp_path):
         name = f"4 samples of 2 % clearance scatter at {amplitude:.4g} N, {law}"
         mean = found.value[f"mean of {name}"]
         deviation = found.uncertainty[f"deviation of the {name}"]
-        # Four samples of a normal deviation of 2 %: some multiples of it either way.
+        # Four samples of a normal deviation of 2 %: some multiples of it to either side.
         assert 0 < abs(mean / amplitude - 1) < 0.05
         assert 0.002 < deviation / amplitude < 0.06
 

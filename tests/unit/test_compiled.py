@@ -162,7 +162,7 @@ assert not {"numba", "petsc4py", "mpi4py"} & sys.modules.keys()
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT.parent)
 
 
-def test_every_kernel_is_kept_this_way():
+def test_every_kernel_is_kept_so():
     for path in ROOT.rglob("*.py"):
         if path.name == "compiled.py":
             continue

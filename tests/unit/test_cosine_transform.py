@@ -22,7 +22,7 @@ def test_it_is_the_first_kind_of_any_length(rows, columns, strided, seed):
 
 
 def test_rounding_stays_small_in_a_long_record():
-    """A weak cosine beside a strong one, 1e-9 of it in amplitude; 5534 is twice a prime."""
+    """A weak cosine added to a strong one, 1e-9 of it in amplitude; 5534 is twice a prime."""
     for last in (4420, 4421, 5534):
         angle = np.pi * np.arange(last + 1) / last
         record = np.cos(101 * angle) + 1e-9 * np.cos(3333 * angle)

@@ -61,6 +61,7 @@ def test_a_new_folder_gets_its_marker(tmp_path, kind):
     with claim(folder, kind, OLD) as work:
         assert not work.going_on
         assert work.folder == folder
+    # The lock is removed with the claim.
     assert names_in(folder) == {kind.marker}
     assert (folder / kind.marker).read_text() == OLD
 
@@ -81,6 +82,7 @@ def test_nothing_but_results_of_the_same_kind_is_replaced(tmp_path):
 
 
 def test_the_same_case_is_resumed_and_nothing_is_touched(run):
+    # With the time of its last change: a file that is written again to the same bytes would differ.
     before = (run / "case.toml").stat()
     for resume in (False, True):
         with claim(run, RUN, OLD, resume=resume) as work:
@@ -98,6 +100,7 @@ def test_another_case_is_refused_with_the_difference(run, resume):
 def test_a_folder_that_is_not_there_is_not_resumed(tmp_path):
     message = "contains no run to resume; omit --resume"
     assert_refused(message, tmp_path / "deep" / "none", RUN, OLD, resume=True)
+    # Not even the folder above it was created.
     assert not names_in(tmp_path)
 
 
@@ -177,6 +180,7 @@ def test_a_swap_killed_anywhere_is_finished_by_the_next_command(run, monkeypatch
         assert (folder / "run.h5").read_text() == content
         if renamings:
             assert names_in(folder) == {"case.toml", "run.h5", "figures", "notes.txt"}, renamings
+    # Otherwise there are more renamings than were tried.
     assert not killed
 
 
@@ -207,6 +211,7 @@ def test_new_results_that_were_begun_are_dropped_by_force(run):
 def test_files_that_a_killed_command_leaves_are_removed(tmp_path):
     for name in ("parts", "figures"):
         (tmp_path / name).mkdir()
+    # Names as processes that were killed leave them, on this host and on others.
     for name in (".lock", ".run.h5.part", ".run.h5.host-7-ab.part", "figures/.ledger.png.host-7-cd.part"):
         (tmp_path / name).touch()
     (tmp_path / ".parts.old").mkdir()
@@ -256,6 +261,7 @@ def held(folder: Path) -> Iterator[subprocess.Popen]:
     pipe = subprocess.PIPE
     with subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdin=pipe, stdout=pipe) as process:
         try:
+            # It has the lock as soon as it has printed.
             process.stdout.readline()
             yield process
         finally:
@@ -304,6 +310,7 @@ def test_a_command_waits_for_a_process_that_is_ending(run, tmp_path, caplog, fol
     """After ``kill -9`` of a rank, mpirun returns while another rank, which has the lock, is still ending."""
     folder = tmp_path / "new" if folder_is_new else run
     with held(folder) as process, caplog.at_level(logging.INFO, logger="vipetsc"):
+        # The holder ends on its own, a moment after this process has begun to wait.
         Timer(0.3, process.stdin.close).start()
         begin = time.monotonic()
         with locked(MPI.COMM_SELF, folder):
@@ -351,6 +358,7 @@ def test_a_folder_that_cannot_be_locked_is_not_left_behind(tmp_path, monkeypatch
     def refuse(*_):
         raise PermissionError(13, "Permission denied")
 
+    # As on a file system without locks.
     monkeypatch.setattr("vipetsc.io.lock._acquire", refuse)
     with pytest.raises(PermissionError), locked(MPI.COMM_SELF, tmp_path / "a" / "b"):
         pass

@@ -172,7 +172,7 @@ def test_a_long_lattice_is_taken_for_a_part_of_a_ring(ends, monkeypatch):
     assert found == pytest.approx(exact, abs=1e-9 * exact.sum(axis=0).max())
 
 
-def test_the_upper_share_is_that_of_the_bands_above_the_drive():
+def test_the_upper_fraction_is_that_of_the_bands_above_the_drive():
     chain = Chain(CELLS["four-band"], 20)
     burst = ToneBurst(1.0, DRIVEN, 30)
     u, v = random_fields(chain, 1)

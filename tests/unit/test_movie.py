@@ -197,7 +197,7 @@ def test_a_gif_holds_every_frame_for_its_time(clear, stage):
     assert lasts == round(1000 * count / 3, -1)
 
 
-def test_an_mp4_is_made_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monkeypatch):
+def test_an_mp4_is_written_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monkeypatch):
     """ffmpeg gets every frame as it is; where it fails, its words are raised and the old movie stays."""
     # In place of ffmpeg: a script that writes what it reads into the last of its arguments.
     program = tmp_path / "ffmpeg"

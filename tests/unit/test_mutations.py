@@ -37,7 +37,7 @@ def test_spoilt_cases_are_read_or_refused(tmp_path):
             defects.append((mutation.parent, mutation.changes, verdict.defect))
     assert defects == []
 
-    # Changes that all end one way would test nothing of the other. In thousands one of seven is read; a new key or
+    # Changes that all have one outcome would test nothing of the other. In thousands one of seven is read; a new key or
     # a new example draws other changes.
     assert sum(bool(verdict.refusal) for verdict in verdicts) > 75
     assert sum(bool(verdict.cases) for verdict in verdicts) > 8

@@ -17,6 +17,7 @@ def measured() -> xr.Dataset:
     variables = {
         "time": variable("time", [0.0, 0.5, 1.0], "s", "time"),
         "cell": variable("cell", [3, 7], "1", "cell, counted from 1"),
+        # A lattice without sites has dimensions of length zero, which HDF5 treats apart.
         "site": variable("site", np.zeros(0, int), "1", "contact site"),
         "velocity": variable(("time", "cell"), np.arange(6.0).reshape(3, 2), "m/s", "velocity"),
         "sites/cell": variable("site", np.zeros(0, int), "1", "cell of the site"),
@@ -49,6 +50,7 @@ def test_what_is_written_is_read_back(tmp_path):
         assert json.loads(data.attrs["statistics"]) == {"steps": 3}
         assert data.attrs["bands/start"] == 0.5
 
+        # By the group's own coordinate, which has the name of the root's.
         assert data["coarse/total"].sel({"coarse/time": 1.0}).item() == 4.0
         assert data["velocity"].sel(cell=7, time=0.5).item() == 3.0
         assert data["bands/energy"].sel({"bands/part": 2}).values.tolist() == [0, 1, 0]

@@ -271,13 +271,13 @@ def test_failed_and_impossible_designs_are_reported_as_worst_and_the_search_goes
 
     # Design 0 is the case, which belongs to no generation.
     first = 1
-    for told in sampler.generations:
-        last = first + len(told)
+    for reported in sampler.generations:
+        last = first + len(reported)
         losses = search.losses()[first:last]
         bad = np.isnan(losses)
-        assert np.array_equal(told[~bad], losses[~bad])
+        assert np.array_equal(reported[~bad], losses[~bad])
         # CMA-ES ranks designs: any number above all others says "worst".
-        assert np.all(told[bad] > np.nanmax(search.losses()[:last]))
+        assert np.all(reported[bad] > np.nanmax(search.losses()[:last]))
         first = last
 
 

@@ -71,6 +71,7 @@ def test_what_is_kept_is_not_drawn_and_not_half(tmp_path):
     """A picture that is there in all formats is kept; one that lacks a format is drawn for both."""
     drawn: list[int] = []
     (tmp_path / "page-0.png").write_text("old")
+    # The second page lacks its PDF.
     (tmp_path / "page-1.png").write_text("old")
     (tmp_path / "page-0.pdf").write_text("old")
 
@@ -91,7 +92,9 @@ def test_a_note_stands_below_the_picture_and_moves_nothing(tmp_path):
     strip = round(NOTE * SCREEN)
     assert noted.shape[0] == pytest.approx(plain.shape[0] + strip, abs=1)
     assert noted.shape[1] == plain.shape[1]
+    # A strip without text has one colour.
     assert np.ptp(noted[-strip:]) > 0.2
+    # A mean, since the renderer may place an edge between pixels anew.
     assert np.abs(noted[: plain.shape[0]] - plain).mean() < 0.01
 
 
@@ -108,6 +111,7 @@ def test_a_figure_is_laid_out_once_for_all_formats(tmp_path, monkeypatch):
 
     assert laid_out == [figure]
     (axes,) = figure.axes
+    # Without a bound an axis of many decades has hundreds of minor ticks, which take most of a layout's time.
     assert len(axes.yaxis.get_minorticklocs()) <= 2 * 6 + 2
 
 
@@ -124,6 +128,7 @@ WAVE_Y = 100 + 50 * np.sin(np.linspace(0, 20, 2001))
 @pytest.fixture
 def curves_and_map():
     """Draw axes with two curves and points, a map with a colour bar, and axes that are switched off."""
+    # A gap of two values.
     x = np.array([1.0, 10.0, np.nan, np.nan, 100.0])
     with rc_style():
         figure = new_figure(4, 2)
@@ -162,6 +167,7 @@ def test_curves_and_points_of_a_picture_are_in_its_numbers(curves_and_map, tmp_p
     assert curve["y"] == [2, 20, None, 200]
 
     assert many["label"] == ""
+    # Of 2001 points: a page does not show more.
     assert len(many["x"]) < 400
     thinned = np.interp(np.log(WAVE_X), np.log(many["x"]), many["y"])
     # The curve rises by 1 from one of its points to the next: 6 are a few of them.
@@ -217,6 +223,7 @@ def test_an_inset_has_numbers_of_its_own_within_its_axes(tmp_path):
 def test_every_claim_has_a_figure_that_shows_it():
     """Figures show all claims, and are those of the paper, its appendix and its supplement, in their order."""
     shown = {claim for figure in PAPER_FIGURES for claim in figure.claims}
+    # In both directions: no claim without a picture, and no picture of a claim that was removed.
     assert shown == set(CLAIMS)
 
     paper = [f"Fig. {number}" for number in range(1, 13)]

@@ -1,4 +1,4 @@
-"""The paper's plan comes with the package; what is made from results is stale by content alone."""
+"""The paper's plan comes with the package; what is derived from results is stale by content alone."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_a_sweep_of_which_members_failed_is_not_finished(tmp_path):
 
 
 def test_times_of_files_make_nothing_stale(searched):
-    """A result stays done, with the same inputs to what is made from it, though its files are newer."""
+    """A result stays done, with the same inputs to what is derived from it, though its files are newer."""
     plan, root = searched
     before = plan.inputs(root)
 
@@ -134,7 +134,7 @@ def test_another_version_of_the_package_is_another_input(searched, monkeypatch):
 
 
 def test_another_case_is_another_input_and_a_stale_step(searched):
-    """A step whose case has changed is stale, begun once its folder is claimed, and done when it is made."""
+    """A step whose case has changed is stale, begun once its folder is claimed, and done when it has ended."""
     plan, root = searched
     step = replace(plan.steps[0], changes=(*SMALL, "design.eta.count=4"))
 
@@ -142,7 +142,7 @@ def test_another_case_is_another_input_and_a_stale_step(searched):
     assert step.identity(root) != plan.steps[0].identity(root)
     assert plan.steps[0].state(root / "none") == MISSING
 
-    # As a kill leaves it before it is made anew: what was begun is gone on with.
+    # As a kill leaves it before it is run anew: what was begun is continued.
     with claimed(MPI.COMM_SELF, step.folder(root), SEARCH, step.text, force=True):
         pass
     assert step.state(root) == BEGUN
@@ -184,7 +184,7 @@ def test_stale_pictures_go_before_new_ones_are_drawn(searched):
 
 
 def test_a_request_to_stop_makes_nothing_more_and_has_no_result(tmp_path):
-    """A request that comes first lets nothing be made or reported: only the folder is the plan's."""
+    """A request that comes first lets nothing be drawn or reported: only the folder is the plan's."""
     stop = StopRequest()
     stop.requested = True
     reported = []
@@ -196,7 +196,7 @@ def test_a_request_to_stop_makes_nothing_more_and_has_no_result(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["plan.json"]
 
 
-def test_fingerprints_tell_parts_apart():
+def test_fingerprints_distinguish_parts():
     """A fingerprint depends on where one part ends and the next begins; text counts as its bytes."""
     assert fingerprint("ab", "c") != fingerprint("a", "bc") != fingerprint("abc")
     assert fingerprint("ab") == fingerprint(b"ab")
@@ -210,7 +210,7 @@ def test_the_plan_names_what_it_does_not_know():
 
 
 def test_a_search_is_done_when_its_file_has_its_case(searched):
-    """The search's file holds the case that it was made with, and is the step's result."""
+    """The search's file holds the case that it was computed with, and is the step's result."""
     plan, root = searched
     with open_netcdf(root / "design" / "design.h5", "search") as search:
         assert tomllib.loads(search.attrs["case"]) == tomllib.loads(plan.steps[0].text)

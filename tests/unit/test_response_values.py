@@ -1,4 +1,4 @@
-"""Numbers of whole frequency responses: their largest value and the widest range below a level, of known curves."""
+"""Numbers of frequency responses: their largest value and the widest range below a level, of curves in closed form."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_data_set_is_not_read_before_its_size_is_known(file):
+def test_the_size_of_a_data_set_is_checked_before_it_is_read(file):
     """Sixteen terabytes of samples are refused by their number, which no memory could hold."""
     assert (
         f"holds (1000000000000, 2) numbers; give time and value in two columns, with at most {MOST_SAMPLES} rows"

@@ -1,4 +1,4 @@
-"""Spectral measures against waves whose spectrum is known, and their sums against Parseval."""
+"""Spectral measures against waves with a spectrum in closed form, and their sums against Parseval."""
 
 import numpy as np
 import pytest
@@ -232,7 +232,7 @@ def test_parts_of_bands_that_overlap_touch_or_begin_above_zero():
     assert Parts.of([Band(1, 1e-9, 6.0)]).names == ("band 1", "above")
 
 
-def test_transfer_is_the_mean_share_after_arrival():
+def test_transfer_is_the_mean_fraction_after_arrival():
     """The transfer is the mean over time, from the arrival on, of the fraction of the energy above the drive."""
     energy = np.array([[1.0, 1.0, 3.0], [0.0, 1.0, 1.0]])
     above = np.array([False, True])
@@ -259,7 +259,7 @@ def test_taper_keeps_the_mean_square():
 
 
 def test_ridge_of_a_packet_lies_on_the_branch():
-    """A packet on band 2 of the four-band cell, made of its Bloch modes."""
+    """A packet on band 2 of the four-band cell, composed of its Bloch modes."""
     cell = four_band("calibrated")
     n = 128
     interval = 4e-4
@@ -274,7 +274,7 @@ def test_ridge_of_a_packet_lies_on_the_branch():
 
     found, frequency = ridge(dispersion(velocity, [1.0], interval, tapers=(1, 0)), floor=1e-2)
     assert len(found) >= 10
-    # The packet travels one way only.
+    # The packet travels in one direction.
     assert np.all(found > 0)
     branch = bloch(cell, found).frequency[:, 1]
     assert np.abs(frequency / branch - 1).max() < 1e-3

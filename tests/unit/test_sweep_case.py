@@ -167,7 +167,7 @@ def test_a_number_or_a_name_finds_its_member():
 
 @pytest.mark.slow
 def test_many_members_are_cheap_until_one_is_asked_for():
-    """A sweep of 250 000 members has their names in seconds, since no case is made until it is asked for."""
+    """A sweep of 250 000 members has their names in seconds, since no case is resolved until it is asked for."""
     plan = sweep_of("[sweep.drive]\namplitude = { linear = [0.0, 1.0], count = 250_000 }")
 
     assert plan.count == 250_000
@@ -179,7 +179,7 @@ def test_many_members_are_cheap_until_one_is_asked_for():
 
 
 def test_a_sweep_of_more_than_a_million_members_is_refused():
-    """1001 times 1000 members are refused before one of them is made."""
+    """1001 times 1000 members are refused before one of them is resolved."""
     amplitudes = "{ linear = [1, 2], count = 1001 }"
     frequencies = "{ linear = [1, 2], count = 1000 }"
     with pytest.raises(CaseError, match="makes 1001000 members; at most 1000000"):
@@ -220,8 +220,8 @@ def test_a_range_meets_decimal_numbers_without_rounding():
     assert values("{ linear = [-0.1, 0.2], count = 4 }") == (-0.1, 0.0, 0.1, 0.2)
 
 
-def test_a_member_is_made_once():
-    """A member is kept once it is made, and not passed on to a copy of the sweep, whose cases differ."""
+def test_a_member_is_resolved_once():
+    """A member is kept once it is resolved, and not passed on to a copy of the sweep, whose cases differ."""
     plan = sweep_of("[sweep.drive]\namplitude = [1.0, 2.0]")
 
     members = plan.members()

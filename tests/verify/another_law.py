@@ -273,6 +273,7 @@ harmonics = 31
         amplitude = curve["amplitude"].values
         largest = curve["largest"].values
     expected = periodic(omega, amplitude[-1], chain)
+    # The second number says that the law's own term counts.
     return {"steady": abs(float(largest[-1, 0]) / expected - 1), "steady_hardens": STEADY_B * (expected - D) ** 2}
 
 

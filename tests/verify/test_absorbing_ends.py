@@ -53,6 +53,7 @@ def test_what_a_drive_sends_is_its_work(cell, mass):
     work = run(of)["energy/work"].values[-1]
 
     source, _ = source_and_sections(of)
+    # At the right alone: a wall at the left reflects what goes there.
     (sent,) = integrate(lambda omegas: source.sent(omegas, "right").sum(axis=1)[None], source.edges())
     assert sent == pytest.approx(work, rel=1e-3)
 
@@ -119,7 +120,9 @@ def test_what_comes_back_in_a_run_is_what_is_stated(strength):
     burst = source.waveform.duration
     every, some, least = returning(source, section, [0, 2 * before / end, 2 * (before + length) / (end - burst)])
     assert reflected([source], [section]) == pytest.approx(every, rel=0.01)
+    # Slow waves are still within the end or before it: the run lies between what has come back for certain and all.
     assert 0.98 * least < measured < 1.02 * some
+    # The weak end reflects fast waves, the strong one slow waves: both bounds are tested.
     assert (least > 0.9 * every) == (strength < 100)
     assert measured > 0.35 * every
 
@@ -142,6 +145,7 @@ def test_both_ends_absorb_what_each_of_them_gets():
         for end in ("right", "both")
     )
     fractions = [stated(of) for of in (one, both)]
+    # In proportion to what each side sends, so that a second end leaves the fraction as it is.
     assert fractions[1] == pytest.approx(fractions[0], rel=0.02)
     # Next to a wall that the end does not replace, waves at the band's edge are not sent at all.
     at_wall = case({"cells": 300, "absorbing": {"cells": 20, "strength": 200.0}}, BURST)
@@ -161,6 +165,7 @@ def test_drives_without_an_end_or_a_sine():
     source, sections = source_and_sections(sine)
     z = condensed(sections[0], np.array([1023.0]))[0]
     waves = damped_waves(source.cell, 1023.0)
+    # Waves that decay carry no energy to the end.
     carries = Side.at("right", waves).decay() < 1e-7
     assert reflected([source], sections) == pytest.approx(reflections(z, waves, "right")[carries].max())
 
@@ -170,6 +175,7 @@ def test_drives_without_an_end_or_a_sine():
     omegas = np.array([50.0, 300.0])
     times = np.linspace(0, waveform.settled, 20001)
     sums = trapezoid(waveform.force(times) * np.exp(-1j * omegas[:, None] * times), times)
+    # The transform of a constant from there on, in the limit of a slow decay.
     tail = np.exp(-1j * omegas * waveform.settled) / (1j * omegas)
     assert waveform.spectrum(omegas) == pytest.approx(sums + tail, rel=1e-5)
     assert 0 < reflected([held], sections) < 1

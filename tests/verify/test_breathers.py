@@ -91,7 +91,7 @@ def test_the_tongues_of_the_in_phase_mode_are_followed():
 
     shooting = Shooting(Dop853Flow(system), MAPS["quarter"], 1e-12)
     resonances = []
-    # The tips, and points some way down the other side of each.
+    # The tips, and points beyond each on its other side.
     for i in (*tips, *(tips + 4)):
         point = points[i]
         frame = shooting.relative_frame(displacement(problem, point), point.period)

@@ -100,7 +100,7 @@ def test_branch_switching(kind, periods, kerschen_in_phase):
     *_, far = Continuation(problem, first, NnmTable(points=10))
     assert far.residual <= 1e-11
 
-    # After a quarter period an orbit of the first branch that began at rest passes through zero, and the other way.
+    # After a quarter period an orbit of the first branch that began at rest passes through zero, and conversely.
     arc = problem.arc(far.x, far.period)
     quarter = problem.flow.arc(arc.start, far.period / 4, far.period).end
     dofs = problem.system.dofs

@@ -63,7 +63,7 @@ def impacts_of(sites: int, episodes: int, loss: float = 0.0) -> xr.Dataset:
 
 
 @pytest.mark.slow
-def test_impacts_that_markers_do_not_tell_apart_are_a_map():
+def test_impacts_that_markers_do_not_distinguish_are_a_map():
     few = impact_panels.impacts(impacts_of(5, 20, 1e-6), None).axes
     assert len(few[0].collections) == 2
     assert not few[0].images

@@ -31,6 +31,7 @@ PROFILES = {"springs[2].damping": {"cells": [7, 8, 15], "value": 0.4}, "groundin
 
 def long_chain(ends: str) -> Chain:
     """A damped four-band lattice of CELLS cells, every mass, spring and dashpot of which is another."""
+    # Three short lattices, one after the other: no two cells are equal.
     parts = [scattered_chain(ends, seed).variation for seed in (1, 2, 3)]
     arrays = {name: np.concatenate([dict(part.items())[name] for part in parts]) for name, _ in parts[0].items()}
     return replace(scattered_chain(ends), cells=CELLS, variation=Variation(**arrays))
@@ -49,6 +50,7 @@ def test_the_loss_of_free_motion_is_that_of_matrix_exponentials(ends):
     c = model.chain.damping_rows(0, CELLS).toarray()
 
     rng = np.random.default_rng(4)
+    # Of the sizes of a wave of about 1 krad/s, so that both count in the loss.
     u = 1e-5 * rng.normal(size=n)
     v = 1e-2 * rng.normal(size=n)
     cells = np.hstack([u.reshape(CELLS, -1), v.reshape(CELLS, -1)])
@@ -59,6 +61,7 @@ def test_the_loss_of_free_motion_is_that_of_matrix_exponentials(ends):
     engine.destroy()
 
     a = np.block([[np.zeros((n, n)), np.eye(n)], [-k / masses[:, None], -c / masses[:, None]]])
+    # Exact for polynomials up to degree 31, far more than the motion needs within an interval.
     nodes, weights = leggauss(16)
     expected = 0.0
     for x, weight in zip(nodes, weights, strict=True):
@@ -101,6 +104,7 @@ def test_the_loss_of_a_driven_lattice_with_stops_is_that_of_scipy(sample_interva
 
     lattice = ScipyLattice(chain.masses(), chain.stiffness_rows(0, 10).toarray(), damping, stops, force)
     end = float(run["time"][-1])
+    # Simpson's rule leaves 1e-9 of the integral at this spacing.
     times = np.linspace(0.0, end, 20_001)
     motion, impacts = lattice.motion(times, np.zeros(10 * d), np.zeros(10 * d), 0.0)
     expected = simpson(np.einsum("ti,ij,tj->t", motion[1], damping, motion[1]), x=times)
@@ -139,9 +143,11 @@ def test_the_energy_balance_closes_by_terms_computed_apart(name, sample_interval
 
     assert statistics["engine"] == "propagator"
     assert statistics["episodes"] > 0
+    # A loss far below the work would close the balance even if it were wrong.
     assert statistics["dissipated_by_damping"] > 0.01 * statistics["work"]
     assert statistics["ledger_error"] < 1e-10
     lost = run["energy/dissipated_by_damping"].values
+    # A dashpot never returns energy; what is below zero is rounding.
     assert np.diff(lost).min() > -1e-15 * statistics["work"]
 
 

@@ -112,7 +112,7 @@ def test_groups_carry_their_time_in_plain_xarray(folder):
         assert impacts.loss.sizes["episode"] > 2
 
 
-def test_links_are_no_variables_and_give_way_to_one(tmp_path):
+def test_links_are_no_variables_and_are_replaced_by_one(tmp_path):
     """A group's variable that has the name of a coordinate stays: no link takes its place."""
     data = {
         "time": variable("time", [0.0, 1.0], "s", "time"),

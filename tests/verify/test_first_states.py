@@ -48,8 +48,10 @@ def after_a_period(states: SteadyStates, omega: float, amplitude: float, start: 
     lattice = ScipyLattice(
         chain.masses(), chain.stiffness_matrix().toarray(), np.zeros((n, n)), stops, lambda t: push * np.cos(omega * t)
     )
+    # From a phase without contact, since the integrator begins with open stops.
     times = (PHASE + np.array([0.0, 2 * np.pi])) / omega
     motion, impacts = lattice.motion(times, *start, start=float(times[0]))
+    # One on either side: the state is the one that was sought.
     assert impacts == 2
     return motion[:2, -1]
 
@@ -74,8 +76,10 @@ def test_a_range_begins_where_growing_amplitudes_do_not_lead(by_weights):
     omega = 1000.0
     few = states_from(omega, 3.0)
     first = first_state(few)
+    # Growing amplitudes alone would not have led there.
     assert len(by_weights) == 1
 
+    # With so many harmonics the truncation is below the tolerance of the comparison.
     many = states_from(omega, 3.0, harmonics=101)
     xi = refined(few, many, first.xi)
     _, amplitude = many.drive(xi[-1])
@@ -94,6 +98,7 @@ def test_growing_weights_lead_to_the_state_of_growing_amplitudes(monkeypatch, by
     assert states.measured(expected).episodes == 2
     assert not by_weights
 
+    # Growing amplitudes are ended early, so that the other path is taken to the same state.
     monkeypatch.setattr(steps, "MOST_RAMP", 5)
     monkeypatch.setattr(steps, "LONGEST_RAMP", 0.5)
     assert first_state(states).xi == pytest.approx(expected, abs=1e-9)

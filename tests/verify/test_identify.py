@@ -1,4 +1,4 @@
-"""Identification: derivatives against both engines, parameters from made records, and what a record cannot tell."""
+"""Identification: derivatives against both engines, parameters from computed records, and what records lack."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def chain_table(path, **record: Any) -> dict[str, Any]:
     }
 
 
-def test_a_displaced_lattice_tells_its_stop_and_its_initial_state(tmp_path):
+def test_a_displaced_lattice_determines_its_stop_and_its_initial_state(tmp_path):
     """Free decay after an unknown release, from another integrator: parameters and the whole state to 1e-6."""
     times = np.arange(0.0, 0.15, 1 / 2000)
     # The offset in the case is half a second off: with no drive the clock must not matter.
@@ -89,7 +89,7 @@ def test_a_displaced_lattice_tells_its_stop_and_its_initial_state(tmp_path):
 
 
 def test_a_struck_lattice_begins_as_the_case_says(tmp_path):
-    """A mass is struck with a known velocity at the offset; the record overrides the case's [initial].
+    """A mass is struck with a given velocity at the offset; the record overrides the case's [initial].
 
     Its first samples are left out: the first window has contacts behind its beginning only.
     """

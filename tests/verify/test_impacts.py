@@ -60,7 +60,7 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     assert episode["approach_velocity"] == pytest.approx(1.0, abs=1e-9)
     assert episode["onset"] == pytest.approx(1e-3, abs=1e-9)
     assert rebound == pytest.approx(effective_restitution(restitution), abs=1e-8)
-    # The law is made for r near 1: its own error is of second order in 1 - r.
+    # The law is derived for r near 1: its own error is of second order in 1 - r.
     assert abs(rebound - restitution) < (1 - restitution) ** 2
 
     reduced_mass = masses[0] * masses[1] / sum(masses)

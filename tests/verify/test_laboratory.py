@@ -17,7 +17,7 @@ TWO_DRIVES = {"more": [{"amplitude": 1.0, "frequency": 1500.0, "cycles": 6, "cel
 
 def laboratory(**time) -> Case:
     """24 damped cells that all differ, and three sites of which each has a law and stops of its own."""
-    # Each site loses energy, so that the restitutions of all three can be scattered either way.
+    # Each site loses energy, so that the restitutions of all three can be scattered up and down.
     each = DIFFERING | {"restitution": [0.6, 0.8, 0.9]}
 
     return small_case(

@@ -37,7 +37,7 @@ def shares(runs: ScatteringRuns, *points: float) -> np.ndarray:
 
 
 def make_runs(folder: Path, case: LawCase) -> ScatteringRuns:
-    """The runs of a law on this rank, none of which has been made."""
+    """The runs of a law on this rank, none of which has been simulated."""
     folder.mkdir(exist_ok=True)
     return ScatteringRuns(case, folder, MPI.COMM_SELF, StopRequest())
 
@@ -47,6 +47,7 @@ def make_runs(folder: Path, case: LawCase) -> ScatteringRuns:
 def test_wave_energies_sum_to_the_lattices_and_go_where_the_wave_goes(cell, cells):
     """Energies of Bloch waves sum to the ring's energy; a single wave's goes with its group velocity."""
     rng = np.random.default_rng(1)
+    # Any state: the sum holds for all of them.
     u, v = rng.normal(size=(2, cells, cell.dofs))
     chain = Chain(cell, cells, "periodic")
     whole = 0.5 * (chain.masses() @ v.ravel() ** 2 + u.ravel() @ chain.stiffness_matrix() @ u.ravel())
@@ -56,9 +57,11 @@ def test_wave_energies_sum_to_the_lattices_and_go_where_the_wave_goes(cell, cell
     assert by_direction(energy, speed).sum() == pytest.approx(whole, rel=1e-12)
 
     number = np.arange(cells)
+    # A wavenumber that fits on the ring, in both directions.
     for kappa in (2 * np.pi * 5 / cells, -2 * np.pi * 5 / cells):
         point = bloch(cell, kappa)
         wave = np.exp(1j * kappa * number)[:, None] * point.vectors[:, 1]
+        # Displacement and velocity of one travelling wave, rather than of a standing one.
         rate = -1j * point.frequency[1] * wave
 
         single = by_direction(*wave_energies(cell, wave.real, rate.real))
@@ -68,6 +71,7 @@ def test_wave_energies_sum_to_the_lattices_and_go_where_the_wave_goes(cell, cell
 
 def test_the_spectrum_of_a_burst_is_its_transform():
     burst = ToneBurst(3.0, 100.0, 5)
+    # The burst begins and ends at zero, so that a plain sum is the trapezoidal rule.
     t, dt = np.linspace(0, burst.duration, 200_001, retstep=True)
     w = np.array([0.0, 30.0, 80.0, 100.0, 120.0, 333.0])
     expected = np.exp(-1j * np.outer(w, t)) @ burst.force(t) * dt
@@ -101,6 +105,7 @@ def test_shares_sum_to_one_and_nothing_happens_below_the_onset(lattice, tmp_path
     transmitted = 2 * runs.setting.band
     reflected = transmitted + 1
 
+    # Below the onset, above it, and where the site is nearly closed.
     quiet, met, hard = shares(runs, 0.999, 1.3, 6.0)
 
     alone = np.zeros_like(quiet)
@@ -112,6 +117,7 @@ def test_shares_sum_to_one_and_nothing_happens_below_the_onset(lattice, tmp_path
         assert row.sum() == pytest.approx(1, abs=1e-5)
         assert row[-2] == 0  # restitution 1 dissipates nothing
         assert row[transmitted] < 0.99
+        # The contact has done something.
         assert row[reflected] > 1e-3
 
 
@@ -123,6 +129,7 @@ def test_a_lossy_site_dissipates_what_is_missing(tmp_path):
 
 
 def test_the_bilinear_law_depends_on_amplitude_over_clearance_alone(tmp_path):
+    # Thirty times apart: with Hertz's law the fractions would differ.
     near = law_case(contacts={"law": "bilinear", "clearance": 1e-3})
     far = law_case(contacts={"law": "bilinear", "clearance": 3e-2})
 
@@ -132,10 +139,11 @@ def test_the_bilinear_law_depends_on_amplitude_over_clearance_alone(tmp_path):
     np.testing.assert_allclose(first, second, atol=1e-6)
 
 
-def test_longer_distances_do_not_change_the_shares(tmp_path):
+def test_longer_distances_do_not_change_the_fractions(tmp_path):
     contacts = {"restitution": 0.7}
     short = make_runs(tmp_path / "short", law_case(law=COARSE | {"settle": 2.0}, contacts=contacts))
     long = make_runs(tmp_path / "long", law_case(law=COARSE | {"settle": 4.0}, contacts=contacts))
+    # Otherwise the longer wait would have no longer ring.
     assert long.setting.cells > 1.5 * short.setting.cells
 
     # What had not passed after the shorter distance is 4e-5.
@@ -190,6 +198,7 @@ def test_a_law_is_refined_to_its_onset(refined):
 
     drops = np.flatnonzero((transmitted[:-1] > 0.9) & (transmitted[1:] <= 0.9))
     assert len(drops)
+    # Two steps of the finest distance: the jump may lie next to a coarser step.
     assert (law.z[drops + 1] / law.z[drops] < 1.01**2).all()
     assert law.at(0.5).transmitted == law.at(1.0).transmitted == 1
     assert law.at(0.5).upper == 0
@@ -270,6 +279,7 @@ def test_matched_clearances_meet_each_site_at_the_best_z():
     assert z == 1.2
     assert transmitted == 0.7
 
+    # An amplitude that differs from site to site.
     linear = SimpleNamespace(envelope=np.linspace(1e-4, 2e-4, 50))
     clearances = matched_clearances(law, linear, [10, 20, 30], -20.0)
     left = np.sqrt(transmitted ** np.arange(3))

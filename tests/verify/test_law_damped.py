@@ -31,7 +31,7 @@ def damped_case(damping: dict[str, float], **law: Any) -> LawCase:
 
 
 def make_runs(folder: Path, case: LawCase) -> ScatteringRuns:
-    """The runs of a law on this rank, none of which has been made."""
+    """The runs of a law on this rank, none of which has been simulated."""
     folder.mkdir(exist_ok=True)
     return ScatteringRuns(case, folder, MPI.COMM_SELF, StopRequest())
 
@@ -39,6 +39,7 @@ def make_runs(folder: Path, case: LawCase) -> ScatteringRuns:
 def fractions(runs: ScatteringRuns, z: float) -> dict[str, float]:
     """The fractions of a single run by name."""
     runs.make([z])
+    # A point is else the mean of several runs, whose scatter would hide what is compared.
     runs.jittered = lambda point: [point]
     mean, _ = runs.outcomes(z)
     return {name: float(mean[name]) for name in FRACTIONS}
@@ -72,16 +73,18 @@ def test_the_law_tends_to_the_undamped_one_as_dashpots_become_weaker(undamped, t
         assert abs(weak[name] - undamped[name]) < 0.5 * far + 4e-4, name
 
 
-def test_the_wave_decays_on_its_way_as_that_of_dashpots_to_ground(tmp_path):
+def test_the_wave_decays_over_the_distance_as_by_dashpots_to_ground(tmp_path):
     """Dashpots of c m on every mass m take exp(-c t) of the energy: t is the distance over the group velocity."""
     runs = make_runs(tmp_path, damped_case({"mass": 2.0}))
     waves = runs.site_waves
     distance = runs.setting.distance
     band = runs.setting.band
+    # Each wavenumber of the packet has its own speed, and so its own loss.
     sent = waves.weight[:, band] * waves.flux[0, :, band] * np.abs(waves.leaving_drive[:, band]) ** 2
     expected = sent @ np.exp(-2.0 * distance / waves.speed[:, band]) / sent.sum()
 
     assert 1 - waves.taken_before() == pytest.approx(expected, rel=2e-4)
+    # Otherwise a decay that is left out would hardly be seen.
     assert expected < 0.95
 
 
@@ -110,6 +113,7 @@ def test_the_power_through_springs_is_that_of_the_waves(tmp_path):
         i = int(np.flatnonzero(run["cell"].values == cell)[0])
         motion = [run[name].values for name in ("displacement", "velocity")]
         (u, v), (next_u, next_v) = ([f[:, i, spring.start] for f in motion], [f[:, i + 1, spring.end] for f in motion])
+        # The dashpot of the spring carries power, too.
         pull = spring.stiffness * (u - next_u) + spring.damping * (v - next_v)
         return float((pull * (v + next_v) / 2).sum() * setting.interval / amplitude**2)
 
@@ -123,12 +127,14 @@ def test_the_power_through_springs_is_that_of_the_waves(tmp_path):
     returning = carried(BACKWARD, amplitudes[1], away + 0.5)
     coming = carried(FORWARD, waves.arriving, -away - 0.5)
     assert through(site - away - 1) == pytest.approx(coming - returning, abs=2e-3 * runs.arrived)
+    # Enough comes back for its flux to be tested.
     assert returning > 0.05 * runs.arrived
 
 
 def test_the_spectrum_at_any_frequency_is_the_transform():
     """At the frequencies of a fast transform, and between them."""
     rng = np.random.default_rng(3)
+    # An odd length, for which the transform has no bin at half of the sampling rate.
     signal = rng.normal(size=77)
     step = 1e-3
     at_bins = 2 * np.pi * np.fft.rfftfreq(77, step)

@@ -83,7 +83,7 @@ def test_what_is_kept_does_not_change_what_is_measured(sweep, tmp_path):
 
 
 @pytest.mark.slow
-def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
+def test_damaged_records_are_named_and_simulated_again(sweep, tmp_path):
     _, _, folder = sweep
     out = shutil.copytree(folder, tmp_path / "out")
     before = datasets(out / "ensemble.h5")
@@ -94,7 +94,7 @@ def test_records_that_were_damaged_are_named_and_made_again(sweep, tmp_path):
     assert len(lines) == 7
     assert b'"linear"' in lines[0][:10]
 
-    # Without the linear run the two members that are scaled from it are made too.
+    # Without the linear run the two members that are scaled from it are simulated too.
     for number, missing in ((0, 2), (2, 1), (6, 1)):
         damaged = lines.copy()
         damaged[number] = lines[number].replace(b"2", b"3", 1)
@@ -155,7 +155,7 @@ def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_linear_run_that_was_not_foreseen_is_made_where_it_is_needed(sweep, tmp_path, monkeypatch):
+def test_an_unforeseen_linear_run_is_simulated_where_it_is_needed(sweep, tmp_path, monkeypatch):
     _, ensemble, _ = sweep
     # Only the first member is looked at before the sweep: the second site list comes as a surprise.
     monkeypatch.setattr("vipetsc.studies.sweep.MOST_SURVEYED", 1)

@@ -54,7 +54,7 @@ def test_its_only_mode():
 def test_dashpots_alone_resist_a_motion_of_equal_masses_together():
     cell = Case.from_table(ONE_MASS).model().chain.cell
     assert damped_bloch(cell, 0.0).rate == pytest.approx([0.0], abs=1e-12)
-    # A wave that is slow beside its damping has two real rates, whose product is the squared frequency.
+    # A wave that is slow compared with its damping has two real rates, whose product is the squared frequency.
     rate = damped_bloch(cell, 0.01).rate[0]
     squared = 4 * 0.75 * np.sin(0.005) ** 2
     assert rate == pytest.approx(-0.03 + np.sqrt(0.03**2 - squared), rel=1e-9)

@@ -33,7 +33,7 @@ SPRINGS = [{"start": 1, "end": 1, "stiffness": 1.0, "next_cell": True}, {"start"
 
 
 def absorbing(end: str = "both", **nfrc: Any) -> dict[str, Any]:
-    """A lattice of two masses a cell with absorbing ends, one site and a force beside it."""
+    """A lattice of two masses a cell with absorbing ends, one site and a force next to it."""
     lattice = {"cells": 12, "cell": {"masses": [1.0, 0.3], "springs": SPRINGS, "contact": [1, 2]}}
     ends = {"end": end, "cells": 3, "strength": 2.0}
     options = {"source": "force", "over": "amplitude", "range": [2.0, 2.5], "fixed": [0.7], "harmonics": 9}

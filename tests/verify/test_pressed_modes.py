@@ -254,7 +254,7 @@ OPENING = 8000.0
 
 
 def test_the_state_at_rest_is_that_of_a_run():
-    """Stiffness, load and energy of small and large motions are those with which runs are made."""
+    """Stiffness, load and energy of small and large motions are those of runs."""
     nnm = System.from_case(NnmCase.from_table(SITES))
     time = {"end": 0.01, "sample_interval": 1e-4}
     drive = {"amplitude": 1.0, "frequency": 1000.0, "cycles": 3, "cell": 4}

@@ -145,7 +145,7 @@ def test_undecided_states_have_no_special_points_between_them(tmp_path, monkeypa
 
 
 class States:
-    """Steady states of given stability, of which nothing else is known."""
+    """Steady states of given stability, of which nothing else is given."""
 
     options = SimpleNamespace(special_points="all")
 
@@ -177,7 +177,7 @@ class States:
         (Stability(3, 1.0, -1.0), 1.0, ["period-doubling", "neimark-sacker"]),
     ],
 )
-def test_signs_and_numbers_tell_the_kinds(right, slope, kinds):
+def test_signs_and_numbers_give_the_kinds(right, slope, kinds):
     """A determinant that changes sign is a real multiplier that passes; pairs are what is left of the number."""
     states = States(Stability(0, 1.0, 1.0), right)
     ends = [Response(xi=np.array([float(i)]), tangent=np.array([tangent])) for i, tangent in enumerate((1.0, slope))]

@@ -1,4 +1,4 @@
-"""Struck masses move as theory says, on both engines, and pictures and measures of such runs are made."""
+"""Struck masses move as theory says, on both engines, and such runs have pictures and measures."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def test_a_wave_is_refused():
 
 
 def test_a_lattice_without_damping_has_a_state_between_its_resonances():
-    """The dashpots on the way keep the state from the resonance that a growing force passes; none of them is left."""
+    """Dashpots of the continuation keep the state from the resonance that a growing force passes; none is left."""
     cell = {
         "masses": [0.004, 0.002],
         "springs": [

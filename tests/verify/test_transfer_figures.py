@@ -223,7 +223,7 @@ def test_transfer_has_a_panel_a_band_and_both_segments(whole, transfer_pictures)
     assert list(transfer_pictures) == [f"hertz-calibrated-1-site-4-cycles-{a}N" for a in (1, 60)]
 
     figure = transfer_pictures["hertz-calibrated-1-site-4-cycles-60N"]
-    # Matplotlib before 3.8 has no public way to a figure's title.
+    # Matplotlib before 3.8 has no public access to a figure's title.
     heading = figure.get_suptitle() if hasattr(figure, "get_suptitle") else figure._suptitle.get_text()
     assert heading == "Hertz, calibrated, 1 site, 4 cycles, 60 N"
 

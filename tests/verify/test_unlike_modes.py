@@ -216,7 +216,7 @@ def test_bloch_waves_and_all_modes_give_the_same_breather_on_one_side(one_sided)
 
 
 def test_a_breather_begins_at_the_site_that_is_asked_for():
-    """At a linear stop that is twice as far the breather is twice as large, and the other way it is its negative."""
+    """At a linear stop that is twice as far the breather is twice as large, on the other side its negative."""
     sites = (4, 13)
     chain = Chain(breather_chain().cell, 18, "fixed", sites, (CLEARANCE, 2 * CLEARANCE))
     stops = [Stops.both(four_band_contact("bilinear"), clearance) for clearance in chain.clearances]
