@@ -80,6 +80,7 @@ def numbers_of(folder: Path) -> dict[str, np.ndarray]:
     return numbers
 
 
+@pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize("column", STUDIES, ids=lambda column: column.heading)
 def test_every_yes_is_computed(column, tmp_path, in_process):
     """The verb ends well, and its results differ from those without the feature: no yes is one that is ignored."""

@@ -171,6 +171,9 @@ start_energy = {0.9 * touching}
 points = 60
 truncation = 1e-4
 
+[output]
+figures = false
+
 [nnm.own]
 masses = [{MASS}]
 springs = [{{ start = 0, end = 1, stiffness = {SPRING} }}]
@@ -197,7 +200,7 @@ def periodic(omega: float, amplitude: float, chain) -> float:
     pair[chain.cell.resonator] = 1
 
     def rate(t, y, strength):
-        u, v = np.split(y, 2)
+        u, v = y.reshape(2, -1)
         w = pair @ u
         push = np.sign(w) * force(max(abs(w) - D, 0.0), SOFT, STEADY_B)
         pull = stiffness @ u + push * pair
@@ -208,7 +211,7 @@ def periodic(omega: float, amplitude: float, chain) -> float:
         # Nothing dissipates: the orbit is even in time, and so about half a period.
         times = np.linspace(0, np.pi / omega, 201)
         start = np.concatenate([u, 0 * u])
-        return solve_ivp(rate, times[[0, -1]], start, "DOP853", times, args=(strength,), rtol=1e-10, atol=1e-14).y
+        return solve_ivp(rate, times[[0, -1]], start, "DOP853", times, args=(strength,), rtol=1e-8, atol=1e-12).y
 
     n = len(masses)
     linear = np.linalg.solve(stiffness - omega**2 * np.diag(masses), np.eye(n)[0])
@@ -220,7 +223,7 @@ def periodic(omega: float, amplitude: float, chain) -> float:
         def speeds_after_half_a_period(u, strength=strength):
             return orbit(u, strength)[n:, -1] / (omega * D)
 
-        solved = root(speeds_after_half_a_period, u * strength / last, tol=1e-9)
+        solved = root(speeds_after_half_a_period, u * strength / last, tol=1e-7)
         assert solved.success, solved.message
         u = solved.x
         last = strength
@@ -263,6 +266,9 @@ infinite = false
 fixed = [{omega}]
 range = [{0.9 * touching}, {3 * touching}]
 harmonics = 31
+
+[output]
+figures = false
 """
     Path("nfrc.toml").write_text(case)
 

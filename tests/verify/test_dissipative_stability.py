@@ -58,7 +58,7 @@ class ForcedCell:
         self.omega = omega
 
     def rate(self, t, y, side, approach):
-        u, v = np.split(y, 2)
+        u, v = y.reshape(2, -1)
         force = self.load * np.cos(self.omega * t) - self.stiffness @ u
         if side:
             # Up to rounding the contact is closed while it is in contact.
@@ -67,7 +67,7 @@ class ForcedCell:
         return np.concatenate([v, force / self.masses])
 
     def gap(self, t, y, side, approach):
-        w = self.pair @ np.split(y, 2)[0]
+        w = self.pair @ y[: len(self.masses)]
         return side * w - self.clearance if side else abs(w) - self.clearance
 
     def one_period(self, state, phase):
@@ -88,7 +88,7 @@ class ForcedCell:
                              atol=1e-14, max_step=2e-4)  # fmt: skip
             t = done.t[-1]
             y = done.y[:, -1]
-            u, v = np.split(y, 2)
+            u, v = y.reshape(2, -1)
             side = 0.0 if side else float(np.sign(self.pair @ u))
             approach = self.pair @ v
         return y

@@ -35,7 +35,7 @@ class Reference:
 
     def rate(self, t: float, y: np.ndarray) -> np.ndarray:
         """Time derivative of displacements and velocities."""
-        u, v = np.split(y, 2)
+        u, v = y.reshape(2, -1)
         force = self.pull @ u
         if self.side.any():
             force += self.contact_forces(u, v)
