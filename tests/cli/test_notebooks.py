@@ -38,6 +38,7 @@ def test_a_notebook_is_kept_without_what_it_printed(path):
     assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
     assert cells(path, "markdown")[0].startswith("# ")
     identities = [cell["id"] for cell in notebook["cells"]]
+    # Cells that were copied have the same identity, of which Jupyter warns.
     assert len({*identities}) == len(identities)
     for cell in notebook["cells"]:
         assert cell.get("outputs", []) == []
@@ -53,6 +54,7 @@ def test_the_manual_shows_what_each_cell_draws():
                 drawing.add(f"notebook-{path.stem}-{number}")
 
     assert drawing == {path.stem for path in (FOLDER.parent / "pictures").glob("notebook-*.png")}
+    # One each: a notebook whose code draws in another manner would not be found above.
     assert len(drawing) == len(NOTEBOOKS)
 
 
@@ -76,11 +78,13 @@ def test_its_cells_run(path, monkeypatch, tmp_path, capsys):
     try:
         names = execute(path)
     finally:
+        # Figures of a notebook stay open, and would be those of the next test.
         plt.close("all")
 
     printed = capsys.readouterr().out
     if path.stem == "own-lattice":
         assert "returns to the site" in printed
+        # What the text says of the number, not its digits, which belong to other tests.
         assert 0.2 < names["dissipated"] < 0.5
     elif path.stem == "sweep-heat-map":
         assert names["fraction"].shape == (5, 6)

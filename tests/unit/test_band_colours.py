@@ -17,6 +17,7 @@ X = np.array([1.0, 2.0, 4.0])
 
 
 def prediction(level: float = 0.2) -> Figure:
+    # Equal energies: only their looks distinguish the curves.
     energies = np.full((3, 4), level)
     data = {"sites/cell": ("site", [5, 9, 12])}
     for kind in ("predicted", "simulated"):
@@ -40,6 +41,7 @@ def law() -> Figure:
 
 def parts() -> Figure:
     figure = style.new_figure(3, 2)
+    # Gaps between them, as measures have, which take no colour of a band.
     names = [name for band in BANDS for name in (f"band {band}", f"gap {band}")]
     transfer.draw_parts(figure.subplots(), X, names, [X] * len(names))
     return figure
@@ -92,6 +94,7 @@ def test_legends_of_a_prediction_touch_nothing(level, tmp_path):
     for axes, box in boxes:
         drawn = [axes.transData.transform(line.get_xydata()) for line in axes.lines if len(line.get_xydata()) == len(X)]
         assert box.y0 > max(points[:, 1].max() for points in drawn)
+        # A legend as wide as its axes would leave no place for the curves.
         assert box.x1 < axes.bbox.x1
 
 

@@ -37,6 +37,7 @@ def test_keywords_give_the_case_of_the_table():
 def test_what_a_program_holds_is_taken():
     """Arrays, tuples, numbers of numpy, paths, sections of another case are what a file has; None is a key left out."""
     written = {"cell": {"masses": [0.01, 0.004], "springs": SPRINGS}, "cells": 60}
+    # The types in which a program holds what a file has as lists and numbers.
     held = {"cell": {"masses": np.array([0.01, 0.004]), "springs": tuple(SPRINGS)}, "cells": np.int64(60), "ends": None}
     drive = {"amplitude": np.float64(8.0), "band": 2, "at": "max-group-velocity"}
     case = Case(lattice=held, drive=drive, contacts=None)
@@ -54,6 +55,7 @@ def test_bad_input_is_refused_as_in_a_file():
         Case.from_table(wrong)
     with pytest.raises(CaseError) as of_keywords:
         Case(**wrong)
+    # The whole text, with all problems in their order.
     assert str(of_keywords.value) == str(of_table.value)
     assert "lattice.cels = 3: unknown key; did you mean lattice.cells?" in str(of_keywords.value)
 
@@ -105,6 +107,7 @@ def test_every_cell_can_be_drawn():
     bead = UnitCell((0.03,), (), 0, 0)
     assert drawing(bead, Pair(0, 0, next_cell=True)).count("circle") == 2
     lone = UnitCell((0.1,), (Spring(0, 0, 1e3, next_cell=True),), 0, 0)
+    # The spring to the next cell, and two halves of the clearance.
     assert drawing(lone, Pair(-1, 0)).count("polyline") == 3
     apart = UnitCell((0.1, 0.2, 0.3), (Spring(0, 0, 1e3, next_cell=True), Spring(1, 2, 1e3)), 0, 1)
     assert drawing(apart, Pair(0, 1)).count("circle") == 4
@@ -116,6 +119,7 @@ def test_text_in_a_table_is_text():
     assert "&lt;b&gt;" in html
     assert "x &lt; y" in html
     assert "gone" not in html
+    # An empty text is left out like None.
     assert "none" not in html
 
 

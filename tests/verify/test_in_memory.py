@@ -40,6 +40,7 @@ def test_a_run_without_a_folder_is_the_run_with_one(tmp_path):
 
     assert held.folder is None
     assert held.complete
+    # To the bit: where results are kept must not change the integration.
     assert held.dataset["velocity"].values.tobytes() == stored.dataset["velocity"].values.tobytes()
     assert held.dataset["velocity"].dims == stored.dataset["velocity"].dims
     assert "complete: " in held._repr_html_()
@@ -59,6 +60,7 @@ def test_a_sweep_without_a_folder_is_the_sweep_with_one(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     plan = small_sweep()
     held = run_sweep(plan)
+    # A temporary folder that is left would fill the disk of a long session.
     assert list(tmp_path.iterdir()) == []
     assert held.folder is None
     assert held.complete
@@ -66,7 +68,9 @@ def test_a_sweep_without_a_folder_is_the_sweep_with_one(tmp_path, monkeypatch):
 
     stored = run_sweep(plan, tmp_path / "sweep")
     xr.testing.assert_equal(
-        held.dataset.drop_vars("cpu_seconds", errors="ignore"), stored.dataset.drop_vars("cpu_seconds", errors="ignore")
+        # CPU times differ from call to call.
+        held.dataset.drop_vars("cpu_seconds", errors="ignore"),
+        stored.dataset.drop_vars("cpu_seconds", errors="ignore"),
     )
     assert np.isfinite(held.dataset["ibtet"]).all()
     assert "sweep of 2 members" in held._repr_html_()
@@ -95,6 +99,7 @@ def test_fields_of_members_need_a_folder():
 
 def test_ranks_of_several_machines_need_a_folder(monkeypatch):
     """A temporary folder of one machine is not seen by the others."""
+    # One machine is all that a test has.
     monkeypatch.setattr(sweeps, "on_one_machine", lambda comm: False)
     with pytest.raises(ValueError, match="ranks on several machines need a folder that all of them see"):
         run_sweep(small_sweep())

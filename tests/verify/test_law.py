@@ -1,4 +1,4 @@
-"""The scattering law of one site: waves by band and direction, shares that sum to one, what does not change them."""
+"""The scattering law of one site: waves by band and direction, fractions that sum to one, what does not change them."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from vipetsc.studies.pair_motion import largest_between
 from vipetsc.studies.scattering_law import POINT_LAYOUT, ScatteringLaw, ScatteringOutcome, matched_clearances
 
 
-def shares(runs: ScatteringRuns, *points: float) -> np.ndarray:
-    """Shares (point, ...) of single runs: band and direction, then dissipated and contact."""
+def fractions(runs: ScatteringRuns, *points: float) -> np.ndarray:
+    """Fractions (point, ...) of single runs: band and direction, then dissipated and contact."""
     runs.make([*points])
     runs.jittered = lambda z: [z]
     # One outcome a point, without the jitter of the clearance.
@@ -100,13 +100,13 @@ def test_the_largest_value_between_samples():
 
 
 @pytest.mark.parametrize("lattice", LATTICES)
-def test_shares_sum_to_one_and_nothing_happens_below_the_onset(lattice, tmp_path):
+def test_fractions_sum_to_one_and_nothing_happens_below_the_onset(lattice, tmp_path):
     runs = make_runs(tmp_path, law_case(lattice))
     transmitted = 2 * runs.setting.band
     reflected = transmitted + 1
 
     # Below the onset, above it, and where the site is nearly closed.
-    quiet, met, hard = shares(runs, 0.999, 1.3, 6.0)
+    quiet, met, hard = fractions(runs, 0.999, 1.3, 6.0)
 
     alone = np.zeros_like(quiet)
     alone[transmitted] = 1
@@ -122,7 +122,7 @@ def test_shares_sum_to_one_and_nothing_happens_below_the_onset(lattice, tmp_path
 
 
 def test_a_lossy_site_dissipates_what_is_missing(tmp_path):
-    (row,) = shares(make_runs(tmp_path, law_case(contacts={"restitution": 0.6})), 1.5)
+    (row,) = fractions(make_runs(tmp_path, law_case(contacts={"restitution": 0.6})), 1.5)
 
     assert row.sum() == pytest.approx(1, abs=1e-7)
     assert row[-2] > 0.01
@@ -133,8 +133,8 @@ def test_the_bilinear_law_depends_on_amplitude_over_clearance_alone(tmp_path):
     near = law_case(contacts={"law": "bilinear", "clearance": 1e-3})
     far = law_case(contacts={"law": "bilinear", "clearance": 3e-2})
 
-    first = shares(make_runs(tmp_path / "near", near), 1.2, 2.0)
-    second = shares(make_runs(tmp_path / "far", far), 1.2, 2.0)
+    first = fractions(make_runs(tmp_path / "near", near), 1.2, 2.0)
+    second = fractions(make_runs(tmp_path / "far", far), 1.2, 2.0)
 
     np.testing.assert_allclose(first, second, atol=1e-6)
 
@@ -147,7 +147,7 @@ def test_longer_distances_do_not_change_the_fractions(tmp_path):
     assert long.setting.cells > 1.5 * short.setting.cells
 
     # What had not passed after the shorter distance is 4e-5.
-    np.testing.assert_allclose(shares(short, 1.2, 2.0), shares(long, 1.2, 2.0), atol=1e-4)
+    np.testing.assert_allclose(fractions(short, 1.2, 2.0), fractions(long, 1.2, 2.0), atol=1e-4)
 
 
 def test_a_site_below_the_drive_is_met_forward(tmp_path):
@@ -156,8 +156,8 @@ def test_a_site_below_the_drive_is_met_forward(tmp_path):
     below = law_case(drive={"cell": 1, "mass": 1}, contacts=contacts)
     above = law_case(drive={"cell": 300, "mass": 4}, contacts=contacts)
 
-    up = shares(make_runs(tmp_path / "up", below), 1.2)
-    down = shares(make_runs(tmp_path / "down", above), 1.2)
+    up = fractions(make_runs(tmp_path / "up", below), 1.2)
+    down = fractions(make_runs(tmp_path / "down", above), 1.2)
 
     np.testing.assert_allclose(up, down, atol=1e-6)
 
@@ -168,10 +168,10 @@ def test_a_wave_sent_by_a_moved_wall_has_the_same_law(tmp_path):
     mass = wall.model().drive_mass + 1
     force = law_case(drive={"cell": 1, "mass": mass}, law=COARSE | {"distance": 20})
     runs = make_runs(tmp_path / "wall", wall)
-    moved = shares(runs, 1.3)
-    np.testing.assert_array_equal(moved, shares(make_runs(tmp_path / "force", force), 1.3))
+    moved = fractions(runs, 1.3)
+    np.testing.assert_array_equal(moved, fractions(make_runs(tmp_path / "force", force), 1.3))
 
-    del runs.jittered  # what ``shares`` put in its place
+    del runs.jittered  # what ``fractions`` put in its place
     data = runs.dataset({1.0: np.nan, 1.3: np.nan})
     assert data["amplitude"].attrs["units"] == "m"
     onset = float(data["amplitude"][0])

@@ -185,6 +185,7 @@ def packet_speed(cell: UnitCell, drive: OneDrive) -> float:
 
 def wave_speed(cell: UnitCell, frequency: float) -> float:
     """Group velocity in cells/s of the fastest wave at ``frequency``; in a gap, the cell's fastest."""
+    # The fastest, since what arrives first decides how long a run lasts.
     speed = max((wave[2] for wave in waves_at(cell, frequency)), default=0.0)
     return speed or fastest_speed(cell)
 
@@ -192,6 +193,7 @@ def wave_speed(cell: UnitCell, frequency: float) -> float:
 def check_wave(cell: UnitCell, drive: OneDrive, time: TimeTable) -> Iterator[Problem]:
     """Problems with a valid drive that sends out no wave, or one that never crosses the lattice."""
     frequency, speed = driven_wave(cell, drive)
+    # The key by which the user has chosen the wave.
     key = next((name for name in ("frequency", "wavenumber") if getattr(drive, name)), "band")
     if not frequency > 0:
         yield Problem(
@@ -210,6 +212,7 @@ def resolve_drives(drives: DriveTable, cell: UnitCell, cells: int, frequency: fl
     resolved = resolve_drive(drives, cell, cells, frequency)
     if not drives.more:
         return resolved.model_copy(update={"more": None})
+    # The motion at t = 0 gives the frequency of the first drive alone.
     others = [resolve_drive(drive, cell, cells) for drive in drives.more]
     return resolved.model_copy(update={"more": others})
 
@@ -245,6 +248,7 @@ def build_drive(drive: OneDrive, chain: Chain) -> list[Drive]:
             # The spring to the left wall belongs to the cell before the first one, which does not vary.
             built.append(Drive(waveform, 0, mass, float(chain.cell.springs[number].stiffness)))
         else:
+            # Of the last cell's own spring: with a profile it is another than the reference cell's.
             stiffness = chain.coefficients(last, last + 1).stiffness[0, number]
             built.append(Drive(waveform, last, mass, float(stiffness)))
     return built

@@ -31,7 +31,10 @@ from vipetsc.lattice.contact import LAWS
 
 DASHPOTS = ("dashpot", "grounding")
 MOST_MASSES = 200
-"""Masses of a lattice whose initial state is estimated: each has two unknowns."""
+"""Masses of a lattice whose initial state is estimated.
+
+Each has two unknowns, by which the motion is differentiated: 400 columns of 400 numbers, 1.3 MB a stage of a step.
+"""
 
 
 class IdentifyTable(Section):
@@ -80,11 +83,13 @@ class IdentifyCase(StudyCase):
             base = Case.from_table({k: table[k] for k in table if k in Case.model_fields} | {"name": "model"})
         except CaseError as error:
             return {}, problems + error.problems
+        # The case is valid: what remains is whether this verb can do what it asks.
         problems += refusals(cls, dict(base), lambda *keys: True)
         if problems:
             return {}, problems
 
         fields = {"table": table, "options": options, "base": base}
+        # Data are read last: a file of GBs must not be read for a case that is refused anyway.
         problems = [*_case_problems(base), *_unknown_problems(options, base), *_record_problems(options, base)]
         if problems:
             return fields, problems
@@ -130,6 +135,7 @@ class IdentifyCase(StudyCase):
                         members=(number,),
                         low=low,
                         high=high,
+                        # The middle of the bounds: the case has no clock of a record from which to begin.
                         start=(low + high) / 2,
                         unit="s",
                         is_logarithmic=False,
@@ -151,6 +157,7 @@ def _varied_sections(record: RecordTable) -> dict[str, Any]:
     """The sections of a case in which a ``record`` differs from it."""
     sections = {}
     if record.drive:
+        # A copy: tables are changed as they are read.
         sections["drive"] = copy.deepcopy(record.drive)
     if isinstance(record.initial, dict) and record.initial:
         sections["initial"] = copy.deepcopy(record.initial)
@@ -232,6 +239,7 @@ def _bounds_problems(unknown: UnknownTable, at: str) -> Iterator[Problem]:
     """Problems of bounds beyond what the quantity may be."""
     low, high = unknown.bounds
     quantity = unknown.quantity
+    # On a linear scale any bounds will do.
     if quantity in OF_EITHER_SIGN and unknown.scale != "logarithmic":
         return
     if quantity == "restitution" and not 0 <= low < high <= 1:
@@ -266,8 +274,10 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             base.varied(**_varied_sections(record))
         except CaseError as error:
             for problem in error.problems:
+                # Named by the record's key: the case itself is valid.
                 yield replace(problem, key=f"{at}.{problem.key}")
 
+    # Without contact the misfit does not depend on them, and the fit would be singular.
     if not any(record.contact for record in options.records):
         for index, unknown in enumerate(options.unknowns, 1):
             if unknown.quantity in OF_SITES:

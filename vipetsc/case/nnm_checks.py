@@ -24,6 +24,7 @@ def check_options(nnm: NnmTable) -> Iterator[Problem]:
     for key, (low, high) in (("energy", nnm.energy), ("frequency", nnm.frequency)):
         if not low < high:
             yield Problem(f"nnm.{key}", [low, high], "must be [low, high]")
+    # Downwards the energy tends to zero, and steps in its logarithm never end.
     if nnm.direction != "up" and not nnm.energy[0] > 0:
         yield Problem("nnm.energy", nnm.energy, "the direction down needs a lowest energy above 0 (J)")
 
@@ -193,6 +194,7 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
     if not nnm.start_frequency:
         yield Problem("nnm.start_frequency", [], "give frequencies in rad/s, between the pass bands or above them")
 
+    # Every place with a nonlinear force has harmonics of its own.
     count = len(chain.sites) + len(nonlinear_places(chain))
     yield from check_start_sites(nnm, count)
 
@@ -243,5 +245,6 @@ def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iter
     if nnm.shooting == "dense" and (nnm.multipliers or nnm.start_frequency):
         key = "multipliers" if nnm.multipliers else "start_frequency"
         yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs nnm.shooting = "krylov"; "dense" has all half-traces')
+    # Beyond this size all linear modes are no longer computed, from which branches begin.
     if krylov and dofs > MOST_MASSES and not nnm.start_frequency:
         yield Problem("nnm.modes", nnm.modes, f"are computed up to {MOST_MASSES} masses: give nnm.start_frequency")

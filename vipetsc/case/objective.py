@@ -108,6 +108,7 @@ class ConstraintTable(MeasuredTable):
             below = (self.at_least - value) / (abs(self.at_least) or 1.0)
         if self.at_most is not None:
             above = (value - self.at_most) / (abs(self.at_most) or 1.0)
+        # Relative excesses of different constraints can be added.
         return max(below, above, 0.0)
 
 
@@ -195,6 +196,7 @@ def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | N
 
 def _nearest(name: str, valid: Sequence[str]) -> str:
     """The nearest of the ``valid`` names if there is one, and all of them."""
+    # 0.6 is difflib's own bound: below it proposals are guesses.
     near = difflib.get_close_matches(name, valid, n=1, cutoff=0.6)
     hint = f"did you mean {near[0]!r}? " if near else ""
     return f"{hint}There are {', '.join(valid)}"
@@ -221,6 +223,7 @@ def _problems_of_runs(objective: MeasuredTable, at: str, base: Case) -> Iterator
         return
 
     is_of_bands = measures[name].dimension == PART
+    # It would be NaN in every run, and all designs would fail.
     if name.startswith("steady") and base.drive.kind != "harmonic":
         remedy = f"a {base.drive.kind} becomes no steady vibration; drive.waveform = harmonic, or peak and rms"
         yield Problem(f"{at}.measure", name, remedy)

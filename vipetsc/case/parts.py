@@ -1,7 +1,7 @@
 """The section ``[plugins]``: modules of the user's, which register laws, waveforms and other parts by name.
 
 The resolved case records every part on which numbers depend, with the version of its module and the SHA-256 of its
-source, so that every result carries them and one that was begun with another source is not gone on with.
+source, so that every result carries them and one that was begun with another source is not continued.
 """
 
 import logging
@@ -55,6 +55,7 @@ class PartName:
         return (*self.shipped, *plugins.registered(self.kind))
 
     def _check(self, value: Any) -> str:
+        # At the check, not at import: modules of the case register their names in between.
         if isinstance(value, str) and value in self.choices:
             return value
         names = [repr(name) for name in self.choices]
@@ -77,6 +78,7 @@ def module_names(table: Mapping[str, Any]) -> list[str]:
     section = table.get("plugins")
     if not isinstance(section, dict):
         return []
+    # Before the types are checked, so that anything may be here; what is wrong is named by that check.
     names = section.get("modules")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return []
@@ -108,6 +110,7 @@ def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
             return table, [Problem("plugins.modules", None, "missing; name files or modules")]
         return table, []
 
+    # Whole paths: results are read from other folders than the one in which they were computed.
     table = with_located(table, Path())
     earlier = table["plugins"].get("parts")
     recorded: dict[str, Any] = {}
@@ -119,6 +122,7 @@ def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
         try:
             rows = _record(name)
         except plugins.PluginError as error:
+            # The record of an earlier reading stands for the module that is not there.
             rows = _rows_of(recorded, name)
             if earlier is None or any(kind in PHYSICS and part in _texts(table) for kind, part, _ in rows):
                 problems.append(Problem(f"plugins.modules[{number + 1}]", names[number], str(error)))
@@ -132,6 +136,7 @@ def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
         now = parts.get(kind, {}).get(part)
         if now and now.get("sha256") != row.get("sha256"):
             changed.setdefault(now["module"], []).append(f"{kind} {part}")
+    # One warning a file, which lists its parts.
     for name, which in changed.items():
         _warn(f"{name} has changed since the case was resolved that used it: {', '.join(which)}")
     return table | {"plugins": table["plugins"] | {"parts": parts}}, problems
@@ -150,6 +155,7 @@ def parts_in_use(table: Mapping[str, Any]) -> list[tuple[plugins.Plugin, Registe
         except plugins.PluginError:
             continue
         for part in plugin.parts:
+            # A module may register several laws, of which the case uses one.
             if part.kind not in PHYSICS or part.name in texts:
                 used.append((plugin, part))
     return used

@@ -34,6 +34,7 @@ def number(value: Any) -> Any:
 
 def once(values: list[Any]) -> list[Any]:
     """``values`` if none of them comes twice; raises ValueError."""
+    # Each named once, in the order of the list.
     twice = [value for value in dict.fromkeys(values) if values.count(value) > 1]
     if twice:
         raise ValueError(f"names {', '.join(map(repr, twice))} more than once")
@@ -133,6 +134,7 @@ class CellTable(Section):
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
         """The arguments of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
         springs = tuple(spring.spring() for spring in self.springs)
+        # A cell of one mass has no pair: host and resonator are the same, which only a contact would refuse.
         host, resonator = self.contact or (1, min(2, len(self.masses)))
         return tuple(self.masses), springs, host - 1, resonator - 1, tuple(self.grounding or ())
 
@@ -152,6 +154,7 @@ class DampingTable(Section):
 
     def fitted(self, cell: UnitCell) -> tuple[np.ndarray, np.ndarray]:
         """The dashpots (dof,), (spring,) in N s/m of a valid ``loss`` in the undamped ``cell``; 0 without one."""
+        # A resolved case has the fitted dashpots, which are not fitted again: another version might fit others.
         if self.grounding is None and self.loss:
             return fitted_dashpots(cell, tuple((int(band), loss) for band, loss in self.loss.items()))
         return np.array(self.grounding or 0.0), np.array(self.springs or 0.0)

@@ -40,7 +40,7 @@ def bounded(parameter: LawParameter) -> Any:
 
 
 if TYPE_CHECKING:
-
+    # For the type checker: keys that are created at run time are invisible to it.
     class ElasticLaw(Section):
         """The law of all sites, and its parameters."""
 

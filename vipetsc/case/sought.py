@@ -96,12 +96,14 @@ class SoughtParameter(NamedTuple):
         """The value at the fit's coordinate ``z``, kept between the bounds, which rounding may miss."""
         value = self.low + (self.high - self.low) * z
         if self.is_logarithmic:
+            # Clipped before the exponential, which would overflow far outside.
             value = np.exp(np.clip(z, np.log(self.low), np.log(self.high)))
         return float(np.clip(value, self.low, self.high))
 
     def slope(self, z: float) -> float:
         """Derivative of the value by the fit's coordinate at ``z``."""
         if self.is_logarithmic:
+            # Of exp(z) the value itself.
             return self.from_coordinate(z)
         return self.high - self.low
 
@@ -187,6 +189,7 @@ def parameters_of(unknown: UnknownTable, base: Case) -> list[SoughtParameter]:
         elif unknown.start is not None:
             start = unknown.start
         else:
+            # Members of one value may differ in the case: their mean is nearest to all of them.
             start = float(np.mean([values[member] for member in members]))
         parameters.append(_parameter(unknown, members, start))
     return parameters
@@ -222,6 +225,7 @@ def changed_case(base: Case, parameters: Sequence[SoughtParameter], values: Iter
             contacts[quantity] = None
 
     changes = {key: section for key, section in (("contacts", contacts), ("drive", drive)) if section}
+    # Only then: a preset's cell that is written out would be another case to its hash.
     if changed_cell is not cell:
         lattice = base.lattice.model_dump(by_alias=True, exclude_none=True)
         changes["lattice"] = dict.fromkeys(lattice) | with_cell(lattice, changed_cell, {})

@@ -48,6 +48,7 @@ class VariablesTable(Section):
     @property
     def varies_cell(self) -> bool:
         """Whether the unit cell varies, and with it the pass bands."""
+        # Any key of the lattice: whether it changes the cell is seen only when it is resolved.
         return bool(self.masses or self.springs or self.lattice)
 
     @property
@@ -88,6 +89,7 @@ class Variable(NamedTuple):
         if self.kind == "log":
             return float(self.low * (self.high / self.low) ** position)
         if self.kind == "choice":
+            # At 1, the end of the cube, floor gives one more than there are.
             return min(float(np.floor(position * self.high)) + 1, self.high)
         value = self.low + (self.high - self.low) * position
         if self.kind == "whole":
@@ -97,6 +99,7 @@ class Variable(NamedTuple):
     def in_case(self, value: float) -> Any:
         """A ``value`` as the case has it."""
         if self.kind == "choice":
+            # A copy: a choice may be a list, which two designs must not have in common.
             return copy.deepcopy(self.choices[int(value) - 1])
         if self.kind in ("whole", "site"):
             return int(value)

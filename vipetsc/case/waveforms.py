@@ -99,10 +99,12 @@ def _impulse_frequency(drive: "OneDrive", highest: float) -> float:
 
 
 def _step_frequency(drive: "OneDrive", highest: float) -> float:
+    # A ramp is taken for half a sine of its length.
     return float(min(np.pi / (drive.ramp or 1.0), highest))
 
 
 def _harmonic_ramp(drive: "OneDrive", frequency: float) -> float:
+    # A rise and a fall must fit into the duration.
     longest = (drive.duration or np.inf) / 2
     return float(min(2 * np.pi * RAMP_PERIODS / frequency, longest))
 
@@ -165,6 +167,7 @@ reserve(WAVEFORM, WAVEFORMS)
 
 def waveform_record(name: str) -> WaveformRecord:
     """The record of a waveform, shipped or of a user's module; raises KeyError if there is none."""
+    # First the package's own names, which no module can register.
     if name in WAVEFORMS:
         return WAVEFORMS[name]
     part = cast(WaveformPart, PARTS[WAVEFORM][name])
@@ -202,6 +205,7 @@ def waveform_record(name: str) -> WaveformRecord:
 
 def is_sine(name: Any) -> bool:
     """Whether ``name`` is that of a waveform whose frequency the case gives."""
+    # Called with unchecked values of a table.
     is_waveform = isinstance(name, str) and (name in WAVEFORMS or name in PARTS[WAVEFORM])
     return is_waveform and waveform_record(name).frequency is None
 
@@ -262,6 +266,7 @@ class OneDrive(Section):
             return f"{self.amplitude:g} m, {about}; {self.kind} of the {self.end} wall"
 
         size = f"{self.amplitude:g} {self.record.unit}, {about}"
+        # The default drive has no need of a name and a place.
         if self.waveform is None and self.cell == self.mass == 1:
             return size
         return f"{size}; {self.kind} on mass {self.mass} of cell {self.cell}"

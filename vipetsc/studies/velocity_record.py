@@ -40,6 +40,7 @@ class VelocityRecord:
         leading = leading_site(run)
         self.site = None if leading is None else int(run["sites/cell"].values[leading])
 
+        # Rounded up: a map has at most so many pixels on either side.
         self.sizes = (-(-len(self.time) // options.pixels), -(-len(self.cells) // options.pixels))
         self.mean_time = spectra.block_means(self.time, self.sizes[0], 0)
         self.mean_cells = self.cells
@@ -86,6 +87,7 @@ class VelocityRecord:
     def mean(self, energy: np.ndarray) -> np.ndarray:
         """Means of ``energy`` (t, cell) over the blocks of a map."""
         over_time = spectra.block_means(energy, self.sizes[0], 0)
+        # Single precision halves the file, and is finer than any colour scale.
         return spectra.block_means(over_time, self.sizes[1], 1).astype(np.float32)
 
 

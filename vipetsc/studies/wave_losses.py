@@ -72,6 +72,7 @@ class WaveLosses:
         self.dashpots = self.rays.extra.ravel()[masses]
         rows = np.zeros((self.rays.extra.size, len(masses)))
         rows[masses, np.arange(len(masses))] = 1.0
+        # Damped, so that the transform's period does not fold the response back.
         omega = middle + line.offset - 1j * line.decay
         motions = compliance.motion(omega, rows) if len(masses) else np.zeros((len(omega), 0, 0))
         self.velocities = 1j * omega[:, None, None] * motions
@@ -98,8 +99,10 @@ class WaveLosses:
                 of_third = self.rays.of_wave(cell, self.third.band, self.third.wavenumber)
                 remaining[self.third.band] += float(sent.third[number] @ of_third.remaining) * step
                 absorbed += float(sent.third[number] @ of_third.absorbed) * step
+        # Rounding may leave a negative energy where nothing is sent.
         remaining = np.maximum(remaining, 0.0)
 
+        # The difference: what ends take without contacts is in the energy of the run without them already.
         in_ends = self._power_in_ends(amplitude, sent.force) - self._power_in_ends(amplitude)
         since = np.exp(-self.rate(self.driven) * self.rays.since)
         remaining[self.driven.band] = -float((sent.given.sum(axis=0) + in_ends) @ since) * step
@@ -121,4 +124,5 @@ class WaveLosses:
             of_sites = self.line.forward(force)
         forces = np.vstack([of_sites, abs(amplitude) * self.driving])
         velocity = self.line.backward(np.einsum("wms,sw->mw", self.velocities, forces))
+        # Half, the mean of a squared cosine. The line's time goes on beyond the run.
         return np.where(self.during, 0.5 * self.dashpots @ np.abs(velocity) ** 2, 0.0)
