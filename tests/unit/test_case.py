@@ -149,6 +149,17 @@ def test_a_misspelt_choice_and_an_unknown_section_name_the_nearest():
     assert "did you mean design?" in found["desing"]
 
 
+def test_a_value_of_no_type_of_its_key_is_refused_with_all_types():
+    assert "must be a number or 'traverse'" in problems({}, "time.end='foo'")["time.end"]
+    scaled = problems({}, "time.atol='scale'")["time.atol"]
+    assert "must be a number or 'scaled' or 'paper'; did you mean 'scaled'?" in scaled
+    assert "must be a whole number, a list or a table" in problems({}, "contacts.sites='a'")["contacts.sites"]
+    # An item of a list is not a value of the key.
+    assert "must be a valid integer" in problems({}, "contacts.sites=[1, 'a']")["contacts.sites[2]"]
+    assert "must be greater than 0" in problems({}, "time.end=-1")["time.end"]
+    assert "equal to 1e-14" in problems({}, "time.rtol=0")["time.rtol"]
+
+
 def test_an_override_below_a_value_is_refused():
     found = problems({"lattice": {"cells": 40}}, "lattice.cells.x=3")
     assert "lattice.cells is a value, not a section" in found["--set lattice.cells.x"]

@@ -359,9 +359,14 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
     message = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     if item["type"] == "missing":
         # pydantic reports the whole section as the input of a missing key.
-        return Problem(path, None, message)
+        return Problem(path, None, "missing; this key is needed here")
     value = item["input"]
-    choices = item.get("ctx", {}).get("expected")
+    details = item.get("ctx", {})
+    for limit in ("ge", "gt", "le", "lt"):
+        if isinstance(details.get(limit), float):
+            # pydantic writes small numbers with all their zeros.
+            message = re.sub(r"[\d.]+$", f"{details[limit]:g}", message)
+    choices = details.get("expected")
     if isinstance(value, str) and choices:
         near = difflib.get_close_matches(value, re.findall(r"'([^']+)'", choices), n=1, cutoff=0.4)
         if near:

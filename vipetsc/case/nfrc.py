@@ -348,8 +348,8 @@ def _check_ground(sections: dict[str, Any], chain: Chain) -> Iterator[Problem]:
     is_open = nfrc.infinite or (nfrc.open_ends and absorbing.end == "both")
     has_walls = chain.ends == "fixed" and not is_open
     if not has_walls and not nfrc.symmetric and any(pair.host < 0 for pair in chain.contact_pairs):
-        reason = "contacts to ground that differ on their two sides have a mean force, which pushes a lattice away"
-        yield Problem("contacts.pair", None, f"{reason} that no wall holds; give stops on both sides at one distance")
+        reason = "in unsymmetric motions contacts to ground have a mean force, which pushes away a lattice that no wall"
+        yield Problem("contacts.pair", None, f'{reason} holds; use ends = "fixed", or equal stops on both sides')
 
 
 def _check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:
