@@ -15,10 +15,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
+from vipetsc.figures.kept_ticks import kept_ticks
+
 
 def lay_out(figure: Figure) -> None:
     """Place the axes of ``figure`` by its layout engine, which it loses: they stay where they are."""
-    with _measured_once(figure):
+    with kept_ticks(figure), _measured_once(figure):
         figure.get_layout_engine().execute(figure)
     remove_engine(figure)
 

@@ -17,6 +17,7 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from vipetsc.figures.figure_data import figure_data
+from vipetsc.figures.kept_ticks import kept_ticks
 from vipetsc.figures.layout import apply_aspects, lay_out, pixel_canvas
 from vipetsc.figures.log_ticks import label_log_axes
 from vipetsc.io.atomic import atomic_write, write_text
@@ -128,7 +129,7 @@ def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
     look = {"ha": "left", "va": "top", "fontsize": 7, "color": GREY}
     text = figure.text(0.05 / width, -0.3 * NOTE / height, "\n".join(lines), **look)
 
-    with atomic_write(path) as partial_path:
+    with kept_ticks(figure), atomic_write(path) as partial_path:
         # The figure's own canvas suffices where nothing is added to its box, and takes less time than ``savefig``.
         if path.suffix == ".pdf" and not lines:
             # Loads the tools for fonts, which take a quarter of the time that matplotlib itself takes.

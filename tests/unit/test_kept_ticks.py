@@ -1,0 +1,93 @@
+"""Ticks that are placed once: the pixels of matplotlib's own, fewer placements, new ones where something moves."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+
+from vipetsc.figures.kept_ticks import kept_ticks
+from vipetsc.figures.style import new_figure, rc_style
+
+pytestmark = pytest.mark.parallel(1)
+
+
+def page() -> Figure:
+    """A laid-out figure of a map with its colour bar, logarithmic axes, twins and small numbers under titles."""
+    figure = new_figure(4.0, 3.0)
+    left, middle, right = figure.subplots(1, 3)
+    image = left.imshow(np.arange(12.0).reshape(3, 4))
+    figure.colorbar(image, ax=left)
+    middle.loglog([1e-7, 1e4], [1.0, 2e9])
+    middle.twinx().plot([0.0, 1.0], [0.0, 3e-5])
+    right.plot([0.0, 1e-6], [0.0, 1e7])
+    for axes in (left, middle, right):
+        axes.set(title="a title", xlabel="across", ylabel="up")
+    return figure
+
+
+def pixels(figure: Figure) -> np.ndarray:
+    figure.canvas.draw()
+    return np.array(figure.canvas.buffer_rgba())
+
+
+@pytest.fixture
+def placements(monkeypatch) -> Counter[str]:
+    """How often ticks are placed, and their labels measured."""
+    counts: Counter[str] = Counter()
+    for name in ("_update_ticks", "_get_ticklabel_bboxes"):
+        own = getattr(Axis, name)
+
+        def counted(axis, *arguments, own=own, name=name):
+            counts[name] += 1
+            return own(axis, *arguments)
+
+        monkeypatch.setattr(Axis, name, counted)
+    return counts
+
+
+def test_a_picture_has_the_same_pixels_from_fewer_placements(placements):
+    with rc_style():
+        expected = pixels(page())
+        of_matplotlib = placements.copy()
+        placements.clear()
+        figure = page()
+        with kept_ticks(figure):
+            drawn = pixels(figure)
+    np.testing.assert_array_equal(drawn, expected)
+    assert all(2 * placements[name] < of_matplotlib[name] for name in of_matplotlib)
+
+
+@pytest.mark.parametrize("change", ["limits", "frame", "resolution"])
+def test_ticks_are_placed_anew_where_something_moves(change):
+    """What is drawn after a change is what matplotlib draws of it."""
+
+    def changed(figure: Figure) -> np.ndarray:
+        pixels(figure)
+        figure.set_layout_engine("none")
+        axes = figure.get_axes()[2]
+        if change == "limits":
+            axes.set_xlim(0.0, 3e-9)
+        elif change == "frame":
+            axes.set_position([0.75, 0.6, 0.1, 0.2])
+        else:
+            figure.set_dpi(150)
+        return pixels(figure)
+
+    with rc_style():
+        expected = changed(page())
+        figure = page()
+        with kept_ticks(figure):
+            drawn = changed(figure)
+    np.testing.assert_array_equal(drawn, expected)
+
+
+def test_nothing_is_left_behind():
+    figure = page()
+    with kept_ticks(figure):
+        axis = figure.get_axes()[0].xaxis
+        assert "_update_ticks" in vars(axis)
+    assert not {"_update_ticks", "_get_ticklabel_bboxes"} & vars(axis).keys()
