@@ -40,15 +40,15 @@ class Spring:
         return self.quadratic == 0
 
     def nonlinear_force(self, z: np.ndarray) -> np.ndarray:
-        """The force's part beyond k z in N, at elongations ``z`` in m."""
+        """The force's part beyond k z in N, at elongations ``z`` (...) in m."""
         return np.asarray(self.quadratic * z**2 + self.cubic * z**3)
 
     def nonlinear_slope(self, z: np.ndarray) -> np.ndarray:
-        """Derivative of ``nonlinear_force`` by z in N/m."""
+        """Derivative (...) of ``nonlinear_force`` by z in N/m, at elongations ``z`` (...) in m."""
         return np.asarray(2 * self.quadratic * z + 3 * self.cubic * z**2)
 
     def nonlinear_energy(self, z: np.ndarray) -> np.ndarray:
-        """Integral of ``nonlinear_force`` from 0 to z in J."""
+        """Integral (...) of ``nonlinear_force`` from 0 to the elongations ``z`` (...) in m, in J."""
         return np.asarray(self.quadratic * z**3 / 3 + self.cubic * z**4 / 4)
 
 

@@ -278,7 +278,7 @@ def _largest_response(cell: UnitCell, cells: int, ends: Ends, driven: int, omega
 
 
 def cells_between(cell: ArrayLike, other: int, cells: int, ends: Ends) -> np.ndarray:
-    """Number of cells from ``cell`` to ``other`` in a lattice of ``cells``; in a ring the shorter direction."""
+    """Number of cells from ``cell`` (...) to ``other`` in a lattice of ``cells``; in a ring the shorter direction."""
     distance = np.abs(np.asarray(cell, np.int64) - other)
     if ends == "periodic":
         distance = np.minimum(distance, cells - distance)

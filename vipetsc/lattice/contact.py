@@ -135,14 +135,14 @@ class Contact:
         return self.law in LAWS and self.onset_exponent == 1
 
     def elastic_force(self, x: ArrayLike) -> np.ndarray:
-        """f in N at the indentation ``x`` in m; zero for x <= 0."""
+        """f (...) in N at indentations ``x`` (...) in m; zero for x <= 0."""
         x = np.maximum(x, 0.0)
         if self.law not in LAWS:
             return self._registered_values("force", x)
         return self.stiffness * x**self.onset_exponent
 
     def elastic_slope(self, x: ArrayLike) -> np.ndarray:
-        """df/dx in N/m at the indentation ``x`` in m; for x <= 0 that of a contact that has just closed."""
+        """df/dx (...) in N/m at indentations ``x`` (...) in m; for x <= 0 that of a contact that has just closed."""
         x = np.maximum(x, 0.0)
         n = self.onset_exponent
         if self.law not in LAWS:
@@ -150,7 +150,7 @@ class Contact:
         return n * self.stiffness * x ** (n - 1)
 
     def elastic_energy(self, x: ArrayLike) -> np.ndarray:
-        """The integral of f in J from 0 to the indentation ``x`` in m; zero for x <= 0."""
+        """The integral of f (...) in J from 0 to indentations ``x`` (...) in m; zero for x <= 0."""
         x = np.maximum(x, 0.0)
         n = self.onset_exponent
         if self.law not in LAWS:
@@ -245,7 +245,7 @@ class Contact:
         return float(scipy.optimize.brentq(lambda e: rebound(c, e), 0.0, most))
 
     def dissipation_factor(self, rate: ArrayLike, approach: ArrayLike) -> np.ndarray:
-        """g = 1 + 3 (1 - r)/2 w'/w'_minus for relative velocity and approach velocity in m/s.
+        """g = 1 + c w'/w'_minus of relative and approach velocities (...) in m/s, with the ``damping`` c.
 
         The paper prints a minus sign, which feeds energy in; Hunt and Crossley's law has a plus.
         """
@@ -257,13 +257,13 @@ class Contact:
     def force(
         self, w: ArrayLike, clearance: ArrayLike, rate: ArrayLike = 0.0, approach: ArrayLike = np.inf
     ) -> np.ndarray:
-        """Restoring force F in N for relative displacement w in m; g = 1 unless an approach is given."""
+        """Restoring force F (...) in N for relative displacements w (...) in m; g = 1 unless an approach is given."""
         w = np.asarray(w, float)
         elastic = self.elastic_force(w - clearance) - self.elastic_force(-w - clearance)
         return elastic * self.dissipation_factor(rate, approach)
 
     def potential(self, w: ArrayLike, clearance: ArrayLike) -> np.ndarray:
-        """Elastic energy in J stored at relative displacement w in m."""
+        """Elastic energy (...) in J stored at relative displacements w (...) in m."""
         return self.elastic_energy(np.abs(np.asarray(w, float)) - clearance)
 
 

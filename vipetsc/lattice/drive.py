@@ -80,11 +80,11 @@ class ToneBurst:
 
     @property
     def breaks(self) -> np.ndarray:
-        """Times in s after the beginning at which the burst is not smooth."""
+        """Times (break,) in s after the beginning at which the burst is not smooth."""
         return np.array([self.duration])
 
     def force(self, t: ArrayLike) -> np.ndarray:
-        """Force in N at time t in s."""
+        """Force (...) in N at times ``t`` (...) in s."""
         t = np.asarray(t, float)
         phase = self.frequency * t
         burst = self.window_amplitude * (1 - np.cos(phase / self.cycles)) * np.sin(phase)
@@ -134,7 +134,7 @@ class Pieces:
 
     @classmethod
     def of(cls, amplitude: float, frequency: float, duration: float, table: np.ndarray) -> Self:
-        """The waveform of a ``table`` in which the amplitude is one."""
+        """The waveform of a ``table`` (piece,) of coefficients in which the amplitude is one."""
         table = table.copy()
         for name in COEFFICIENTS:
             table[name] *= amplitude
@@ -159,7 +159,7 @@ class Pieces:
 
     @property
     def breaks(self) -> np.ndarray:
-        """Times in s after the beginning at which the waveform is not smooth."""
+        """Times (break,) in s after the beginning at which the waveform is not smooth."""
         times = np.append(self.table["start"], self.duration)
         return times[(times > 0) & np.isfinite(times)]
 
@@ -186,7 +186,7 @@ class Pieces:
         return float(np.abs(self.force(np.concatenate(times))).max())
 
     def force(self, t: ArrayLike) -> np.ndarray:
-        """Force in N at time t in s."""
+        """Force (...) in N at times ``t`` (...) in s."""
         t = np.asarray(t, float)
         piece = self._piece(t)
         x = t - piece["start"]
@@ -197,7 +197,7 @@ class Pieces:
         return np.where((t >= self.table["start"][0]) & (t < self.duration), value, 0.0)
 
     def phase(self, t: ArrayLike) -> np.ndarray:
-        """Phase in rad of the sine at time t in s."""
+        """Phase (...) in rad of the sine at times ``t`` (...) in s."""
         t = np.asarray(t, float)
         piece = self._piece(t)
         x = t - piece["start"]
@@ -347,7 +347,7 @@ def main_frequency(times: ArrayLike, values: ArrayLike) -> float:
 
 
 def spectrum(times: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Angular frequencies in rad/s, and the magnitude there of the transform of samples joined by a cubic spline."""
+    """Angular frequencies (n,) in rad/s, and the transform's magnitude (n,) there, of samples joined by a spline."""
     times = np.asarray(times, float)
     values = np.asarray(values, float)
     steps = (times[-1] - times[0]) / np.diff(times).min()

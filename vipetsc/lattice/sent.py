@@ -59,7 +59,7 @@ class Source:
         return integrate(densities, self.edges())
 
     def edges(self) -> np.ndarray:
-        """Frequencies in rad/s between which densities are smooth: edges of bands and of the spectrum's lobes."""
+        """Frequencies (edge,) in rad/s between which densities are smooth: edges of bands and the spectrum's lobes."""
         bands = pass_bands(self.cell)
         edges = [0.0, *(band.low for band in bands), *(band.high for band in bands)]
         main = self.waveform.frequency

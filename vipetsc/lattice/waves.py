@@ -77,7 +77,7 @@ def coupling_blocks(cell: UnitCell) -> Blocks:
 
 
 def bloch_waves(cell: UnitCell, omegas: np.ndarray) -> BlochWaves:
-    """The waves at ``omegas`` in rad/s with parts Re >= 0 and Im <= 0."""
+    """The waves at ``omegas`` (frequency,) in rad/s with parts Re >= 0 and Im <= 0."""
     blocks = coupling_blocks(cell)
     p = blocks.out
     q = blocks.into

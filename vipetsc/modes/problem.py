@@ -91,19 +91,19 @@ class Frame(Protocol[S]):
     tangent: np.ndarray
 
     def encode(self, point: S) -> np.ndarray:
-        """The unknowns of another point of the branch."""
+        """The unknowns (n + 1,) of another point of the branch."""
 
     def direction(self, point: S) -> np.ndarray:
-        """The branch's direction at another point, of any length, in these unknowns."""
+        """The branch's direction (n + 1,) at another point, of any length, in these unknowns."""
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` for the solution at an ``arclength`` along the tangent."""
+        """Newton's method from ``guess`` (n + 1,) for the solution at an ``arclength`` along the tangent."""
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent at a solution, on the side of the frame's own."""
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
 
     def measures(self, attempt: Attempt, direction: np.ndarray) -> S:
-        """The point that an attempt has converged to, where ``direction`` is the unit tangent."""
+        """The point that an attempt has converged to, where ``direction`` (n + 1,) is the unit tangent."""
 
 
 class PeriodicProblem(Protocol[S]):
@@ -134,5 +134,5 @@ class PeriodicProblem(Protocol[S]):
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
-    """The vector divided by its length."""
+    """The vector (n,) divided by its length."""
     return vector / np.linalg.norm(vector)

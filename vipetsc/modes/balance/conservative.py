@@ -64,16 +64,16 @@ class HarmonicFrame:
         self.xi = np.append(x / size, 1.0)
 
     def motion(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Harmonics in m and frequency in rad/s at the unknowns ``xi``."""
+        """Harmonics (n,) in m and frequency in rad/s at the unknowns ``xi`` (n + 1,)."""
         return xi[:-1] * self.size, float(xi[-1] * self.omega)
 
     def encode(self, point: Point) -> np.ndarray:
-        """The unknowns of another motion, which may have another number of harmonics."""
+        """The unknowns (n + 1,) of another motion, which may have another number of harmonics."""
         x = self.problem.resized(point.x, self.balance)
         return np.append(x / self.size, 2 * np.pi / point.period / self.omega)
 
     def direction(self, point: Point) -> np.ndarray:
-        """The branch's direction at another motion, of any length."""
+        """The branch's direction (n + 1,) at another motion, of any length."""
         harmonics = self.problem.resized(point.tangent[:-1], self.balance) / self.size
         return np.append(harmonics, -2 * np.pi / point.period**2 * point.tangent[-1] / self.omega)
 
@@ -89,7 +89,7 @@ class HarmonicFrame:
         return np.column_stack([jacobian, rate * (self.omega / self.size)])
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` for the motion at an ``arclength`` along the tangent."""
+        """Newton's method from ``guess`` (n + 1,) for the motion at an ``arclength`` along the tangent."""
         return self.solve(guess, self.tangent, self.tangent @ self.xi + arclength)
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
@@ -98,7 +98,7 @@ class HarmonicFrame:
         return newton.solve(self, guess, row, value, self.problem.tolerance)
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent at a solution, on the side of the frame's own, which is not across the branch."""
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), along the branch on the side of the frame's own."""
         border = np.vstack([self.jacobian(xi), self.tangent])
         return unit(np.linalg.solve(border, np.append(np.zeros(len(xi) - 1), 1.0)))
 
@@ -193,7 +193,7 @@ class ConservativeMotions:
         return self._newtons[balance.size]
 
     def resized(self, x: np.ndarray, balance: HarmonicBalance) -> np.ndarray:
-        """Unknowns of a ``balance``, zero where they are new."""
+        """Unknowns (n,) of a ``balance`` from those of another one, ``x``; zero where they are new."""
         parts = x.reshape(self.forces.pairs, -1)
         out = np.zeros((len(parts), balance.size // len(parts)))
         count = min(parts.shape[1], out.shape[1])

@@ -47,7 +47,7 @@ class Compliance(Protocol):
     """Interface of ``lattice.compliance``: G (frequencies, pairs, pairs) in m/N, real or complex."""
 
     def at(self, omegas: np.ndarray) -> np.ndarray:
-        """G at frequencies in rad/s, which may be complex."""
+        """G (frequency, place, place) in m/N at ``omegas`` (frequency,) in rad/s, which may be complex."""
 
 
 class Compliances(NamedTuple):
@@ -118,7 +118,7 @@ class HarmonicBalance:
         return z
 
     def series(self, x: np.ndarray, omega: float) -> ForceSeries:
-        """The forces' harmonics and derivatives at the unknowns ``x``."""
+        """The forces' harmonics and derivatives at the unknowns ``x`` (n,)."""
         if self._series is None or self._series[1] != omega or not np.array_equal(self._series[0], x):
             self._series = x.copy(), omega, self.forces.series(self.unpack(x), omega)
         return self._series[2]
@@ -233,7 +233,7 @@ class HarmonicBalance:
         return jacobian, self.pack(out)
 
     def truncation(self, x: np.ndarray, omega: float) -> float:
-        """Estimated size of the harmonics left out, over the largest sum of those kept.
+        """Estimated size of the harmonics left out of ``x`` (n,), over the largest sum of those kept.
 
         Those from K + 1 to 2K are -G F_k with G continued by its last value as k^-2; the others are estimated from them
         by the bound k^-3 of their fall.

@@ -23,7 +23,7 @@ def outputs_of(branch: Branch[Response]) -> dict[str, Stored]:
 
 
 def measure(branch: Branch[Response], stored: str) -> np.ndarray:
-    """A measure or an output of every state, by its name in the file."""
+    """A measure or an output (state, ...) of every state, by its name in the file."""
     if stored in OUTPUTS:
         return np.array([p.measured.outputs[stored] for p in branch.points])
     if stored == "harmonics":

@@ -48,11 +48,11 @@ class Diagonal(Chart):
         self._scale = np.append(np.full(len(x), self.size), period)
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns of initial values and period."""
+        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
         return np.append(x, period) / self._scale
 
     def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values and period."""
+        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
         return xi[:-1] * self.size, float(xi[-1] * self.period)
 
     def to_changes(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
@@ -147,7 +147,7 @@ class LatticeFrame(ShootingFrame[LatticeArc]):
         return self.problem.newton.solve(self, guess, row, value, self.problem.tolerance)
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent at a solution, on the side of the frame's own."""
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
         return self.problem.newton.null_vector(self, xi, self.tangent)
 
 
@@ -187,7 +187,7 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
         return LatticeFrame(self, Diagonal(x, period), x, period, tangent)
 
     def relative_chart(self, x: np.ndarray, period: float) -> Diagonal:
-        """The chart of lattices."""
+        """The chart of lattices for initial values ``x`` (n,)."""
         return Diagonal(x, period)
 
     def null_vector(self, start: Point) -> np.ndarray:

@@ -47,11 +47,11 @@ class SteadyFrame:
         self.shift = equations.shift_near(xi)
 
     def encode(self, point: Response) -> np.ndarray:
-        """The unknowns of another state."""
+        """The unknowns (n + 1,) of another state."""
         return point.xi
 
     def direction(self, point: Response) -> np.ndarray:
-        """The curve's direction at another state."""
+        """The curve's direction (n + 1,) at another state."""
         return point.tangent
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
@@ -63,13 +63,13 @@ class SteadyFrame:
         return self.equations.jacobian(xi, self.shift)
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` for the state at an ``arclength`` along the tangent."""
+        """Newton's method from ``guess`` (n + 1,) for the state at an ``arclength`` along the tangent."""
         # The plane is that of the predictor, whose rounding the first residual then does not see.
         predicted = self.xi + arclength * self.tangent
         return self.solve(guess, self.tangent, self.tangent @ predicted)
 
     def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method for the state with row . xi = value; not converged after an ArithmeticError."""
+        """Newton's method for the state with row . xi = value, (n + 1,); not converged after an ArithmeticError."""
         equations = self.equations
         try:
             return equations.newton.solve(self, guess, row, value, equations.tolerance)
@@ -77,7 +77,7 @@ class SteadyFrame:
             return Attempt(False, str(error), [], guess, left_domain=True)
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent at a state, on the side of the frame's own."""
+        """The unit tangent (n + 1,) at a state ``xi`` (n + 1,), on the side of the frame's own."""
         right = np.zeros(len(xi))
         right[-1] = 1
         direction = np.linalg.solve(np.vstack([self.jacobian(xi), self.tangent]), right)
@@ -118,7 +118,7 @@ class SteadyEquations(ABC):
         return DenseNewton(self.balance.size + 1, self.max_newton)
 
     def shift_near(self, xi: np.ndarray) -> np.ndarray:
-        """The stiffnesses by which the compliance is shifted for states near the unknowns ``xi``."""
+        """The stiffnesses (place,) by which the compliance is shifted for states near the unknowns ``xi`` (n + 1,)."""
         omega, _ = self.drive(xi[-1])
         return self.balance.shift(omega)
 
@@ -159,7 +159,7 @@ class SteadyEquations(ABC):
         return SteadyFrame(self, point.xi, point.tangent)
 
     def first_tangent(self, start: Response, direction: int) -> np.ndarray:
-        """Tangent at the first state, along which the parameter grows (``direction`` 1) or falls (-1)."""
+        """Tangent (n + 1,) at the first state, along which the parameter grows (``direction`` 1) or falls (-1)."""
         along_parameter = np.eye(len(start.xi))[-1] * direction
         return SteadyFrame(self, start.xi, along_parameter).tangent_at(start.xi)
 
@@ -172,7 +172,7 @@ class SteadyEquations(ABC):
         yield SpecialKind("fold", lambda point: float(point.tangent[-1]))
 
     def at(self, guess: np.ndarray, p: float) -> np.ndarray:
-        """Unknowns of the state at the scaled parameter ``p`` near ``guess``; raises ContinuationError."""
+        """Unknowns (n + 1,) of the state at the scaled parameter ``p`` near a ``guess``; raises ContinuationError."""
         along_parameter = np.eye(self.balance.size + 1)[-1]
         begin = np.append(guess[:-1], p)
         attempt = SteadyFrame(self, begin, along_parameter).solve(begin, along_parameter, p)

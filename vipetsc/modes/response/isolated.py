@@ -38,7 +38,7 @@ def places_of(states: Equations, count: int) -> np.ndarray:
 def unknown_states(
     states: Equations, curves_so_far: Callable[[], Curves], candidates: Sequence[np.ndarray]
 ) -> Iterator[np.ndarray]:
-    """Unknowns of those of the ``candidates`` that lie on none of the ``curves_so_far``.
+    """Unknowns (n + 1,) of those of the ``candidates`` that lie on none of the ``curves_so_far``.
 
     The curves are asked for before each state, since curves may be added between two states.
     """
@@ -48,7 +48,7 @@ def unknown_states(
 
 
 def over_amplitudes(states: Equations, curves: Curves, p: float) -> list[np.ndarray]:
-    """Unknowns of states at the scaled parameter ``p`` to which other amplitudes lead from those of the ``curves``."""
+    """Unknowns (n + 1,) of states at the scaled parameter ``p`` to which other amplitudes lead from the ``curves``."""
     states_found: list[np.ndarray] = []
     for begin in states_on(states, curves, p):
         # A line that has come by this state has followed its line already.
@@ -58,7 +58,7 @@ def over_amplitudes(states: Equations, curves: Curves, p: float) -> list[np.ndar
 
 
 def states_on(states: Equations, curves: Curves, p: float) -> list[np.ndarray]:
-    """Unknowns of the states of ``curves`` at the scaled parameter ``p``."""
+    """Unknowns (n + 1,) of the states of ``curves`` at the scaled parameter ``p``."""
     states_found: list[np.ndarray] = []
     for points in curves:
         for before, after in pairwise(point.xi for point in points):

@@ -69,7 +69,7 @@ class StatesOverKey(SteadyEquations):
         return states.parameter.fixed, self.parameter.fixed
 
     def shift_near(self, xi: np.ndarray) -> np.ndarray:
-        """The stiffnesses by which the compliance is shifted for states near the unknowns ``xi``."""
+        """The stiffnesses (place,) by which the compliance is shifted for states near the unknowns ``xi`` (n + 1,)."""
         states, inner = self._at(xi)
         return states.shift_near(inner)
 
@@ -117,19 +117,19 @@ class StatesOverKey(SteadyEquations):
         return states, np.append(motion, self.parameter.fixed / states.parameter.scale)
 
     def from_state(self, value: float, inner: np.ndarray) -> np.ndarray:
-        """The unknowns of the state ``inner`` of the lattice whose key has a ``value``."""
+        """The unknowns (n + 1,) of the state ``inner`` (n + 1,) of the lattice whose key has a ``value``."""
         motion = inner[:-1] * (self.states_at(value).clearance / self.clearance)
         return np.append(motion, value / self.parameter.scale)
 
     def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
-        """The measures of a state for its file, with the value of the key among its outputs."""
+        """The measures of a state ``xi`` (n + 1,) for its file, with the value of the key among its outputs."""
         states, inner = self._at(xi)
         measures = states.measured(inner, perturbations)
         value = self._within(xi[-1]) * self.parameter.scale
         return measures._replace(outputs={"parameter": np.array(value), **measures.outputs})
 
     def stability(self, xi: np.ndarray) -> Stability:
-        """The stability of a state."""
+        """The stability of a state ``xi`` (n + 1,)."""
         states, inner = self._at(xi)
         return states.stability(inner)
 

@@ -32,7 +32,7 @@ class StatesWithStability(Protocol):
         """The section [nfrc] of the case."""
 
     def stability(self, xi: np.ndarray) -> Stability:
-        """The stability of a state."""
+        """The stability of a state ``xi`` (n + 1,)."""
 
     def determinant(self, xi: np.ndarray, exponent: complex) -> float:
         """Hill's determinant at lambda/Om = ``exponent``, where it is real."""
@@ -47,7 +47,7 @@ class StatesWithStability(Protocol):
         """Re lambda/Om up to which perturbations count as stable."""
 
     def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
-        """The measures of a state."""
+        """The measures of a state ``xi`` (n + 1,)."""
 
 
 class StabilityChanges:

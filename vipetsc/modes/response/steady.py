@@ -183,7 +183,7 @@ class SteadyStates(SteadyEquations):
         )
 
     def stability(self, xi: np.ndarray) -> Stability:
-        """The stability of a state; the latest are kept, since neighbours on a curve are compared."""
+        """The stability of a state ``xi`` (n + 1,); the latest are kept, since neighbours on a curve are compared."""
         return self._stabilities.get(xi.tobytes(), lambda: self._evaluate_stability(xi))
 
     def _evaluate_stability(self, xi: np.ndarray) -> Stability:

@@ -26,11 +26,11 @@ class Chart(ABC):
 
     @abstractmethod
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns of initial values and period."""
+        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
 
     @abstractmethod
     def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values and period."""
+        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
 
     @abstractmethod
     def to_changes(self, xi: np.ndarray, changes: np.ndarray) -> np.ndarray:
@@ -76,11 +76,11 @@ class Relative(DenseChart):
         self._derivative = block_diag(self.inverse, period)
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns of initial values and period."""
+        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
         return np.append(self.weights @ x, period / self.period)
 
     def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values and period."""
+        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
         return self.inverse @ xi[:-1], float(xi[-1] * self.period)
 
     def derivative(self, xi: np.ndarray) -> np.ndarray:
@@ -98,13 +98,13 @@ class Logarithmic(DenseChart):
         self.sign = float(np.sign(x[self.lead]))
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns of initial values and period."""
+        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
         xi = np.append(x / x[self.lead], np.log(period / self.period))
         xi[self.lead] = np.log(x[self.lead] / (self.sign * self.size))
         return xi
 
     def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values and period."""
+        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
         lead = self.sign * self.size * np.exp(xi[self.lead])
         x = xi[:-1] * lead
         x[self.lead] = lead
@@ -140,14 +140,14 @@ class Grazing(DenseChart):
             self.clearance = system.contacts[nearest].stops.clearance
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
-        """The unknowns of initial values and period."""
+        """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""
         xi = np.append(x / self.size, period / self.period)
         gap = self.sign * (self.row @ x) / self.clearance - 1
         xi[self.index] = np.sign(gap) * np.sqrt(np.abs(gap))
         return xi
 
     def decode(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Initial values and period."""
+        """Initial values (n,) and period in s at the unknowns ``xi`` (n + 1,)."""
         x = xi[:-1] * self.size
         y = xi[self.index]
         x[self.index] = 0.0

@@ -23,7 +23,7 @@ class ShotOrbits(Protocol):
     free: slice
 
     def arc(self, x: np.ndarray, period: float) -> Arc:
-        """The arc from initial values ``x``."""
+        """The arc from initial values ``x`` (n,)."""
 
     def residual(self, arc: Arc) -> np.ndarray:
         """The residual (n,) at the arc's end, which vanishes for an orbit."""

@@ -42,11 +42,11 @@ class DenseFrame(ShootingFrame[Arc]):
         return self.problem.newton.solve(self, guess, row, value, self.problem.tolerance)
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent at a solution, on the side of the frame's own."""
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
         return self.tangent_towards(xi, self.tangent)
 
     def tangent_towards(self, xi: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """The unit tangent at a solution, on the side of ``reference``."""
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of ``reference`` (n + 1,)."""
         # The null vector, of either sign.
         direction = np.linalg.svd(self.jacobian(xi))[2][-1]
         if direction @ reference < 0:
@@ -103,13 +103,13 @@ class Shooting(ShootingEquations[Arc]):
         return np.column_stack([sensitivity, self.map.fraction * self.end_rate(arc)])
 
     def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray | None = None) -> DenseFrame:
-        """The frame at any initial values and period, in the ``chart`` of that name."""
+        """The frame at any initial values ``x`` (n,) and period, in the ``chart`` of that name."""
         if tangent is None:
             tangent = np.empty(0)
         return DenseFrame(self, CHARTS[chart](self.system, x, period), x, period, tangent)
 
     def relative_frame(self, x: np.ndarray, period: float) -> DenseFrame:
-        """The unknowns of ``relative_chart``."""
+        """The unknowns of ``relative_chart`` for initial values ``x`` (n,)."""
         return DenseFrame(self, self.relative_chart(x, period), x, period, np.empty(0))
 
     def relative_chart(self, x: np.ndarray, period: float) -> Relative:

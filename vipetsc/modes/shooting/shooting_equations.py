@@ -58,15 +58,15 @@ class ShootingFrame(Generic[A]):
             self.tangent = unit(chart.to_unknowns(self.xi, tangent))
 
     def encode(self, point: Point) -> np.ndarray:
-        """The unknowns of another orbit."""
+        """The unknowns (n + 1,) of another orbit."""
         return self.chart.encode(point.x, point.period)
 
     def direction(self, point: Point) -> np.ndarray:
-        """The branch's direction at another orbit, of any length."""
+        """The branch's direction (n + 1,) at another orbit, of any length."""
         return self.chart.to_unknowns(self.encode(point), point.tangent)
 
     def arc(self, xi: np.ndarray) -> A:
-        """The arc from the unknowns ``xi``; raises FlowError where there is none."""
+        """The arc from the unknowns ``xi`` (n + 1,); raises FlowError where there is none."""
         if not np.all(np.isfinite(xi)) or self.chart.decode(xi)[1] <= 0:
             raise FlowError("Newton's method left the domain: the period is not positive")
         return self.problem.arc(*self.chart.decode(xi))
@@ -76,7 +76,7 @@ class ShootingFrame(Generic[A]):
         return self.problem.residual(self.arc(xi)) / self.unit
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` for the orbit at an ``arclength`` along the tangent."""
+        """Newton's method from ``guess`` (n + 1,) for the orbit at an ``arclength`` along the tangent."""
         return self.solve(guess, self.tangent, self.tangent @ self.xi + arclength)
 
     @abstractmethod
@@ -85,10 +85,10 @@ class ShootingFrame(Generic[A]):
 
     @abstractmethod
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent at a solution, on the side of the frame's own."""
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), on the side of the frame's own."""
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
-        """The orbit that an attempt has converged to, where ``direction`` is the branch's unit tangent or None."""
+        """The orbit that an attempt has converged to; ``direction`` (n + 1,) is the branch's unit tangent or None."""
         problem = self.problem
         chart = self.chart
         x, period = chart.decode(attempt.xi)
@@ -162,7 +162,7 @@ class ShootingEquations(ABC, Generic[A]):
         return state
 
     def arc(self, x: np.ndarray, period: float) -> A:
-        """The arc from initial values ``x``; raises FlowError where the flow fails. The latest one is kept."""
+        """The arc from initial values ``x`` (n,); raises FlowError where the flow fails. The latest one is kept."""
         if self._latest is None or self._latest[1] != period or not np.array_equal(self._latest[0], x):
             self._latest = x.copy(), period, self._integrate(self.start(x), period)
         return self._latest[2]
@@ -193,7 +193,7 @@ class ShootingEquations(ABC, Generic[A]):
         return end[n:]
 
     def energy(self, x: np.ndarray) -> float:
-        """Energy in J of the orbit with initial values ``x``."""
+        """Energy in J of the orbit with initial values ``x`` (n,)."""
         zero = np.zeros_like(x)
         if self.map.starts_at_rest:
             return self.system.energy(u=x, v=zero)
@@ -207,7 +207,7 @@ class ShootingEquations(ABC, Generic[A]):
 
     @abstractmethod
     def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray) -> ShootingFrame[A]:
-        """The frame at any initial values and period; ``tangent`` may be empty."""
+        """The frame at any initial values ``x`` (n,) and period; ``tangent`` (n + 1,) may be empty."""
 
     def frame(self, point: Point, chart: str = "auto") -> ShootingFrame[A]:
         """The frame at an orbit; the chart ``auto`` is grazing if the orbit starts near a touch, else relative."""
