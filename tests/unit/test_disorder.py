@@ -139,6 +139,28 @@ def test_what_cannot_be_drawn_is_refused(disorder, message):
     assert len(error.value.problems) == 1, error.value
 
 
+def test_the_clearances_of_the_two_sides_are_drawn_independently():
+    scatter = {"seed": 2, "clearance": {"relative": 0.05}}
+    equal = draw(**scatter).contacts.clearance
+    minus = [3e-3] * 10
+    for sides in ({"clearance_minus": 3e-3}, {"each": {"clearance_minus": minus, "side": ["minus"] * 10}}):
+        case = draw(TEN_SITES | sides, **scatter)
+        drawn = case.contacts.each.clearance_minus
+        assert case.contacts.clearance == equal
+        assert len(set(drawn)) == 10
+        assert drawn == pytest.approx(minus, rel=0.3)
+        assert np.all(np.abs(np.divide(drawn, minus) - np.divide(equal, CLEARANCE)) > 1e-4)
+        assert [gap for _, gap in case.model().gaps] == drawn
+        assert Case.from_toml(case.to_toml()) == case
+
+    one = draw({"sites": [5], "clearance": CLEARANCE, "clearance_minus": 3e-3}, **scatter).contacts
+    assert one.each is None
+    assert one.clearance_minus == drawn[0]
+    changed = "draws|sign must not change"
+    with pytest.raises(CaseError, match=changed):
+        draw(TEN_SITES | {"clearance_minus": 1e-6}, clearance={"absolute": 1e-5})
+
+
 def test_a_deviation_is_described_with_its_size_and_distribution():
     assert str(Deviation(relative=0.05)) == "normal, deviation 5 %"
     assert str(Deviation(absolute=2e-5, distribution="lognormal")) == "lognormal, deviation 2e-05"

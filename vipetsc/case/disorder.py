@@ -27,9 +27,9 @@ SPRING_PARAMETERS = tuple(field.name for field in fields(Spring) if isinstance(f
 class DisorderTable(Section):
     """Quantities that scatter about the values of the case, and the ``seed`` of the random numbers.
 
-    For each site: ``clearance`` (m), ``restitution``, ``sites`` (the cell, rounded), ``stiffness`` (N/m^n) if it is a
-    list; otherwise it is common to all sites, as ``modulus`` (Pa) is. The same in all cells: ``masses`` (kg),
-    ``springs`` (N/m).
+    For each site: ``clearance`` (m), that of each side by itself if there is a ``clearance_minus``, ``restitution``,
+    ``sites`` (the cell, rounded), ``stiffness`` (N/m^n) if it is a list; otherwise it is common to all sites, as
+    ``modulus`` (Pa) is. The same in all cells: ``masses`` (kg), ``springs`` (N/m).
     For each cell: ``cells``, by quantity; the resolved case contains the request instead of the values.
     """
 
@@ -62,8 +62,13 @@ def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Seque
     if contacts.stiffness:
         stiffness.append(contacts.stiffness)
 
+    clearance_minus = lists_of(contacts).get("clearance_minus", [])
+    if not clearance_minus and contacts.clearance_minus is not None:
+        clearance_minus = [contacts.clearance_minus] * len(sites)
+
     return {
         "clearance": clearance,
+        "clearance_minus": clearance_minus,
         "sites": sites,
         "restitution": values_of_sites(contacts, "restitution", len(sites)),
         "stiffness": lists_of(contacts).get("stiffness") or stiffness,
@@ -141,8 +146,12 @@ def _draw(
     """Numbers drawn of each quantity about its ``values``, and the problems with them."""
     drawn: dict[str, list[float]] = {}
     problems: list[Problem] = []
-    for name, deviation in disorder.quantities().items():
-        key = f"disorder.{name}"
+    quantities = disorder.quantities()
+    if "clearance" in quantities and values["clearance_minus"]:
+        # The stops on both sides are machined by themselves.
+        quantities["clearance_minus"] = quantities["clearance"]
+    for name, deviation in quantities.items():
+        key = f"disorder.{name.removesuffix('_minus')}"
         about = np.asarray(values[name], float)
         if name == "sites" and deviation.relative:
             problems.append(Problem(key, deviation.model_dump(exclude_none=True), "give `absolute`, in cells"))
@@ -167,7 +176,7 @@ def _drawn_contacts(contacts: ContactsTable, drawn: Mapping[str, list[float]], m
         table["clearance"] = drawn["clearance"]
 
     # Numbers that differ from site to site are lists; one number stays that of all.
-    for name in ("restitution", "stiffness"):
+    for name in ("clearance_minus", "restitution", "stiffness"):
         if name not in drawn:
             continue
         if name in table.get("each", {}) or len(drawn[name]) > 1:
