@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
+CASES = ROOT / "vipetsc" / "paper" / "cases"  # the same for both versions
 # The version before programs were made fast to start: the targets below are ratios to its times.
 BASELINE = "b03848f"
 # The slowest program, a first run of the earlier version, compiles for a minute; ten leave room for a slow machine.
@@ -39,9 +40,9 @@ amplitude = [2.0, 6.0, 12.0, 18.0, 24.0, 30.0]
 class Program:
     """A call of ``python -m vipetsc``: its ``words``, the ``ranks``, and whether kernels are compiled in it.
 
-    ``{folder}`` in a word is the folder of the version that is measured; ``--force`` lets a round replace another's
-    results. ``target`` is what the ratio of times may be at most, None where there is no goal; it is one of CPU time
-    where ``by_cpu``, else of wall time.
+    ``{folder}`` in a word is the folder of the version that is measured, ``{cases}`` that of the paper's cases;
+    ``--force`` lets a round replace another's results. ``target`` is what the ratio of times may be at most, None where
+    there is no goal; it is one of CPU time where ``by_cpu``, else of wall time.
     """
 
     words: str
@@ -66,6 +67,19 @@ PROGRAMS = {
     "run with pictures, ts": Program("run --set time.engine=ts --force --out {folder}/ts", ranks=2, target=4.5 / 9.3),
     # By CPU time: how many members run at once is a matter of the machine's cores.
     "sweep of six": Program("sweep {folder}/six.toml --force --out {folder}/six", target=2.2 / 4.3, by_cpu=True),
+    # The largest steps of the paper at fewer amplitudes and wavenumbers: every third member is scaled, as there.
+    "members of the step interband": Program(
+        "sweep {cases}/interband.toml --set output.figures=false --set sweep.drive.amplitude=[1.0,100.0,1e4]"
+        " --force --out {folder}/interband",
+        target=110 / 183,
+        by_cpu=True,
+    ),
+    "members of the step scattering": Program(
+        "sweep {cases}/scattering.toml --set output.figures=false --set sweep.drive.amplitude=[0.1,1.5,20.0]"
+        ' --set sweep.drive.wavenumber=["3pi/9","6pi/9"] --force --out {folder}/scattering',
+        target=80 / 133,
+        by_cpu=True,
+    ),
     "first run, with compilation, propagator": Program(
         "run --set time.engine=propagator --set output.figures=false --force --out {folder}/first",
         compiles=True,
@@ -94,7 +108,7 @@ class Version:
             shutil.rmtree(kernels, ignore_errors=True)
             environment["NUMBA_CACHE_DIR"] = str(kernels)
 
-        words = program.words.format(folder=self.folder).split()
+        words = program.words.format(folder=self.folder, cases=CASES).split()
         command = [sys.executable, "-m", "vipetsc", *words]
         if program.ranks > 1:
             command = ["mpirun", "-n", str(program.ranks), *command]
