@@ -144,7 +144,7 @@ def local_entropy(velocity: np.ndarray, stride: int = 1) -> tuple[np.ndarray, np
                     # Folded onto the length: wavenumbers a whole number of lengths apart look the same at every
                     # ``stride``-th cell.
                     start = part.band.start % octave.length
-                    x[:, :, start : start + part.values.shape[1]] += spectrum[:, None, part.band] * part.values
+                    _filter(spectrum[:, part.band], part.values, x[:, :, start : start + part.values.shape[1]])
                 _accumulate(fft.ifft(x, overwrite_x=True), total, s_log_s)
 
         _entropies(total, s_log_s, local[rows])
@@ -189,6 +189,15 @@ def _parts(filters: np.ndarray, length: int) -> list[_FilterPart]:
         band = slice(max(inside[0], cut), min(inside[-1] + 1, cut + length))
         parts.append(_FilterPart(band=band, values=filters[:, band]))
     return parts
+
+
+@njit
+def _filter(spectrum: np.ndarray, values: np.ndarray, x: np.ndarray) -> None:
+    """Add ``spectrum`` (t, k) times the ``values`` (kappa, k) of filters to ``x`` (t, kappa, k)."""
+    for t in range(x.shape[0]):
+        for i in range(x.shape[1]):
+            for k in range(x.shape[2]):
+                x[t, i, k] += spectrum[t, k] * values[i, k]
 
 
 @njit(error_model="numpy", fastmath={"contract"})
