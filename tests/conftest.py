@@ -38,9 +38,33 @@ from vipetsc.io.records import RecordFile
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest
 
+NUMBER_OF_RANKS = re.compile(r"parallel\[(\d+)\]")
+
 # A first call may have to load kernels, or compile them.
 hypothesis.settings.register_profile("vipetsc", deadline=None)
 hypothesis.settings.load_profile("vipetsc")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip tests for another number of ranks than there are, and name the command that runs them.
+
+    For those mpi-pytest calls mpiexec, which Open MPI refuses in a process that has MPI already.
+    """
+    if MPI.get_vendor()[0] != "Open MPI":
+        return
+
+    for item in items:
+        # Mpi-pytest has marked every test with its number of ranks.
+        found = [NUMBER_OF_RANKS.fullmatch(mark.name) for mark in item.iter_markers()]
+        (ranks,) = (int(match[1]) for match in found if match)
+        if ranks == MPI.COMM_WORLD.size:
+            continue
+
+        launcher = f"mpirun -n {ranks} " if ranks > 1 else ""
+        file = item.path.relative_to(config.rootpath)
+        command = f"{launcher}python -m pytest -m 'parallel[{ranks}]' {file}"
+        item.add_marker(pytest.mark.skip(reason=f"another number of ranks: {command}"))
 
 
 @pytest.fixture

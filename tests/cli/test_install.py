@@ -140,7 +140,7 @@ def test_the_wheel_runs_away_from_the_source(site, tmp_path):
     read = call(program, "validate", "runs/examples/waveform.toml", cwd=tmp_path, site=site).stdout
     assert "308 samples, interpolated by a cubic spline" in read
     shutil.copy2(ROOT / "tests/cli/tiny_paper.py", tmp_path)
-    call(sys.executable, "tiny_paper.py", "paper", "fig01", "C8", "C10", cwd=tmp_path, site=site)
+    call(sys.executable, "tiny_paper.py", "paper", "C8", "C10", cwd=tmp_path, site=site)
     for path in ("design/design.h5", "scattering/ensemble.h5", "report.html"):
         assert (tmp_path / "paper" / path).exists()
 

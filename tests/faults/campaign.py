@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -32,15 +33,15 @@ def faults(options: argparse.Namespace) -> dict[str, Any]:
     reached: set[str] = set()
     with tempfile.TemporaryDirectory(prefix="faults-") as work:
         for ranks in options.ranks:
-            crew = Crew(Path(work) / str(ranks), ranks, options.patience)
-            unbroken = references(crew, options.only or list(SCENARIOS))
-            tasks = list(matrix(unbroken, options.kinds))
-            if options.phases:
-                tasks = [task for task in tasks if task["phase"] in options.phases]
-            # A phase counts as reached even if --every leaves out its trials.
-            reached |= {task["phase"] for task in tasks}
-            for task, stages in crew.do(tasks[:: options.every]):
-                rows.append(judged(task | {"ranks": ranks}, stages, options))
+            with Crew(Path(work) / str(ranks), ranks, options.patience) as crew:
+                unbroken = references(crew, options.only or list(SCENARIOS))
+                tasks = list(matrix(unbroken, options.kinds))
+                if options.phases:
+                    tasks = [task for task in tasks if task["phase"] in options.phases]
+                # A phase counts as reached even if --every leaves out its trials.
+                reached |= {task["phase"] for task in tasks}
+                for task, stages in crew.do(tasks[:: options.every]):
+                    rows.append(judged(task | {"ranks": ranks}, stages, options))
 
     # Some scenarios need not come to all phases.
     missed = [] if options.only else sorted(phases() - reached)
@@ -55,8 +56,11 @@ def faults(options: argparse.Namespace) -> dict[str, Any]:
 def kills(options: argparse.Namespace) -> dict[str, Any]:
     """Send signals at random times to whole calls and to single ranks; call the same command, and compare its bits."""
     rows: list[Row] = []
-    with tempfile.TemporaryDirectory(prefix="kills-") as work:
-        crews = {ranks: Crew(Path(work) / str(ranks), ranks, options.patience) for ranks in options.ranks}
+    with tempfile.TemporaryDirectory(prefix="kills-") as work, ExitStack() as leaving:
+        crews = {}
+        for ranks in options.ranks:
+            crews[ranks] = leaving.enter_context(Crew(Path(work) / str(ranks), ranks, options.patience))
+
         # Kernels may be compiled in the first: the times of the second are those of a call.
         for _ in range(2):
             unbroken = {ranks: references(crew, options.only) for ranks, crew in crews.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -138,7 +139,8 @@ clearance = 1.8e-3
 [nfrc]
 restitutions = [1.0, 0.7]
 range = [0.97, 1.01]
-harmonics = 5
+harmonics = 3
+points = 5
 """
 PREDICT = LAW + "[predict]\namplitudes = [4.0, 8.0]\npoints = 16\n"
 OPTIMISE = LAW.partition("[law]")[0] + "[optimise]\nbudget = 8\ncurve = [10.0]\nvariables.clearance = [1e-5, 1e-3]\n"
@@ -246,11 +248,9 @@ SCENARIOS = {
 }
 
 
-def shrink() -> None:
-    """Make the program's own pieces as small as the cases: pictures, chunks, the paper."""
+def shrink_pictures() -> None:
+    """Make the program's own pieces as small as the cases: pictures and chunks."""
     # Workers alone call this: what is replaced stays so in the process.
-    import vipetsc.paper.plan as plan
-    from tests.cli.tiny_paper import tiny_plan
     from vipetsc.dynamics import recorded_sizes
     from vipetsc.figures import measure_pages, registry
 
@@ -259,6 +259,13 @@ def shrink() -> None:
     measures_of = measure_pages.measures_of
     measure_pages.measures_of = lambda ensemble: measures_of(ensemble)[:1]
     recorded_sizes.CHUNK_SAMPLES = SAMPLES_A_CHUNK
+
+
+@cache
+def shrink_paper() -> None:
+    """Make the paper small."""
+    import vipetsc.paper.plan as plan
+    from tests.cli.tiny_paper import tiny_plan
 
     small = tiny_plan()
     steps = []

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import tomllib
+from contextlib import ExitStack
 from typing import get_args
 
 import pytest
@@ -61,21 +62,24 @@ def test_every_system_of_normal_modes_meets_faults():
 @pytest.mark.mpirun
 def test_a_fault_at_any_phase_ends_all_and_loses_nothing(tmp_path):
     """A fault at each phase ends as it should, and the same command then leaves what an unbroken one leaves."""
-    crews = {ranks: Crew(tmp_path / str(ranks), ranks) for ranks in ON_RANKS}
-    tasks = []
-    for ranks, crew in crews.items():
-        tasks += [task | {"ranks": ranks} for task in matrix(references(crew, ON_RANKS[ranks]))]
-    assert phases() - {task["phase"] for task in tasks} == set(), "phases that no verb here comes to"
+    with ExitStack() as leaving:
+        crews = {}
+        tasks = []
+        for ranks, names in ON_RANKS.items():
+            crews[ranks] = leaving.enter_context(Crew(tmp_path / str(ranks), ranks))
+            tasks += [task | {"ranks": ranks} for task in matrix(references(crews[ranks], names))]
+        assert phases() - {task["phase"] for task in tasks} == set(), "phases that no verb here comes to"
 
-    chosen = one_of_each(tasks)
-    found = {}
-    rows = []
-    for ranks, crew in crews.items():
-        for task, stages in crew.do([task for task in chosen if task["ranks"] == ranks]):
-            wrong = judge(task, stages, allowed=crew.patience)
-            rows.append(task | {"wrong": wrong, "came": stages["ended"]["fired"]})
-            if wrong:
-                found[task["id"]] = (*wrong, last_words(stages))
+        chosen = one_of_each(tasks)
+        found = {}
+        rows = []
+        for ranks, crew in crews.items():
+            for task, stages in crew.do([task for task in chosen if task["ranks"] == ranks]):
+                wrong = judge(task, stages, allowed=crew.patience)
+                rows.append(task | {"wrong": wrong, "came": stages["ended"]["fired"]})
+                if wrong:
+                    found[task["id"]] = (*wrong, last_words(stages))
+            crew.dismiss()
 
     # Pytest shows it when the test fails.
     print(fault_table(rows, KINDS, list(ON_RANKS)))

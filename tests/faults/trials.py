@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,47 +38,78 @@ Record = dict[str, Any]
 
 @dataclass
 class Crew:
-    """Workers on a number of ``ranks`` that do tasks in ``folder``; a call has ``patience`` s to end."""
+    """Workers on a number of ``ranks`` that do tasks in ``folder``; a call has ``patience`` s to end.
+
+    A worker goes on from task to task until one of them ends it. ``with Crew(...) as crew`` leaves none behind.
+    """
 
     folder: Path
     ranks: int
     patience: float = 40.0
 
-    def do(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, dict[str, Record]]]:
-        """Do all ``tasks``: each with its records by stages, when it is done.
+    def __post_init__(self) -> None:
+        self.worker: subprocess.Popen | None = None
+        # Tasks that the worker may still be given.
+        self.left = 0
 
-        After a task that ended its worker a new worker goes on.
-        """
+    def __enter__(self) -> Crew:
         self.folder.mkdir(parents=True, exist_ok=True)
-        left = list(tasks)
-        stages_of: dict[str, dict[str, Record]] = {}
-        while left:
-            (self.folder / "results.jsonl").write_text("")
-            code, messages = self._launch(left[:AT_ONCE])
-            for line in (self.folder / "results.jsonl").read_text().splitlines():
-                record = json.loads(line)
-                stages_of.setdefault(record["id"], {})[record["stage"]] = record
+        return self
 
-            while left and "finished" in stages_of.get(left[0]["id"], {}):
-                task = left.pop(0)
-                yield task, stages_of.pop(task["id"])
-            if not left:
-                return
+    def __exit__(self, *_: object) -> None:
+        self.dismiss()
 
-            # The next task is the one that ended its worker, unless the worker was done with all that it was given.
-            task = left[0]
-            stages = stages_of.setdefault(task["id"], {})
-            if code == 0 and "ended" not in stages:
-                continue
-
-            end = self._end(code, messages)
-            if "begun" in stages and task["do"] == "trial":
-                # The new worker first does what the old one did not come to: the same command again.
+    def do(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, dict[str, Record]]]:
+        """Do all ``tasks``: each with its records by stages, when it is done."""
+        for task in tasks:
+            stages, end = self._put(task)
+            if end and task["do"] == "trial" and "begun" in stages:
                 stages.setdefault("ended", end | {"broken": unreadable(self.folder / task["scenario"])})
-                left[0] = task | {"do": "finish"}
-            else:
-                left.pop(0)
-                yield task, stages | {"finished": end | {"differs": "it did not end by itself"}}
+                # A new worker does what the old one did not come to: the same command again.
+                found, end = self._put(task | {"do": "finish"})
+                stages |= found
+
+            if end:
+                stages["finished"] = end | {"differs": "it did not end by itself"}
+            yield task, stages
+
+    def dismiss(self) -> None:
+        """Let the worker end, if there is one."""
+        if self.worker is None:
+            return
+
+        self.worker.stdin.close()
+        try:
+            self.worker.wait(self.patience)
+        except subprocess.TimeoutExpired:
+            os.killpg(self.worker.pid, signal.SIGKILL)
+        self._bury()
+
+    def _put(self, task: Task) -> tuple[dict[str, Record], Record | None]:
+        """Have a worker do a task: its records by stages, and how it ended its worker if it did."""
+        if self.left == 0:
+            self.dismiss()
+        if self.worker is None:
+            self._launch()
+
+        self.left -= 1
+        (self.folder / "results.jsonl").write_text("")
+        # A worker that has ended takes none.
+        with suppress(BrokenPipeError):
+            self.worker.stdin.write(json.dumps(task) + "\n")
+            self.worker.stdin.flush()
+        self._await(task)
+
+        stages = {record["stage"]: record for record in self._records()}
+        if "finished" in stages:
+            return stages, None
+        return stages, self._end(*self._bury())
+
+    def _records(self) -> list[Record]:
+        """What the worker has reported of its task."""
+        # The last line may not be whole.
+        whole = (self.folder / "results.jsonl").read_text().rpartition("\n")[0]
+        return [json.loads(line) for line in whole.splitlines()]
 
     def _end(self, code: int, messages: str) -> Record:
         """Return what a call that ended its worker has left: exit code, messages, the time since its fault."""
@@ -87,52 +118,56 @@ class Crew:
         since = time.time() - float(fired.read_text()) if fired.exists() else 0.0
         return {"code": code, "errors": errors, "since": since, "fired": fired.exists(), "mpirun": messages}
 
-    def _launch(self, tasks: Sequence[Task]) -> tuple[int, str]:
-        """Call mpirun with a worker; return its code and its messages. No process of it is left."""
-        worker = [sys.executable, "-m", "tests.faults.worker", str(self.folder), json.dumps(tasks), str(self.patience)]
+    def _launch(self) -> None:
+        """Call mpirun with a worker."""
+        worker = [sys.executable, "-m", "tests.faults.worker", str(self.folder), str(self.patience)]
         command = ["mpirun", "--oversubscribe", "-n", str(self.ranks), *worker]
         environment = clean_environment() | {"PYTHONPATH": str(ROOT)}
-        log = self.folder / "mpirun.log"
-        with log.open("w") as file:
-            process = subprocess.Popen(
-                command, cwd=ROOT, env=environment, stdout=file, stderr=file, start_new_session=True
-            )
-            code = self._await(process, {task["id"]: task for task in tasks if "delay" in task})
+        with (self.folder / "mpirun.log").open("w") as file:
+            self.worker = subprocess.Popen(
+                command, cwd=ROOT, env=environment, start_new_session=True,
+                stdin=subprocess.PIPE, stdout=file, stderr=file, text=True,
+            )  # fmt: skip
+        self.left = AT_ONCE
 
+    def _bury(self) -> tuple[int, str]:
+        """Return the code and the messages of the mpirun of a worker that ends; no process of it is left."""
+        code = self.worker.wait()
+        self.worker = None
+        self.left = 0
         # After a kill, ranks may outlive their mpirun.
         for number in processes_of(self.folder):
             with suppress(ProcessLookupError):
                 os.kill(number, signal.SIGKILL)
-        return code, log.read_text(errors="replace")
+        return code, (self.folder / "mpirun.log").read_text(errors="replace")
 
-    def _await(self, process: subprocess.Popen, kills: dict[str, Task]) -> int:
-        """Return the exit code of a worker, which is killed if it reports nothing for longer than any call may take.
+    def _await(self, task: Task) -> None:
+        """Wait until the worker is done with a task, or has ended: killed if it is silent longer than any call may be.
 
-        ``kills`` are tasks by their ids that are to meet a signal from outside, a ``delay`` in s after they began.
+        A task with a ``delay`` is to meet a signal from outside, so many s after it began.
         """
         results = self.folder / "results.jsonl"
         reported = -1
         last = time.monotonic()
-        while process.poll() is None:
+        while self.worker.poll() is None:
             size = results.stat().st_size
             if size != reported:
                 reported = size
                 last = time.monotonic()
-                lines = results.read_text().splitlines()
-                record = json.loads(lines[-1]) if lines else {}
+                records = self._records()
+                record = records[-1] if records else {}
+                if record.get("stage") == "finished":
+                    return
 
-                kill = None
-                if record.get("stage") == "begun":
-                    kill = kills.get(record["id"])
                 # A call that has ended in the meantime is past being killed.
-                if kill and not self._changes(results, size, record["time"] + kill["delay"]):
+                is_begun = record.get("stage") == "begun"
+                if is_begun and "delay" in task and not self._changes(results, size, record["time"] + task["delay"]):
                     (self.folder / "fired").write_text(str(time.time()))
-                    self._kill(process.pid, record["processes"], kill)
+                    self._kill(self.worker.pid, record["processes"], task)
             # A reference may take ten times the patience, since kernels may have to be compiled in it.
             elif time.monotonic() - last > 15 * self.patience:
-                os.killpg(process.pid, signal.SIGKILL)
+                os.killpg(self.worker.pid, signal.SIGKILL)
             time.sleep(0.01)
-        return process.returncode
 
     def _changes(self, results: Path, size: int, until: float) -> bool:
         """Return whether the worker reports something before the time ``until``."""

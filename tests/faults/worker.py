@@ -1,8 +1,9 @@
-"""Does trials one after the other, all ranks of mpirun together: ``python -m tests.faults.worker FOLDER TASKS``.
+"""Does trials one after the other, all ranks of mpirun together: ``python -m tests.faults.worker FOLDER PATIENCE``.
 
-A trial calls the program in this process while one rank meets a fault, looks at what is left, calls the program again
-as nothing had happened, and compares with an unbroken call. What ends the process ends all; ``trials`` then starts a
-new one, whose first task is to call again. Lines of JSON in FOLDER/results.jsonl say how far the trials are.
+Tasks come to stdin, a line of JSON each, until it is closed. A trial calls the program in this process while one rank
+meets a fault, looks at what is left, calls the program again as nothing had happened, and compares with an unbroken
+call. What ends the process ends all; ``trials`` then starts a new one, whose first task is to call again. Lines of JSON
+in FOLDER/results.jsonl say how far the task is.
 """
 
 from __future__ import annotations
@@ -27,9 +28,20 @@ petsc4py.init(["faults", "-no_signal_handler"])
 from mpi4py import MPI
 
 from tests.faults.inject import Injector
-from tests.faults.scenarios import SCENARIOS, Scenario, copy, difference, prepare, shrink, unreadable, words_of
+from tests.faults.scenarios import (
+    SCENARIOS,
+    Scenario,
+    copy,
+    difference,
+    prepare,
+    shrink_paper,
+    shrink_pictures,
+    unreadable,
+    words_of,
+)
 from vipetsc.cli.main import main as vipetsc
-from vipetsc.parallel import install_abort_hook
+from vipetsc.parallel import install_abort_hook, on_root
+from vipetsc.process import collect_seldom
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
 Task = dict[str, Any]
@@ -62,6 +74,9 @@ class Worker:
     def do(self, task: Task) -> None:
         """Do one task; all ranks call it."""
         scenario = SCENARIOS[task["scenario"]]
+        # To load the paper takes a second, which its own scenario alone needs.
+        if scenario.verb.name == "paper":
+            shrink_paper()
         if task["do"] == "reference":
             self._reference(task, scenario)
             return
@@ -221,14 +236,21 @@ class Worker:
                 file.write(json.dumps({"id": task["id"], "stage": stage, "time": time.time(), **more}) + "\n")
 
 
+def tasks(comm: MPI.Comm) -> Iterator[Task]:
+    """Yield the tasks that come to the stdin of rank 0, on all ranks, which sleep until one comes."""
+    while line := on_root(comm, sys.stdin.readline):
+        yield json.loads(line)
+
+
 def main() -> int:
-    """Do the tasks in the file."""
+    """Do tasks until there are no more."""
+    collect_seldom()
     logging.basicConfig(format="%(message)s")
     logging.getLogger("vipetsc").setLevel(logging.INFO)
     install_abort_hook()
-    shrink()
-    worker = Worker(folder=Path(sys.argv[1]), patience=float(sys.argv[3]))
-    for task in json.loads(sys.argv[2]):
+    shrink_pictures()
+    worker = Worker(folder=Path(sys.argv[1]), patience=float(sys.argv[2]))
+    for task in tasks(MPI.COMM_WORLD):
         worker.do(task)
     return 0
 
