@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -112,12 +112,19 @@ def after_a_period(states: SteadyStates, point: Response, state: np.ndarray) -> 
     return solved.y[:, -1].reshape(state.shape)
 
 
-def multipliers(states: SteadyStates, point: Response, state: np.ndarray) -> np.ndarray:
-    """Floquet multipliers of the motion through ``state``, by differences of the map of a period."""
+class PeriodMap(NamedTuple):
+    """The ``end`` of a period that begins in a state, and the Floquet ``multipliers`` of the motion from there."""
+
+    end: np.ndarray
+    multipliers: np.ndarray
+
+
+def period_map(states: SteadyStates, point: Response, state: np.ndarray) -> PeriodMap:
+    """The map of a period at a ``state``, its derivative by differences."""
     step = 1e-6
     # Integrated together, all have the same steps, whose errors the differences do not contain.
     ends = after_a_period(states, point, state + step * np.vstack([np.zeros(len(state)), np.eye(len(state))]))
-    return np.linalg.eigvals((ends[1:] - ends[0]).T / step)
+    return PeriodMap(end=ends[0], multipliers=np.linalg.eigvals((ends[1:] - ends[0]).T / step))
 
 
 def followed(case: NfrcCase, folder):

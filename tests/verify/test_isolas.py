@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
 import vipetsc
-from tests.rigs import after_a_period, multipliers, rate_of
+from tests.rigs import period_map, rate_of
 from tests.steady_states import motion_at
 from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
@@ -91,9 +91,9 @@ def test_its_two_ends_are_folds_of_the_flow(curves):
     assert found == [frequencies.min(), frequencies.max()]
     for point in folds:
         state = state_of(states, point)
-        end = after_a_period(states, point, state)
-        assert np.abs(end - state).max() < 1e-5 * np.abs(state).max()
-        assert np.abs(multipliers(states, point, state) - 1).min() < 1e-2
+        period = period_map(states, point, state)
+        assert np.abs(period.end - state).max() < 1e-5 * np.abs(state).max()
+        assert np.abs(period.multipliers - 1).min() < 1e-2
 
 
 @pytest.mark.slow

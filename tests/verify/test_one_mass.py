@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.conftest import run_of
-from tests.rigs import TWO_MASSES, after_a_period, followed, multipliers
+from tests.rigs import TWO_MASSES, followed, period_map
 from tests.steady_states import motion_at
 from vipetsc.case import Case
 from vipetsc.case.nfrc import NfrcCase
@@ -69,16 +69,16 @@ def test_its_frequency_response_comes_back_after_a_period(tmp_path):
     assert len(touching) > 10
     for point in [touching[i] for i in np.linspace(0, len(touching) - 1, 10).astype(int)]:
         state = np.ravel(motion_at(states, point.xi, np.arange(1)))
-        end = after_a_period(states, point, state)
-        assert np.abs(end - state).max() < 1e-3 * np.abs(state).max()
-        grows = np.abs(multipliers(states, point, state)) > 1.001
+        period = period_map(states, point, state)
+        assert np.abs(period.end - state).max() < 1e-3 * np.abs(state).max()
+        grows = np.abs(period.multipliers) > 1.001
         assert point.measured.unstable == np.count_nonzero(grows)
 
     # At the folds the map of a period has a multiplier of 1.
     for point in points:
         if point.kind == "fold":
             state = np.ravel(motion_at(states, point.xi, np.arange(1)))
-            values = multipliers(states, point, state)
+            values = period_map(states, point, state).multipliers
             assert np.abs(values - 1).min() < 0.02
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import vipetsc
-from tests.rigs import TWO_MASSES, after_a_period, multipliers
+from tests.rigs import TWO_MASSES, period_map
 from tests.steady_states import motion_at
 from vipetsc.case import CaseError
 from vipetsc.case.case_file import put
@@ -102,9 +102,9 @@ def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are
         # Unknowns are in units of the clearance, which varies along the curve.
         xi = np.append(point.xi[:-1] * states.clearance / inner.clearance, 0.2 / inner.parameter.scale)
         state = np.concatenate([part.ravel() for part in motion_at(inner, xi, np.arange(2))])
-        end = after_a_period(inner, Response(xi=xi), state)
-        assert np.abs(end - state).max() < 1e-3 * np.abs(state).max()
-        grows = np.abs(multipliers(inner, Response(xi=xi), state)) > 1.001
+        period = period_map(inner, Response(xi=xi), state)
+        assert np.abs(period.end - state).max() < 1e-3 * np.abs(state).max()
+        grows = np.abs(period.multipliers) > 1.001
         assert point.measured.unstable == np.count_nonzero(grows)
         unstable.add(point.measured.unstable)
     # Otherwise only stable states were tried.

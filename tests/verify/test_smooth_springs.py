@@ -9,7 +9,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 
-from tests.rigs import OUTPUT, TWO_MASSES, after_a_period, followed, multipliers
+from tests.rigs import OUTPUT, TWO_MASSES, followed, period_map
 from tests.steady_states import motion_at
 from vipetsc.case import CaseError
 from vipetsc.case.nfrc import NfrcCase
@@ -51,9 +51,9 @@ def chain_of(count: int, spring: dict[str, Any], **nfrc: Any) -> dict[str, Any]:
 def misses(states: SteadyStates, point: Response) -> tuple[float, int]:
     """By how much a state misses itself after a period of SciPy's integration, relatively; multipliers beyond 1."""
     state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(states.case.lattice.cells))])
-    end = after_a_period(states, point, state)
-    grows = np.abs(multipliers(states, point, state)) > 1.001
-    return float(np.abs(end - state).max() / np.abs(state).max()), np.count_nonzero(grows)
+    period = period_map(states, point, state)
+    grows = np.abs(period.multipliers) > 1.001
+    return float(np.abs(period.end - state).max() / np.abs(state).max()), np.count_nonzero(grows)
 
 
 @pytest.fixture(scope="module")

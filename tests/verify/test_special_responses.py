@@ -13,7 +13,7 @@ import pytest
 
 import vipetsc
 from tests.conftest import assert_same_bits, datasets
-from tests.rigs import TWO_MASSES, followed, multipliers
+from tests.rigs import TWO_MASSES, followed, period_map
 from tests.steady_states import motion_at
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.cli.verbs.branch_verbs import curve_rows
@@ -42,7 +42,7 @@ def case_of(changes: dict[str, Any], **nfrc: Any) -> NfrcCase:
 def multipliers_at(states, point) -> np.ndarray:
     """Floquet multipliers of a state by differences of the map of a period."""
     state = np.ravel(motion_at(states, point.xi, np.arange(2)))
-    return multipliers(states, point, state)
+    return period_map(states, point, state).multipliers
 
 
 @pytest.mark.slow

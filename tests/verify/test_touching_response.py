@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.rigs import TWO_MASSES, after_a_period, followed, multipliers
+from tests.rigs import TWO_MASSES, followed, period_map
 from tests.steady_states import motion_at
 from tests.verify.test_one_mass import ONE_MASS
 from vipetsc.case import CaseError
@@ -35,9 +35,9 @@ def touching(table: dict[str, Any] = ONE_MASS, contacts: dict[str, Any] | None =
 def error_of_a_period(states: SteadyStates, point: Any) -> tuple[float, int]:
     """By how much a state misses itself after a period of time integration, relatively; multipliers beyond 1."""
     state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(states.case.lattice.cells))])
-    end = after_a_period(states, point, state)
-    grows = np.abs(multipliers(states, point, state)) > 1.001
-    return float(np.abs(end - state).max() / np.abs(state).max()), np.count_nonzero(grows)
+    period = period_map(states, point, state)
+    grows = np.abs(period.multipliers) > 1.001
+    return float(np.abs(period.end - state).max() / np.abs(state).max()), np.count_nonzero(grows)
 
 
 def test_its_resonance_is_that_of_a_bilinear_oscillator(tmp_path):
