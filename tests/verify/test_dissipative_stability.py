@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 from tests.steady_states import motion_at, nfrc_case
 from vipetsc.lattice import Contact, DenseCompliance
+from vipetsc.modes.balance import hill
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.hill import LEAST_OF_FINITE, Hill
@@ -32,10 +33,42 @@ def test_determinants_do_not_depend_on_the_states_before(last):
     def alone(series):
         return Hill(compliance, omega, last, odd=True, finite=True).determinants(series, exponents)
 
-    hill = Hill(compliance, omega, last, odd=True, finite=True)
+    kept = Hill(compliance, omega, last, odd=True, finite=True)
     for series in (free, touching, free):
-        assert np.array_equal(hill.determinants(series, exponents), alone(series))
+        assert np.array_equal(kept.determinants(series, exponents), alone(series))
     assert not np.allclose(alone(free), alone(touching), rtol=1e-3)
+
+
+@pytest.mark.parametrize("entries", [1, 2 * 22**2, 1 << 17])
+def test_determinants_of_many_exponents_are_those_of_hills_matrix(monkeypatch, entries):
+    """det(I + G J) of two dissipative contacts, written out mode by mode: one at a time, in pairs, all together."""
+    monkeypatch.setattr(hill, "ENTRIES", entries)
+    omega = 1.8
+    last = 5
+    law = Contact("hertz", 50.0, restitution=0.7)
+    forces = SiteForces([Stops.both(law, 1.0), Stops.both(law, 0.8)])
+    stiffness = np.array([[2.0, -0.7], [-0.7, 1.5]])
+    z = np.zeros((2, last + 1), complex)
+    z[:, 1] = [1.2, 1.0 + 0.3j]
+    series = forces.series(z, omega)
+    assert series.closed.all()
+
+    exponents = np.array([0.02, 0.1 + 0.2j, 0.01 + 0.4j, 0.3j, 0.05 + 0.45j])
+    found = Hill(DenseCompliance(np.ones(2), stiffness, np.eye(2)), omega, last, odd=False, finite=True).determinants(
+        series, exponents
+    )
+
+    orders = np.arange(-last, last + 1)
+    for mu, determinant in zip(exponents, found, strict=True):
+        jacobian = series.jacobian(mu, orders)
+        matrix = np.eye(2 * len(orders), dtype=complex)
+        for row, k in enumerate(orders):
+            rate = (1j * k + mu) * omega
+            compliance = np.linalg.inv(stiffness + rate**2 * np.eye(2))
+            for column in range(len(orders)):
+                slopes = np.diag(jacobian[:, row, column])
+                matrix[2 * row : 2 * row + 2, 2 * column : 2 * column + 2] += compliance @ slopes
+        assert determinant == pytest.approx(np.linalg.det(matrix), rel=1e-9)
 
 
 class ForcedCell:
