@@ -8,7 +8,7 @@ from pathlib import Path
 import vipetsc
 
 CHAPTER = Path(vipetsc.__file__).parent / "manual/extend.md"
-MODULE = re.compile(r"file `(\w+\.py)`:\n\n```python\n(.*?)^```$", flags=re.M | re.S)
+MODULE = re.compile(r"file\s+`(\w+\.py)`:\n\n```python\n(.*?)^```$", flags=re.M | re.S)
 
 
 def write_modules(folder: Path, chapter: Path = CHAPTER) -> list[str]:
