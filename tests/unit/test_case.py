@@ -154,6 +154,9 @@ def test_a_value_of_no_type_of_its_key_is_refused_with_all_types():
     scaled = problems({}, "time.atol='scale'")["time.atol"]
     assert "must be a number or 'scaled' or 'paper'; did you mean 'scaled'?" in scaled
     assert "must be a whole number, a list or a table" in problems({}, "contacts.sites='a'")["contacts.sites"]
+    # A single table in TOML's brackets where there may be several.
+    more = problems({"drive": {"more": {"amplitude": 1.0}}})["drive.more"]
+    assert more.endswith("must be a valid list of tables; write [[drive.more]]")
     # An item of a list is not a value of the key.
     assert "must be a valid integer" in problems({}, "contacts.sites=[1, 'a']")["contacts.sites[2]"]
     assert "must be greater than 0" in problems({}, "time.end=-1")["time.end"]

@@ -366,6 +366,8 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
         if isinstance(details.get(limit), float):
             # pydantic writes small numbers with all their zeros.
             message = re.sub(r"[\d.]+$", f"{details[limit]:g}", message)
+    if item["type"] == "list_type" and isinstance(value, dict):
+        message += f" of tables; write [[{path}]]"
     choices = details.get("expected")
     if isinstance(value, str) and choices:
         near = difflib.get_close_matches(value, re.findall(r"'([^']+)'", choices), n=1, cutoff=0.4)
