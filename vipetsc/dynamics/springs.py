@@ -5,13 +5,16 @@ result does not depend on the partition, to the last bit. Where all cells are al
 have one number each; else (``is_varied``) each cell has its own, and the sums are the same.
 """
 
+from typing import Any
+
 import numpy as np
 
 from vipetsc.compiled import kernel
 from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.spring_law import nonlinear_energy, nonlinear_force
 
-# Cells in one pass: what a pass touches stays in the first-level cache.
+# Cells in one pass: a pass over the springs of a mass touches a row of each of its neighbours and one of the result,
+# 4 kB each of so many cells, which stay in a first-level cache of 32 kB.
 CHUNK = 512
 
 
@@ -22,11 +25,16 @@ def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) ->
     Of a ``mass`` counted on behind the cell's, where ghosts have velocities: its velocity in m/s.
     """
     shape = lattice.shape
-    if cell < 0:
-        return y[shape.left_ghost + mass] if shape.left_ghost >= 0 else 0.0
+    if 0 <= cell < shape.cells:
+        return y[mass * shape.cells + cell]
+
+    # The rank's first component of the neighbouring cell; a lattice ends without one, in a wall.
+    ghost = shape.left_ghost
     if cell >= shape.cells:
-        return y[shape.right_ghost + mass] if shape.right_ghost >= 0 else 0.0
-    return y[mass * shape.cells + cell]
+        ghost = shape.right_ghost
+    if ghost < 0:
+        return 0.0
+    return y[ghost + mass]
 
 
 @kernel
@@ -51,26 +59,38 @@ def _is_beyond_free_end(lattice: LatticeRecord, cell: int) -> bool:
 
 
 @kernel
+def _table_entry(lattice: LatticeRecord, coupling: Any, cell: int) -> int:
+    """Where ``stiffness`` and ``damping`` have the spring of a ``coupling`` of the owned ``cell``."""
+    # A row of the tables begins with the cell before the first one; a spring is its left cell's.
+    left = cell + min(coupling.offset, 0)
+    return coupling.spring * (lattice.shape.cells + 1) + 1 + left
+
+
+@kernel
 def _varied_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
     """Acceleration of one mass as by ``spring_acceleration``, with the cell's own numbers and dashpots."""
     shape = lattice.shape
-    n, d = shape.cells, shape.dofs
-    total = 0.0
+    n = shape.cells
+    d = shape.dofs
+    is_damped = shape.damping >= 0
+
+    # Sum of k (u_other - u) + c (v_other - v) over the springs and the dashpots parallel to them.
+    force = 0.0
     for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
         coupling = lattice.couplings[s]
-        c = cell + coupling.offset
-        if _is_beyond_free_end(lattice, c):
+        other_cell = cell + coupling.offset
+        if _is_beyond_free_end(lattice, other_cell):
             continue
-        # A row of the tables begins with the cell before the first one; a spring is its left cell's.
-        entry = coupling.spring * (n + 1) + 1 + cell + min(coupling.offset, 0)
-        total += lattice.stiffness[entry] * (displacement(y, lattice, c, coupling.other) - y[mass * n + cell])
-        if shape.damping >= 0:
-            rate = displacement(y, lattice, c, d + coupling.other) - y[(d + mass) * n + cell]
-            total += lattice.damping[entry] * rate
+        entry = _table_entry(lattice, coupling, cell)
+        stretch = displacement(y, lattice, other_cell, coupling.other) - y[mass * n + cell]
+        force += lattice.stiffness[entry] * stretch
+        if is_damped:
+            rate = displacement(y, lattice, other_cell, d + coupling.other) - y[(d + mass) * n + cell]
+            force += lattice.damping[entry] * rate
 
-    if shape.damping >= 0:
-        total -= lattice.grounding[mass * n + cell] * y[(d + mass) * n + cell]
-    return total * lattice.inverse_masses[mass * n + cell]
+    if is_damped:
+        force -= lattice.grounding[mass * n + cell] * y[(d + mass) * n + cell]
+    return force * lattice.inverse_masses[mass * n + cell]
 
 
 @kernel
@@ -80,50 +100,57 @@ def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: 
         return _varied_acceleration(y, lattice, cell, mass)
 
     here = y[mass * lattice.shape.cells + cell]
-    total = 0.0
+    force = 0.0
     for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
         coupling = lattice.couplings[s]
-        c = cell + coupling.offset
-        if _is_beyond_free_end(lattice, c):
+        other_cell = cell + coupling.offset
+        if _is_beyond_free_end(lattice, other_cell):
             continue
-        total += coupling.stiffness * (displacement(y, lattice, c, coupling.other) - here)
-    return total * lattice.masses[mass].inverse_mass
+        force += coupling.stiffness * (displacement(y, lattice, other_cell, coupling.other) - here)
+    return force * lattice.masses[mass].inverse_mass
 
 
 @kernel
-def _add_spring(out: np.ndarray, other: np.ndarray, here: np.ndarray, stiffness: float) -> None:
-    for i in range(out.size):
-        out[i] += stiffness * (other[i] - here[i])
+def _add_equal_springs(forces: np.ndarray, other: np.ndarray, here: np.ndarray, stiffness: float) -> None:
+    """Add to the ``forces`` in N those of one spring, k (u_other - u), in consecutive cells."""
+    for i in range(forces.size):
+        forces[i] += stiffness * (other[i] - here[i])
 
 
 @kernel
-def _add_springs(out: np.ndarray, other: np.ndarray, here: np.ndarray, factors: np.ndarray) -> None:
-    for i in range(out.size):
-        out[i] += factors[i] * (other[i] - here[i])
+def _add_varied_springs(forces: np.ndarray, other: np.ndarray, here: np.ndarray, factors: np.ndarray) -> None:
+    """Add to the ``forces`` as ``_add_equal_springs``, with a factor of each cell: stiffness, or damping of rates."""
+    for i in range(forces.size):
+        forces[i] += factors[i] * (other[i] - here[i])
 
 
 @kernel
-def _varied_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, a: int, out: np.ndarray) -> None:
-    """Accelerations of a mass in the cells from ``a`` on, whose neighbours are all owned."""
-    n, m = lattice.shape.cells, out.size
+def _varied_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, first: int, out: np.ndarray) -> None:
+    """Accelerations of a mass in the cells from ``first`` on, whose neighbours are all owned."""
+    n = lattice.shape.cells
+    count = out.size
+    is_damped = lattice.shape.damping >= 0
+    # Components of the state: the mass's displacements in these cells, and its velocities, all displacements later.
+    begin = mass * n + first
     velocities = lattice.shape.dofs * n
-    here = y[mass * n + a :][:m]
-    rate = y[velocities + mass * n + a :][:m]
+    here = y[begin:][:count]
+    rate = y[velocities + begin :][:count]
 
+    # Forces first, as sums over the springs in the cell's order.
     out[:] = 0.0
     for s in range(lattice.masses[mass].first, lattice.masses[mass].last):
         coupling = lattice.couplings[s]
-        first = coupling.other * n + coupling.offset + a
-        entry = coupling.spring * (n + 1) + 1 + a + min(coupling.offset, 0)
-        _add_springs(out, y[first:][:m], here, lattice.stiffness[entry:])
-        if lattice.shape.damping >= 0:
-            _add_springs(out, y[velocities + first :][:m], rate, lattice.damping[entry:])
+        other = coupling.other * n + coupling.offset + first
+        entry = _table_entry(lattice, coupling, first)
+        _add_varied_springs(out, y[other:][:count], here, lattice.stiffness[entry:])
+        if is_damped:
+            _add_varied_springs(out, y[velocities + other :][:count], rate, lattice.damping[entry:])
 
-    if lattice.shape.damping >= 0:
-        for i in range(m):
-            out[i] -= lattice.grounding[mass * n + a + i] * rate[i]
-    for i in range(m):
-        out[i] *= lattice.inverse_masses[mass * n + a + i]
+    if is_damped:
+        for i in range(count):
+            out[i] -= lattice.grounding[begin + i] * rate[i]
+    for i in range(count):
+        out[i] *= lattice.inverse_masses[begin + i]
 
 
 @kernel
@@ -133,18 +160,19 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
     here = y[mass * n : (mass + 1) * n]
     row = lattice.masses[mass]
     inverse = lattice.masses[mass].inverse_mass
-    for a in range(1, n - 1, CHUNK):
-        b = min(a + CHUNK, n - 1)
-        out = acceleration[a:b]
+    for first in range(1, n - 1, CHUNK):
+        stop = min(first + CHUNK, n - 1)
+        out = acceleration[first:stop]
         if is_varied(lattice):
-            _varied_accelerations(y, lattice, mass, a, out)
+            _varied_accelerations(y, lattice, mass, first, out)
             continue
 
+        # Forces first, as sums over the springs in the cell's order; those of a mass are equal in all cells.
         out[:] = 0.0
         for s in range(row.first, row.last):
             coupling = lattice.couplings[s]
-            first = coupling.other * n + coupling.offset
-            _add_spring(out, y[first + a : first + b], here[a:b], coupling.stiffness)
+            others = coupling.other * n + coupling.offset
+            _add_equal_springs(out, y[others + first : others + stop], here[first:stop], coupling.stiffness)
         for i in range(out.size):
             out[i] *= inverse
 
@@ -159,11 +187,11 @@ def spring_accelerations(y: np.ndarray, lattice: LatticeRecord, mass: int, accel
 def _elongation(y: np.ndarray, lattice: LatticeRecord, s: int, cell: int) -> float:
     """Elongation in m of the ``nonlinear`` spring ``s`` of a ``cell``; 0 of one beyond a free end."""
     coupling = lattice.nonlinear[s]
-    c = cell + coupling.offset
-    if _is_beyond_free_end(lattice, c):
+    other_cell = cell + coupling.offset
+    if _is_beyond_free_end(lattice, other_cell):
         return 0.0
     here = y[coupling.mass * lattice.shape.cells + cell]
-    return coupling.sign * (displacement(y, lattice, c, coupling.other) - here)
+    return coupling.sign * (displacement(y, lattice, other_cell, coupling.other) - here)
 
 
 @kernel
@@ -204,7 +232,8 @@ def add_squares(
     n = lattice.shape.cells
     for s in range(lattice.springs.size):
         spring = lattice.springs[s]
-        start, end = half + spring.start, half + spring.end
+        start = half + spring.start
+        end = half + spring.end
         factors = values[s * (n + 1) + 1 + first :]
         # The spring of the last cell to the next one ends among the ghosts, in a wall or nowhere.
         leaves = spring.next_cell == 1 and first + sums.size == n
@@ -225,7 +254,9 @@ def add_squares(
 @kernel
 def damping_powers(y: np.ndarray, lattice: LatticeRecord, powers: np.ndarray) -> None:
     """Power in W that the dashpots of each owned cell dissipate."""
-    n, d = lattice.shape.cells, lattice.shape.dofs
+    n = lattice.shape.cells
+    d = lattice.shape.dofs
+    # c (v_other - v)^2 of the dashpots parallel to springs, then c v^2 of those to the ground.
     powers[:] = 0.0
     add_squares(y, lattice, 0, d, lattice.damping, powers)
     for mass in range(d):

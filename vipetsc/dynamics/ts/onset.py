@@ -14,7 +14,8 @@ class _OnsetStep(NamedTuple):
 
 
 # Where all forces begin linearly, and else. Hertz's force begins as (t - onset)^(3/2), which no step of high order
-# resolves: the velocity's error goes as h^(5/2). The fractions are those that the controller settles at.
+# resolves: the velocity's error goes as h^(5/2). The fractions are those that the controller settles at. Half of them
+# saves every fourth rejected trial of the built-in case, 3 % of all, twice as much costs 2 %; the error is the same.
 _LINEAR = _OnsetStep(fraction=1 / 20, order=8)
 _OTHER = _OnsetStep(fraction=1 / 200, order=2.5)
 _LONGEST = 0.1
