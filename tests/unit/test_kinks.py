@@ -9,7 +9,8 @@ from tests.unit.propagator_parts import MASS, RATE, pressed_mass
 from vipetsc.contact.law import CLOSED
 from vipetsc.contact.search import MOST_ATTEMPTS
 from vipetsc.dynamics.propagator import advance
-from vipetsc.dynamics.propagator.advance import CUT, DONE, SHORTEST, advance_cluster, first_kink
+from vipetsc.dynamics.propagator.advance import CUT, DONE, SHORTEST, advance_cluster
+from vipetsc.dynamics.propagator.kinks import first_kink
 from vipetsc.dynamics.propagator.loss_tables import no_losses
 from vipetsc.dynamics.propagator.nodes import EXIT
 from vipetsc.dynamics.propagator.substeps import Substep

@@ -99,10 +99,10 @@ masses: ``step_choice`` compares the two.
 **Modules**, from the lattice to the engine. ``rows``: powers of the lattice's matrix, row by row. ``series``: how many
 of them count, and how far. ``groups``: contact DoFs and their groups. ``step_choice``: the length of a step.
 ``taylor``: values of the series. ``stencil``: P on a rank's cells. ``clusters``: tables of contact DoFs. ``nodes``:
-tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep.
-``advance``: substeps up to a change of modes. ``forces``: changes up to the step's end. ``engine``: steps up to the
-sample. ``dashpots``, ``free_losses``, ``loss_modes``, ``loss_tables``, ``losses``: what dashpots dissipate. ``tangent``
-and ``tangent_kernels``: variations.
+tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep. ``kinks``:
+where a contact opens or closes without a change of modes. ``advance``: substeps up to a change of modes. ``forces``:
+changes up to the step's end. ``engine``: steps up to the sample. ``dashpots``, ``free_losses``, ``loss_modes``,
+``loss_tables``, ``losses``: what dashpots dissipate. ``tangent`` and ``tangent_kernels``: variations.
 
 References
 ----------

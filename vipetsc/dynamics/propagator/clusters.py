@@ -69,7 +69,9 @@ class DofTables(NamedTuple):
 def groups_within_reach(groups: Groups, dofs: np.ndarray, reach: int, layout: Layout) -> Groups:
     """The ``groups`` of which a DoF lies within ``reach`` of the rank's cells; ``dofs`` are theirs, in their order."""
     # On a ring a DoF also stands one turn before and one turn after its own place.
-    turns = (-layout.cells, 0, layout.cells) if layout.periodic else (0,)
+    turns: tuple[int, ...] = (0,)
+    if layout.periodic:
+        turns = (-layout.cells, 0, layout.cells)
     near = np.zeros(len(dofs), bool)
     for turn in turns:
         near |= (dofs["last"] + turn >= layout.start - reach) & (dofs["cell"] + turn < layout.stop + reach)
@@ -108,7 +110,10 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     ledger = places[[*(-1 - i for i in layout.drives), *layout.sites]]
 
     leftmost_cells = dofs["cell"] - series.reach
-    margin = series.reach + 1 if layout.damped else 0  # of what moves the dashpots that forces reach
+    # Beyond the cells that forces reach lie those that move the dashpots there, which losses are computed from.
+    margin = 0
+    if layout.damped:
+        margin = series.reach + 1
     column = halo.add(leftmost_cells - margin, series.width + 2 * margin) + margin
     return DofTables(
         column=column,

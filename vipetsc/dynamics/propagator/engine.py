@@ -16,6 +16,7 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.tracker import Tracks
+from vipetsc.dynamics.drives import Drives
 from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
@@ -79,6 +80,16 @@ def _complete(state: np.ndarray, states: States, ledger: np.ndarray, energies: n
             k += 1
 
 
+@kernel
+def _is_driven(dofs: DofTables, c: int, drives: Drives, begin: float) -> bool:
+    """Whether a drive of cluster ``c`` is on in the step from ``begin`` in s on."""
+    driven = False
+    # Behind its sites and springs a cluster has its driven masses.
+    for i in range(dofs.first[c] + dofs.sites[c] + dofs.springs[c], dofs.first[c + 1]):
+        driven |= begin < drives.rows[i].duration
+    return driven
+
+
 @njit(error_model="numpy")
 def take_steps(
     states: States, step: StepTables, halo: Halo, dofs: DofTables, clusters: Cluster, tracks: Tracks, samples: Samples
@@ -102,8 +113,8 @@ def take_steps(
         error = exchange(halo, steps % 2, cells)
 
         # The ledger and the ghosts follow the cells in the state only where it is looked at.
-        k = steps // states.parts - samples.number if steps % states.parts == 0 else -1
-        is_sample = 0 <= k < samples.work.shape[0]
+        k = steps // states.parts - samples.number
+        is_sample = steps % states.parts == 0 and 0 <= k < samples.work.shape[0]
         if is_sample or steps == progress.last:
             _complete(state, states, dofs.ledger, clusters.energy, halo.columns)
         if is_sample:
@@ -117,16 +128,19 @@ def take_steps(
         if steps == progress.last or (failed and halo.scatter == 0):
             break
 
-        # The clusters read the halo, that is the state before the step.
+        # Free motion of all cells, and what dashpots dissipate in it.
         apply_propagator(step.stencil, cells, halo.columns, next_cells)
         lost = states.components[1 - steps % 2, rows * owned : states.rows * owned]
         if lost.size > 0:
             add_free_losses(step.free_losses, cells, halo.columns, state[rows * owned : states.rows * owned], lost)
-        for c in range(0 if failed else clusters.state.size):
+
+        # What forces add. The clusters read the halo, that is the state before the step.
+        count = clusters.state.size
+        if failed:
+            count = 0
+        for c in range(count):
             may_touch = expand_free_motion(dofs, c, halo.columns, clusters.taylor)
-            for i in range(dofs.first[c] + dofs.sites[c] + dofs.springs[c], dofs.first[c + 1]):
-                may_touch |= begin < clusters.drives.rows[i].duration
-            if not may_touch:
+            if not may_touch and not _is_driven(dofs, c, clusters.drives, begin):
                 continue
             followed, tracks = follow_contacts(clusters, step.by_pairs, dofs, c, tracks, begin)
             if not followed:
@@ -161,11 +175,15 @@ class Propagator(Engine):
 
         # Everything that reads cells of other ranks says which before the halo is bound; the ghosts come last.
         self._regions = HaloRegions(layout)
-        dashpots = DashpotRows(series) if layout.damped else None
+        dashpots = None
+        if layout.damped:
+            dashpots = DashpotRows(series)
         self._forces = on_every_rank(layout.comm, lambda: Forces(model, layout, series, self._regions, dashpots))
         self._stencil = create_stencil(series, layout, self._regions)
         # Without dashpots any stencil serves: none is applied.
-        loss_stencil = create_loss_stencil(dashpots, layout, self._regions) if dashpots else self._stencil
+        loss_stencil = self._stencil
+        if dashpots is not None:
+            loss_stencil = create_loss_stencil(dashpots, layout, self._regions)
         self._tables = StepTables(self._stencil, loss_stencil, *self._forces.losses)
         ghosts = [cell for cell in layout.neighbours() if cell is not None]
         for cell in ghosts:

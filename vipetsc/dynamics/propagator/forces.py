@@ -54,11 +54,13 @@ from vipetsc.dynamics.site_dofs import site_records
 from vipetsc.dynamics.spring_law import SPRING_LAW
 
 # A contact's first substep as a fraction of its duration at a tolerance of 1e-6; it goes with the error as others do.
+# On the built-in case half as much saves 5 % of all substeps with Hertz's law and costs 6 % with the bilinear one;
+# twice as much does the reverse, 3 % and 4 %.
 FIRST_SUBSTEP = 0.1
 FIRST_TOLERANCE = 1e-6
 # Most by which a loose tolerance lengthens it.
 LONGEST_FIRST = 2.0
-# Changes of one cluster in one step beyond which it counts as stalled.
+# Changes of one cluster in one step beyond which it counts as stalled; the built-in case has two at most.
 MOST_CHANGES = 5_000
 FORCE = np.dtype([("number", np.int64), ("energy", float), ("history", HISTORY), ("cluster", SUBSTEP_STATE)])
 """A DoF of ``contact_dofs`` in a checkpoint: its number, below 0 of a drive, and what its cluster's record has."""

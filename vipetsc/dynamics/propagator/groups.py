@@ -77,7 +77,9 @@ def contact_dofs(model: Model) -> np.ndarray:
     dofs["last"][sites] += joins
 
     # ``gaps`` is empty where the clearances of every site are equal on both sides.
-    dofs["clearance"][sites] = np.min(model.gaps, axis=1) if model.gaps else lattice.clearances
+    dofs["clearance"][sites] = lattice.clearances
+    if model.gaps:
+        dofs["clearance"][sites] = np.min(model.gaps, axis=1)
     dofs["clearance"][first_drive:] = np.inf
     if len(springs):
         _fill_springs(dofs[len(sites) : first_drive], lattice, springs)

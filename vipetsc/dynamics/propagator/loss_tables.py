@@ -103,7 +103,9 @@ def _create_responses(dofs: np.ndarray, model: Model, dashpots: DashpotRows) -> 
     _, examples, table = np.unique(keys, axis=0, return_index=True, return_inverse=True)
 
     # On a short ring a dashpot is reached from both sides: it is one.
-    distinct = min(count, chain.cells) if chain.ends == "periodic" else count
+    distinct = count
+    if chain.ends == "periodic":
+        distinct = min(count, chain.cells)
     rates = np.zeros((len(examples), distinct, dashpots.rates, dashpots.powers))
     for out, example in zip(rates, examples.tolist(), strict=True):
         for k in range(count):

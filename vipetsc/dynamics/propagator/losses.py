@@ -13,7 +13,7 @@ import numpy as np
 from vipetsc.compiled import kernel, njit
 from vipetsc.dynamics.propagator.clusters import DofTables, is_zero
 from vipetsc.dynamics.propagator.nodes import NODES
-from vipetsc.dynamics.propagator.stencil import Stencil
+from vipetsc.dynamics.propagator.stencil import Stencil, multiply_dense
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial
 from vipetsc.dynamics.vectors import LANES, add_lanes, add_product, store, zeros
 
@@ -112,12 +112,7 @@ def add_free_losses(
     masses = state.shape[0] // 2
     total = np.empty(2 * masses)
     for column, at, table in stencil.border_cells:
-        rows = stencil.borders[table]
-        total[:] = 0.0
-        for row in range(rows.shape[0]):
-            for k in range(rows.shape[1]):
-                for o in range(total.size):
-                    total[o] += columns[row, column + k] * rows[row, k, o]
+        multiply_dense(stencil.borders[table], columns, column, total)
         # Displacement and velocity mass by mass, as in the stencil's blocks: sums are rounded alike.
         dense = 0.0
         for mass in range(masses):

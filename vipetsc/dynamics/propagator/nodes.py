@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legval
 
+# Nodes of a substep. On the built-in case up to 0.5 s six of them take 2.4 times as many substeps and 1.4 times the CPU
+# time; 10 and 16 take 0.6 and 0.4 of the substeps, each of which is dearer, and the same CPU time.
 NODES = 8
 PLAIN, ONSET, EXIT = range(3)
 

@@ -19,7 +19,7 @@ import numpy as np
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.variation import Coefficients
 
-# Cells whose coefficients are looked at together: a lattice of millions is not copied as a whole.
+# Cells whose coefficients are looked at together, some MB: a lattice of millions is not copied as a whole.
 CHUNK = 65_536
 RowMap = Callable[[np.ndarray], np.ndarray]
 
@@ -123,7 +123,9 @@ def _multiply(
     masses that are displaced by the row x.
     """
     x = rows / neighbours.masses
-    out = np.zeros_like(rows) if ground is None else -ground * x
+    out = np.zeros_like(rows)
+    if ground is not None:
+        out = -ground * x
     for spring, value in zip(neighbours.chain.cell.springs, springs.swapaxes(0, 1)[:, :, None], strict=True):
         start = x[:, :, spring.start]
         end = x[:, :, spring.end]

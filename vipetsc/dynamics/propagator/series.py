@@ -207,7 +207,10 @@ class StepSeries:
         """
         near = self.reach + 1
         differs = self.chain.differs.astype(int)
-        differs = np.pad(differs, near, mode="wrap") if self.chain.ends == "periodic" else np.pad(differs, near)
+        if self.chain.ends == "periodic":
+            differs = np.pad(differs, near, mode="wrap")
+        else:
+            differs = np.pad(differs, near)
         return np.append(0, np.cumsum(differs))
 
     def is_interior(self, cells: ArrayLike) -> np.ndarray:

@@ -16,7 +16,7 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import inlined, njit
 from vipetsc.dynamics import native
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.series import StepSeries
@@ -47,7 +47,10 @@ class HaloRegions:
         """The columns of all ranges, to be filled from one of the ``states``; all ranks must call it."""
         layout = self._layout
         cells = np.concatenate(self._ranges)
-        cells = cells % layout.cells if layout.periodic else np.clip(cells, 0, layout.cells - 1)
+        if layout.periodic:
+            cells = cells % layout.cells
+        else:
+            cells = np.clip(cells, 0, layout.cells - 1)
         columns = np.zeros((2 * layout.dofs, len(cells)))
 
         # One rank has all cells in memory and copies them; its handles stay 0.
@@ -234,17 +237,21 @@ def _dense_rows(series: StepSeries, cells: np.ndarray, ends: list[tuple[int, int
 @njit(error_model="numpy")
 def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, out: np.ndarray) -> None:
     """Put P(H) times the lattice's ``state``, whose halo is ``columns``, into ``out`` (2 dof, owned cell)."""
+    # On flat arrays, in which row r of cell i is at r cells + i: the output rows of each block, the input of each term.
     cells = state.shape[1]
     x = state.reshape(-1)
     y = out.reshape(-1)
     values = stencil.values
     to = stencil.blocks * cells
     places = stencil.rows * cells + stencil.offsets
+
+    # So many neighbouring cells at once: all have the same rows of P.
     for first, stop in stencil.interior:
         for a in range(first, stop, LANES):
             # The last vector overlaps the one before.
             i = min(a, stop - LANES)
             for b in range(to.shape[0]):
+                # The rows of the block are among those that it reads: two vectors ahead they are fetched from memory.
                 for k in range(4):
                     prefetch(x, to[b, k] + i + 2 * LANES)
                 # Names, not an array: the sums stay in registers.
@@ -263,12 +270,17 @@ def apply_propagator(stencil: Stencil, state: np.ndarray, columns: np.ndarray, o
                 store(sum3, y, to[b, 3] + i)
 
     total = np.empty(out.shape[0])
-    for column, at, table in stencil.border_cells:
-        rows = stencil.borders[table]
-        total[:] = 0.0
-        for row in range(rows.shape[0]):
-            for k in range(rows.shape[1]):
-                for o in range(total.size):
-                    total[o] += columns[row, column + k] * rows[row, k, o]
-        for o in range(total.size):
-            out[o, at] = total[o]
+    for column, cell, table in stencil.border_cells:
+        multiply_dense(stencil.borders[table], columns, column, total)
+        for output in range(total.size):
+            out[output, cell] = total[output]
+
+
+@inlined
+def multiply_dense(rows: np.ndarray, columns: np.ndarray, column: int, total: np.ndarray) -> None:
+    """Put the dense ``rows`` (2 dof, cell, output) times the halo's ``columns`` from ``column`` on into ``total``."""
+    total[:] = 0.0
+    for row in range(rows.shape[0]):
+        for k in range(rows.shape[1]):
+            for output in range(total.size):
+                total[output] += columns[row, column + k] * rows[row, k, output]

@@ -32,7 +32,8 @@ from vipetsc.dynamics.samples import Samples
 from vipetsc.dynamics.site_dofs import site_records
 from vipetsc.parallel import on_every_rank
 
-# Rows of the tape of a cluster, 208 B each with the motion at the nodes.
+# Rows of the tape of a cluster, 208 B each with the motion at the nodes. A contact takes fewer than 30 of them in the
+# built-in case; an orbit that needs more rows is refused with their number.
 MOST_ROWS = 8192
 
 
@@ -165,7 +166,11 @@ class TangentPropagator(Propagator):
         """
         layout = self._layout
         tape = self._forces.clusters.tape
-        for number in range(1, samples + 1) if look else [samples]:
+        # Without anything to show the engine goes to the last sample at once.
+        numbers = range(samples, samples + 1)
+        if look:
+            numbers = range(1, samples + 1)
+        for number in numbers:
             # Nothing is stored: the engine goes to the sample before the one that would be.
             result = self.fill(no_samples(self._model, layout, number + 1))
             needed = layout.comm.allreduce(int(tape.used.max(initial=0)), max)
@@ -227,7 +232,7 @@ class TangentPropagator(Propagator):
 
     def _open_rows(self, c: int, rows: np.ndarray, is_held: np.ndarray) -> np.ndarray:
         """Which ``rows`` (row,) of the tape of cluster ``c`` are of an open site, as those that ``is_held`` may be."""
-        # A substep ends where such a site opens or closes: its middle tells.
+        # A substep ends where such a site opens or closes: in its middle the site is what it is all through.
         w = self._forces.clusters.tape.motion[c, : len(rows), 0, NODES // 2]
         sites = self._forces.clusters.contacts[self._forces.dofs.first[c] + rows["site"]]
         side = np.sign(rows["mode"])

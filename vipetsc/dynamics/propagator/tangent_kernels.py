@@ -64,14 +64,18 @@ def _slopes(site: Any, row: Any, w: float, v: float) -> tuple[float, float, floa
 def _begin_contact(cluster: Cluster, row: Any, x: np.ndarray, first: int) -> None:
     """Set the variations of w'_minus of a site whose contact begins, in the images ``x`` of unit vectors.
 
-    ``x[j]`` holds the coefficients of all DoFs' series, then w'_minus of every site. The onset comes earlier by dw/w',
-    and w'_minus changes by dw' - w'' dw/w'. Below its floor |w'_minus| is held there and does not vary.
+    ``x[j]`` holds the coefficients of all DoFs' series, then w'_minus of every site, from ``first`` on. The onset comes
+    earlier by dw/w', and w'_minus changes by dw' - w'' dw/w'. Below its floor |w'_minus| is held there and does not
+    vary.
     """
-    w = row.site * cluster.taylor.shape[1]  # the place of dw in x[j]; that of dw' times the interval is the next one
+    # The place of dw in x[j]; that of dw' times the interval is the next one.
+    w = row.site * cluster.taylor.shape[1]
     floored = abs(row.rate) < cluster.contacts[row.site].floor
     for j in range(x.shape[0]):
-        change = x[j, w + 1] / cluster.interval - row.acceleration * x[j, w] / row.rate
-        x[j, first + row.site] = 0.0 if floored else change
+        change = 0.0
+        if not floored:
+            change = x[j, w + 1] / cluster.interval - row.acceleration * x[j, w] / row.rate
+        x[j, first + row.site] = change
 
 
 @njit(error_model="numpy")
@@ -80,41 +84,102 @@ def _force_variations(
 ) -> np.ndarray:
     """Variations (site and node, column) of the forces of the closed sites ``rows`` in a substep.
 
-    dF = F_w dw + F_v dv + F_q dq at the nodes, where dw and dv are those of the free motion, by ``x``, and what dF adds
-    through the responses. Drives do not depend on the state: their variations are zero.
+    At the nodes dF = F_w dw + F_v dv + F_q dq. The motion dw, dv is that of the free motion, by ``x``, and what dF adds
+    through the responses R: with S = (F_w, F_v) on the diagonal
+
+        (1 - S R) dF = S (dw, dv)_free + F_q dq.
+
+    Drives do not depend on the state: their variations are zero.
     """
     sites = rows.size
-    columns = x.shape[0]
-    dofs, terms = cluster.taylor.shape
-    system = np.eye(sites * NODES)
-    right = np.zeros((sites * NODES, columns))
+    left = np.eye(sites * NODES)
+    right = np.zeros((sites * NODES, x.shape[0]))
     slopes = np.zeros((NODES, 3))
     to_w = np.zeros((NODES, NODES))
     to_v = np.zeros((NODES, NODES))
-    for a in range(sites):
-        row = rows[a]
-        i = row.site
+    for target in range(sites):
+        row = rows[target]
+        of_target = slice(target * NODES, (target + 1) * NODES)
         for node in range(NODES):
-            slopes[node] = _slopes(cluster.contacts[i], row, motion[a, 0, node], motion[a, 1, node])
-            s = substep.length * cluster.nodes.position[substep.kind, node]
-            for j in range(columns):
-                # Horner's scheme, for the value and the slope of the series.
-                w = 0.0
-                v = 0.0
-                for k in range(terms - 1, -1, -1):
-                    v = v * s + w
-                    w = w * s + x[j, i * terms + k]
-                change = slopes[node, 0] * w + slopes[node, 1] * v / cluster.interval
-                right[a * NODES + node, j] = change + slopes[node, 2] * x[j, dofs * terms + i]
+            w = motion[target, 0, node]
+            v = motion[target, 1, node]
+            slopes[node] = _slopes(cluster.contacts[row.site], row, w, v)
+        _fill_free_forces(cluster, substep, row.site, slopes, x, right[of_target])
 
-        for b in range(sites):
-            if node_responses(cluster, substep, i, rows[b].site, to_w, to_v):
-                for node in range(NODES):
-                    for k in range(NODES):
-                        # The responses are displacement (m/N) and velocity (m/s/N); only series are in units of H.
-                        by_force = slopes[node, 0] * to_w[k, node] + slopes[node, 1] * to_v[k, node]
-                        system[a * NODES + node, b * NODES + k] -= by_force
-    return np.linalg.solve(system, right)
+        for source in range(sites):
+            if node_responses(cluster, substep, row.site, rows[source].site, to_w, to_v):
+                of_source = slice(source * NODES, (source + 1) * NODES)
+                _subtract_responses(slopes, to_w, to_v, left[of_target, of_source])
+    return np.linalg.solve(left, right)
+
+
+@kernel
+def _fill_free_forces(
+    cluster: Cluster, substep: Substep, i: int, slopes: np.ndarray, x: np.ndarray, out: np.ndarray
+) -> None:
+    """Put F_w dw + F_v dv + F_q dq of site ``i`` with the free motion's dw and dv into ``out`` (node, column).
+
+    ``slopes`` (node, 3) are F_w, F_v and F_q; ``x`` (column, coefficient) as in ``_begin_contact``.
+    """
+    dofs, terms = cluster.taylor.shape
+    for node in range(NODES):
+        s = substep.length * cluster.nodes.position[substep.kind, node]
+        for j in range(x.shape[0]):
+            # Horner's scheme, for the value and the slope of the series.
+            w = 0.0
+            v = 0.0
+            for k in range(terms - 1, -1, -1):
+                v = v * s + w
+                w = w * s + x[j, i * terms + k]
+            change = slopes[node, 0] * w + slopes[node, 1] * v / cluster.interval
+            out[node, j] = change + slopes[node, 2] * x[j, dofs * terms + i]
+
+
+@kernel
+def _subtract_responses(slopes: np.ndarray, to_w: np.ndarray, to_v: np.ndarray, out: np.ndarray) -> None:
+    """Subtract S R from the block ``out`` (node of the target, node k of the source) of the system."""
+    for node in range(NODES):
+        for k in range(NODES):
+            # The responses are displacement (m/N) and velocity (m/s/N); only series are in units of H.
+            out[node, k] -= slopes[node, 0] * to_w[k, node] + slopes[node, 1] * to_v[k, node]
+
+
+@kernel
+def _end_of_substep(rows: np.ndarray, begin: int) -> int:
+    """The row behind the last one of the substep of which the row ``begin`` is the first: it has one of each site."""
+    stop = begin
+    while stop < rows.size and rows[stop].position == rows[begin].position:
+        stop += 1
+    return stop
+
+
+# Not a ``kernel``: it returns views to a function that counts references to them.
+@njit(error_model="numpy")
+def _select_closed(cluster: Cluster, rows: np.ndarray) -> Trial:
+    """The workspace for variations in a substep whose closed sites are those of ``rows``: nothing else acts."""
+    room = cluster.trial
+    active = room.active[: rows.size]
+    for a in range(active.size):
+        active[a] = rows[a].site
+    return Trial(
+        active=active,
+        closed=active,
+        springs=active[:0],
+        force=room.force,
+        w=room.w,
+        v=room.v,
+        taylor=room.taylor,
+        site_motion=room.site_motion,
+        sums=room.sums,
+    )
+
+
+@njit(error_model="numpy")
+def _shift_all(x: np.ndarray, count: int, terms: int, s: float) -> None:
+    """Shift the series (``count``, ``terms``) of free motion in each row of ``x`` to ``s`` later."""
+    for j in range(x.shape[0]):
+        series = x[j, : count * terms].reshape(count, terms)
+        shift(series, s, series)
 
 
 @njit(error_model="numpy")
@@ -128,7 +193,6 @@ def linearise(
     energies and position, and the workspace of a trial, are overwritten.
     """
     cluster = select_cluster(clusters, dofs, c)
-    room = cluster.trial
     count, terms = cluster.taylor.shape
     size = count * terms
     columns = size + cluster.contacts.size
@@ -139,32 +203,14 @@ def linearise(
     begin = 0
     position = 0.0
     while begin < rows.size:
-        # Rows of one substep, of all sites that were closed in it.
+        stop = _end_of_substep(rows, begin)
         row = rows[begin]
-        stop = begin
-        while stop < rows.size and rows[stop].position == row.position:
-            stop += 1
-        active = room.active[: stop - begin]
-        for a in range(active.size):
-            active[a] = rows[begin + a].site
         substep = Substep(row.kind, row.length)
-        trial = Trial(
-            active=active,
-            closed=active,
-            springs=active[:0],
-            force=room.force,
-            w=room.w,
-            v=room.v,
-            taylor=room.taylor,
-            site_motion=room.site_motion,
-            sums=room.sums,
-        )
+        trial = _select_closed(cluster, rows[begin:stop])
 
         # Free motion up to it, where the tape has nothing.
         if row.position > position:
-            for j in range(columns):
-                series = x[j, :size].reshape(count, terms)
-                shift(series, row.position - position, series)
+            _shift_all(x, count, terms, row.position - position)
         for a in range(begin, stop):
             if rows[a].onset:
                 _begin_contact(cluster, rows[a], x, size)
@@ -177,9 +223,9 @@ def linearise(
             series = x[j, :size].reshape(count, terms)
             copy(series, cluster.taylor)
             copy(moments[j], cluster.moments)
-            for a in range(active.size):
+            for a in range(trial.active.size):
                 for node in range(NODES):
-                    trial.force[active[a], node] = forces[a * NODES + node, j]
+                    trial.force[trial.active[a], node] = forces[a * NODES + node, j]
             update_taylor(cluster, trial, substep)
             accumulate_moments(cluster, trial, substep)
             copy(trial.taylor, series)
@@ -216,21 +262,34 @@ def _contact_step(dofs: DofTables, c: int, variations: Variations, j: int, numbe
 
 
 @njit(error_model="numpy")
+def _move_variation(
+    variations: Variations, stencil: Stencil, halo: Halo, dofs: DofTables, owned: int, step: int, j: int
+) -> int:
+    """Move variation ``j`` through one ``step``: dy+ = P dy + (impulses of dmu); PETSc's error code. Collective."""
+    # Two slots are read and written in turn, as the engine's states are.
+    here = step % 2
+    rows = halo.columns.shape[0]
+    cells = variations.components[j, here, : rows * owned].reshape(rows, owned)
+    next_cells = variations.components[j, 1 - here, : rows * owned].reshape(rows, owned)
+    error = exchange(halo, 2 * j + here, cells)
+    apply_propagator(stencil, cells, halo.columns, next_cells)
+
+    # Only clusters in contact leave impulses; their series come from the halo, that is from before the step.
+    for c in range(variations.places.shape[1]):
+        number = variations.places[step, c]
+        if number >= 0:
+            expand_free_motion(dofs, c, halo.columns, variations.taylor)
+            _contact_step(dofs, c, variations, j, number, next_cells)
+    return error
+
+
+@njit(error_model="numpy")
 def move_variations(variations: Variations, stencil: Stencil, halo: Halo, dofs: DofTables, owned: int) -> int:
     """Move all variations through the orbit's steps; returns PETSc's error code. Collective."""
-    rows = halo.columns.shape[0]
-    error = 0
     for step in range(variations.places.shape[0]):
+        # One after another in each step: the rows of P are then in the cache.
         for j in range(variations.components.shape[0]):
-            state = variations.components[j, step % 2]
-            out = variations.components[j, 1 - step % 2]
-            cells = state[: rows * owned].reshape(rows, owned)
-            next_cells = out[: rows * owned].reshape(rows, owned)
-            error = error or exchange(halo, 2 * j + step % 2, cells)
-            apply_propagator(stencil, cells, halo.columns, next_cells)
-            for c in range(variations.places.shape[1]):
-                number = variations.places[step, c]
-                if number >= 0:
-                    expand_free_motion(dofs, c, halo.columns, variations.taylor)
-                    _contact_step(dofs, c, variations, j, number, next_cells)
-    return error
+            error = _move_variation(variations, stencil, halo, dofs, owned, step, j)
+            if error != 0:
+                return error
+    return 0
