@@ -245,7 +245,7 @@ def test_the_chapter_on_verbs_lists_those_that_are_there():
     taking = {verb.name for verb in VERBS.values() if verb.takes_petsc_options}
     assert listed(r"become part of the\s+case \((.*?)\)") == taking
     leaving = {verb.name for verb in VERBS.values() if verb.results}
-    assert listed(r"interrupted commands\n\n(.*?) look at the output folder first") == leaving
+    assert listed(r"interrupted commands\n\n(.*?)\s+look at the output folder first") == leaving
 
 
 def test_the_names_that_extend_gives_are_where_it_says():
