@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from mpi4py import MPI
@@ -74,8 +77,11 @@ def test_two_processes_draw_what_one_draws(run, tmp_path):
     with SecondProcess() as second:
         draw_unmeasured(PICTURES, run, second)
         drawn = draw_pictures(PICTURES, [run], MPI.COMM_SELF, afresh=False, second=second)
-        # A folder without results: that a request fails ends nothing.
-        second.ask("run", [tmp_path])
+        # Both were asked for the two that show measures, and each took one turn too many.
+        assert next(second.turns) == 2 + 2
+
+        # A request that fails ends nothing.
+        second.ask("run", [run], names=["no figure"])
         assert second.drawn() is None
         # It waits for the next request.
         assert second._process.poll() is None
@@ -141,23 +147,37 @@ def test_no_second_process_on_one_core(monkeypatch):
     assert not SecondProcess.is_useful()
 
 
-def test_two_processes_take_each_turn_once():
+@pytest.fixture
+def turns() -> Iterator[int]:
+    """The descriptor of a file of turns."""
+    file = os.memfd_create("turns")
+    yield file
+    os.close(file)
+
+
+def taker(file: int, count: int) -> subprocess.Popen:
+    """A process that says that it has begun, and writes the numbers that it takes."""
     program = (
         "import sys; from itertools import islice\n"
         "from vipetsc.figures.common_turns import CommonTurns\n"
-        "print(*islice(CommonTurns(int(sys.argv[1])), 2000))\n"
+        "print('begun', flush=True)\n"
+        f"print(*islice(CommonTurns({file}), {count}))\n"
     )
-    file = os.memfd_create("turns")
-    try:
-        words = [sys.executable, "-c", program, str(file)]
-        with (
-            subprocess.Popen(words, stdout=subprocess.PIPE, text=True, pass_fds=(file,)) as first,
-            subprocess.Popen(words, stdout=subprocess.PIPE, text=True, pass_fds=(file,)) as second,
-        ):
-            taken = [[int(word) for word in process.communicate()[0].split()] for process in (first, second)]
-        # Every turn once, whichever process took it.
-        assert sorted(taken[0] + taken[1]) == list(range(4000))
-        # The count is in the file, so that a third reader continues it.
-        assert next(CommonTurns(file)) == 4000
-    finally:
-        os.close(file)
+    return subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, pass_fds=(file,))
+
+
+def test_two_processes_take_each_turn_once(turns):
+    with taker(turns, 2000) as first, taker(turns, 2000) as second:
+        taken = [process.communicate()[0].split()[1:] for process in (first, second)]
+    assert sorted(map(int, taken[0] + taken[1])) == list(range(4000))
+    assert next(CommonTurns(turns)) == 4000
+
+
+def test_a_turn_is_not_taken_while_another_process_takes_one(turns):
+    with taker(turns, 1) as other:
+        fcntl.lockf(turns, fcntl.LOCK_EX)
+        assert other.stdout.readline() == "begun\n"
+        time.sleep(0.1)
+        os.pwrite(turns, (7).to_bytes(8, "little"), 0)
+        fcntl.lockf(turns, fcntl.LOCK_UN)
+        assert other.stdout.readline() == "7\n"
