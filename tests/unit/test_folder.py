@@ -342,6 +342,24 @@ def test_a_folder_that_its_holder_removes_before_it_can_be_locked_is_created_aga
     assert not folder.exists()
 
 
+def test_a_folder_that_its_holder_removes_while_it_is_created_is_created_again(tmp_path, monkeypatch):
+    """The folder exists when the system is asked to create it, and does not when Python looks whether it is one."""
+    folder = tmp_path / "new"
+    mkdir = os.mkdir
+    refused = []
+
+    def refuse_once(path, *arguments):
+        if not refused:
+            refused.append(path)
+            raise FileExistsError(17, "File exists", str(path))
+        mkdir(path, *arguments)
+
+    monkeypatch.setattr(os, "mkdir", refuse_once)
+    with locked(MPI.COMM_SELF, folder):
+        assert (folder / ".lock").exists()
+    assert refused == [folder]
+
+
 def test_a_command_waits_only_as_long_as_announced_for_a_process_that_stays(run, caplog, monkeypatch):
     monkeypatch.setattr("vipetsc.io.lock.PATIENCE", 0.4)
     with held(run), caplog.at_level(logging.INFO, logger="vipetsc"):

@@ -99,11 +99,15 @@ def _acquire(path: Path, created: list[Path]) -> int | None:
     while True:
         # Inside the loop, because a holder that ends removes the folder if it created it and left nothing there.
         created += [folder for folder in (path, *path.parents) if not folder.exists()]
-        path.mkdir(parents=True, exist_ok=True)
         try:
+            path.mkdir(parents=True, exist_ok=True)
             descriptor, holder = _try_to_lock(path)
-        except FileNotFoundError:
-            continue  # a holder that ended just now has removed the folder again
+        except (FileNotFoundError, FileExistsError):
+            # A holder that ended just now has removed the folder again: before it could be locked, or after it was
+            # found to exist and before it was looked at.
+            if path.exists() and not path.is_dir():
+                raise
+            continue
         if holder is None:
             return descriptor
 
