@@ -228,6 +228,20 @@ def test_sides_and_dashpots_to_the_ground_go_into_the_case(tmp_path):
     assert plan.case_of([7e-4]).model().gaps == ((5e-4, 7e-4), (4e-4, 7e-4), (3e-4, 7e-4))
 
 
+def test_sites_without_a_stop_on_the_side_minus_keep_their_numbers(tmp_path):
+    """The clearance of the side - is sought where one is; numbers of other sites stay finite, and those are refused."""
+    unknown = {"quantity": "clearance_minus", "of": [[1]], "bounds": [1e-4, 1e-2]}
+    record = record_in(written(tmp_path))
+    base = lattice_table(contacts={"clearance_minus": 9e-4, "each": {"side": ["both", "plus", "both"]}})
+    plan = IdentifyCase.from_table(identify_table(base, record, unknowns=[unknown]))
+    case = plan.case_of([7e-4])
+    assert case.contacts.each.clearance_minus == [7e-4, 9e-4, 9e-4]
+    assert [gap for _, gap in case.model().gaps] == [7e-4, np.inf, 9e-4]
+
+    with pytest.raises(CaseError, match="site 2 has no stop on the side w < 0"):
+        IdentifyCase.from_table(identify_table(base, record, unknowns=[unknown | {"of": "each"}]))
+
+
 def test_coordinates_and_values_are_inverse(tmp_path):
     plan = IdentifyCase.from_table(identify_table(lattice_table(), record_in(written(tmp_path))))
     for parameter in plan.parameters:

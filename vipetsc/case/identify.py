@@ -4,6 +4,7 @@ import copy
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
+from math import isfinite
 from typing import Annotated, Any, ClassVar
 
 import tomli_w
@@ -220,6 +221,13 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             yield Problem(f"{at}.of", unknown.of, f"numbers are from 1 to {len(values)}, one or more in each group")
             continue
         for group in groups:
+            # There are no gaps where the clearances of both sides are equal.
+            gaps = base.model().gaps
+            if quantity == "clearance_minus" and gaps and all(not isfinite(gaps[member][1]) for member in group):
+                remedy = (
+                    f"site {group[0] + 1} has no stop on the side w < 0; name the other sites, as in of = [[1], [2]]"
+                )
+                yield Problem(f"{at}.of", unknown.of, remedy)
             for member in group:
                 if (quantity, member) in taken:
                     yield Problem(f"{at}.of", unknown.of, f"{quantity} {member + 1} is sought twice")

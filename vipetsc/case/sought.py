@@ -125,7 +125,10 @@ def values_of(case: Case, quantity: str) -> list[float]:
     if quantity == "clearance":
         return list(model.chain.clearances)
     if quantity == "clearance_minus":
-        return [minus for _, minus in model.gaps]
+        # The numbers of the case: a site without a stop on that side has one too, which acts on nothing.
+        given = values_of_sites(case.contacts, quantity, len(model.chain.sites))
+        both = model.chain.clearances
+        return [both[site] if value is None else value for site, value in enumerate(given)]
     return values_of_sites(case.contacts, quantity, len(model.chain.sites))
 
 
