@@ -1,7 +1,7 @@
 """The case of the verb ``identify``: measured records, and the parameters that are sought in them."""
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from math import isfinite
@@ -179,6 +179,25 @@ def _case_problems(base: Case) -> Iterator[Problem]:
             return
 
 
+def _group_problems(
+    unknown: UnknownTable, groups: Sequence[Sequence[int]], base: Case, taken: set[tuple[str, int]], at: str
+) -> Iterator[Problem]:
+    """Problems of the ``groups`` of members of an ``unknown``, of which each has one value; they join those ``taken``.
+
+    ``at`` is the path of the unknown.
+    """
+    quantity = unknown.quantity
+    gaps = base.model().gaps  # none where the clearances of both sides are equal
+    for group in groups:
+        if quantity == "clearance_minus" and gaps and all(not isfinite(gaps[member][1]) for member in group):
+            remedy = f"site {group[0] + 1} has no stop on the side w < 0; name the other sites, as in of = [[1], [2]]"
+            yield Problem(f"{at}.of", unknown.of, remedy)
+        for member in group:
+            if (quantity, member) in taken:
+                yield Problem(f"{at}.of", unknown.of, f"{quantity} {member + 1} is sought twice")
+            taken.add((quantity, member))
+
+
 def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
     """Problems of the unknowns in a case."""
     # A value that two unknowns change would be determined by neither.
@@ -220,18 +239,7 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
         if wrong or not all(groups):
             yield Problem(f"{at}.of", unknown.of, f"numbers are from 1 to {len(values)}, one or more in each group")
             continue
-        for group in groups:
-            # There are no gaps where the clearances of both sides are equal.
-            gaps = base.model().gaps
-            if quantity == "clearance_minus" and gaps and all(not isfinite(gaps[member][1]) for member in group):
-                remedy = (
-                    f"site {group[0] + 1} has no stop on the side w < 0; name the other sites, as in of = [[1], [2]]"
-                )
-                yield Problem(f"{at}.of", unknown.of, remedy)
-            for member in group:
-                if (quantity, member) in taken:
-                    yield Problem(f"{at}.of", unknown.of, f"{quantity} {member + 1} is sought twice")
-                taken.add((quantity, member))
+        yield from _group_problems(unknown, groups, base, taken, at)
         starts: list[float | None]
         if not isinstance(unknown.start, list):
             starts = [unknown.start]
