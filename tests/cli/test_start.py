@@ -50,3 +50,11 @@ def test_a_run_without_pictures_loads_no_pictures_and_its_pictures_load_no_kerne
     small = ("--set", "time.end=0.01", "--set", "output.figures=false")
     assert "matplotlib" not in loaded_by("run", CASE, "--out", tmp_path / "run", *small)
     assert "numba" not in loaded_by("plot", tmp_path / "run")
+
+
+def test_the_second_process_loads_neither_kernels_nor_mpi():
+    """A copy of the program next to a run, that draws its pictures."""
+    program = "import sys, vipetsc.figures.draw_requests, vipetsc.figures.registry; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert "matplotlib" in loaded
+    assert not {"numba", "mpi4py", "petsc4py"} & {*loaded}
