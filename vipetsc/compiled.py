@@ -41,7 +41,8 @@ def njit(*signature: Any, **options: Any) -> Any:
     """``numba.njit`` with a cache; without a signature, a ``Kernel`` that is compiled at the first call."""
     if signature and callable(signature[0]):
         return njit()(signature[0])
-    compile_entry = _decorator(numba.njit, *signature, **options)
+    # No C code calls these.
+    compile_entry = _decorator(numba.njit, *signature, no_cfunc_wrapper=True, **options)
     if signature:
         return compile_entry
     return lambda function: Kernel(function, compile_entry, options)

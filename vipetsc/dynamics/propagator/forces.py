@@ -67,13 +67,13 @@ FORCE = np.dtype([("number", np.int64), ("energy", float), ("history", HISTORY),
 
 
 @njit(error_model="numpy")
-def _update_open_episodes(cluster: Cluster, tracks: Tracks) -> None:
-    """Bring the open episodes of a cluster up to date."""
-    for i in range(cluster.contacts.size):
-        if in_episode(cluster.contacts[i].mode):
-            history = cluster.history[i]
+def _update_open_episodes(contacts: np.ndarray, histories: np.ndarray, tracks: Tracks) -> None:
+    """Bring the open episodes of ``contacts`` (site,) up to date with their ``histories`` of dtype ``HISTORY``."""
+    for i in range(contacts.size):
+        if in_episode(contacts[i].mode):
+            history = histories[i]
             reached = Extremes(history.indentation, history.force, history.smallest_force)
-            update_episode(cluster.contacts, tracks, i, reached)
+            update_episode(contacts, tracks, i, reached)
 
 
 @njit(error_model="numpy")
@@ -82,7 +82,7 @@ def _switch(cluster: Cluster, tracks: Tracks, now: float) -> None:
     contacts = cluster.contacts
     state = cluster.state[0]
     # Before the switch: an episode that ends takes its extremes along.
-    _update_open_episodes(cluster, tracks)
+    _update_open_episodes(contacts, cluster.history, tracks)
     had_contact = np.empty(contacts.size, np.bool_)
     for i in range(contacts.size):
         had_contact[i] = in_episode(contacts[i].mode)
@@ -142,7 +142,7 @@ def follow_contacts(
             _switch(cluster, own_tracks, now)
             landings_nowhere += site >= 0
         else:
-            _update_open_episodes(cluster, own_tracks)
+            _update_open_episodes(cluster.contacts, cluster.history, own_tracks)
             rest_site(cluster.contacts, own_tracks, site, cluster.site_motion, cluster.energy, now)
     return False, tracks
 
@@ -217,7 +217,7 @@ class Forces:
     def take_episodes(self, unfinished: bool) -> np.ndarray:
         """Episodes closed since the last call, and ``unfinished`` ones as they are, that this rank logs."""
         if unfinished:
-            _update_open_episodes(self.clusters, self.tracker.tracks)
+            _update_open_episodes(self.clusters.contacts, self.clusters.history, self.tracker.tracks)
         episodes = self.tracker.take_episodes(self.clusters.energy, unfinished)
         return episodes[self._logs_number[episodes["site"]]]
 

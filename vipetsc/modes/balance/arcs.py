@@ -32,14 +32,19 @@ def _crossings(motion: np.ndarray, offset: float, out: np.ndarray) -> int:
     c = np.empty(6)
     for i in range(samples):
         bernstein(motion[i], motion[(i + 1) % samples], h, b)
-        b -= offset
-        if (b.max() <= 0.0 and not above) or (b.min() > 0.0 and above):
+        stays_below = True
+        stays_above = True
+        for k in range(6):
+            b[k] -= offset
+            stays_below &= b[k] <= 0.0
+            stays_above &= b[k] > 0.0
+        if (stays_below and not above) or (stays_above and above):
             continue
 
         # The search finds where a polynomial turns positive (2 if nowhere); downcrossings are those of its negative.
-        c[:] = b
-        if above:
-            c[:] = -b
+        sign = -1.0 if above else 1.0
+        for k in range(6):
+            c[k] = sign * b[k]
         begin = 0.0
         root = first_upcrossing(c)
         while root <= 1.0 and count < out.size:
@@ -54,8 +59,9 @@ def _crossings(motion: np.ndarray, offset: float, out: np.ndarray) -> int:
             for k in range(1, 6):
                 for j in range(6 - k):
                     c[j] = (1.0 - root) * c[j] + root * c[j + 1]
-            c[:] = -c
             c[0] = 0.0
+            for k in range(1, 6):
+                c[k] = -c[k]
             root = first_upcrossing_after_start(c, 0.0)
     return count
 
