@@ -28,6 +28,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from tests.coarse import coarse_pictures
 from vipetsc import __version__
 from vipetsc.case import Case, Sweep
 from vipetsc.cli.main import main
@@ -38,6 +39,7 @@ from vipetsc.io.records import RecordFile
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest
 
+ROOT = Path(__file__).parents[1]
 NUMBER_OF_RANKS = re.compile(r"parallel\[(\d+)\]")
 
 # A first call may have to load kernels, or compile them.
@@ -295,12 +297,18 @@ def in_process(capsys, monkeypatch):
 
 
 @pytest.fixture
-def on_ranks(vipetsc, in_process):
-    """Call the program on a number of ranks of mpirun, or with 0 in this process: ``on_ranks(ranks, "run", ...)``."""
+def on_ranks(request, vipetsc, in_process):
+    """Call the program on a number of ranks of mpirun, or with 0 in this process: ``on_ranks(ranks, "run", ...)``.
+
+    Where the test has plain pictures, those of the ranks are so too.
+    """
+    options: dict[str, Any] = {}
+    if "plain_pictures" in request.fixturenames:
+        options = {"module": "tests.coarse", "env": clean_environment() | {"PYTHONPATH": str(ROOT)}}
 
     def call(ranks: int, *arguments: object) -> subprocess.CompletedProcess:
         if ranks:
-            return vipetsc(ranks, *arguments)
+            return vipetsc(ranks, *arguments, **options)
         return in_process(*arguments)
 
     return call
@@ -309,11 +317,7 @@ def on_ranks(vipetsc, in_process):
 @pytest.fixture
 def plain_pictures(monkeypatch):
     """Coarse pictures that are not laid out, which costs most: for tests of files, not of what is seen."""
-    from vipetsc.figures import style
-    from vipetsc.figures.layout import remove_engine
-
-    monkeypatch.setattr(style, "SCREEN", 80)
-    monkeypatch.setattr(style, "_lay_out", remove_engine)
+    coarse_pictures(monkeypatch.setattr)
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ def numbers(path):
 
 
 @pytest.mark.mpirun
-def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, in_process, case, tmp_path):
+def test_search_leaves_its_file_its_pictures_and_a_table(on_ranks, in_process, case, tmp_path):
     """The search leaves its files; the cell that it names has the bands that the cell's model has.
 
     A second call makes nothing, and two ranks make the same bits.
@@ -84,7 +84,7 @@ def test_search_leaves_its_file_its_pictures_and_a_table(vipetsc, in_process, ca
     assert modified(out) == written
 
     before = numbers(out / "design.h5")
-    assert vipetsc(2, "design", case, "--out", out, "--force").returncode == 0
+    assert on_ranks(2, "design", case, "--out", out, "--force").returncode == 0
     assert_same_bits(before, numbers(out / "design.h5"))
 
 

@@ -1,0 +1,28 @@
+"""The program with coarse pictures: ``python -m tests.coarse ARGUMENTS`` of the command line, for tests of files."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+
+def coarse_pictures(replace: Callable[[object, str, object], None]) -> None:
+    """Make pictures coarse and do not lay them out, which costs most; ``replace`` is called as ``setattr`` is."""
+    from vipetsc.figures import style
+    from vipetsc.figures.layout import remove_engine
+
+    replace(style, "SCREEN", 80)
+    replace(style, "_lay_out", remove_engine)
+
+
+def main() -> int:
+    """Go in by the front door."""
+    coarse_pictures(setattr)
+
+    from vipetsc.__main__ import main as vipetsc
+
+    return vipetsc()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
