@@ -252,7 +252,9 @@ class System:
         if self.dofs != 2:
             return f"mode-{mode + 1}"
         first, second = self.linear_modes()[1][:, mode]
-        return "in-phase" if first * second > 0 else "out-of-phase"
+        if first * second > 0:
+            return "in-phase"
+        return "out-of-phase"
 
     def gaps(self, u: np.ndarray) -> np.ndarray:
         """How far every contact is beyond its stop in m at displacements ``u`` (..., n), shape (..., contacts)."""

@@ -177,9 +177,13 @@ def _contacts_on_tape(substeps: ClosedSubsteps, stops: Stops, number: int, durat
         side = substeps.side[part[0]]
         depths = side * substeps.w[part] - stops.clearance_on(int(side))
         densities = substeps.weights[part] * stops.law.elastic_force(depths) * substeps.rate[part] ** 2
-        onset = abs(float(substeps.first_rate[part[0]])) if substeps.onset[part[0]] else None
-        is_closed_at_end = substeps.end[part[-1]] > (1 - AT_END) * duration
-        separation = None if is_closed_at_end else abs(float(substeps.last_rate[part[-1]]))
+        # Without a speed: closed at the arc's start, or at its end.
+        onset = None
+        if substeps.onset[part[0]]:
+            onset = abs(float(substeps.first_rate[part[0]]))
+        separation = None
+        if substeps.end[part[-1]] <= (1 - AT_END) * duration:
+            separation = abs(float(substeps.last_rate[part[-1]]))
         yield _Contact(float(densities.sum()), onset, separation)
 
 
@@ -188,8 +192,12 @@ def _taken(law: Contact, contacts: Iterable[_Contact]) -> float:
     total = 0.0
     for contact in contacts:
         # A contact that is closed at rest, at the arc's start or end, is its own image backwards in time.
-        onset = contact.separation if contact.onset is None else contact.onset
-        separation = contact.onset if contact.separation is None else contact.separation
+        onset = contact.onset
+        if onset is None:
+            onset = contact.separation
+        separation = contact.separation
+        if separation is None:
+            separation = contact.onset
         if onset is None or separation is None:
             return np.nan
         slowness = sum(1 / max(speed, law.approach_floor) for speed in (onset, separation))

@@ -60,7 +60,10 @@ class LatticeFlow:
         self.comm = comm
         self._laws = tuple(of_site.law for of_site in stops)
         gaps = tuple((of_site.plus, of_site.minus) for of_site in stops)
-        self._gaps = () if all(plus == minus for plus, minus in gaps) else gaps
+        # ``Model`` takes clearances from the chain where those of every site are equal on both sides.
+        self._gaps: tuple[tuple[float, float], ...] = ()
+        if any(plus != minus for plus, minus in gaps):
+            self._gaps = gaps
         self.layout = Layout(self._model(1.0, 1), comm)
         self._omega = StepSeries(chain, 1.0, RTOL).omega_max_h
 
@@ -111,8 +114,13 @@ class LatticeFlow:
         if why:
             raise FlowError(f'{why}; nnm.shooting = "dense" does without such steps')
 
-        engine = TangentPropagator(model, self.layout, 0 if look else MOST_ROWS)
-        largest = np.abs(start).max(axis=1, initial=0.0) if start.size else np.zeros(len(start))
+        rows = MOST_ROWS
+        if look:
+            rows = 0
+        engine = TangentPropagator(model, self.layout, rows)
+        largest = np.zeros(len(start))
+        if start.size:
+            largest = np.abs(start).max(axis=1, initial=0.0)
         # The same scale on all ranks, or substeps and with them the bits would depend on their number.
         self.comm.Allreduce(MPI.IN_PLACE, largest, MPI.MAX)
         u, v = np.split(largest, 2)

@@ -47,7 +47,9 @@ def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
     if case.nfrc.open_ends:
         absorbing = case.lattice.absorbing
         assert absorbing is not None  # checked in the case
-        ends = ("left", "right") if absorbing.end == "both" else (absorbing.end,)
+        ends: tuple[str, ...] = (absorbing.end,)
+        if absorbing.end == "both":
+            ends = ("left", "right")
         without = build_chain(case.lattice.model_copy(update={"absorbing": None}), case.contacts)
         return OpenCompliance(without, places, ends)
     if needs_modes(chain) and not case.nfrc.infinite:

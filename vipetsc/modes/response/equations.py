@@ -125,7 +125,9 @@ class SteadyEquations(ABC):
     def drive(self, p: float) -> tuple[float, float]:
         """Frequency (rad/s) and amplitude at the scaled parameter ``p``."""
         over, fixed, scale = self.parameter
-        return (fixed, p * scale) if over == "amplitude" else (p * scale, fixed)
+        if over == "amplitude":
+            return fixed, p * scale
+        return p * scale, fixed
 
     def residual(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
         """The residual (n,) of the harmonics, which vanishes at a steady state, over the clearance."""

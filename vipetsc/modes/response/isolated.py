@@ -111,7 +111,10 @@ def with_amplitude(states: Equations, line: SteadyStates, begin: np.ndarray, p: 
 def over_amplitude(states: Equations, p: float) -> SteadyStates:
     """The equations over the amplitude at the scaled parameter ``p``, from 1/reach to reach times the curve's."""
     omega, amplitude = states.drive(p)
-    lattice = states if isinstance(states, SteadyStates) else states.states_at(p * states.parameter.scale)
+    if isinstance(states, SteadyStates):
+        lattice = states
+    else:
+        lattice = states.states_at(p * states.parameter.scale)
     reach = states.options.isola_reach
     update = {"over": "amplitude", "fixed": [omega], "range": [amplitude / reach, amplitude * reach]}
     case = lattice.case.model_copy(update={"nfrc": lattice.options.model_copy(update=update)})

@@ -55,7 +55,9 @@ class ResponseOutputs:
         self.pairs = [(names.index(source), names.index(receiver)) for source, receiver in output.transmission or []]
 
         chain = compliance.chain
-        self._springs = compliance.springs if isinstance(compliance, ModalCompliance) else []
+        self._springs = []
+        if isinstance(compliance, ModalCompliance):
+            self._springs = compliance.springs
         self.walls: list[WallSprings] = []
         if self.wants_forces and not (case.nfrc.infinite or case.nfrc.open_ends) and chain.ends == "fixed":
             self.walls = [wall_springs(chain, wall) for wall in WALLS]
@@ -133,10 +135,12 @@ class ResponseOutputs:
             u = field[:, self.cells.index(wall.cell)][:, wall.masses]
             rate = 1j * motion.omega * np.arange(len(u))[:, None]
             force = (wall.stiffness * u + wall.damping * rate * u).sum(axis=1)
+            # A spring that pulls at the left wall is stretched by u > 0, one at the right wall by u < 0.
             for place, beyond in zip(self._springs, motion.forces[len(self.contacts) :], strict=True):
-                # A spring that pulls at the left wall is stretched by u > 0, one at the right wall by u < 0.
-                if (place.start if name == "left" else place.end) < 0:
-                    force += beyond if name == "left" else -beyond
+                if name == "left" and place.start < 0:
+                    force += beyond
+                if name != "left" and place.end < 0:
+                    force -= beyond
             for moved, ratio in self._moved:
                 if name == moved:
                     force[1] -= wall.stiffness.sum() * ratio * motion.amplitude
@@ -161,14 +165,19 @@ class WallSprings(NamedTuple):
 def wall_springs(chain: Chain, wall: str) -> WallSprings:
     """The springs of a lattice with fixed ends to its ``wall``, "left" or "right"."""
     # A spring between cells belongs to the left one: those to the left wall to the cell before the first one.
-    is_left = wall == "left"
-    owner = -1 if is_left else chain.cells - 1
     numbers = [number for number, spring in enumerate(chain.cell.springs) if spring.next_cell]
     springs = [chain.cell.springs[number] for number in numbers]
+    cell = chain.cells - 1
+    owner = chain.cells - 1
+    masses = [spring.start for spring in springs]
+    if wall == "left":
+        cell = 0
+        owner = -1
+        masses = [spring.end for spring in springs]
     coefficients = chain.coefficients(owner, owner + 1)
     return WallSprings(
-        cell=0 if is_left else chain.cells - 1,
-        masses=np.array([spring.end if is_left else spring.start for spring in springs], int),
+        cell=cell,
+        masses=np.array(masses, int),
         stiffness=coefficients.stiffness[0, numbers],
         damping=coefficients.damping[0, numbers],
     )

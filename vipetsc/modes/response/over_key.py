@@ -28,7 +28,9 @@ from vipetsc.modes.response.steady import SteadyStates
 
 # Step of a difference in the key, over half its range.
 SLOPE = 1e-5
-# Values whose lattices are kept: those of a step and of its differences.
+# Values whose lattices are kept: those of a step and of its differences. Over a clearance a curve of 24 states builds
+# 71 lattices so, 94 with 4 values and 117 with 2; over a stiffness one of 27 builds 272, 273 and 299. 18 values save
+# nothing over the clearance, 9 % over the stiffness.
 KEPT_VALUES = 9
 
 

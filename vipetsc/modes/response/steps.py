@@ -57,7 +57,9 @@ class TurningSteps:
         p = point.xi[-1]
         if low <= p <= high:
             return None
-        bound = low if p < low else high
+        bound = high
+        if p < low:
+            bound = low
         # A curve ends on its range, so that curves over the same range end at the same parameter.
         xi = states.at(point.xi, bound)
         tangent = states.frame(point).tangent_at(xi)

@@ -93,7 +93,9 @@ def _sweep(states: SteadyStates, count: int, direction: int) -> Case:
     drives: list[dict[str, Any]] = []
     for one, ratio in case.drive.ratios:
         # The wall that moves says which mass is driven.
-        place = {"end": one.end} if one.end else {"cell": one.cell, "mass": one.mass}
+        place: dict[str, Any] = {"cell": one.cell, "mass": one.mass}
+        if one.end:
+            place = {"end": one.end}
         chirp = {
             "waveform": "chirp",
             "amplitude": ratio * states.parameter.fixed,
@@ -109,7 +111,10 @@ def _sweep(states: SteadyStates, count: int, direction: int) -> Case:
     interval = case.time.sample_interval
     assert interval != "auto"  # that of a resolved case
     time = {"end": duration, "sample_interval": min(interval, 2 * np.pi / (high * PER_PERIOD))}
-    contacts = {} if case.contacts.each and case.contacts.each.restitution else {"restitution": states.restitution}
+    # Sites that have restitutions of their own keep them.
+    contacts = {"restitution": states.restitution}
+    if case.contacts.each and case.contacts.each.restitution:
+        contacts = {}
     return case.varied(
         without=["drive", "time", "output", "analysis"],
         drive=drive,
