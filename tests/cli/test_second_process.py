@@ -140,11 +140,13 @@ def test_the_second_process_ends_with_the_one_that_asks():
     assert not ended.stderr
 
 
-def test_no_second_process_on_one_core(monkeypatch):
+@pytest.mark.parametrize(("cores", "load", "useful"), [(2, 1.4, True), (1, 0.0, False), (2, 8.0, False)])
+def test_a_second_process_needs_an_idle_core(cores, load, useful, monkeypatch):
     monkeypatch.delitem(sys.modules, "matplotlib", raising=False)
-    assert SecondProcess.is_useful() == (len(os.sched_getaffinity(0)) > 1)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0})
-    assert not SecondProcess.is_useful()
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {*range(cores)})
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load))
+    assert SecondProcess.is_useful() == useful
 
 
 @pytest.fixture

@@ -43,11 +43,13 @@ class SecondProcess:
 
     @staticmethod
     def is_useful() -> bool:
-        """Whether there is a core for it, and this process would load the tools for pictures too.
+        """Whether there is an idle core for it, and this process would load the tools for pictures too.
 
-        Where they are loaded, as in a test or a notebook, pictures are drawn before a second process could begin.
+        Where they are loaded, as in a test or a notebook, pictures are drawn before a second process could begin. Where
+        other work takes all cores, loading the program twice would take its time from both.
         """
-        return len(os.sched_getaffinity(0)) > 1 and "matplotlib" not in sys.modules
+        has_idle_core = len(os.sched_getaffinity(0)) > 1 and os.getloadavg()[0] < (os.cpu_count() or 1)
+        return has_idle_core and "matplotlib" not in sys.modules
 
     @property
     def is_asked(self) -> bool:
