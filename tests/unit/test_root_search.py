@@ -73,6 +73,15 @@ def test_a_pair_of_crossings_inside_one_step_is_found():
     np.testing.assert_allclose(first_upcrossing(coefficients - 1.01 * polynomial(peak)), 2)
 
 
+def test_the_first_of_three_roots_is_found():
+    """(s - 0.2)(s - 0.3)(s - 0.9) ends above zero: a bisection of the whole step would go to its last root."""
+    # s^3 - 1.4 s^2 + 0.51 s - 0.054 in Bernstein's form.
+    coefficients = np.array([-0.054, -0.054 + 0.51 / 3, -0.054 + (2 * 0.51 - 1.4) / 3, 0.056])
+
+    np.testing.assert_allclose(evaluate(coefficients, 0.5, np.empty(6)), 0.3 * 0.2 * -0.4)
+    np.testing.assert_allclose(first_upcrossing(coefficients), 0.2, atol=1e-12)
+
+
 def test_a_start_that_has_just_landed_is_no_crossing():
     """s (s - 0.4), raised by the rounding of a landing: on zero and falling at first."""
     coefficients = np.array([0.0, -0.2, 0.6]) + 1e-12
