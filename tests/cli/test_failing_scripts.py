@@ -54,7 +54,7 @@ def run_script(text: str, folder: Path, ranks: int) -> subprocess.CompletedProce
     script = folder / "fails.py"
     script.write_text(text)
     command = ["mpirun", "--oversubscribe", "-n", str(ranks), sys.executable, str(script)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, env=clean_environment(), check=False)
 
 
 @pytest.mark.mpirun

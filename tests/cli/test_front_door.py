@@ -355,7 +355,7 @@ def test_a_disk_that_fills_ends_all_and_loses_nothing(in_process, case, tmp_path
     script.write_text(FULL_DISK)
     command = ["mpirun", "--oversubscribe", "-n", str(ranks), sys.executable, str(script), str(limit)]
     command += ["run", str(case), "--out", str(out), "--force", *QUICK]
-    full = subprocess.run(command, capture_output=True, text=True, timeout=60, env=clean_environment(), check=False)
+    full = subprocess.run(command, capture_output=True, text=True, timeout=300, env=clean_environment(), check=False)
 
     assert full.returncode == 1, full.stdout + full.stderr
     assert "Traceback" not in full.stderr
