@@ -130,11 +130,14 @@ def test_what_is_wrong_is_named_with_its_remedy(text, message):
 
 
 def test_one_impossible_member_does_not_spoil_the_others():
-    """A member outside the lattice has its problems in place of a case; its neighbours are cases."""
-    members = sweep_of("[sweep.contacts]\nsites = [[10], [99], [20]]").members()
+    """A member outside the lattice has its problems in place of a case, and the sweep warns of them."""
+    plan = sweep_of("[sweep.contacts]\nsites = [[10], [99], [20]]")
+    members = plan.members()
 
     assert [member.case is not None for member in members] == [True, False, True]
     assert "contacts.sites = [99]" in str(members[1].problems[0])
+    assert plan.warnings() == [f"members that will fail: {members[1].problems[0]} (1 member)"]
+    assert not sweep_of("[sweep.contacts]\nsites = [[10], [20]]").warnings()
 
 
 def test_names_of_members_are_those_of_their_values():

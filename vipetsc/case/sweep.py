@@ -5,6 +5,7 @@ import hashlib
 import itertools
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +21,7 @@ from vipetsc.case.html import html_table
 from vipetsc.case.schema import number
 from vipetsc.case.study import StudyCase, with_fastest_engine
 from vipetsc.case.value_ranges import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
-from vipetsc.wording import shortened
+from vipetsc.wording import counted, shortened
 
 # Members whose cases are resolved to check a sweep before it begins, and sites that they have together: either takes
 # about a second, at 0.6 ms a member and 5 us a site.
@@ -210,6 +211,14 @@ class Sweep(StudyCase):
         # The first member stands for all: to count the sites of each takes what is to be saved.
         table, _ = self.member_table([0] * len(self.axes))
         return self.members(max(1, min(MOST_TRIED, MOST_TRIED_SITES // max(1, _site_count(table)))))
+
+    def warnings(self) -> list[str]:
+        """Problems of members that are no valid cases, among those that are tried: they fail, the others do not."""
+        counts = Counter(str(problem) for member in self.tried() for problem in member.problems)
+        if not counts:
+            return []
+        problems = [f"{problem} ({counted(number, 'member')})" for problem, number in counts.items()]
+        return [f"members that will fail: {shortened(problems)}"]
 
     def runs(self) -> list[CaseFile]:
         """The valid cases among the members that are tried."""
