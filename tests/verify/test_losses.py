@@ -102,11 +102,16 @@ CHAIN: dict[str, Any] = {
 
 
 @pytest.mark.parametrize(
-    ("law", "stiffness", "side", "omega"), [("hertz", 1e7, "both", 4500.0), ("bilinear", 1e5, "plus", 1600.0)]
+    ("law", "stiffness", "stops", "omega"),
+    [
+        ("hertz", 1e7, {}, 4500.0),
+        ("hertz", 1e7, {"clearance_minus": 1.2e-4}, 4500.0),
+        ("bilinear", 1e5, {"side": "plus"}, 1600.0),
+    ],
 )
-def test_lattices_without_matrices_lose_what_orbits_lose(law, stiffness, side, omega):
+def test_lattices_without_matrices_lose_what_orbits_lose(law, stiffness, stops, omega):
     """Dashpots and contacts of a breather by the propagator's steps, and by the flow with dense matrices."""
-    contacts = {"law": law, "stiffness": stiffness, "sites": [7, 9], "clearance": [1e-4, 1.3e-4], "side": side}
+    contacts = {"law": law, "stiffness": stiffness, "sites": [7, 9], "clearance": [1e-4, 1.3e-4]} | stops
     nnm = {"system": "chain", "tolerance": 1e-12, "forced": [6, 1]}
 
     def case(shooting: str) -> NnmCase:
