@@ -147,6 +147,8 @@ def test_a_second_process_needs_an_idle_core(cores, load, useful, monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load))
     assert SecondProcess.is_useful() == useful
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert not SecondProcess.is_useful()
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.unit.claim_files import measure, put_sweep
+from vipetsc.paper.cell_costs import PAPER_CELL
 from vipetsc.paper.claims import criteria as constants
 from vipetsc.paper.claims import measure_claims, write_claims
 from vipetsc.paper.claims.criteria import CLAIMS, FAILS, HOLDS, IN_PART, LAWS, UNMEASURED, Criterion, verdict
@@ -177,7 +178,7 @@ def test_constants_inside_of_quantities_are_those_specified():
     assert (constants.QUIET, constants.PEAK, constants.HIGH) == (0.1, (0.9, 1.8), 10.0)
     assert (constants.ABRUPT, constants.LOW) == (10**0.5, 10)
     assert (constants.HALF_WIDTH, constants.NATIVE) == (0.02, (7, 8))
-    assert (constants.PAPER_CELL, constants.GRID) == ((0.1, 0.5), 0.1)
+    assert (PAPER_CELL, constants.GRID) == ((0.1, 0.5), 0.1)
     assert constants.COUNTED == ("band 1", "band 2", "band 3", "band 4", "gap 1", "gap 2")
     # The paper's (n - 1)/(2 (n + 1)) for the exponent n = 3/2 of Hertz's law.
     assert pytest.approx((1.5 - 1) / (2 * (1.5 + 1))) == constants.HERTZ_LIMIT

@@ -9,10 +9,12 @@ from scipy.integrate import trapezoid
 
 from vipetsc.lattice import Band, bloch, diatomic, four_band, pass_bands
 from vipetsc.spectra import (
+    CellWindow,
     Dispersion,
     Parts,
     block_means,
     dispersion,
+    dispersions,
     front_arrival,
     ibtet,
     kinetic_energy,
@@ -256,6 +258,19 @@ def test_taper_keeps_the_mean_square():
         assert np.mean(window**2) == pytest.approx(1, rel=1e-14)
         assert np.allclose(window, window[::-1])
     assert taper(101, 0.2)[0] < 1e-2
+
+
+def test_windows_of_a_dispersion_are_dispersions_of_their_cells():
+    """Windows, which have one transform in time, have the dispersions of their cells cut out of the field."""
+    velocity = noise((40, 21, 2), 3)
+    windows = [CellWindow(), CellWindow(slice(0, 8), taper=0.5), CellWindow(slice(9, 21), taper=0.2)]
+    options = {"lengths": (45, 24), "highest": 20.0}
+
+    found = dispersions(velocity, MASSES, 0.1, windows, **options)
+    assert found[0].frequency[-1] <= 20.0
+    for spectrum, window in zip(found, windows, strict=True):
+        (alone,) = dispersions(velocity[:, window.cells], MASSES, 0.1, [CellWindow(taper=window.taper)], **options)
+        assert np.allclose(spectrum.energy, alone.energy, rtol=1e-12, atol=1e-15 * alone.energy.max())
 
 
 def test_ridge_of_a_packet_lies_on_the_branch():

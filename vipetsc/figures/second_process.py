@@ -48,6 +48,9 @@ class SecondProcess:
         Where they are loaded, as in a test or a notebook, pictures are drawn before a second process could begin. Where
         other work takes all cores, loading the program twice would take its time from both.
         """
+        # macOS has neither affinities nor files in memory.
+        if not sys.platform.startswith("linux"):
+            return False
         has_idle_core = len(os.sched_getaffinity(0)) > 1 and os.getloadavg()[0] < (os.cpu_count() or 1)
         return has_idle_core and "matplotlib" not in sys.modules
 

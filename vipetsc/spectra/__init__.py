@@ -5,7 +5,17 @@ from typing import TYPE_CHECKING
 
 from vipetsc.spectra.directions import band_envelopes, by_direction, wave_energies
 from vipetsc.spectra.fits import FEWEST, PowerLaw, doubt, normalised, power_law
-from vipetsc.spectra.fourier import TAPER, Dispersion, dispersion, kinetic_energy, ridge, taper, wavenumber_content
+from vipetsc.spectra.fourier import (
+    TAPER,
+    CellWindow,
+    Dispersion,
+    dispersion,
+    dispersions,
+    kinetic_energy,
+    ridge,
+    taper,
+    wavenumber_content,
+)
 from vipetsc.spectra.pooling import block_means, block_sums, blocks
 
 if TYPE_CHECKING:

@@ -4,7 +4,9 @@ A field is anything that can be indexed as ``velocity[..., dof]`` to give a (t, 
 or an HDF5 dataset, of which one mass at a time is then held in memory.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -78,57 +80,74 @@ def taper(length: int, fraction: float) -> np.ndarray:
     return window / np.sqrt(np.mean(window**2))
 
 
+class CellWindow(NamedTuple):
+    """Cells of which a dispersion is taken: a slice of them, and the fraction of it under cosine flanks at its ends."""
+
+    cells: slice = slice(None)
+    taper: float = TAPER
+
+
 def dispersion(
+    velocity: np.ndarray, masses: ArrayLike, interval: float, *, tapers: tuple[float, float] = (TAPER, TAPER)
+) -> Dispersion:
+    """The `dispersions` of all cells, with flanks over the fractions ``tapers`` of the record and of the cells."""
+    (spectrum,) = dispersions(velocity, masses, interval, [CellWindow(taper=tapers[1])], in_time=tapers[0])
+    return spectrum
+
+
+def dispersions(
     velocity: np.ndarray,
     masses: ArrayLike,
     interval: float,
+    windows: Sequence[CellWindow],
     *,
-    cells: slice = slice(None),
-    tapers: tuple[float, float] = (TAPER, TAPER),
+    in_time: float = TAPER,
     lengths: tuple[int, int] | None = None,
     highest: float = np.inf,
     rows: slice = slice(None),
     memory: float = np.inf,
-) -> Dispersion:
-    """Energy over wavenumber and frequency by 2-D FFT of mass-weighted velocities, added over the masses.
+) -> list[Dispersion]:
+    """Energy over wavenumber and frequency in each of ``windows``, by 2-D FFT of mass-weighted velocities.
 
-    ``velocity`` (t, cell, dof) in m/s every ``interval`` s, of which the window ``cells`` is taken; ``masses`` (dof)
-    in kg, ones for a plain velocity spectrum. ``tapers``: the fractions of the (time, space) window under cosine flanks
-    at its two ends together. ``lengths``: of the transforms (time, space), zero-padded; by default the next that are
-    fast. Frequencies above ``highest`` (rad/s) are dropped; of the others those ``rows`` are returned. No more than
-    ``memory`` bytes of the velocity are read at once.
+    ``velocity`` (t, cell, dof) in m/s every ``interval`` s; ``masses`` (dof) in kg, ones for a plain velocity spectrum;
+    energies are added over the masses. ``in_time``: the fraction of the record under cosine flanks at its two ends
+    together. ``lengths``: of the transforms (time, space), zero-padded; by default the next that are fast. Frequencies
+    above ``highest`` (rad/s) are dropped; of the others those ``rows`` are returned. No more than ``memory`` bytes of
+    the velocity are read at once.
 
-    Returns the energy on kappa in (-pi, pi] and omega >= 0; both halves of the real signal's frequencies are added up.
+    Returns the energies on kappa in (-pi, pi] and omega >= 0; both halves of the real signal's frequencies are added
+    up.
     """
-    window = range(velocity.shape[1])[cells]
-    t = velocity.shape[0]
-    x = len(window)
+    t, x = velocity.shape[:2]
     nt, nx = lengths or (fft.next_fast_len(t, real=True), fft.next_fast_len(x))
     frequency = 2 * np.pi * fft.rfftfreq(nt, interval)
     taken = range(nt)[: np.count_nonzero(frequency <= highest)][rows]
-    in_time = taper(t, tapers[0])[:, None]
-    in_space = taper(x, tapers[1])
+    flanks = taper(t, in_time)[:, None]
 
-    energy = np.zeros((len(taken), nx))
-    # Time first, of blocks of cells: frequencies that are dropped are never held for all cells.
+    energies = [np.zeros((len(taken), nx)) for _ in windows]
+    # Time first, of blocks of cells: frequencies that are dropped are never held for all cells. Windows only weight
+    # cells, so that they have this transform in common.
     spectrum = np.empty((len(taken), x), dtype=complex)
     for j, mass in enumerate(np.asarray(masses)):
         for block in blocks(x, 8 * t, memory):
-            signal = np.asarray(velocity[:, window.start + block.start : window.start + block.stop, j])
-            spectrum[:, block] = fft.rfft(signal * in_time * in_space[block], nt, axis=0)[taken]
-        # The inverse transform's sign in space makes exp(i (kappa x - omega t)) land on +kappa.
-        waves = fft.ifft(spectrum, nx, axis=1, norm="forward")
-        energy += mass * (waves.real**2 + waves.imag**2)
-    # Parseval over both padded transforms; half of m v^2; the mean over the samples.
-    energy /= 2 * t * nt * nx
+            signal = np.asarray(velocity[:, block, j])
+            spectrum[:, block] = fft.rfft(signal * flanks, nt, axis=0)[taken]
+        for window, energy in zip(windows, energies, strict=True):
+            part = spectrum[:, window.cells]
+            # The inverse transform's sign in space makes exp(i (kappa x - omega t)) land on +kappa.
+            waves = fft.ifft(part * taper(part.shape[1], window.taper), nx, axis=1, norm="forward")
+            energy += mass * (waves.real**2 + waves.imag**2)
+
     # Of a real signal omega > 0 stands for -omega too; 0 and the highest of an even length have no opposite.
     has_opposite = [0 < row < (nt + 1) // 2 for row in taken]
-    energy[has_opposite] *= 2
-
     # From the transform's order of wavenumbers to ascending ones over (-pi, pi].
     order = np.roll(np.arange(nx), (nx - 1) // 2)
     wavenumber = 2 * np.pi * np.where(order > nx // 2, order - nx, order) / nx
-    return Dispersion(wavenumber=wavenumber, frequency=frequency[taken], energy=energy.T[order])
+    for energy in energies:
+        # Parseval over both padded transforms; half of m v^2; the mean over the samples.
+        energy /= 2 * t * nt * nx
+        energy[has_opposite] *= 2
+    return [Dispersion(wavenumber, frequency[taken], energy.T[order]) for energy in energies]
 
 
 def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[np.ndarray, np.ndarray]:

@@ -16,25 +16,23 @@ from mpi4py import MPI
 
 import numpy as np
 import xarray as xr
-from scipy import fft
 
 import vipetsc
 from vipetsc import spectra
 from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.netcdf import tabulated
-from vipetsc.lattice import pass_bands
 from vipetsc.lattice.chain import cells_between
 from vipetsc.parallel import divided, on_every_rank, on_root
 from vipetsc.spectra.measures import MEASURES, PART, row_of, take
 from vipetsc.studies.analysis_options import describe_options
 from vipetsc.studies.band_measures import BANDS, band_energies
+from vipetsc.studies.dispersion_measures import dispersions_by_side
 from vipetsc.studies.modal_measures import MODAL, modal_energies
 from vipetsc.studies.run_record import record_of
 from vipetsc.studies.velocity_record import VelocityRecord
 
 FORMAT_VERSION = 3
-HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
 SNAPSHOTS = 500  # at most this many samples are transformed by wavelets
 MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: a window of cells is needed
 
@@ -200,7 +198,7 @@ def _measure(
         if samples < 2:
             part.left_out.append("dispersion, bands, ibtet, partition, entropy: fewer than two samples were recorded")
             return {}
-        return _dispersions(part) if "dispersion" in measures else {}
+        return dispersions_by_side(part) if "dispersion" in measures else {}
 
     def bands(part: VelocityRecord) -> dict[str, Any]:
         return band_energies(part, measures) if samples > 1 and "bands" in measures else {}
@@ -258,63 +256,6 @@ def _maps(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
         values["wavenumber"] = wavenumber
         values["wavenumber_content"] = np.concatenate(contents)
     return values
-
-
-def _dispersions(record: VelocityRecord) -> dict[str, Any]:
-    """Dispersion of all cells, of those before and of those after the first site."""
-    nt, cells = record.velocity.shape[:2]
-    if cells < 2:
-        record.left_out.append("dispersion: a single cell was recorded")
-        return {}
-
-    # Time is padded to a length that transforms fast; a padded row of cells would have other wavenumbers.
-    length = fft.next_fast_len(nt, real=True)
-    highest = HEADROOM * pass_bands(record.model.chain.cell)[-1].high
-    frequencies = np.count_nonzero(2 * np.pi * fft.rfftfreq(length, record.interval) <= highest)
-    sizes = [-(-n // (2 * record.options.pixels)) for n in (cells, frequencies)]
-    values: dict[str, Any] = {}
-    for name, window in _windows(record).items():
-        if len(range(cells)[window]) < 2:
-            record.left_out.append(f"{name}: fewer than two of its cells were recorded")
-            continue
-        # A wave that crosses the border of a window would smear over all wavenumbers.
-        across = spectra.TAPER if name == "dispersion" else 0.5
-        pieces = []
-        for block in spectra.blocks(-(-frequencies // sizes[1]), 16 * cells * sizes[1], record.memory):
-            spectrum = spectra.dispersion(
-                record.weighted,
-                record.masses,
-                record.interval,
-                lengths=(length, cells),
-                highest=highest,
-                memory=record.memory,
-                cells=window,
-                tapers=(spectra.TAPER, across),
-                rows=slice(block.start * sizes[1], block.stop * sizes[1]),
-            )
-            pieces.append(spectrum.folded().pooled(*sizes))
-        values["wavenumber"] = pieces[0].wavenumber
-        values["frequency"] = np.concatenate([piece.frequency for piece in pieces])
-        values[name] = np.concatenate([piece.energy for piece in pieces], axis=1).astype(np.float32)
-    return values
-
-
-def _windows(record: VelocityRecord) -> dict[str, slice]:
-    """The recorded cells of which a dispersion is taken, by its name."""
-    windows = {"dispersion": slice(None)}
-    if record.site is None:
-        record.left_out.append("dispersion_before, dispersion_after: the lattice has no sites")
-    elif record.model.chain.ends == "periodic":
-        record.left_out.append("dispersion_before, dispersion_after: on a ring the wave travels in both directions")
-    else:
-        low, high = map(int, np.searchsorted(record.cells, [record.site, record.site + 1]))
-        lower = slice(0, low)
-        upper = slice(high, len(record.cells))
-        # The wave may travel to lower cells: before and after refer to its direction.
-        drive_below = record.model.drive_cell < record.site
-        windows["dispersion_before"] = lower if drive_below else upper
-        windows["dispersion_after"] = upper if drive_below else lower
-    return windows
 
 
 def _wavelets(record: VelocityRecord, measures: Collection[str], arrival: float | None) -> dict[str, Any]:

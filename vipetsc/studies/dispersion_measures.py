@@ -1,0 +1,72 @@
+"""Dispersions of a run: of all its cells, and of those before and after the first site."""
+
+from typing import Any
+
+import numpy as np
+from scipy import fft
+
+from vipetsc import spectra
+from vipetsc.lattice import pass_bands
+from vipetsc.studies.velocity_record import VelocityRecord
+
+HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
+
+
+def dispersions_by_side(record: VelocityRecord) -> dict[str, Any]:
+    """Dispersion of all cells, of those before and of those after the first site."""
+    nt, cells = record.velocity.shape[:2]
+    if cells < 2:
+        record.left_out.append("dispersion: a single cell was recorded")
+        return {}
+
+    # Time is padded to a length that transforms fast; a padded row of cells would have other wavenumbers.
+    length = fft.next_fast_len(nt, real=True)
+    highest = HEADROOM * pass_bands(record.model.chain.cell)[-1].high
+    frequencies = np.count_nonzero(2 * np.pi * fft.rfftfreq(length, record.interval) <= highest)
+    sizes = [-(-n // (2 * record.options.pixels)) for n in (cells, frequencies)]
+    windows: dict[str, spectra.CellWindow] = {}
+    for name, window in _windows(record).items():
+        if len(range(cells)[window.cells]) < 2:
+            record.left_out.append(f"{name}: fewer than two of its cells were recorded")
+        else:
+            windows[name] = window
+
+    pieces: dict[str, list[spectra.Dispersion]] = {name: [] for name in windows}
+    for block in spectra.blocks(-(-frequencies // sizes[1]), 16 * cells * sizes[1], record.memory):
+        spectra_of_block = spectra.dispersions(
+            record.weighted,
+            record.masses,
+            record.interval,
+            [*windows.values()],
+            lengths=(length, cells),
+            highest=highest,
+            memory=record.memory,
+            rows=slice(block.start * sizes[1], block.stop * sizes[1]),
+        )
+        for of_window, spectrum in zip(pieces.values(), spectra_of_block, strict=True):
+            of_window.append(spectrum.folded().pooled(*sizes))
+
+    whole = pieces["dispersion"]
+    values = {"wavenumber": whole[0].wavenumber, "frequency": np.concatenate([piece.frequency for piece in whole])}
+    for name, of_window in pieces.items():
+        values[name] = np.concatenate([piece.energy for piece in of_window], axis=1).astype(np.float32)
+    return values
+
+
+def _windows(record: VelocityRecord) -> dict[str, spectra.CellWindow]:
+    """The recorded cells of which a dispersion is taken, by its name."""
+    windows = {"dispersion": spectra.CellWindow()}
+    if record.site is None:
+        record.left_out.append("dispersion_before, dispersion_after: the lattice has no sites")
+    elif record.model.chain.ends == "periodic":
+        record.left_out.append("dispersion_before, dispersion_after: on a ring the wave travels in both directions")
+    else:
+        low, high = map(int, np.searchsorted(record.cells, [record.site, record.site + 1]))
+        # A wave that crosses the border of a window would smear over all wavenumbers, but for wide flanks.
+        lower = spectra.CellWindow(slice(0, low), taper=0.5)
+        upper = spectra.CellWindow(slice(high, len(record.cells)), taper=0.5)
+        # The wave may travel to lower cells: before and after refer to its direction.
+        drive_below = record.model.drive_cell < record.site
+        windows["dispersion_before"] = lower if drive_below else upper
+        windows["dispersion_after"] = upper if drive_below else lower
+    return windows
