@@ -43,13 +43,13 @@ def dispersions_by_side(record: VelocityRecord) -> dict[str, Any]:
             memory=record.memory,
             rows=slice(block.start * sizes[1], block.stop * sizes[1]),
         )
-        for of_window, spectrum in zip(pieces.values(), spectra_of_block, strict=True):
-            of_window.append(spectrum.folded().pooled(*sizes))
+        for window_pieces, spectrum in zip(pieces.values(), spectra_of_block, strict=True):
+            window_pieces.append(spectrum.folded().pooled(*sizes))
 
     whole = pieces["dispersion"]
     values = {"wavenumber": whole[0].wavenumber, "frequency": np.concatenate([piece.frequency for piece in whole])}
-    for name, of_window in pieces.items():
-        values[name] = np.concatenate([piece.energy for piece in of_window], axis=1).astype(np.float32)
+    for name, window_pieces in pieces.items():
+        values[name] = np.concatenate([piece.energy for piece in window_pieces], axis=1).astype(np.float32)
     return values
 
 
