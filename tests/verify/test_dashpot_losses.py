@@ -19,7 +19,7 @@ from tests.unit.test_inhomogeneity import ENDS, scattered_chain
 from vipetsc.case import Case
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.propagator.tangent import no_samples
+from vipetsc.dynamics.propagator.tangent import unrecorded_samples
 from vipetsc.lattice import Chain, Variation
 
 DAMPING = {"mass": 10.0, "stiffness": 1e-5}
@@ -56,7 +56,7 @@ def test_the_loss_of_free_motion_is_that_of_matrix_exponentials(ends):
     cells = np.hstack([u.reshape(CELLS, -1), v.reshape(CELLS, -1)])
     engine.begin(cells, np.zeros((0, 2)), 0.0)
     # To the sample before the number: one interval.
-    engine.fill(no_samples(model, layout, number=2))
+    engine.fill(unrecorded_samples(model, layout, goal=1))
     lost = engine.state.array[2 * n : 2 * n + CELLS].sum()
     engine.destroy()
 

@@ -13,6 +13,7 @@ from scipy.linalg import eigh
 from tests.breathers import BREATHER_CELLS as CELLS
 from tests.breathers import BREATHER_FREQUENCY, breather_chain
 from tests.models import CLEARANCE, four_band_contact
+from vipetsc.dynamics.propagator.tangent import TangentPropagator
 from vipetsc.lattice import Chain, Contact, four_band
 from vipetsc.lattice.chain import Pair
 from vipetsc.modes.balance.stops import Stops
@@ -147,6 +148,31 @@ def test_the_approach_velocity_enters_the_linearisation():
     arc.engine._linear = None
     arc.engine._release()
     assert np.abs(arc.move(change) - moved).max() > 1e-3 * np.abs(moved).max()
+
+
+def test_substeps_of_a_pressed_contact_are_those_in_which_it_is_closed():
+    """A pressed site that opens has substeps in which nothing pushes: they belong to no contact."""
+    depth = 1e-5
+    stops = Stops(Contact("hertz", STIFFNESS["hertz"]), -depth, np.inf)
+    flow = LatticeFlow(breather_chain("fixed", (5,)), [stops], MPI.COMM_SELF)
+
+    arc = flow.arc(irregular_motion((5,), w=0.0, speed=-3.0), PERIOD)
+
+    assert arc.episodes > 0
+    assert 0.0 < arc.closed < 0.9 * arc.duration
+    # The other cluster is that of the drive, which has no site.
+    substeps = [part for part in arc.engine.closed_substeps() if part.site.size]
+    assert len(substeps) == 1
+    assert (substeps[0].w > -depth).all()
+    assert substeps[0].weights.sum() == pytest.approx(arc.closed, rel=1e-12)
+
+
+def test_an_orbit_without_a_tape_has_no_variations():
+    """Without a tape the contacts would be missing from the linearisation, and nothing would show it."""
+    flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
+    engine = TangentPropagator(flow._model(PERIOD, 1), flow.layout, rows=0)
+    with pytest.raises(ValueError, match="rows is 0"):
+        engine.move(np.zeros((1, 2 * DOFS, CELLS)))
 
 
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])

@@ -13,7 +13,7 @@ from vipetsc.dynamics.engine import FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.step_choice import refusal
-from vipetsc.dynamics.propagator.tangent import no_samples
+from vipetsc.dynamics.propagator.tangent import unrecorded_samples
 
 
 def test_a_lattice_without_contacts_is_stepped():
@@ -32,11 +32,11 @@ def test_contacts_that_cannot_be_followed_end_the_run():
     engine = Propagator(model, layout)
 
     # In the first samples the driven cell moves by less than the clearance.
-    assert engine.fill(no_samples(model, layout, 4)) == FillResult(0)
+    assert engine.fill(unrecorded_samples(model, layout, goal=3)) == FillResult(0)
     assert engine.steps == 3
     assert engine.time == 3 * model.sample_interval
 
-    stalled = engine.fill(no_samples(model, layout, model.samples)).stalled
+    stalled = engine.fill(unrecorded_samples(model, layout, goal=model.samples - 1)).stalled
     assert re.match(r"the contacts of sites 1 at 0.0\d+ s", stalled)
     # The state is the last one before.
     assert engine.time == engine.steps * model.sample_interval
@@ -54,7 +54,7 @@ def test_ten_thousand_sites_are_set_up_and_restored():
     assert refusal(model) is None
     layout = Layout(model, MPI.COMM_SELF)
     engine = Propagator(model, layout)
-    assert engine.fill(no_samples(model, layout, 2)) == FillResult(0)
+    assert engine.fill(unrecorded_samples(model, layout, goal=1)) == FillResult(0)
 
     state = engine.checkpoint()
     other = Propagator(model, layout)

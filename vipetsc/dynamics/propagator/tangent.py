@@ -1,13 +1,30 @@
 """An orbit of a lattice that nothing drives, and the motion of variations along it.
 
-``TangentPropagator`` runs the orbit as the engine does, but from a state of one's own, and keeps on a tape the substeps
-in which contacts were closed. From them it computes, once for the orbit, one small matrix for each step and cluster in
-contact. The matrix maps variations of the series of the free motion of the cluster's DoFs, and of w'_minus of its sites
-(the approach velocity at which the present contact began), at the beginning of a step to those of the moments of the
-forces, and of w'_minus, at its end (sec. 9 of the derivation in the package's docstring, written out in
-``tangent_kernels``). After that any number of variations of the initial state are moved at the cost of linear steps.
-That is what shooting for periodic orbits of a whole lattice asks for: products of the monodromy matrix with vectors,
-never the matrix.
+``TangentPropagator`` runs the orbit as the engine does, from any given state, and writes each substep in which contacts
+were closed on a tape. From the tape it computes how variations of the orbit's beginning move to its end. Shooting for
+periodic orbits of a whole lattice asks for that: for products of the monodromy matrix with vectors, never the matrix.
+
+**Method.** A step takes the lattice's state y to P y, the free motion, plus what the forces of contacts leave (sec. 5
+of the derivation in the package's docstring). The forces depend on y through few numbers: for each cluster, the Taylor
+coefficients a of the free motion of its DoFs, and the approach velocities q of its sites. q is w'_minus, the relative
+velocity at which the present contact began, by which the law scales its damping. A variation dy therefore moves by
+
+    dy+ = P dy + L dmu,    (dmu, dq+) = J (da, dq),    da = T dy,
+
+where T is ``expand_free_motion``, L is ``apply_impulses``, and mu are the moments of the forces. J is one small matrix
+for each step and cluster in contact, computed once for the orbit by linearising the collocation of each substep on the
+tape (``tangent_kernels``). After that a variation costs as much as a linear step, and the small products.
+
+**Times of onset and separation** vary with y, too. The variation of the state has no term for them: the force is
+continuous at each change of mode, zero at an onset, at a separation, and where clipping begins and ends. To act earlier
+by dt changes the state by the order of dt^2, and the saltation matrix is the identity (Leine and Nijmeijer 2004,
+ch. 7). Only q feels the instant: an onset at the velocity w' and acceleration w'' comes earlier by dw/w', so that
+dq = dw' - w'' dw/w'. J leaves the ends of substeps where the orbit has them. It is the derivative of the flow up to the
+error of the collocation, and not that of a program that chooses its substeps by the state.
+
+References
+----------
+R. I. Leine and H. Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems, Springer 2004.
 """
 
 import copy
@@ -17,7 +34,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case import Model
-from vipetsc.contact.law import CLOSED, PERMANENT
+from vipetsc.contact.law import CLOSED, FREE, PERMANENT
+from vipetsc.dynamics.energies import ENERGY_SUMS
 from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
@@ -25,27 +43,33 @@ from vipetsc.dynamics.propagator.clusters import expand_free_motion
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.nodes import NODES, at_end
 from vipetsc.dynamics.propagator.stencil import Halo, exchange
-from vipetsc.dynamics.propagator.step_choice import refusal
+from vipetsc.dynamics.propagator.step_choice import refusal as refusal_of_steps
 from vipetsc.dynamics.propagator.substeps import create_tape
 from vipetsc.dynamics.propagator.tangent_kernels import Variations, linearise, move_variations
 from vipetsc.dynamics.samples import Samples
 from vipetsc.dynamics.site_dofs import site_records
 from vipetsc.parallel import on_every_rank
 
-# Rows of the tape of a cluster, 208 B each with the motion at the nodes. A contact takes fewer than 30 of them in the
-# built-in case; an orbit that needs more rows is refused with their number.
+# Rows of the tape of a cluster, 208 B each with the motion at the nodes: 1.7 MB. A contact takes fewer than 30 of them
+# in the built-in case, so that there is room for hundreds of contacts in one orbit; one that needs more is refused with
+# the number of rows. The system gives memory to rows as they are written: those that are never used cost none.
 MOST_ROWS = 8192
 
 
 class _Linearisation(NamedTuple):
-    """``matrices`` (number, row, column) of an orbit; ``places`` (step, cluster) numbers them, -1 without contact."""
+    """The matrices J of an orbit, ``matrices`` (number, row, column).
+
+    ``places`` (step, cluster) is the number of the matrix of that step and cluster, -1 without contact in it. Rows and
+    columns are those of the largest cluster; a smaller one uses the first of them. A DoF with its 2 term coefficients
+    and its w'_minus takes some 30 rows: 8 kB a step in contact for a site alone, 800 kB for ten sites in one cluster.
+    """
 
     places: np.ndarray
     matrices: np.ndarray
 
 
 class _Moving(NamedTuple):
-    """Workspace of so many variations, the halo for their exchanges, and the objects of PETSc behind it."""
+    """Workspace of ``variations`` moved together, the ``halo`` for their exchanges, and the PETSc objects behind it."""
 
     variations: Variations
     halo: Halo
@@ -55,8 +79,9 @@ class _Moving(NamedTuple):
 class ClosedSubsteps(NamedTuple):
     """Substeps (row,) of an orbit in which contacts were closed, in the order of time at each site.
 
-    ``site`` counts the lattice's sites from 0, ``side`` is 1 or -1; ``onset`` marks those with which a contact begins.
-    They end at ``end`` in s. ``first_rate`` and ``last_rate`` are w' in m/s at both ends; ``w`` and ``rate`` (row,
+    A substep in which several sites were closed has a row for each. ``site`` counts the lattice's sites from 0,
+    ``side`` is 1 or -1; ``onset`` marks substeps with which a contact begins. A substep ends at ``end`` in s, counted
+    from the orbit's beginning. ``first_rate`` and ``last_rate`` are w' in m/s at both ends; ``w`` and ``rate`` (row,
     node) are w in m and w' in m/s at the nodes, whose ``weights`` (row, node) in s integrate over the substep.
     """
 
@@ -71,14 +96,15 @@ class ClosedSubsteps(NamedTuple):
     weights: np.ndarray
 
 
-def no_samples(model: Model, layout: Layout, number: int) -> Samples:
-    """Samples of which none is stored, after which the next is that of the ``number``.
+def unrecorded_samples(model: Model, layout: Layout, goal: int) -> Samples:
+    """Samples with which ``Propagator.fill`` advances to the sample ``goal``, counted from 0, and stores none.
 
-    An engine that fills them advances to the sample before that one.
+    The engine goes to the last sample for which there is room. Without room that is the one before the first, so that
+    the first one must be ``goal`` + 1. All arrays are empty, and what describes samples is never read.
     """
     return Samples(
-        number=number,
-        sums=np.zeros((0, 5, 2), np.int64),
+        number=goal + 1,
+        sums=np.zeros((0, ENERGY_SUMS, 2), np.int64),
         work=np.zeros((0, 0)),
         losses=np.zeros((0, 0)),
         fields=np.zeros((0, 0, 0, 0)),
@@ -96,19 +122,19 @@ def no_samples(model: Model, layout: Layout, number: int) -> Samples:
 
 
 class TangentPropagator(Propagator):
-    """The engine for a lattice that nothing drives, from a state of one's own, with the motion of variations of it.
+    """The engine of a lattice that nothing drives: one orbit from a given state, and the motion of its variations.
 
-    ``cells`` are arrays (2 dof, owned cell), displacements before velocities. A contact that dissipates must be open
-    at the beginning: the approach velocity w'_minus with which it began is not part of the state. An engine is for one
-    orbit: ``place``, then ``run``, then ``move`` any number of times. The tape of a cluster has so many ``rows``; an
-    engine without any runs the orbit alone.
+    Call ``place`` once, then ``run`` once, then ``move`` any number of times. States are arrays (2 dof, owned cell),
+    displacements in m before velocities in m/s. The drives of ``model`` are switched off. ``rows`` is the room for
+    substeps in contact on the tape of each cluster; with 0 there is no tape, and ``move`` raises ValueError.
     """
 
     def __init__(self, model: Model, layout: Layout, rows: int = MOST_ROWS) -> None:
         super().__init__(model, layout)
         self._model = model
         clusters = self._forces.clusters
-        # Clusters with a drive that acts are solved in every step; without one only those whose sites may touch.
+        # A drive of no duration never acts. Its cluster is then solved only in steps in which a site may touch, as all
+        # others are.
         clusters.drives.rows["duration"] = 0.0
         self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), rows))
         self._linear: _Linearisation | None = None
@@ -116,24 +142,26 @@ class TangentPropagator(Propagator):
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
-        """Why it does not suit ``model``: what the engine refuses, nonlinear springs, contacts that touch at rest.
+        """Why this engine does not suit ``model``, in words, or None.
 
-        About such a contact no motion is linear, however small; one that is pressed at rest has a slope.
+        It refuses what ``Propagator`` refuses; nonlinear springs, whose force is collocated but not linearised here;
+        and contacts that touch at rest, about which no motion is linear, however small: their stiffness jumps from 0 to
+        that of the contact. A contact that is pressed at rest has a slope there, and is not refused.
         """
         if not model.chain.is_linear:
             return "springs have a quadratic or cubic part; variations are not supported for them"
         sites = site_records(model, np.arange(len(model.chain.sites)))
-        if ((np.abs(sites["mode"]) == PERMANENT) & (sites["preload"] == 0)).any():
+        if (np.minimum(sites["clearance"], sites["clearance_minus"]) == 0).any():
             return "contacts touch at rest; variations are not supported for them"
-        return refusal(model)
+        return refusal_of_steps(model)
 
     def place(self, cells: np.ndarray, speed: float) -> None:
-        """Begin at ``cells``; ``speed`` in m/s is a typical one of relative motion.
+        """Begin at the state ``cells`` (2 dof, owned cell); ``speed`` in m/s is a typical one of relative motion.
 
-        Errors of substeps in contact are relative to the approach velocity, which a contact that is closed already does
-        not have: it gets ``speed``.
+        The errors of substeps in contact are relative to the approach velocity. That of a contact that is closed at the
+        beginning is not part of the state: ``speed`` takes its place. All ranks must call it.
 
-        Raises StalledError, on all ranks, for a closed contact that dissipates.
+        Raises StalledError, on all ranks, for a closed contact that dissipates, whose force depends on it.
         """
         clusters = self._forces.clusters
         sites = clusters.contacts
@@ -149,20 +177,23 @@ class TangentPropagator(Propagator):
         if self._layout.comm.allreduce(bool((closed & (sites["damping"] != 0)).any())):
             raise StalledError("a contact that dissipates is closed at the beginning")
 
-        # Contacts that are pressed at rest stay as they are, closed or open: substeps end where they open and close.
-        is_held = np.abs(sites["mode"]) == PERMANENT
-        side = np.where(is_held, np.sign(sites["mode"]), np.sign(w))
-        sites["mode"] = np.where(is_held, sites["mode"], np.where(closed, side * CLOSED, 0))
-        sites["approach"] = np.where(closed | is_held, side * speed, 1.0)
-        # No contact has just begun or ended, where forces are not smooth and the first substeps are short.
+        # Contacts that are pressed at rest keep the mode PERMANENT, closed or open: their force has a kink where they
+        # open and close, and substeps end there (``kinks``).
+        is_pressed = np.abs(sites["mode"]) == PERMANENT
+        side = np.where(is_pressed, np.sign(sites["mode"]), np.sign(w))
+        sites["mode"] = np.where(is_pressed, sites["mode"], np.where(closed, side * CLOSED, FREE))
+        # An open contact gets its velocity at its onset. Until then it is not read; 1 is what ``create_contacts`` sets.
+        sites["approach"] = np.where(closed | is_pressed, side * speed, 1.0)
+        # Contacts that are closed already count as old, at any duration: substeps are short only after an onset.
         clusters.history["onset"] = -np.inf
         clusters.history["duration"] = 1.0
 
     def run(self, samples: int, look: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
-        """Advance to the sample of that number, counted from the start; returns the cells there.
+        """Advance to the sample number ``samples``, counted from 0 at the start; returns the cells there.
 
-        ``look`` sees the cells of every sample on the way. Raises StalledError on all ranks, also where the orbit needs
-        more substeps in contact than the tape has rows.
+        Cells are states (2 dof, owned cell). ``look`` is called with those of every sample on the way. All ranks must
+        call it. Raises StalledError, on all ranks, where the engine stalls, and where the orbit needs more substeps in
+        contact than the tape has rows.
         """
         layout = self._layout
         tape = self._forces.clusters.tape
@@ -171,8 +202,8 @@ class TangentPropagator(Propagator):
         if look:
             numbers = range(1, samples + 1)
         for number in numbers:
-            # Nothing is stored: the engine goes to the sample before the one that would be.
-            result = self.fill(no_samples(self._model, layout, number + 1))
+            result = self.fill(unrecorded_samples(self._model, layout, goal=number))
+            # A full tape goes on to count the rows that it lacks; one without rows counts none.
             needed = layout.comm.allreduce(int(tape.used.max(initial=0)), max)
             room = tape.rows.shape[1]
             if result.stalled or needed > room:
@@ -194,77 +225,98 @@ class TangentPropagator(Propagator):
         episodes = 0
         for c in np.flatnonzero(self._forces.logs):
             rows = tape.rows[c, : tape.used[c]]
+            is_open = self._is_open(c)
             begin = rows["begin"] + rows["position"] * self.series.interval
-            is_held = np.abs(rows["mode"]) >= PERMANENT
-            is_open = self._open_rows(c, rows, is_held)
-            intervals = np.column_stack([begin, begin + rows["length"] * self.series.interval])
-            spans.append(intervals[~is_open])
+            end = begin + rows["length"] * self.series.interval
+            spans.append(np.column_stack([begin, end])[~is_open])
+
             # The first substep after an onset is marked; a contact that is closed from the start has none on the tape.
-            episodes += int(np.sum(((rows["onset"] > 0) | (begin == 0.0)) & ~is_held))
-            for site in np.unique(rows["site"][is_held]):
-                of_site = is_open[rows["site"] == site]
-                episodes += int(np.sum(of_site & ~np.append(False, of_site[:-1])))
+            is_pressed = np.abs(rows["mode"]) == PERMANENT
+            begins = (rows["onset"] > 0) | (begin == 0.0)
+            episodes += int(np.sum(begins & ~is_pressed))
+            for site in np.unique(rows["site"][is_pressed]):
+                is_open_here = is_open[rows["site"] == site]
+                was_open_before = np.append(False, is_open_here[:-1])
+                episodes += int(np.sum(is_open_here & ~was_open_before))
         return np.concatenate(spans), episodes
 
     def closed_substeps(self) -> list[ClosedSubsteps]:
-        """The substeps in which contacts were closed, of each cluster that this rank logs."""
+        """The substeps in which contacts were closed, one record for each cluster that this rank logs."""
         clusters = self._forces.clusters
-        tables = clusters.nodes
         interval = self.series.interval
         substeps = []
-        for c in np.flatnonzero(self._forces.logs):
-            rows = clusters.tape.rows[c, : clusters.tape.used[c]]
-            w, rate = clusters.tape.motion[c, : len(rows)].swapaxes(0, 1)
+        for c in np.flatnonzero(self._forces.logs).tolist():
+            is_closed = ~self._is_open(c)
+            rows = clusters.tape.rows[c, : clusters.tape.used[c]][is_closed]
+            motion = clusters.tape.motion[c, : clusters.tape.used[c]][is_closed]
+            rate = motion[:, 1]
             length = rows["length"] * interval
+            # ``sites`` counts from 1, as messages do. "begin" is the beginning of the step, "position" that of the
+            # substep within it.
             of_cluster = ClosedSubsteps(
-                site=np.array(self._forces.sites(int(c)), int)[rows["site"]] - 1,
+                site=np.array(self._forces.sites(c), int)[rows["site"]] - 1,
                 side=np.sign(rows["mode"]),
                 onset=rows["onset"] > 0,
                 end=rows["begin"] + rows["position"] * interval + length,
                 first_rate=rows["rate"],
                 last_rate=rate @ at_end(),
-                w=w,
+                w=motion[:, 0],
                 rate=rate,
-                weights=tables.weight[rows["kind"]] * length[:, None],
+                weights=clusters.nodes.weight[rows["kind"]] * length[:, None],
             )
             substeps.append(of_cluster)
         return substeps
 
-    def _open_rows(self, c: int, rows: np.ndarray, is_held: np.ndarray) -> np.ndarray:
-        """Which ``rows`` (row,) of the tape of cluster ``c`` are of an open site, as those that ``is_held`` may be."""
-        # A substep ends where such a site opens or closes: in its middle the site is what it is all through.
-        w = self._forces.clusters.tape.motion[c, : len(rows), 0, NODES // 2]
+    def _is_open(self, c: int) -> np.ndarray:
+        """Which rows (row,) of the tape of cluster ``c`` are of an open site.
+
+        The tape has the sites that are not free. Of these only a contact that is pressed at rest may be open.
+        """
+        tape = self._forces.clusters.tape
+        rows = tape.rows[c, : tape.used[c]]
+        # A substep ends where such a contact opens or closes: in its middle it is what it is all through.
+        w = tape.motion[c, : tape.used[c], 0, NODES // 2]
         sites = self._forces.clusters.contacts[self._forces.dofs.first[c] + rows["site"]]
         side = np.sign(rows["mode"])
         clearance = np.where(side > 0, sites["clearance"], sites["clearance_minus"])
-        return np.asarray(is_held & (side * w < clearance))
+        return np.asarray((np.abs(rows["mode"]) == PERMANENT) & (side * w < clearance))
 
     def _linearise(self) -> _Linearisation:
-        """Compute the matrices of the orbit from the tape."""
+        """Compute the matrices J of the orbit from the tape."""
         clusters = self._forces.clusters
         dofs = self._forces.dofs
         tape = clusters.tape
         places = np.full((self.steps, len(clusters.state)), -1)
         matrices: list[np.ndarray] = []
-        # Coefficients of every DoF of the largest cluster, and w'_minus of every site: each has a DoF of its own.
-        largest = int(np.diff(dofs.first).max(initial=0)) * (clusters.taylor.shape[1] + 1)
+        # Rows and columns of J: 2 term coefficients of the first DoF, then of the second, and so on; then w'_minus of
+        # each site. Every site is a DoF, drives and springs are DoFs without w'_minus: one more for each DoF is enough.
+        coefficients = clusters.taylor.shape[1]
+        largest = int(np.diff(dofs.first).max(initial=0)) * (coefficients + 1)
 
         energy = clusters.energy.copy()
         for c in range(len(clusters.state)):
             rows = tape.rows[c, : tape.used[c]]
             motion = tape.motion[c, : tape.used[c]]
+            # Rows are in the order of time: those of one step follow each other.
             steps, first = np.unique(np.rint(rows["begin"] / self.series.interval), return_index=True)
             stop = np.append(first, len(rows))[1:]
             for step, a, b in zip(steps.astype(int), first, stop, strict=True):
                 places[step, c] = len(matrices)
                 matrices.append(np.zeros((largest, largest)))
                 linearise(clusters, dofs, c, rows[a:b], motion[a:b], matrices[-1])
-        # The kernels that carry variations through a substep are those of the motion itself, and change its energies.
+        # The kernels that carry variations through a substep are those of the motion itself, and add to its energies
+        # what the variations' forces would dissipate.
         clusters.energy[:] = energy
         return _Linearisation(places, np.array(matrices).reshape(len(matrices), largest, largest))
 
     def move(self, cells: np.ndarray) -> np.ndarray:
-        """Move variations (variation, 2 dof, owned cell) of the beginning to the orbit's end; collective."""
+        """Move variations (variation, 2 dof, owned cell) of the beginning to the orbit's end; all ranks must call it.
+
+        The map is linear: variations may have any size, with velocities per s in the unit of the displacements. Raises
+        ValueError for an engine without a tape, and RuntimeError where PETSc fails to exchange cells.
+        """
+        if self._forces.clusters.tape.rows.shape[1] == 0:
+            raise ValueError("rows is 0: an orbit without a tape has no variations; rows must be at least 1")
         layout = self._layout
         count = len(cells)
         rows = 2 * layout.dofs
@@ -284,10 +336,10 @@ class TangentPropagator(Propagator):
         return moved.reshape(count, rows, layout.owned).copy()
 
     def _create_moving(self, count: int, linear: _Linearisation) -> _Moving:
-        """Create the workspace of ``count`` variations; collective."""
+        """Create the workspace of ``count`` variations; all ranks must call it."""
         components = np.zeros((count, 2, self._components.shape[1]))
         states = [self._layout.create_vector(array) for pair in components for array in pair]
-        # The same cells as the engine's, in columns of its own.
+        # A shallow copy has the engine's ranges of cells, and binds columns and a scatter of its own to them.
         regions = copy.copy(self._regions)
         halo = regions.bind_columns(states)
         taylor = self._forces.clusters.taylor.copy()
@@ -308,6 +360,6 @@ class TangentPropagator(Propagator):
         self._moving = None
 
     def destroy(self) -> None:
-        """Free the variations' objects as well."""
+        """Free the PETSc objects of the variations and of the engine; all ranks must call it."""
         self._release()
         super().destroy()

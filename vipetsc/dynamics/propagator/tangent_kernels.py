@@ -1,16 +1,20 @@
 r"""Compiled motion of variations along an orbit, by the same exact steps: sec. 9 of the derivation.
 
-**9. Variations.** A variation dy is the difference to a neighbouring orbit, to first order. A step takes the lattice's
-state y to P y plus what the forces leave, their moments mu (sec. 5). These depend on y only through the few
-coefficients a that describe the free motion of a cluster. A variation therefore moves by
+**9. Variations.** A variation dy is the difference to a neighbouring orbit, to first order. It moves through a step by
 
-    dy+ = P dy + (impulses of dmu),    (dmu, dq+) = J (da, dq),    da linear in dy (sec. 2),
+    dy+ = P dy + (impulses of dmu),    (dmu, dq+) = J (da, dq),    da linear in dy (sec. 2):
 
-with one small matrix J for each step and cluster in contact, computed once for an orbit; q are the approach velocities
-w'_minus of the cluster's sites. J comes from the substeps on the orbit's ``tape``: in each the collocation of sec. 3 is
-linearised at its nodes, dF = F_w dw + F_v dv + F_q dq with dw, dv affine in dF, a linear system for the dF. Forces are
-continuous and a substep ends exactly on each change of a mode, so that the saltation matrix of the state is the
-identity (Leine and Nijmeijer 2004, ch. 7); at an onset the instant moves by -dw/w', and dq = dw' - w'' dw/w'.
+see ``tangent``, where the method, its letters and the terms of onset and separation are explained. ``move_variations``
+applies these lines, and ``linearise`` computes J, for one step and cluster, from the substeps on the orbit's tape.
+
+**J.** Column j of J is what becomes of a unit of the j-th of the numbers (a, q): all unit vectors are carried through
+the step together. Where the tape has nothing, series are shifted. In a substep the collocation of sec. 3 is linearised
+at its nodes: the variations of the forces there and of the motion obey
+
+    dF = F_w dw + F_v dv + F_q dq,    (dw, dv) = (dw, dv)_free + R dF,
+
+with the derivatives F_w, F_v, F_q of the law and the responses R of sec. 3, a linear system for dF. From dF the series
+at the substep's end and the moments follow as those of the motion do from F. At an onset dq = dw' - w'' dw/w'.
 """
 
 from typing import Any, NamedTuple
