@@ -19,6 +19,7 @@ from vipetsc.modes.branches.branch_checks import sampled
 from vipetsc.modes.branches.files import LAYOUTS, read_branch, write_branch
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.branches.regions import regions
+from vipetsc.modes.problem import FlowError
 from vipetsc.parallel import StopRequest
 
 NAME = "branch-out-of-phase"
@@ -192,3 +193,25 @@ def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(
     (parts / crossing).unlink()
     follow(parts, resume=True, **nnm)
     assert (parts / crossing).exists()
+
+
+def test_a_branch_whose_lower_part_fails_keeps_it_and_its_upper_part(tmp_path):
+    """Both parts are in the file, whose ending says what failed; resumed, it says so again."""
+    nnm = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.0295], "locate": False}
+
+    def fail_below(branch, point):
+        if branch.name.endswith("-down") and point.index == 3:
+            raise FlowError("the flow ends here")
+
+    failed = follow(tmp_path, fail_below, **nnm)
+    resumed = follow(tmp_path, resume=True, **nnm)
+
+    # From the last point below the start over the start itself to the end above it.
+    assert [point.index for point in failed.points[:5]] == [3, 2, 1, 0, 1]
+    assert failed.points[0].energy < 0.029
+    assert failed.points[-1].energy > 0.0295
+    assert failed.ending == "failed: below the start: the flow ends here"
+    assert read_branch(tmp_path / f"{NAME}.h5").ending == failed.ending
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{NAME}.csv", f"{NAME}.h5"]
+    assert resumed.ending == failed.ending
+    assert table_of(resumed) == table_of(failed)

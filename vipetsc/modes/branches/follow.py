@@ -1,4 +1,15 @@
-"""Follow the branches of a case, one a rank or all ranks together; save them as they grow, resume them at their end."""
+"""Follow the branches of a case, one a rank or all ranks together; save them as they grow, resume them at their end.
+
+A *branch* is a curve of periodic motions along which one parameter changes: a nonlinear normal mode (NNM), whose energy
+and frequency change, or a nonlinear frequency response curve (NFRC), whose parameter is the drive's frequency or
+another key of the case. Its *points* are single motions. Those of the continuation are regular; *special* points lie
+between them, where something changes: a fold of the energy or of the frequency, a change of stability, a contact that
+grazes. A ``Method`` gives the equations of a case's branches and their starts, ``Continuation`` makes the steps; this
+module is the loop around them, with its files.
+
+Phases of this loop are audit events ``vipetsc.<phase>`` of Python, which cost nothing unless a hook listens: the tests
+raise errors and signals there (chapter `trust` of the manual).
+"""
 
 import logging
 import sys
@@ -24,11 +35,13 @@ from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.branches.responses import ResponseMethod
 from vipetsc.modes.continuation.arclength import Continuation, StepRule
 from vipetsc.modes.continuation.special import locate
-from vipetsc.modes.problem import PeriodicProblem
+from vipetsc.modes.problem import ContinuationError, PeriodicProblem
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 
 # Seconds between two writings of a growing branch.
 SAVE_EVERY = 10.0
+# What a finding begins with where the part of a branch below its start has failed.
+FAILED_BELOW = "below the start: "
 
 logger = logging.getLogger(__name__)
 BranchCase = NnmCase | NfrcCase
@@ -77,10 +90,10 @@ def follow_all(
     """All branches of ``case``, written into ``folder`` if there is one; rank r follows every size-th one, from r on.
 
     Each branch is computed on one rank, so that its bits do not depend on the number of ranks, or on all ranks together
-    where a lattice is shot without dense matrices. A branch that fails is written as far as it came, says why in its
-    ``ending``, and the others go on. A ``stop`` ends each branch at its next point, with an ending that begins with
-    "stopped"; ``resume`` goes on from there, to the same bits. Returns all branches on rank 0, in the order of the
-    case; an empty list on the others.
+    where a lattice is shot without dense matrices. A branch that fails is written as far as it came and says why in its
+    ``ending``, and the others go on. Where the part below its start fails, the part above is followed all the same. A
+    ``stop`` ends each branch at its next point, with an ending that begins with "stopped"; ``resume`` goes on from
+    there, to the same bits. Returns all branches on rank 0, in the order of the case; an empty list on the others.
     """
     follower = partial(Follower, case, folder, provenance(comm), listener, stop, resume)
     jobs = method_of(case).jobs(case)
@@ -108,7 +121,7 @@ def follow_all(
 class Follower:
     """Follows the branches of a case on the ranks ``comm``, into a folder or, without one, in memory alone.
 
-    ``about`` are attributes of the files.
+    ``about`` are attributes of the files. ``listener(branch, point)`` is called on rank 0 after each regular point.
     """
 
     def __init__(
@@ -132,7 +145,7 @@ class Follower:
         self.method: Method[Any] = method_of(case)(case, comm)
 
     def follow(self, job: int) -> list[Branch[Any]]:
-        """The branch of a ``job`` (of a linear mode its number from 0), then those that cross it, if asked for."""
+        """The branch of a ``job``, one of ``Method.jobs``, then those that cross it, if asked for."""
         sys.audit("vipetsc.member", job + 1)
         branch = self._begun(self.method.name(job))
         if not branch.complete:
@@ -164,20 +177,23 @@ class Follower:
             on_root(self.comm, lambda: write_branch(branch, folder, self.about))
 
     def _follow(self, branch: Branch[Any], job: int) -> None:
-        """Compute the points of a branch, then the quantities of the whole branch that its file holds as well."""
+        """Compute the points of a branch, then what its file holds of the whole branch (``Method.finish``)."""
         method = self.method
         problem = method.problem(job)
         interruptions: tuple[type[Exception], ...] = (StoppedError, *method.failures)
         try:
-            *before, direction = method.directions()
             if branch.points:
                 # A branch that is resumed has its lower part already, or it would have no points.
                 start = branch.regular()[-1]
             else:
                 start = method.start(problem, job)
-                if before:
+                if method.has_lower_part:
                     self._follow_down(branch, problem, start)
-            self.grow(branch, problem, start, method.rule, direction)
+            self.grow(branch, problem, start, method.rule, method.direction)
+            # A branch lacks its far end where its lower part failed, also if it was stopped and resumed since.
+            for finding in branch.findings:
+                if finding.startswith(FAILED_BELOW):
+                    raise ContinuationError(finding)
         except interruptions:
             if method.finishes_failed and branch.points:
                 method.finish(problem, branch)
@@ -185,12 +201,16 @@ class Follower:
         method.finish(problem, branch)
 
     def _follow_down(self, branch: Branch[Any], problem: PeriodicProblem[Any], start: Any) -> None:
-        """Begin a branch with its part below the start, from the far end on."""
+        """Begin a branch with its part below the start, from the far end on; raises StoppedError on request."""
         down = self._begun(f"{branch.name}-down")
         if down.points:
             start = down.regular()[-1]
         if not down.complete:
-            self.grow(down, problem, start, self.method.rule, direction=-1)
+            try:
+                self.grow(down, problem, start, self.method.rule, direction=-1)
+            # The points so far belong to the branch, whose part above the start does not depend on them.
+            except self.method.failures as error:
+                down.findings.append(f"{FAILED_BELOW}{error}")
         # The part was followed away from the start: in the order of the branch its tangents are reversed.
         for p in reversed(down.points):
             branch.points.append(replace(p, tangent=-p.tangent, energy_tangent=-p.energy_tangent))
@@ -204,9 +224,13 @@ class Follower:
         rule_of: Callable[[PeriodicProblem[Any], Any, int], StepRule[Any]],
         direction: int = 1,
     ) -> None:
-        """Continue ``branch`` from ``start`` until it ends, and locate its special points.
+        """Continue ``branch`` from the motion ``start`` until it ends, and locate its special points.
 
-        It is saved every ``SAVE_EVERY`` seconds. Raises ContinuationError or FlowError if it cannot go on, StoppedError
+        ``rule_of(problem, start, done)`` gives the steps and the end of a branch that has ``done`` regular points after
+        its start. A ``direction`` of 1 leaves a start that has no tangent towards growing energy, -1 towards falling
+        energy. The branch is saved every ``SAVE_EVERY`` seconds.
+
+        Raises ContinuationError, FlowError or another of the method's ``failures`` if it cannot go on, StoppedError
         on request; the branch holds the points so far.
         """
         method = self.method
@@ -214,14 +238,17 @@ class Follower:
         # the number that it may have; its start does not.
         regular = branch.regular()
         rule = rule_of(problem, start, max(len(regular) - 1, 0))
+        # The step of a branch that begins is 0, and the rule's first step is taken.
         continuation = Continuation(problem, start, rule, direction, branch.next_step or None)
         check = method.monitor(problem)
-        # The monitor compares with all earlier points; a resumed branch has to be judged as one that never stopped.
+        # The monitor compares a point with all earlier ones, and says so where the branch retraces itself or returns to
+        # the linear mode. A resumed branch has to be judged as one that never stopped.
         for point in regular:
             check(point)
-        before = None
+        # The last two points: a special point between the newest two may need the direction of the one before them.
+        one_before_last = None
         if len(regular) > 1:
-            before = regular[-2]
+            one_before_last = regular[-2]
         last = continuation.point
         finding = None
         saved = time.monotonic()
@@ -232,8 +259,15 @@ class Follower:
             for point in continuation:
                 sys.audit("vipetsc.step")
                 if method.locates:
-                    grazing = method.grazing
-                    special = locate(problem, last, continuation.passed, rule.chart, grazing, before, branch.findings)
+                    special = locate(
+                        problem,
+                        left=last,
+                        right=continuation.passed,
+                        chart=rule.chart,
+                        grazing=method.grazing,
+                        before=one_before_last,
+                        missed=branch.findings,
+                    )
                     branch.points += [method.assess(problem, replace(p, next_step=point.next_step)) for p in special]
                 assessed = method.assess(problem, point)
                 branch.points.append(assessed)
@@ -253,7 +287,7 @@ class Follower:
                     saved = time.monotonic()
                 if stopped:
                     raise StoppedError(f"stopped on request after point {assessed.index}; continue with --resume")
-                before = last
+                one_before_last = last
                 last = point
         # A branch that fails or is stopped is checked as well; one that is resumed finds the same jumps again.
         finally:

@@ -29,8 +29,9 @@ class Method(ABC, Generic[S]):
     """A method that finds the branches of one case, which ``jobs`` numbers from 0 on.
 
     ``kind`` is the kind of their files. ``shared``: all ranks follow a branch together. ``failures`` end a branch and
-    not the program. ``keeps_empty``: a branch without points leaves a file that says why. ``finishes_failed``: the
-    a branch that failed has the additions to the file of a whole branch, too.
+    not the program. ``keeps_empty``: a branch without points leaves a file that says why. ``finishes_failed``: a
+    branch that failed has the additions to the file of a whole branch, too. ``locates``: special points are looked for
+    between the regular ones, those where a contact grazes only with ``grazing``.
     """
 
     kind: ClassVar[str]
@@ -72,9 +73,15 @@ class Method(ABC, Generic[S]):
     def rule(self, problem: PeriodicProblem[S], start: S, done: int) -> StepRule[S]:
         """Steps and end of a branch that has ``done`` regular points after its start."""
 
-    def directions(self) -> list[int]:
-        """Directions from the start in which a branch is followed, in this order."""
-        return [1]
+    @property
+    def direction(self) -> int:
+        """1 if a branch is followed from its start towards growing energy, -1 towards falling energy."""
+        return 1
+
+    @property
+    def has_lower_part(self) -> bool:
+        """Whether a branch is followed from its start towards falling energy, too, before ``direction``."""
+        return False
 
     def assess(self, problem: PeriodicProblem[S], point: S) -> S:
         """The point with the quantities of its file that continuation does not need."""

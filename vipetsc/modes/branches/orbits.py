@@ -51,9 +51,17 @@ class NnmMethod(Method[Point]):
         """Guarded steps to the end of the ranges."""
         return guarded_steps(problem, self.options, done)
 
-    def directions(self) -> list[int]:
-        """The directions by [nnm]: down, up, or down first and then up."""
-        return {"up": [1], "down": [-1], "both": [-1, 1]}[self.options.direction]
+    @property
+    def direction(self) -> int:
+        """-1, towards falling energy, if ``nnm.direction`` is down alone; else 1."""
+        if self.options.direction == "down":
+            return -1
+        return 1
+
+    @property
+    def has_lower_part(self) -> bool:
+        """Whether ``nnm.direction`` asks for both directions."""
+        return self.options.direction == "both"
 
     def asked(self, problem: PeriodicProblem[Point], branch: Branch[Point]) -> Iterator[Point]:
         """The orbits at the energies ``nnm.orbits_at``, wherever the branch passes one."""
