@@ -1,4 +1,13 @@
-"""Wavenumber scattering at three amplitudes: energy, wavelets, entropy, wavenumber bins (Figs. 2-4, A1, A2, S1)."""
+"""Wavenumber scattering at three amplitudes: energy, wavelets, entropy, wavenumber bins.
+
+A sweep over the amplitude A of the drive has a run at its lowest, middle and highest amplitude in each figure. In a
+linear lattice energies grow as A^2 and velocities as A: over these, what differs between the panels is nonlinear.
+
+X(kappa, x) is the Morlet wavelet transform in space of the velocity of the cells' host masses (``spectra.wavelet``);
+H(x, t) the local entropy of |X|^2 over the wavenumbers kappa and H(t) its energy-weighted mean (``spectra.entropies``);
+the bins K_1, K_2, ... are equal parts of the wavenumbers from 0 to pi, into which the velocity is divided by an inverse
+transform of the nodes of each. "Paper, Fig. n" is a figure of Phys. Rev. E 108, 044214 (2023).
+"""
 
 from itertools import pairwise
 from typing import NamedTuple, Self
@@ -18,21 +27,34 @@ from vipetsc.io.read import field_time
 from vipetsc.lattice import bloch, pass_bands
 from vipetsc.spectra import Nodes, inverse, transform
 
-KC = 12.0  # the wavelets of the entropy
-NODES = 120  # wavenumbers of theirs, a grid twice as fine as that of the entropy
-BINS_KC = 6.0  # the wavelets of the bins
+# Centre wavenumbers of the wavelets, both the paper's: a larger one tells wavenumbers apart, as entropies need it, a
+# smaller one positions, as the maps of bins do.
+KC = 12.0
+BINS_KC = 6.0
+# Wavenumbers in a map of |X|: twice those of the entropy, whose rows would be seen as steps.
+WAVENUMBERS = 120
 SHOWN = 7  # bins whose maps are drawn
 EXPLAINED = 4  # bins in the picture that explains them
+# Decades below the largest value that a colour scale shows: of |X| over all panels, of |X| next to its bins, where two
+# tell the packets from their tails, and of the energy of bins, which differ by more.
+WAVELET_DECADES = 2.5
+DOMAIN_DECADES = 2
 BINS_DECADES = 4
-LEVEL = 0.003  # of the largest energy of any bin: contours there enclose the packets, and not their tails
+# Contours of a bin's energy, as a fraction of the largest of any bin: there they enclose packets and not their tails.
+LEVEL = 0.003
 FIELD = "partition/kinetic_energy"  # (bin, snapshot, cell)
-BLUR = 0.006, 0.01  # of all snapshots and cells: the carrier's beat is smoothed out before contours are drawn
+# Standard deviations of the smoothing before contours are drawn, as fractions of the number of snapshots and of cells:
+# longer than the beat of the carrier wave, shorter than a packet.
+BLUR = 0.006, 0.01
 LEAST_WEIGHT = 1e-5  # of the largest: cells with less energy have no entropy
+# The relative error up to which the paper takes its partition to be complete (its Eq. (A8)).
+COMPLETE = 0.01
 ROWS = {
     "kinetic_energy": "Energy of a cell",
     "wavenumber_content": "Energy of a wavenumber",
     "dispersion": "Mean energy of a bin",
 }
+# The times of ``AmplitudeSeries.snapshot_times``, in their order.
 MOMENTS = ("Before the first site", "At the first site", "Past the last site", "Near the end")
 
 
@@ -40,8 +62,7 @@ MOMENTS = ("Before the first site", "At the first site", "Past the last site", "
 def amplitudes(series: AmplitudeSeries) -> Figure:
     """Draw three amplitudes by (space-time kinetic energy, wavenumber content, dispersion); paper, Fig. 2.
 
-    Energies are divided by the square of the amplitude: one scale serves a row, and what differs between its
-    panels is nonlinear.
+    Energies are divided by the square of the amplitude, so that one scale serves a row.
     """
     figure, grid = series.page(3, 6.4, sharey="row")
     for row, (name, label) in zip(grid, ROWS.items(), strict=True):
@@ -58,6 +79,7 @@ def amplitudes(series: AmplitudeSeries) -> Figure:
             else:
                 cell = member.model.chain.cell
                 image = panels.dispersion_map(axes, field, norm, cell)
+                # In krad/s, with a tenth more than the highest pass band.
                 axes.set_ylim(0, 1.1e-3 * pass_bands(cell)[-1].high)
         panels.colour_bar(image, row, f"{label} / A² (J/N²)")
 
@@ -79,10 +101,10 @@ def wavelets(series: AmplitudeSeries) -> Figure:
 
     A black line marks the wavenumber of the linear wave at the drive's frequency.
     """
-    kappa = np.pi * np.arange(1, NODES + 1) / NODES
+    kappa = np.pi * np.arange(1, WAVENUMBERS + 1) / WAVENUMBERS
     times = series.snapshot_times()
     transforms = [_wavelets(member, times, kappa) for member in series.runs]
-    norm = panels.log_norm(*(transformed.values for transformed in transforms), decades=2.5)
+    norm = panels.log_norm(*(transformed.values for transformed in transforms), decades=WAVELET_DECADES)
 
     figure, grid = series.page(4, 6.6, sharex=True, sharey=True)
     for row, moment in enumerate(MOMENTS):
@@ -102,9 +124,10 @@ def wavelets(series: AmplitudeSeries) -> Figure:
 
 
 def _wavelets(member: MemberRun, times: np.ndarray, kappa: np.ndarray) -> Wavelets:
-    """Return the transforms of the samples nearest to ``times`` (s) at the wavenumbers ``kappa``."""
+    """Return the transforms of the samples nearest to ``times`` (s) at the wavenumbers ``kappa``, in rad per cell."""
     time = field_time(member.run)
     samples = [int(np.argmin(np.abs(time - t))) for t in times]
+    # The velocity is that of (time, cell, mass of the cell); the transform is padded beyond the last cell.
     host = member.run["velocity"][samples, :, member.model.chain.cell.host].values
     magnitude = np.abs(transform(host, kappa, KC)[..., : host.shape[-1]])
     return Wavelets(time=time[samples], values=magnitude / abs(member.case.drive.amplitude))
@@ -114,7 +137,8 @@ def _wavelets(member: MemberRun, times: np.ndarray, kappa: np.ndarray) -> Wavele
 def entropy_maps(series: AmplitudeSeries) -> Figure:
     """Draw H(x, t) at three amplitudes to one scale, with the energy-weighted H(t) over each; paper, Fig. A2.
 
-    Cells are blank where they have hardly any energy: only the wavelets' tails are there.
+    A dashed line marks the time from which averages of H are taken, that of the linear wave's arrival. Cells are blank
+    where they have hardly any energy: only the wavelets' tails are there.
     """
     fields = []
     for member in series.runs:
@@ -161,7 +185,7 @@ def shown_bins(wavenumber: float, count: int, shown: int = SHOWN) -> list[int]:
     if above:
         pair = driven, driven + 1
 
-    # Each of the pair that is missing takes the place of the nearest bin that is not of the pair.
+    # Evenly spread bins may lack one bin of the pair, or both. Each of these replaces the nearest bin of the others.
     bins = [round(number) for number in np.linspace(0, count - 1, min(shown, count))]
     for wanted in pair:
         if wanted not in bins:
@@ -173,7 +197,7 @@ def shown_bins(wavenumber: float, count: int, shown: int = SHOWN) -> list[int]:
 
 @from_series(FIELD, wave=True)
 def partition(series: AmplitudeSeries) -> Figure:
-    """Draw seven bins in space-time at the medium amplitude, contours of all, the driven band (paper, Fig. 4)."""
+    """Draw some bins in space-time at the medium amplitude, contours of all, the driven band (paper, Fig. 4)."""
     medium = series.runs[1]
     field = medium.analysis[FIELD].load()
     bins = shown_bins(series.wave.wavenumber, len(field))
@@ -241,7 +265,11 @@ def _draw_contours(axes: Axes, member: MemberRun, colours: np.ndarray) -> None:
 
 @from_series("partition/reconstructed")
 def reconstruction(series: AmplitudeSeries) -> Figure:
-    """Draw total and reconstructed energy over time, relative error, energy between bins (paper, Fig. A1)."""
+    """Draw total and reconstructed energy over time, relative error, energy between bins (paper, Fig. A1).
+
+    The velocities of the bins add up to that of the lattice, but their energies do not: ``cross_share`` of the analysis
+    is the fraction of the kinetic energy (KE) that is in products of the velocities of two bins.
+    """
     figure, grid = series.page(3, 5.0, sharex="col", sharey="row")
     for (energies, errors, crosses), member in zip(grid.T, series.runs, strict=True):
         analysis = member.analysis
@@ -254,11 +282,11 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
 
         energies.plot(time, kinetic / square, color=style.BLACK, lw=1.4, label="KE of the lattice")
         energies.plot(time, reconstructed / square, color=style.ORANGE, lw=0.8, ls="--", label="KE of the bins' sum")
-        energies.plot(time, parts.sum(axis=0) / square, color=style.BLUE, lw=0.7, label="sum of the twelve KE")
+        energies.plot(time, parts.sum(axis=0) / square, color=style.BLUE, lw=0.7, label=f"sum of the {len(parts)} KE")
 
         # Before the wave comes both energies are 0, and so is their difference.
         errors.semilogy(time, np.where(error > 0, error, np.nan), lw=0.7)
-        errors.axhline(0.01, color=style.VERMILION, lw=0.8, ls="--")
+        errors.axhline(COMPLETE, color=style.VERMILION, lw=0.8, ls="--")
 
         crosses.plot(time, analysis["partition/cross_share"].values, color=style.GREEN, lw=0.8)
         crosses.set(ylim=(0, 1), xlabel="Time (s)", xlim=time[[0, -1]])
@@ -267,7 +295,8 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
     grid[0, 0].set(ylabel="Kinetic energy / A² (J/N²)", ylim=(0, None))
     grid[0, 0].legend(loc="upper left")
     grid[1, 0].set(ylabel="Relative error")
-    panels.note(grid[1, 0], "1 %", (1, 0.01), (-2, -2), xycoords=("axes fraction", "data"), ha="right", va="top")
+    limit = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "top"}
+    panels.note(grid[1, 0], f"{100 * COMPLETE:g} %", (1, COMPLETE), (-2, -2), **limit)
     grid[2, 0].set(ylabel="Fraction of KE between bins")
     return figure
 
@@ -289,6 +318,7 @@ class Snapshot(NamedTuple):
         sample = int(np.argmin(np.abs(field_time(member.run) - time)))
         velocity = member.run["velocity"][sample, :, member.model.chain.cell.host].values
 
+        # These bins are those of the analysis, which has their bounds (``spectra.wavelet.BINS``).
         # The transform is padded; what lies beyond the cells is not shown.
         nodes = Nodes.log(BINS_KC)
         transformed = transform(velocity, nodes.kappa, BINS_KC)
@@ -304,7 +334,8 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
     field = member.analysis[FIELD].load()
     cells = member.run["cell"].values
     bounds = member.analysis["partition/bounds"].values
-    snapshot = Snapshot.nearest(member, series.snapshot_times()[2])
+    past_last_site = series.snapshot_times()[MOMENTS.index("Past the last site")]
+    snapshot = Snapshot.nearest(member, past_last_site)
     bins = shown_bins(series.wave.wavenumber, len(field), EXPLAINED)
     colours = bin_colours(len(field))
 
@@ -355,7 +386,7 @@ def _draw_domain(axes: Axes, cells: np.ndarray, snapshot: Snapshot, bounds: np.n
     inside = snapshot.nodes.kappa <= np.pi
     kappa = snapshot.nodes.kappa[inside] / np.pi
     magnitude = np.abs(snapshot.transformed[inside])
-    norm = panels.log_norm(magnitude, decades=2)
+    norm = panels.log_norm(magnitude, decades=DOMAIN_DECADES)
     axes.pcolormesh(cells, kappa, magnitude, shading="nearest", norm=norm, cmap="magma_r", rasterized=True)
     axes.hlines(bounds[1:-1] / np.pi, *cells[[0, -1]], color=style.GREY, lw=0.4)
 
