@@ -6,16 +6,26 @@ are the zeros of
 
     D(lambda) = det(I + G(k Om - i lambda) J(lambda)),   Re lambda > 0,  |Im lambda| <= Om/2.
 
-D is analytic there, tends to 1 for large Re lambda, is real on the real axis and has the period i Om but for what is
-left out: it is a function of w = exp(-2 pi lambda/Om), analytic inside the circle of Re lambda = ``least`` Om, and its
-zeros there are the inverse multipliers. Their number N is minus the turns of D along that line (Cauchy's argument
-principle), and the Fourier coefficients of log D - N log w on the circle are their sums of powers, from which they are
-found, and corrected on D itself. If a motion has odd orders alone and forces are odd, odd orders of perturbations do
-not meet even ones: D is the product of two determinants. J is a Toeplitz matrix unless forces dissipate.
+A perturbation grows in a period by its multiplier exp(2 pi lambda/Om); in the code mu is lambda/Om. D is analytic
+there, tends to 1 for large Re lambda and is real on the real axis. To add i Om to lambda is to number the orders k
+anew: with all orders D has the period i Om and is a function of w = exp(-2 pi lambda/Om), analytic inside the circle of
+Re lambda = ``least`` Om, whose zeros there are the inverse multipliers. Their number N is minus the turns of D along
+that line (Cauchy's argument principle). Their sums of powers are Fourier coefficients on a circle |w| = R (Delves and
+Lyness): with w = R exp(-i phi),
+
+    sum_j (w_j/R)^p = -(p/pi) int_0^pi Re[(log D - N log w) exp(-i p phi)] d phi,   p = 1, ..., N,
+
+and Newton's identities turn these into the polynomial of the zeros. It is ill-conditioned for large N; what it gives
+are guesses, which a secant method corrects on D itself. If a motion has odd orders alone and forces are odd, odd orders
+of perturbations do not meet even ones: D is the product of two determinants. J is a Toeplitz matrix unless forces
+dissipate.
 
 **Many harmonics.** Without dissipation the orders beyond ``KEPT``, d_h = -(I + G_hh J_hh)^-1 G_hh J_hl d_l, are
 eliminated with G at lambda = 0: their part of J falls as KEPT^-4 with Hertz's law, and changes by lambda/(KEPT Om) of
-itself. The double zero at lambda = 0, of a shift in time and of the neighbouring motion, stays exactly there.
+itself. At lambda = 0 the elimination is exact. Above the pass bands G is even in the frequency, so that the changes of
+the orders k and -k have opposite signs, and cancel to first order in lambda for a motion that is even in time: D keeps
+its double zero at lambda = 0, of a shift in time and of the neighbouring motion.
+
 Cf. G. W. Hill, Acta Math. 8 (1886) 1; von Groll and Ewins, J. Sound Vib. 241 (2001) 223; L. M. Delves and
 J. N. Lyness, Math. Comput. 21 (1967) 543.
 """
@@ -54,7 +64,7 @@ LARGEST_LOG = 300.0  # of a determinant, which overflows beyond
 
 
 class ContourLine(NamedTuple):
-    """D along Re lambda = const: Im lambda/Om from 0 to 1/2 as ``positions``, and log D with its turns added up.
+    """D along Re lambda = const: Im lambda/Om from 0 to 1/2 as ``positions``, and log D with its angles added up.
 
     ``ends`` are D at the first and the last position, where it is real.
     """
@@ -66,7 +76,9 @@ class ContourLine(NamedTuple):
     def zeros_beyond(self) -> int:
         """The number of zeros to the right of the line; -1 if it is undecided."""
         turned = -float(self.logs[-1].imag) / np.pi
-        # D is real at both ends: a number that is far from whole says that a turn of D was missed.
+        # With all orders D is real at both ends, and it has turned by a whole number of half circles. A number that is
+        # far from whole says that orders are left out that matter. (Whether a turn was missed it cannot say: ``_line``
+        # sees to that.)
         if abs(turned - round(turned)) >= 0.25:
             return -1
         return round(turned)
@@ -190,11 +202,14 @@ class Hill:
         g = _of_pairs(self.compliance.at(orders[high] * self.omega), acting)
         rows = np.repeat(high, pairs)
         inner = _plus_one(g, jacobian[np.ix_(rows, rows)])
-        moved = np.linalg.solve(inner, _plus_one(g, jacobian[np.ix_(rows, ~rows)], 0.0))
+        moved = np.linalg.solve(inner, _product(g, jacobian[np.ix_(rows, ~rows)]))
         return jacobian[np.ix_(~rows, ~rows)] - jacobian[np.ix_(~rows, rows)] @ moved
 
     def _line(self, series: ForceSeries, growth: float) -> ContourLine:
-        """D on Re lambda = ``growth`` Om, so finely that no turn of it is missed."""
+        """D on Re lambda = ``growth`` Om, so finely that it turns by ``TURN`` at most from one position to the next.
+
+        Where a zero is so near to the line that the finest interval does not resolve it, it is counted on either side.
+        """
         # D varies over the distance from the line to the poles, which are those of the modes of a finite system.
         intervals = COARSE
         if self.finite:
@@ -258,8 +273,7 @@ class Hill:
         if count < 0:
             return None
 
-        # Fourier coefficients of log D - N log w on w = exp(-2 pi growth - i angle) are sums of powers of the zeros;
-        # Newton's identities turn these into the polynomial that vanishes at the zeros.
+        # Sums of powers by the formula of the module, with phi = ``angle``; the polynomial by Newton's identities.
         angle = 2 * np.pi * line.positions
         regular = line.logs + 1j * count * angle
         sums = [-p * trapezoid((regular * np.exp(-1j * p * angle)).real, angle) / np.pi for p in range(1, count + 1)]
@@ -324,8 +338,16 @@ def _flat(jacobian: np.ndarray) -> np.ndarray:
     return out.reshape(*several, rows * pairs, columns * pairs)
 
 
-def _plus_one(g: np.ndarray, matrix: np.ndarray, one: float = 1.0) -> np.ndarray:
+def _plus_one(g: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """1 + G J of G (..., order, pair, pair), which is diagonal in the orders, and J (..., order pair, order pair)."""
+    out = _product(g, matrix)
+    diagonal = np.arange(out.shape[-1])
+    out[..., diagonal, diagonal] += 1.0
+    return out
+
+
+def _product(g: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """G J of G (..., order, pair, pair), which is diagonal in the orders, and J (..., order pair, columns)."""
     count, pairs = g.shape[-3:-1]
     rows = matrix.reshape(*matrix.shape[:-2], count, pairs, -1)
     # Products of matrices by BLAS pay for many pairs alone.
@@ -333,7 +355,4 @@ def _plus_one(g: np.ndarray, matrix: np.ndarray, one: float = 1.0) -> np.ndarray
         product = np.einsum("...kij,...kjn->...kin", g, rows)
     else:
         product = np.matmul(g, rows)
-    product = product.reshape(*product.shape[:-3], count * pairs, -1)
-    diagonal = np.arange(min(product.shape[-2:]))
-    product[..., diagonal, diagonal] += one
-    return product
+    return product.reshape(*product.shape[:-3], count * pairs, -1)
