@@ -151,7 +151,7 @@ def test_the_entropy_moves_with_the_field():
 def test_snapshots_do_not_see_each_other():
     signal = scattering_run()
     local, weight = local_entropy(signal)
-    # Eight are transformed together: the first one falls on all places of such a chunk.
+    # They are transformed together: the first one falls on many places of such a chunk.
     for first in (1, 4, 7, 11):
         late_local, late_weight = local_entropy(signal[first:])
         assert np.array_equal(local[first:], late_local)

@@ -14,24 +14,27 @@ Averages are taken from the linear wave's arrival on. A plain mean over all poin
 count in it as much as the others.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import kernel, njit
 from vipetsc.spectra.wavelet import padded_length, transform_filters
 
 # The paper's: wavenumbers of the nodes, and centre wavenumber of the wavelets.
 NODES = 60
 KC = 12.0
-# Snapshots that are transformed together, and nodes that are filtered together. Of 300 cells 4 of either take a tenth
-# longer, 2 of either a quarter to twice as long, and 16 gain a tenth and take twice the memory.
-CHUNK = 8
+# Snapshots that are transformed together, and nodes that are filtered together: of 300 cells such an array just fits
+# into a core's cache. With 8 snapshots 10 % slower, with 32 the same; with 16 nodes and 32 snapshots half as fast.
+CHUNK = 16
 GROUP = 8
+# Operations of a matrix product that take as long as one of a fast transform, taken from below: 4 were measured.
+PRODUCT_GAIN = 3
 # Snapshots in which the largest weight is sought, those of most energy over as many cells. In the built-in run 2 and 32
 # find the same one.
 STRONGEST = 8
@@ -137,15 +140,8 @@ def local_entropy(velocity: np.ndarray, stride: int = 1) -> tuple[np.ndarray, np
 
         total, s_log_s = np.zeros((2, len(signal), local.shape[1]))
         for octave in _octaves(cells, stride):
-            spectrum = fft.rfft(signal, octave.length * stride)
-            for group in octave.groups:
-                x = np.zeros((len(signal), len(group[0].values), octave.length), dtype=complex)
-                for part in group:
-                    # Folded onto the length: wavenumbers a whole number of lengths apart look the same at every
-                    # ``stride``-th cell.
-                    start = part.band.start % octave.length
-                    _filter(spectrum[:, part.band], part.values, x[:, :, start : start + part.values.shape[1]])
-                _accumulate(fft.ifft(x, overwrite_x=True), total, s_log_s)
+            for x in octave.transforms(signal):
+                _accumulate(x, total, s_log_s)
 
         _entropies(total, s_log_s, local[rows])
         weight[rows] = np.ldexp(total, 2 * exponent[:, None])
@@ -159,31 +155,98 @@ class _FilterPart(NamedTuple):
     values: np.ndarray
 
 
-class _Octave(NamedTuple):
-    """An octave of nodes: the ``length`` of its transforms, and its filters in groups, each cut into parts."""
+class _FastOctave(NamedTuple):
+    """An octave of nodes whose wavelet transforms are fast Fourier transforms.
 
+    ``padded`` and ``length`` are the lengths of the transforms of signals, and of those at every ``stride``-th cell;
+    the filters of the nodes are in ``groups``, each cut into parts.
+    """
+
+    padded: int
     length: int
     groups: list[list[_FilterPart]]
 
+    def transforms(self, signal: np.ndarray) -> Iterator[np.ndarray]:
+        """X (t, kappa, cell) at every ``stride``-th cell of the padded ``signal`` (t, cell), group by group."""
+        spectrum = fft.rfft(signal, self.padded)
+        for group in self.groups:
+            x = np.zeros((len(signal), len(group[0].values), self.length), dtype=complex)
+            for part in group:
+                # Folded onto the length: wavenumbers a whole number of lengths apart look the same at every
+                # ``stride``-th cell.
+                start = part.band.start % self.length
+                _filter(spectrum[:, part.band], part.values, x[:, :, start : start + part.values.shape[1]])
+            yield fft.ifft(x, overwrite_x=True)
+
+
+class _NarrowOctave(NamedTuple):
+    """An octave of nodes that let so few wavenumbers through that matrix products take less time than transforms.
+
+    ``waves`` (cell, 2 k) are the real and imaginary parts of exp(-i k x) in turn, ``filters`` (kappa, k) those of the
+    nodes, ``waves_back`` (k, cell) are exp(i k x) at every ``stride``-th cell. The wavenumbers k are those of the
+    padded line, so that the sums are its Fourier transforms.
+    """
+
+    waves: np.ndarray
+    filters: np.ndarray
+    waves_back: np.ndarray
+
+    @classmethod
+    def of(cls, filters: np.ndarray, padded: int, cells: int, stride: int) -> Self:
+        """The octave with these ``filters`` (kappa, k) on a line of ``padded`` cells."""
+        inside = np.flatnonzero(_lets_through(filters))
+        # Of whole turns nothing is left, so that no digits are lost in them.
+        turns = np.outer(np.arange(cells), inside) % padded / padded
+        waves = np.exp(-2j * np.pi * turns)
+        return cls(
+            waves=waves.view(float),
+            filters=filters[:, inside] * (stride / padded),
+            waves_back=np.ascontiguousarray(waves[::stride].conj().T),
+        )
+
+    def transforms(self, signal: np.ndarray) -> Iterator[np.ndarray]:
+        """X (t, kappa, cell) at every ``stride``-th cell of the ``signal`` (t, cell), of all nodes."""
+        # The rounding of a product depends on the number of its rows. It has always as many, so that snapshots have the
+        # same bits among any others.
+        rows = np.zeros((CHUNK, signal.shape[1]))
+        rows[: len(signal)] = signal
+        spectrum = (rows @ self.waves)[: len(signal)].view(complex)
+        filtered = spectrum[:, None] * self.filters
+        yield filtered @ self.waves_back
+
 
 @lru_cache(maxsize=8)
-def _octaves(cells: int, stride: int) -> list[_Octave]:
+def _octaves(cells: int, stride: int) -> list[_FastOctave | _NarrowOctave]:
     """The octaves of the nodes; a transform's length is the padded one, which the lowest node sets, over ``stride``."""
     kappa = np.pi * np.arange(1, NODES + 1) / NODES
-    octaves = []
+    octaves: list[_FastOctave | _NarrowOctave] = []
     # Wavelets of higher nodes are shorter: the transforms of an octave need the room of its lowest node alone.
     for number in range(int(np.log2(NODES)) + 1):
         nodes = kappa[2**number - 1 : 2 ** (number + 1) - 1]
         length = fft.next_fast_len(-(-padded_length(cells, KC, nodes[0]) // stride))
-        filters = transform_filters(nodes, KC, length * stride) / stride
-        groups = [_parts(filters[first : first + GROUP], length) for first in range(0, len(nodes), GROUP)]
-        octaves.append(_Octave(length=length, groups=groups))
+        padded = length * stride
+        filters = transform_filters(nodes, KC, padded) / stride
+
+        # Additions and multiplications for one snapshot, by products and by transforms.
+        width = np.count_nonzero(_lets_through(filters))
+        in_products = 4 * width * cells + 8 * width * len(nodes) * -(-cells // stride)
+        in_transforms = 2.5 * padded * np.log2(padded) + 5 * len(nodes) * length * np.log2(length)
+        if in_products < PRODUCT_GAIN * in_transforms:
+            octaves.append(_NarrowOctave.of(filters, padded, cells, stride))
+        else:
+            groups = [_parts(filters[first : first + GROUP], length) for first in range(0, len(nodes), GROUP)]
+            octaves.append(_FastOctave(padded=padded, length=length, groups=groups))
     return octaves
+
+
+def _lets_through(filters: np.ndarray) -> np.ndarray:
+    """Whether any of the ``filters`` (kappa, k) lets something through, by wavenumber (k)."""
+    return np.asarray(filters.max(axis=0) > np.finfo(float).eps * filters.max())
 
 
 def _parts(filters: np.ndarray, length: int) -> list[_FilterPart]:
     """The bands where any of the ``filters`` (kappa, k) lets something through, cut at multiples of ``length``."""
-    inside = np.flatnonzero(filters.max(axis=0) > np.finfo(float).eps * filters.max())
+    inside = np.flatnonzero(_lets_through(filters))
     parts = []
     for cut in range(inside[0] // length * length, inside[-1] + 1, length):
         band = slice(max(inside[0], cut), min(inside[-1] + 1, cut + length))
@@ -191,13 +254,16 @@ def _parts(filters: np.ndarray, length: int) -> list[_FilterPart]:
     return parts
 
 
-@njit
+@kernel
 def _filter(spectrum: np.ndarray, values: np.ndarray, x: np.ndarray) -> None:
     """Add ``spectrum`` (t, k) times the ``values`` (kappa, k) of filters to ``x`` (t, kappa, k)."""
     for t in range(x.shape[0]):
         for i in range(x.shape[1]):
             for k in range(x.shape[2]):
-                x[t, i, k] += spectrum[t, k] * values[i, k]
+                z = spectrum[t, k]
+                value = values[i, k]
+                # Part by part: a real factor would be multiplied as a complex one, which takes longer.
+                x[t, i, k] += complex(z.real * value, z.imag * value)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
