@@ -97,6 +97,14 @@ def test_fewer_cells_have_the_entropy_that_they_have_among_all(stride):
         assert getattr(thinned, name) == pytest.approx(getattr(whole, name), rel=1e-3)
 
 
+@pytest.mark.parametrize("stride", [2, 3])
+def test_long_waves_keep_their_weight_at_fewer_cells(stride):
+    signal = packet(300.0, kappa=0.1)[None]
+    _, whole_weight = local_entropy(signal)
+    _, weight = local_entropy(signal, stride)
+    assert weight == pytest.approx(whole_weight[:, ::stride], rel=1e-6, abs=1e-9 * whole_weight.max())
+
+
 def test_the_mask_is_relative_to_the_largest_weight_of_all_snapshots():
     # The loudest snapshot is not among every second one.
     signal = scattering_run()
