@@ -41,7 +41,7 @@ class SearchSpace:
         return np.clip(values, [v.low for v in self.variables], [v.high for v in self.variables])
 
     def to_unit(self, values: np.ndarray) -> np.ndarray:
-        """The point in the unit cube (variable) of ``values``."""
+        """The point (variable,) in the unit cube that stands for ``values`` (variable,)."""
         return np.array([variable.to_unit(x) for x, variable in zip(values, self.variables, strict=True)])
 
     def from_unit(self, point: np.ndarray) -> np.ndarray:

@@ -240,7 +240,10 @@ def impact_time(site: Any, speed: float) -> float:
 
 @kernel
 def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[float, float]:
-    """Force on the host in N and dissipated power in W of site ``i`` in its present mode, at w in m and w' in m/s."""
+    """Force on the host in N and dissipated power in W of site ``i`` in its present mode, at w in m and w' in m/s.
+
+    ``contacts`` (site,) are of dtype ``SITE``; ``rate`` is w'.
+    """
     site = contacts[i]
     if site.mode == FREE:
         return 0.0, 0.0

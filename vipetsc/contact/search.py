@@ -100,7 +100,10 @@ def _count_changes(c: np.ndarray) -> int:
 
 @allocating
 def first_upcrossing(b: np.ndarray) -> float:
-    """Smallest s in [0, 1] at which the polynomial ``b`` (n <= 6,) turns positive; 2 if it never does."""
+    """Smallest s in [0, 1] at which a polynomial turns positive; 2 if it never does.
+
+    ``b`` (n,), n <= 6, are its Bernstein coefficients. Method: see the package's docstring.
+    """
     # Nearly every call ends here: what follows allocates.
     if b[0] > 0.0:
         return 0.0
@@ -148,7 +151,11 @@ def first_upcrossing(b: np.ndarray) -> float:
 
 @allocating
 def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
-    """``first_upcrossing``, where a start within ``tolerance`` of zero has just landed and is itself no crossing."""
+    """Smallest s in [0, 1] at which a polynomial turns positive, but for its start; 2 if it never does.
+
+    ``b`` (n,), n <= 6, are its Bernstein coefficients. A start within ``tolerance`` of zero has just been landed on,
+    and is itself no crossing.
+    """
     if abs(b[0]) > tolerance:
         return first_upcrossing(b)
     # The polynomial without its value at 0, divided by s: the root at the start is gone, all others stay.

@@ -72,7 +72,7 @@ def with_room(tracks: Tracks) -> Tracks:
 
 @njit(error_model="numpy")
 def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extremes) -> None:
-    """Update the open episode of site ``i`` with the extremes ``reached`` in an interval of time."""
+    """Update the open episode of site ``i`` of ``contacts`` (site,) with the extremes ``reached`` in an interval."""
     track = tracks.sites[i]
     site = contacts[i]
     episode = track.episode
@@ -130,8 +130,9 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
 def rest_site(contacts: np.ndarray, tracks: Tracks, i: int, motion: np.ndarray, energies: np.ndarray, t: float) -> bool:
     """Let site ``i`` rest in contact if it touches a stop without clearance; whether it does. The log must have room.
 
-    Otherwise as ``switch_sites``. Motion below the tolerance of a landing can ask for one landing after the other at
-    the same time: the force of a site at rest needs none.
+    ``contacts`` (site,) are of dtype ``SITE``; ``motion`` (site, 3) has w, w' and w'' at the time ``t`` in s, and
+    ``energies`` (site,) in J are what sites have dissipated. Motion below the tolerance of a landing can ask for one
+    landing after the other at the same time: the force of a site at rest needs none.
     """
     site = contacts[i]
     side = resting_side(site)
@@ -199,7 +200,10 @@ def _set_mode(contacts: np.ndarray, tracks: Tracks, i: int, mode: int, rate: flo
 
 @kernel
 def shortest_impact(contacts: np.ndarray) -> float:
-    """The smallest ``impact_time`` in s of the sites in contact, of the approach of each; inf if there is none."""
+    """The smallest ``impact_time`` in s of the ``contacts`` (site,) that are closed; inf if none is.
+
+    Each has the time of an impact at its approach velocity.
+    """
     shortest = np.inf
     for i in range(contacts.size):
         if abs(contacts[i].mode) in (CLOSED, CLIPPED):
@@ -291,13 +295,19 @@ class ImpactTracker:
         return switch_sites(self.contacts, self.tracks, self.start, energies, t)
 
     def rest(self, number: int, t: float, energies: np.ndarray) -> None:
-        """Let the site of that ``number`` in the log rest in contact, if it is here; otherwise as ``switch``."""
+        """Let the site of that ``number`` in the log rest in contact at ``t`` in s, if it is here.
+
+        ``energies`` (sites,) are the dissipated energies in J; the motion is that in ``start``.
+        """
         self.tracks = with_room(self.tracks)
         for i in np.flatnonzero(self.tracks.sites["number"] == number):
             rest_site(self.contacts, self.tracks, i, self.start, energies, t)
 
     def take_episodes(self, energies: np.ndarray, unfinished: bool = False) -> np.ndarray:
-        """Episodes closed since the last call, and ``unfinished`` ones as they are; ``energies`` as in ``switch``."""
+        """Episodes (episode,) of dtype ``EPISODE`` closed since the last call, and ``unfinished`` ones as they are.
+
+        ``energies`` (sites,) are the dissipated energies in J.
+        """
         closed = self.tracks.log[: self.tracks.closed[0]].copy()
         self.tracks.closed[:] = 0
         if not unfinished:
@@ -316,7 +326,7 @@ class ImpactTracker:
         return sites
 
     def restore(self, table: np.ndarray) -> None:
-        """Go back to a checkpoint, the ``table`` of all sites by their numbers."""
+        """Go back to a checkpoint, the ``table`` (site,) of dtype ``TRACKED`` of all sites by their numbers."""
         numbered = self.tracks.sites["number"] >= 0
         sites = table[self.tracks.sites["number"][numbered]]
         self.tracks.sites[numbered] = sites

@@ -143,7 +143,10 @@ def measure(y: np.ndarray, lattice: LatticeRecord, unit: float, sums: np.ndarray
 
 @kernel
 def add_energy(sums: np.ndarray, energy: float, unit: float) -> None:
-    """Add an ``energy`` in J to the springs' in the ``sums`` of ``measure``."""
+    """Add an ``energy`` in J to that of the springs.
+
+    ``sums`` (energy, 2) are multiples of ``unit`` in J and of unit/2^40, as ``measure`` fills them.
+    """
     _add_one(sums, _SPRING, energy, unit)
 
 

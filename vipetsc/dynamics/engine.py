@@ -69,12 +69,16 @@ class Engine(ABC):
 
     @abstractmethod
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go back to a checkpoint, given the parts of all ranks that wrote it, in order; their number may differ."""
+        """Go back to a checkpoint, given the parts of all ranks that wrote it, in order; their number may differ.
+
+        A part has the arrays that ``checkpoint`` returned on its rank; all ranks must call it.
+        """
 
     def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Go on from a checkpoint of a run without sites, given the parts of all its ranks; sites stand at rest.
 
-        Raises NotImplementedError, on all ranks, for an engine whose ``opens`` is false; ``simulate`` asks it for none.
+        A part has the arrays that ``checkpoint`` returned on its rank. Raises NotImplementedError, on all ranks, for an
+        engine whose ``opens`` is false; ``simulate`` asks it for none.
         """
         raise NotImplementedError(f"{self.name} does not open with samples of another run")
 

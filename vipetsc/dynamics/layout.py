@@ -83,7 +83,10 @@ class Layout:
         return ((self.offsets[rank] + cells - start)[:, None] + mass_offsets).astype(PETSc.IntType)
 
     def create_vector(self, array: np.ndarray | None = None) -> PETSc.Vec:
-        """A zero state with ghosts for the neighbouring cells, in ``array`` if one is given."""
+        """A zero state with ghosts for the neighbouring cells; all ranks must call it.
+
+        It has its components in ``array`` (component,) if one is given: the rank's own, then those of the ghosts.
+        """
         indices = self.state_indices([cell for cell in self.neighbours() if cell is not None])
         indices = indices[:, : self.ghost_rows].ravel()
         # One array holds owned components and ghosts, so that compiled code reads both without a copy.
@@ -92,7 +95,10 @@ class Layout:
         return PETSc.Vec().createGhostWithArray(indices, array, size=(self.size, PETSc.DETERMINE), comm=self.comm)
 
     def losses(self, y: np.ndarray) -> np.ndarray:
-        """Energies in J that the ``contacts`` have dissipated, from the part ``y`` of the state; 0 for other ranks'."""
+        """Energies (contact,) in J that the ``contacts`` have dissipated, 0 for those that other ranks own.
+
+        ``y`` (component,) is the rank's part of the state.
+        """
         losses = np.zeros(len(self.contacts))
         losses[np.isin(self.contacts, self.sites)] = y[self.dissipated : self.size]
         return losses
@@ -121,9 +127,10 @@ class Layout:
         return {"cells": self.motion(y), "dashpots": dashpots, "work": works, "losses": losses}
 
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]], y: np.ndarray) -> None:
-        """Fill this rank's part ``y`` of the state from the checkpoints of all ranks that wrote one.
+        """Fill this rank's part ``y`` (component,) of the state from the checkpoints of all ranks that wrote one.
 
-        Sites that these do not name have dissipated nothing.
+        Each has the arrays of ``checkpoint``, ``cells`` (cell, 2 dofs) first. Sites that they do not name have
+        dissipated nothing.
         """
         rows = y[: self.rows * self.owned].reshape(self.rows, self.owned)
         at = 0
@@ -163,7 +170,7 @@ def sites_within(chain: Chain, start: int, stop: int) -> tuple[tuple[int, ...], 
 
 
 def join(checkpoints: Sequence[Mapping[str, np.ndarray]], keys: Mapping[str, str | None]) -> dict[str, np.ndarray]:
-    """The tables named in ``keys`` of all ranks' ``checkpoints``, one after the other.
+    """The tables (row,) named in ``keys`` of all ranks' ``checkpoints``, one after the other.
 
     ``keys`` gives the field by which the rows of a table are put in order, None for the order of the ranks.
     """

@@ -85,7 +85,7 @@ class Observer:
         return {key: np.array(getattr(self, key)) for key in self.saved}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on from the data of ``checkpoint``; the engine has been restored before."""
+        """Go on from ``state``, the arrays () of ``checkpoint`` by name; the engine has been restored before."""
         for key in self.saved:
             setattr(self, key, state[key].item())
 
@@ -102,7 +102,7 @@ class Observer:
 
 
 class Guard(Observer):
-    """Raises RunawayError for a state that is not finite, or has more energy than it received."""
+    """Raises RunawayError, on all ranks, for a state that is not finite, or has more energy than it received."""
 
     name = "guard"
     saved = ("most_work",)

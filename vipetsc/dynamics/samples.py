@@ -49,9 +49,10 @@ class Samples(NamedTuple):
 
 @njit(error_model="numpy")
 def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> bool:
-    """Store the rank's part ``y`` of the state, ghosts up to date, as sample ``k``; False if it is not finite.
+    """Store the rank's part ``y`` (component,) of the state, ghosts up to date, as sample ``k``; whether it is finite.
 
-    The modes of the owned sites are those of ``contacts[rows]``.
+    ``contacts`` (site,) of dtype ``SITE`` have the modes of the sites; ``rows`` (owned site,) are those of the sites
+    that the rank owns.
     """
     shape = samples.lattice.shape
     drives = samples.lattice.drives

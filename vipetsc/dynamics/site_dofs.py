@@ -19,7 +19,10 @@ SITE_DOFS = np.dtype([("host", END), ("resonator", END), ("ledger", np.int64)])
 
 
 def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
-    """Sites of dtype ``SITE``, free or held together; a number below 0 is a site without stops."""
+    """Sites (site,) of dtype ``SITE``, free or held together, of those ``numbers`` (site,) in the lattice, from 0.
+
+    A number below 0 is a site without stops.
+    """
     numbers = np.maximum(np.asarray(numbers, np.int64), -1)
     chain = model.chain
 
@@ -77,7 +80,10 @@ def create_site_dofs(model: Model, layout: Layout, ghosts: tuple[int, int]) -> n
 
 @kernel
 def relative_motion(y: np.ndarray, site_dofs: np.ndarray, i: int) -> tuple[float, float]:
-    """w = u_resonator - u_host in m of site ``i`` in the state ``y``, and w' in m/s."""
+    """w = u_resonator - u_host in m of site ``i`` in the state ``y`` (component,), and w' in m/s.
+
+    ``site_dofs`` (site,) are of dtype ``SITE_DOFS``.
+    """
     host, resonator = site_dofs[i].host, site_dofs[i].resonator
     if host.u < 0:
         return y[resonator.u], y[resonator.v]

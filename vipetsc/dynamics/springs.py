@@ -95,7 +95,11 @@ def _varied_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass:
 
 @kernel
 def spring_acceleration(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
-    """Acceleration in m/s^2 of one mass by its springs and dashpots; the sums of the chunked loops, bit for bit."""
+    """Acceleration in m/s^2 of one mass of an owned ``cell`` by its springs and dashpots.
+
+    ``y`` (component,) is the rank's part of the state, with ghosts. The sums are those of the chunked loops, bit for
+    bit.
+    """
     if is_varied(lattice):
         return _varied_acceleration(y, lattice, cell, mass)
 
@@ -196,7 +200,10 @@ def _elongation(y: np.ndarray, lattice: LatticeRecord, s: int, cell: int) -> flo
 
 @kernel
 def nonlinear_force_on(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
-    """Force in N on one mass by the parts of its springs that are not linear."""
+    """Force in N on one mass of an owned ``cell`` by the parts of its springs that are not linear.
+
+    ``y`` (component,) is the rank's part of the state, with ghosts.
+    """
     total = 0.0
     for s in range(lattice.nonlinear.size):
         coupling = lattice.nonlinear[s]
@@ -208,7 +215,10 @@ def nonlinear_force_on(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: i
 
 @kernel
 def add_nonlinear_energies(y: np.ndarray, lattice: LatticeRecord, first: int, energies: np.ndarray) -> None:
-    """Add energies of springs beyond their linear parts, in the cells from ``first`` on and to a wall on the left."""
+    """Add energies in J of springs beyond their linear parts to ``energies`` (cell,), of the cells from ``first`` on.
+
+    ``y`` (component,) is the rank's part of the state, with ghosts. A spring to a wall on the left is the first cell's.
+    """
     for s in range(lattice.nonlinear.size):
         coupling = lattice.nonlinear[s]
         for i in range(energies.size):
@@ -223,10 +233,11 @@ def add_nonlinear_energies(y: np.ndarray, lattice: LatticeRecord, first: int, en
 def add_squares(
     y: np.ndarray, lattice: LatticeRecord, first: int, half: int, values: np.ndarray, sums: np.ndarray
 ) -> None:
-    """Add to ``sums`` those over the springs of the cells from ``first`` on of a value times the stretch squared.
+    """Add to ``sums`` (cell,), of cells from ``first`` on, a value times the stretch squared of each of their springs.
 
-    ``values`` is the table ``stiffness`` with ``half`` 0, or ``damping`` with ``half`` = dofs: of velocities. A spring
-    to a wall on the left is the first cell's.
+    ``y`` (component,) is the rank's part of the state, with ghosts. ``values`` (spring and cell,) is the lattice's
+    table ``stiffness`` in N/m with ``half`` 0, or ``damping`` in N s/m with ``half`` = dofs: the stretch is then that
+    of velocities. A spring to a wall on the left is the first cell's.
     """
     shape = lattice.shape
     n = lattice.shape.cells
@@ -253,7 +264,10 @@ def add_squares(
 
 @kernel
 def damping_powers(y: np.ndarray, lattice: LatticeRecord, powers: np.ndarray) -> None:
-    """Power in W that the dashpots of each owned cell dissipate."""
+    """Put the power in W that the dashpots of each owned cell dissipate into ``powers`` (cell,).
+
+    ``y`` (component,) is the rank's part of the state, with ghosts.
+    """
     n = lattice.shape.cells
     d = lattice.shape.dofs
     # c (v_other - v)^2 of the dashpots parallel to springs, then c v^2 of those to the ground.

@@ -229,9 +229,9 @@ def note(axes: Axes, text: str, at: Sequence[float], shift: tuple[float, float],
 def shade_regions(axes: Axes, energy: np.ndarray, region: np.ndarray, left: float, at_top: bool) -> None:
     """Shade the regions I-IV of a branch (``modes.branches.regions``) on the axis of energy, and name them.
 
-    ``energy`` (J) and ``region`` (1-4) are those of the branch's points. Each region is shaded from where the one below
-    it ends, the first from ``left`` above 0, to the largest energy of its points; a region without points above the one
-    below is left out. Names are at the top or the bottom of the panel.
+    ``energy`` (point,) in J and ``region`` (point,), 1 to 4, are those of the branch. Each region is shaded from where
+    the one below it ends, the first from ``left`` above 0, to the largest energy of its points; a region without points
+    above the one below is left out. Names are at the top or the bottom of the panel.
     """
     height = 0.985 if at_top else 0.015
     look = {"ha": "center", "va": "top" if at_top else "bottom", "color": style.GREY}

@@ -40,7 +40,7 @@ class DampedPoint(NamedTuple):
 
 
 def damped_bloch(cell: UnitCell, kappa: ArrayLike) -> DampedPoint:
-    """The waves of ``cell`` at real wavenumbers ``kappa`` in rad per cell, from the eigenvalues of the state."""
+    """The waves of ``cell`` at real wavenumbers ``kappa`` (...) in rad per cell, from the eigenvalues of the state."""
     kappa = np.asarray(kappa, float)
     d = cell.dofs
     inverse = 1 / np.asarray(cell.masses)[:, None]

@@ -91,7 +91,7 @@ class ToneBurst:
         return np.where((t > 0) & (t < self.duration), burst, 0.0)
 
     def spectrum(self, frequency: ArrayLike) -> np.ndarray:
-        """Fourier transform in N s at ``frequency`` w in rad/s: the integral of F(t) exp(-i w t)."""
+        """Fourier transform (...) in N s at ``frequency`` (...) w in rad/s: the integral of F(t) exp(-i w t)."""
         w = np.asarray(frequency, float) * (1 + 1e-7j)  # off the poles, which the first factor cancels
         lines = {self.frequency * (1 + k / self.cycles): 1 - 1.5 * abs(k) for k in (-1, 0, 1)}
         sines = sum(factor * line / (line**2 - w**2) for line, factor in lines.items())

@@ -68,7 +68,8 @@ class CellSearch:
 def search_cells(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: ArrayLike) -> CellSearch:
     """Solve the Bloch problem of every four-band cell of the grid ``lam`` x ``eta`` at every ``wavenumber``.
 
-    Raises ValueError if a lambda is not positive or an eta not between 0 and 1: at eta = 1 the host has no mass left.
+    ``lam`` and ``eta`` (value,) have no unit, ``wavenumber`` (kappa,) is in rad per cell. Raises ValueError if a lambda
+    is not positive or an eta not between 0 and 1: at eta = 1 the host has no mass left.
     """
     lams, etas, kappa = (np.atleast_1d(np.asarray(values, float)) for values in (lam, eta, wavenumber))
     frequency = []

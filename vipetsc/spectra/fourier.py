@@ -90,7 +90,11 @@ class CellWindow(NamedTuple):
 def dispersion(
     velocity: np.ndarray, masses: ArrayLike, interval: float, *, tapers: tuple[float, float] = (TAPER, TAPER)
 ) -> Dispersion:
-    """The `dispersions` of all cells, with flanks over the fractions ``tapers`` of the record and of the cells."""
+    """The `dispersions` of all cells of a ``velocity`` (time, cell, dof) in m/s.
+
+    ``masses`` (dof,) are in kg, the ``interval`` of samples in s. Flanks take the fractions ``tapers`` of the record
+    and of the cells.
+    """
     (spectrum,) = dispersions(velocity, masses, interval, [CellWindow(taper=tapers[1])], in_time=tapers[0])
     return spectrum
 

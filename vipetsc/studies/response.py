@@ -136,7 +136,10 @@ class Burst:
         return np.asarray(np.fft.rfft(w * np.exp(-self.decay * self.time), self.padded))
 
     def envelope(self, spectrum: np.ndarray, middle: float, half: float) -> np.ndarray:
-        """a(t) of the part Re a exp(i middle t) of a signal within ``half`` of ``middle``."""
+        """a(t) (time,) of the part Re a exp(i middle t) of a signal within ``half`` of ``middle``, both in rad/s.
+
+        ``spectrum`` (omega,) is the signal's.
+        """
         part = np.zeros(self.padded, complex)
         part[: len(self.omega)] = np.where(np.abs(self.omega - middle) < half, 2 * spectrum, 0)
         return np.asarray(np.fft.ifft(part)[: len(self.time)] * np.exp((self.decay - 1j * middle) * self.time))

@@ -3,11 +3,25 @@
 A step (sec. 4 of the derivation in the package's docstring) is a chain of substeps: collocate one of a length that
 seems right (sec. 3), search it for the first time at which a site changes its mode, and if there is one, repeat the
 substep so that it ends there, since the force law inside a substep must be smooth. Then judge its error, take it or try
-a shorter one. ``advance_cluster`` returns at each change, at which ``forces`` switches the site, and at the end of the
-step. While no site is closed, no drive is on and there is no nonlinear spring, the motion is a polynomial and the
-cluster goes to its first onset at once (sec. 2).
+a shorter one. ``advance_cluster`` returns at each change, where its caller ``forces.follow_contacts`` switches the
+site, and at the end of the step. While no site is closed, no drive is on and there is no nonlinear spring, the motion
+is a polynomial and the cluster goes to its first onset at once (sec. 2). Contacts that touch or are pressed at rest,
+of mode ``PERMANENT``, change no mode; substeps end where they open or close, too (``kinks``).
 
-Substeps also end where a contact that touches or is pressed at rest opens or closes (``kinks``).
+Positions and lengths are in units of the step H: a substep's ``length``, a cluster's ``position``. The ``position`` of
+a change is a fraction of the substep that was searched. 2 stands for none, since no position exceeds 1.
+
+**Blind substeps.** Rounding may show the search a change at the very start of a substep, where the site has just
+landed, though its switching function does not rise there. That is no change, but a search of any substep from there
+would find it again. The next substep is therefore taken without a search, and so short (``BLIND``) that a site which
+does change in it is found beyond its switching point at the start of the one after.
+
+**Rest.** A site whose stop has no clearance can come to the stop again before it has left the tolerance of its last
+landing: the front of a wave passes through all magnitudes below that tolerance, and each of its roots would be landed
+on and switched. Such a landing leads nowhere, and so does a change at the very start that is none. The first one in a
+step may be an accident of rounding. From the second one on (``may_rest``) the site is to rest instead: the advance ends
+with ``RESTS`` in place of ``CHANGED``, because any mode that the site could be switched to would ask for the next such
+landing at once. ``vipetsc.contact`` says what force a site at rest has and when it leaves.
 """
 
 import numpy as np
@@ -35,28 +49,31 @@ from vipetsc.dynamics.propagator.taylor import ROUNDING, copy, first_onset, shif
 DONE, CHANGED, RESTS, FAILED = range(4)
 
 # None of the numbers below is sharp. On the built-in case up to 0.5 s (5,200 substeps tried with Hertz's law, 960 of
-# them rejected; 3,000 and 80 with the bilinear one) each may be halved or doubled, ``SAFETY`` be 0.8 or 0.95, and
-# substeps change by 5 % at most. The error against a tolerance of 1e-13 stays where rounding scatters it, 2e-12 to
-# 4e-11 of the largest displacement, with the bilinear law, whose slope jumps, 3e-9 to 3e-8.
+# them rejected; 3,000 and 80 with the bilinear one) each was halved and doubled, and ``SAFETY`` set to 0.8 and 0.95.
+# The number of substeps changes by 5 % at most, but for half of ``DRIVEN``, which doubles the drive's own 920 substeps;
+# ``MOST_SUBSTEPS`` and ``SHORTEST`` change no digit. Displacements differ from those of a run with rtol = 1e-13 by
+# 2e-12 to 4e-11 of the largest one, with the bilinear law by 3e-9 to 3e-8, whichever number is varied. So do runs with
+# rtol = 1e-12 to 3e-14 from one another: impacts amplify rounding, with that law from 2e-13 at .25 s to 1e-8 at .5 s.
 #
-# Substeps of one step beyond which a cluster counts as stalled: nearly a thousand times what the built-in case takes at
-# most, 18, or 22 at 1000 N.
+# Substeps from one change to the next beyond which a cluster counts as stalled: nearly a thousand times what the
+# built-in case takes in a whole step at most, 18, or 22 at 1000 N. ``forces.MOST_CHANGES`` bounds the changes.
 MOST_SUBSTEPS = 20_000
 # Longest substep where sites are searched for changes, in radians of the sum of the highest frequencies of lattice and
-# drives, a bound of all rates: the quintic that the search sees misses (omega h)^6/46080 of an oscillation's amplitude,
-# 9e-8 at this length.
+# drives: the quintic that the search sees misses (omega h)^6/46080 of an oscillation's amplitude, 9e-8 at this length.
+# A contact may be stiffer and faster than that. Its substeps are bounded by their error; what the quintic misses of
+# them can hide two changes that follow each other closely, but no change is placed by it: landings are on the motion.
 SEARCHED = 0.4
 # ... and without sites: nothing is searched, and eight nodes integrate a drive's sine over 1.25 rad to rounding.
 DRIVEN = 1.25
 # Longest substep of a contact in ages of the contact. Hertz's force goes as the power 3/2 of the age: plain nodes
 # integrate that over 1.5 ages to 3e-14 of it, over 3 ages to 1e-11.
 MOST_AGES = 1.5
-# A contact is new below this fraction of its duration.
+# A contact is new up to an age of this fraction of the duration in s that was predicted at its onset (``impact_time``).
 NEW = 1e-7
 # Longest substep, as a fraction of the step, that is taken without a search for changes.
 BLIND = 1e-7
 # Shortest substep, as a fraction of the step, that is rejected for its error, cut at a kink, or halved because a
-# contact both begins and ends in it.
+# contact both begins and ends in it. A shorter one is taken as it is: that ends the search for an allowed length.
 SHORTEST = 1e-9
 # Order by which the substep follows its error: the last coefficients fall as h^6 and h^7, and the error is their sum
 # times the substep's length. Of the orders 7 and 8 the higher one changes the length less.
@@ -67,7 +84,8 @@ LEAST_GROWTH = 0.2
 MOST_GROWTH = 2.0
 # A substep that could not be collocated is repeated at this fraction of its length.
 CUT = 0.4
-# Landings go on to this fraction of their tolerance, the rounding of w, as long as Newton's steps help.
+# A landing is good within its tolerance, 1e-10 of the clearance. Newton's steps go on as long as they help, to this
+# fraction of the tolerance, which is the rounding of w.
 LANDING_GOAL = 1e-4
 
 
@@ -76,6 +94,7 @@ def _advance_freely(cluster: Cluster) -> int:
     """Go to the first onset, or to the end of the step, while no force acts."""
     state = cluster.state[0]
     remaining = 1.0 - state.position
+    # The distance to the first onset in units of H, 2 if there is none.
     first = 2.0
     for i in range(cluster.contacts.size):
         first = min(first, first_onset(cluster.taylor[i], cluster.contacts[i], remaining))
@@ -92,7 +111,11 @@ def _advance_freely(cluster: Cluster) -> int:
 
 @inlined
 def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
-    """The next substep: as long as its error allows, to where a drive is not smooth, short while a contact is young."""
+    """The next substep: as long as its error allows, and not beyond a point where a drive is not smooth.
+
+    While a contact is young its force is a root of time: nodes of the kind ``ONSET`` follow it from the onset on, plain
+    ones over ``MOST_AGES`` of its age.
+    """
     state = cluster.state[0]
     sites = cluster.contacts
     highest = 0.0
@@ -103,6 +126,7 @@ def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
     if sites.size > 0:
         radians = SEARCHED
     length = min(1.0 - state.position, state.length, radians / fastest)
+    # ``active`` has the closed sites, then the springs, then the drives that are on.
     for j in range(trial.closed.size + trial.springs.size, trial.active.size):
         end = drive_end(cluster.drives, trial.active[j], state.begin, cluster.interval, state.position)
         length = min(length, end - state.position)
@@ -113,6 +137,8 @@ def _choose_substep(cluster: Cluster, trial: Trial) -> Substep:
         if not begins_linearly(sites[i].elastic) and abs(sites[i].mode) == CLOSED:
             age = (state.begin - cluster.history[i].onset) / cluster.interval + state.position
             if age * cluster.interval <= NEW * cluster.history[i].duration:
+                # These nodes suit this contact at any length. Of another one that is young as well only the error of
+                # the substep is a bound.
                 return Substep(ONSET, longest)
             length = min(length, MOST_AGES * age)
     return Substep(PLAIN, length)
@@ -126,7 +152,7 @@ def _try_substep(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
     update_taylor(cluster, trial, substep)
     state = cluster.state[0]
     # Drives are evaluated at the cluster's position, which is the substep's end for this call. Taking the length off
-    # again may leave a rounding error in it, for which comparisons of times allow (SAME_TIME).
+    # again may leave a rounding error in it, for which comparisons of times allow (``substeps.SAME_TIME``).
     state.position += substep.length
     evaluate_site_motion(cluster, trial.taylor, trial.site_motion)
     state.position -= substep.length
@@ -140,6 +166,8 @@ def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
     Returns the substep that is now in ``trial``; its length is negative if it could not be collocated.
     """
     state = cluster.state[0]
+    # The shorter substep has a slightly other motion, in which the kink may lie a little before its end: once or twice
+    # is enough. A kink that remains inside after all attempts is left to the control of the error.
     for _ in range(MOST_ATTEMPTS):
         fraction = first_kink(cluster, trial, substep.length)
         if fraction > 1.0 or fraction * substep.length < SHORTEST:
@@ -156,7 +184,8 @@ def _end_on_kink(cluster: Cluster, trial: Trial, substep: Substep) -> Substep:
 def _land(cluster: Cluster, trial: Trial, substep: Substep, change: ModeChange) -> tuple[float, bool]:
     """Repeat a substep so that it ends on a ``change``.
 
-    Returns its length, with a minus sign if it could not be collocated, and whether it ends on the change.
+    Returns its length, with a minus sign if it could not be collocated, and whether it ends on the change. Without a
+    change at its end the substep is valid all the same, and has none inside.
     """
     contacts = cluster.contacts
     site = change.site
@@ -173,7 +202,9 @@ def _land(cluster: Cluster, trial: Trial, substep: Substep, change: ModeChange) 
         end = switching(contacts, site, change.function, trial.site_motion[site])
         landing, outcome = correct(landing, end.value, end.rate * h, end.tolerance, LANDING_GOAL * end.tolerance)
         if outcome == SEARCH:
-            # A change of whichever site lies before: this site's change is then sought in what is left before it.
+            # Newton's method comes no nearer. The first change in the repeated substep, of this site or another, bounds
+            # the length on which this site's change is sought further; another's is met at the start of the next
+            # substep. If there is none, the change was a near miss of the quintic: the substep is taken up to here.
             seconds = h * landing.length
             earlier = first_change(contacts, cluster.site_motion, trial.site_motion, seconds, trial.sums.bernstein)
             if earlier.position > 1.0:
@@ -196,6 +227,7 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
     if change.position > 1.0:
         return substep, False, -1
 
+    # Of the switching functions of a closed site number 0 is that of separation (``contact.changes``).
     site = cluster.contacts[change.site]
     separates = not begins_linearly(site.elastic) and abs(site.mode) == CLOSED and change.function == 0
     if separates and substep.kind == ONSET and substep.length > SHORTEST:
@@ -216,7 +248,7 @@ def _search_and_land(cluster: Cluster, trial: Trial, substep: Substep) -> tuple[
 
 @kernel
 def _has_stayed(cluster: Cluster, trial: Trial, site: int, length: float) -> bool:
-    """Whether a ``site`` that can rest has not moved from where it had landed, in a substep of that ``length``."""
+    """Whether a ``site`` that can rest has stayed within the tolerance of a landing in a substep of that ``length``."""
     start = cluster.site_motion[site]
     # Without a length nothing was tried: the site is where it was.
     end = start
@@ -227,10 +259,11 @@ def _has_stayed(cluster: Cluster, trial: Trial, site: int, length: float) -> boo
 
 @inlined
 def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) -> bool:
-    """Set the next substep's length by the error of the one ``taken``; whether that is small enough."""
+    """Set the next substep's length by the error of the one ``taken``, its length; whether the error is allowed."""
     state = cluster.state[0]
     ratio = error_ratio(cluster, trial, taken)
     factor = min(max(SAFETY * (1.0 / max(ratio, 1e-30)) ** (1.0 / ORDER), LEAST_GROWTH), MOST_GROWTH)
+    # One of the shortest length is taken whatever its error.
     if ratio > 1.0 and taken > SHORTEST:
         state.rejected += 1
         state.length = factor * taken
@@ -246,7 +279,11 @@ def _control_length(cluster: Cluster, trial: Trial, taken: float, landed: bool) 
 
 @kernel
 def _update_extremes(cluster: Cluster, trial: Trial, i: int, seconds: float) -> None:
-    """Update the extremes of site ``i`` by a substep of so many ``seconds``."""
+    """Update the extremes of the contact of site ``i`` by a substep of so many ``seconds``.
+
+    They are the largest indentation in m and the largest and smallest force on the host in N, positive where the
+    contact pushes; the smallest one shows whether it has pulled.
+    """
     start = cluster.site_motion[i]
     end = trial.site_motion[i]
     history = cluster.history[i]

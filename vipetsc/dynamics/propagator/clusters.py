@@ -2,14 +2,26 @@
 
 A force acts on the lattice along a DoF x = c u, a relative displacement or a mass's own (sec. 2 of the derivation in
 the package's docstring). DoFs so close that one feels the other within a step form a cluster (sec. 6). Two tables hold
-all that a step must know of the lattice around them: the rows c (-A)^m, by which ``expand_free_motion`` finds the
+all that a step must know of the lattice at their place: the rows c (-A)^m, by which ``expand_free_motion`` finds the
 Taylor series of x(s) and ``apply_impulses`` adds what forces leave in the lattice (sec. 5); and the responses G of
-``create_responses``, by which one DoF moves another (sec. 3). With dashpots (sec. 7) the rows are c P_k and c Q_k, one
-for each power of time.
+``create_responses``, by which one DoF moves another (sec. 3).
 
 **Notation.** M, K and C are the matrices of masses, springs and dashpots, H the step in s, t the time from its
-beginning, s = t/H, and A = H^2 M^-1 K. Powers of A bear H^2m already; ``factors`` H^(k mod 2)/k! add what the power s^k
-lacks (see ``series``).
+beginning, s = t/H, and A = H^2 M^-1 K. From the displacements u_0 and velocities v_0 at the beginning free motion is
+
+    u(s) = sum_m (-A)^m [u_0 s^2m / (2m)! + H v_0 s^(2m+1) / (2m+1)!].
+
+Powers of A bear H^2m already; ``factors`` H^(k mod 2)/k! add what the power s^k lacks (see ``series``). With dashpots
+(sec. 7) it is
+
+    u(s) = sum_k s^k/k! (P_k u_0 + Q_k H v_0),   P_(k+1) = -Q_k H^2 M^-1 K,   Q_(k+1) = P_k - Q_k H M^-1 C,
+
+from P_0 = 1 and Q_0 = 0, and the rows are c P_k and c Q_k, two for each power of time. ``StepSeries`` says how many
+powers count (``terms``, twice as many with dashpots) and at how many cells' distance they end (``reach``).
+
+**Numbers of DoFs** are those of ``contact_dofs``: 0 to n - 1 the n sites, then the springs that are not linear, and
+-1 - i for the i-th drive. Its array has the drives last and in reverse, so that a negative number is an index from the
+end.
 
 **Rows that serve both ways** (Maxwell's reciprocity). M and K are symmetric, so that (-A)^m M^-1 is: what the force on
 x leaves in every displacement, (-A)^m M^-1 c^T, is M^-1 times the row c (-A)^m, by which x is read from every
@@ -18,7 +30,7 @@ force changes velocities alone at once; what follows is the motion from these ve
 P_k is needed. The velocity, the derivative of sum_k Q_k s^k H/k!, has the same Q_k with the factor 1/(k-1)!.
 
 **Words.** A *group* is a set of DoFs of the lattice that are solved for together, as numbers (``Groups``); a *cluster*
-is such a group on a rank that feels it, with its tables (``DofTables``). ``groups`` finds them.
+is such a group on a rank that has cells within reach of it, with its tables (``DofTables``). ``groups`` finds them.
 """
 
 from typing import NamedTuple
@@ -32,25 +44,29 @@ from vipetsc.dynamics.propagator.groups import Groups, contact_dofs
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.stencil import HaloRegions
 
-# The tables' clearances are the sites' times 1 less this: ``first_onset`` takes an approach to 1e-10 of a clearance for
-# an onset, and the sum by which a site is judged unable to touch is rounded.
+# The tables' clearances are the sites' times 1 less this. A site whose bound sum |a_k| on |w| is below the clearance is
+# not searched at all. ``first_onset`` takes an approach to 1e-10 of the clearance for an onset, and the sum is rounded:
+# ten times that much keeps both on the safe side, and hardly a site is searched for it.
 NEARLY_TOUCHING = 1e-9
 
 
 class DofTables(NamedTuple):
     """The contact DoFs of a rank, cluster by cluster, and the tables by which they and the lattice move each other.
 
-    The DoFs of cluster c are ``first[c]`` to ``first[c + 1]``: its sites, ``sites[c]`` of them, ``springs[c]`` springs
-    that are not linear, and then its driven masses. A DoF's rows span ``StepSeries.width`` cells. ``column`` (dof,) is
-    the first of these among the columns of the halo, ``owned`` (dof, cell) their numbers among the rank's cells, -1 for
-    cells of other ranks. ``clearance`` (dof,) in m is the displacement below which no force acts: the lesser of a
-    site's two, next to nothing for a spring, inf for a driven mass.
+    The DoFs of cluster c begin at ``first[c]`` and end before ``first[c + 1]``: its sites, ``sites[c]`` of them,
+    ``springs[c]`` springs that are not linear, and then its driven masses. A DoF's rows span ``StepSeries.width``
+    cells, from ``reach`` before its own on. ``column`` (dof,) is the first of these among the columns of the halo,
+    ``owned`` (dof, cell) their numbers among the rank's cells, -1 for cells of other ranks. ``clearance`` (dof,) in m
+    is the displacement below which no force acts. For a site it is the lesser of its two clearances, 0 or negative for
+    one that touches or is pressed at rest, which therefore acts in every step; for a spring the elongation below which
+    its nonlinear force is rounding; inf for a driven mass.
 
     DoFs that have equal rows share a table: ``table`` (dof,) numbers it in ``rows`` (table, mass, cell, term) and in
     ``inverse_masses`` (table, mass, cell) in 1/kg. ``factors`` (2 term,) are H^(k mod 2)/k!. With dashpots ``rows`` are
     (table, 2 mass, cell, 2 term), those of P_k before those of Q_k, and ``factors`` 1/k! and then H/k!.
 
-    ``ledger`` lists the DoFs whose energy is kept in the rank's part of the state.
+    ``ledger`` lists the DoFs whose energies the rank's part of the state contains, in the order in which it does: the
+    works of the rank's drives, then what its sites have dissipated.
     """
 
     column: np.ndarray
@@ -67,12 +83,16 @@ class DofTables(NamedTuple):
 
 
 def groups_within_reach(groups: Groups, dofs: np.ndarray, reach: int, layout: Layout) -> Groups:
-    """The ``groups`` of which a DoF lies within ``reach`` of the rank's cells; ``dofs`` are theirs, in their order."""
+    """The ``groups`` of which a DoF lies within ``reach`` cells of the rank's.
+
+    ``dofs`` (dof,) are the records of ``contact_dofs`` of ``groups.numbers``, in that order.
+    """
     # On a ring a DoF also stands one turn before and one turn after its own place.
     turns: tuple[int, ...] = (0,)
     if layout.periodic:
         turns = (-layout.cells, 0, layout.cells)
     near = np.zeros(len(dofs), bool)
+    # "last" is a DoF's last cell, ``stop`` the cell behind the rank's last one.
     for turn in turns:
         near |= (dofs["last"] + turn >= layout.start - reach) & (dofs["cell"] + turn < layout.stop + reach)
 
@@ -90,7 +110,8 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     # Cells that a form has weights for: 2 if forces join cells, else 1.
     span = dofs["form"].shape[1]
 
-    # DoFs of equal form share a table where their cells have equal rows, those of one representative.
+    # DoFs of equal form have one table in common where their cells have equal rows. ``representatives`` gives the first
+    # cell with the rows of each.
     form_cells = np.stack([dofs["cell"], dofs["last"] % layout.cells][:span], axis=1)
     weights = dofs["form"].reshape(len(dofs), span * layout.dofs)
     representatives = series.representatives(form_cells.ravel()).reshape(form_cells.shape)
@@ -98,7 +119,8 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     cells = kinds[:, :span].astype(np.int64)
     forms = kinds[:, span:].reshape(len(kinds), span, layout.dofs)
 
-    # Masses around a representative are those around all DoFs of its table; beyond an end of the lattice none is used.
+    # Masses near a representative are those near all DoFs of its table. Beyond an end of the lattice the numbers are
+    # those of an endless one, and none is used: rows have zeros there.
     masses = np.zeros((len(kinds), layout.dofs, series.width))
     for i, cell in enumerate(cells[:, 0].tolist()):
         leftmost = cell - series.reach
@@ -158,9 +180,10 @@ def _form_rows(cells: np.ndarray, forms: np.ndarray, series: StepSeries) -> np.n
 
 
 def create_responses(groups: Groups, tables: DofTables, model: Model, series: StepSeries) -> np.ndarray:
-    """Create the motion (dof, source, term) of each DoF after a unit impulse on each DoF of its cluster, times H.
+    """Create the motion (dof, source, term) of each DoF after a unit impulse on each DoF of its cluster.
 
-    An impulse on DoF l leaves the velocities M^-1 c_l^T, on which the rows of DoF i act: see ``Cluster.response``.
+    It is the coefficients g_p in m/N of H times the displacement, by powers s^p: those of p = 2 term + 1, or with
+    dashpots of p = term + 1. An impulse on DoF l leaves the velocities M^-1 c_l^T, on which the rows of DoF i act.
     Sources are counted within the cluster; columns beyond a smaller cluster's size are zero.
     """
     all_dofs = contact_dofs(model)
@@ -191,7 +214,8 @@ def create_responses(groups: Groups, tables: DofTables, model: Model, series: St
         targets = np.flatnonzero(np.repeat(sizes, sizes) > j)
         sources = np.repeat(groups.first[:-1], sizes)[targets] + j
 
-        # Columns of the target's rows in which the cells of the source lie.
+        # Columns of the target's rows in which the cells of the source lie. A ring has at least ``width`` cells: each
+        # of them is in one column at most.
         columns = series.reach + (cells[sources] - cells[targets])[:, None] + form_cells
         if model.chain.ends == "periodic":
             columns = columns % model.chain.cells
@@ -213,13 +237,14 @@ def create_responses(groups: Groups, tables: DofTables, model: Model, series: St
 # Not a ``kernel`` of ``vipetsc.compiled``, since it makes arrays.
 @njit(error_model="numpy")
 def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
-    """Expand the free motion of the DoFs of cluster ``c`` in powers of t/H; whether a site may reach its clearance.
+    """Expand the free motion of the DoFs of cluster ``c`` in powers of t/H; whether a force may act on one of them.
 
-    Coefficients in m go into ``taylor`` (dof, 2 term); ``columns`` (2 mass, column) hold the lattice's state at the
-    beginning of the step.
+    A force may act on a site or spring that reaches its clearance. Coefficients in m go into ``taylor`` (dof, 2 term);
+    ``columns`` (2 mass, column) hold the lattice's state at the beginning of the step.
     """
     _, masses, width, terms = dofs.rows.shape
-    # With dashpots there is a row for each mass's velocity, too, as there is in ``columns``.
+    # With dashpots there are rows for displacements and rows for velocities, as many as ``columns`` has; without, the
+    # rows of displacements serve for both, and are half as many.
     if masses == columns.shape[0]:
         return _expand_damped_motion(dofs, c, columns, taylor)
 
@@ -265,6 +290,7 @@ def _expand_damped_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: 
             for k in range(width):
                 x = columns[j, leftmost + k]
                 row = dofs.rows[dofs.table[i], j, k]
+                # 2 j // rows is 0 in the first half of the rows, those of displacements, and 1 in the second.
                 for m in range(terms):
                     total[2 * j // rows, m] += x * row[m]
 
@@ -278,7 +304,7 @@ def _expand_damped_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: 
 
 @kernel
 def is_zero(row: np.ndarray) -> bool:
-    """Whether all numbers of a ``row`` are zero."""
+    """Whether all numbers of a ``row`` (number,) are zero."""
     zero = True
     for value in row:
         zero &= value == 0.0
@@ -289,7 +315,8 @@ def is_zero(row: np.ndarray) -> bool:
 def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
     """Add to the owned cells ``out`` (2 mass, cell) the motion that forces within the step have caused at its end.
 
-    Row i of ``moments`` (dof, 2 term) belongs to the DoF ``first`` + i: integrals of its force times (1 - t/H)^k dt.
+    Row i of ``moments`` (dof, 2 term) in N s belongs to the DoF ``first`` + i: integrals of its force times (1 - t/H)^k
+    dt over the step. Displacements in m come before velocities in m/s.
     """
     masses, width, terms = dofs.rows.shape[1:]
     # With dashpots: see ``expand_free_motion``.

@@ -7,23 +7,36 @@ the nodes is a small system of equations that ``collocate`` solves by Picard's i
 the free motion of all DoFs to the substep's end, ``error_ratio`` judges the interpolant, and ``accumulate_moments``
 adds the forces to the moments by which the step will move the lattice (sec. 5).
 
-**Notation.** H is the linear step in s, s the position in it in units of H; a substep has its ``length`` in these units
-and nodes of one of three kinds, ``substep.kind``: plain ones, or ones that crowd where a force of Hertz begins or ends
-(``nodes``). A DoF is the relative displacement w of a contact site, the elongation of a spring that is not linear, or
-the displacement of a driven mass; those on which a force acts in a substep are ``trial.active``: the sites in contact,
-``trial.closed``, all springs, ``trial.springs``, and the masses whose drive is on. A ``Cluster`` holds what has been
-taken, a ``Trial`` a substep that may still be thrown away.
+**Notation.** H is the linear step in s, s the position in it in units of H; a substep has its ``length`` d in these
+units and nodes of one of three kinds, ``substep.kind``: plain ones, or ones that crowd where a force of Hertz begins or
+ends; z in [0, 1] is the variable in which they are Gauss's (``nodes``). A DoF is the relative displacement w of a
+contact site, the elongation of a spring that is not linear, or the displacement of a driven mass; those on which a
+force acts in a substep are ``trial.active``: the sites in contact, ``trial.closed``, all springs, ``trial.springs``,
+and the masses whose drive is on. The *free motion* of a DoF is its motion from here on if no force acted on any DoF. A
+``Cluster`` holds what has been taken, a ``Trial`` a substep that may still be thrown away.
+
+**Sums at the nodes.** H times the displacement of DoF i after a unit impulse on DoF l is the sum over p of g_p s^p, g_p
+in m/N (``Cluster.response``). With Lagrange's polynomials l_k of the nodes s_k, s from 0 to 1 in the substep, a unit
+force of l at node k moves i at node j by
+
+    to_w[k, j] = sum over p of g_p d^(p + 1) powers[p, k, j],   powers[p, k, j] = integral_0^s_j (s_j - s)^p l_k(s) ds,
+
+and its rate by to_v[k, j], the same with the derivative p g_p d^p/H and the power p - 1. The tables ``powers`` do not
+depend on the lattice.
 
 **Picard's iteration** puts the motion at the nodes into the force law, the forces into the integrals, and so on. With a
 contact of stiffness k on a mass m each sweep leaves 0.006 (h omega)^2 of the error, omega^2 = k/m, h the substep's
-length in s (0.006 is the spectral radius of the tables' double integral): it contracts up to h omega = 12, and in the
-substeps that the error estimate allows, of h omega = 1 to 2, ten sweeps or so reach rounding. Newton's method would
-need fewer, but in each the law's derivatives and the solution of a linear system of 8 equations for each active DoF.
+length in s. 0.006 is the spectral radius of the tables' double integral ``powers[1]`` of plain nodes: the iteration
+contracts up to h omega = 12, and in the substeps that the error estimate allows, of h omega = 1 to 2, ten sweeps or so
+reach rounding. Of a force -c w' each sweep leaves 0.09 h c/m, by the single integral ``powers[0]``. Newton's method
+would need fewer sweeps, but in each the law's derivatives and the solution of a linear system of 8 equations for each
+active DoF.
 
 **Moments.** The integrals of a force times powers of the lag to the substep's end are sums over the nodes with Gauss's
-weights. They are those of the interpolant, a polynomial of degree 7 in the nodes' variable z, as long as the product's
-degree is at most 15: up to the 8th power with plain nodes, up to the 3rd with the others, where the lag is quadratic in
-z. For higher powers, which the response multiplies by its high, small terms, they err as Gauss's rule does.
+weights. They are those of the interpolant, a polynomial of degree 7 in z, as long as the integrand's degree in z is at
+most 15: up to the 8th power with plain nodes, where the lag is linear in z; up to the 3rd with the others, where the
+lag is quadratic and ds = s'(z) dz adds one degree more, 7 + 2 x 3 + 1 = 14. For higher powers, which the response
+multiplies by its high, small terms, they err as Gauss's rule does.
 
 Whether a function is a ``kernel`` or ``inlined``, put in place of its calls, matters for speed alone: see
 ``vipetsc.compiled``.
@@ -50,10 +63,11 @@ CONVERGED = 1e-15
 STAGNANT = 1e-13
 # A response's terms smaller than this, relative to its first one, are left out.
 SMALLEST_RESPONSE = 1e-18
-# Error at a substep's end over that of the force's last two Legendre coefficients, taken from above. Gauss's rule
-# integrates these two exactly, so that the end errs by later, smaller coefficients only: on a linear contact and on one
-# of Hertz by 2e-4 of the two or less, wherever that is above rounding. The hundredfold margin is for other forces, and
-# cheap: half of it saves 8 % of the substeps of the built-in case, twice as much costs 9 %.
+# The error in w' at a substep's end is taken to be this times (|c_6| + |c_7|) d g_1/H, with the last two Legendre
+# coefficients in z of the force at the nodes. Gauss's rule integrates these two exactly, so that the end errs by later,
+# smaller coefficients only: on a linear contact and on one of Hertz by 2e-4 of the two or less, wherever that is above
+# rounding. The hundredfold margin is for other forces, and cheap: half of it saves 8 % of the substeps of the built-in
+# case, twice as much costs 9 %.
 SUPERCONVERGENCE = 0.02
 # Binomial coefficients binom(p, k), p down, k across, of all powers of s that a series may have.
 BINOMIALS = binom(*np.ogrid[: 2 * MOST_TERMS, : 2 * MOST_TERMS])
@@ -79,7 +93,10 @@ def _force_of_spring(cluster: Cluster, i: int, z: float) -> float:
 
 @kernel
 def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) -> None:
-    """Put w, w', w'' of every site at the present position, where the series is ``taylor``, into ``out`` (site, 3)."""
+    """Put w, w', w'' of every site at the present position into ``out`` (site, 3), in m, m/s and m/s^2.
+
+    ``taylor`` (dof, 2 term) is the series of the free motion from that position on, in m.
+    """
     # A record in an array of one: compiled code can change it in place.
     state = cluster.state[0]
     sites = cluster.contacts.size
@@ -108,7 +125,8 @@ def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) 
 def _stride(cluster: Cluster) -> int:
     """From one power of time in a response to the next: 2, since they are odd, or with dashpots 1.
 
-    A series has 2 n coefficients, a response its n odd ones, or with dashpots the 2 n - 1 after the zeroth.
+    A series has 2 n coefficients, a response its n odd ones, or with dashpots the 2 n - 1 after the zeroth: the sizes
+    of the two arrays tell them apart.
     """
     return 1 if 2 * cluster.response.shape[2] > cluster.taylor.shape[1] else 2
 
@@ -117,8 +135,7 @@ def _stride(cluster: Cluster) -> int:
 def node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.ndarray, to_v: np.ndarray) -> bool:
     """Fill ``to_w`` and ``to_v`` (node k, node) with what a unit force of DoF ``j`` at node k adds to w, w' of ``i``.
 
-    With the substep's length d, the term g s^p of the response adds g d^(p + 1) to w and p g d^p/H to w', times the
-    tables' integrals of the powers p and p - 1. Returns whether ``j`` moves ``i`` at all.
+    They are in m/N and m/s/N, the sums of the module's docstring. Returns whether ``j`` moves ``i`` at all.
     """
     to_w[:] = 0.0
     to_v[:] = 0.0
@@ -133,7 +150,7 @@ def node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.
         ratio *= substep.length
 
     # Terms fall as those of the fastest mode's sine do, with dashpots as those of its exponential function: from one
-    # power p to the next by theta d/(p + 1), d theta its radians in the substep.
+    # power p to the next by theta d/(p + 1), with theta = ``omega_max_h`` its radians in the step.
     size = 1.0
     radians = cluster.omega_max_h * substep.length
     for m in range(cluster.response.shape[2]):
@@ -218,9 +235,10 @@ def _move(cluster: Cluster, trial: Trial) -> float:
 def _replace(cluster: Cluster, i: int, w: np.ndarray, v: np.ndarray, trial: Trial) -> float:
     """Put the motion ``w``, ``v`` of DoF ``i`` at the nodes into ``trial``; returns the largest change.
 
-    A change of a site's w is divided by its clearance, one of w' by the sum of |w'| and the contact's approach
-    velocity; one of a spring's elongation by its largest value and the size of waves, together. It is inf if the motion
-    is not finite, and 0 for a driven mass, whose force does not depend on its motion.
+    A change of a site's w is divided by its ``scale``, its clearance or, where that is 0, the size of waves; one of w'
+    by |w'| plus the contact's approach velocity; one of a spring's elongation by its largest value plus the spring's
+    ``scale``, the size of waves in m. It is inf if the motion is not finite, and 0 for a driven mass, whose force does
+    not depend on its motion.
     """
     contacts = cluster.contacts
     change = 0.0
@@ -232,7 +250,8 @@ def _replace(cluster: Cluster, i: int, w: np.ndarray, v: np.ndarray, trial: Tria
         if i < contacts.size:
             site = contacts[i]
             change = max(change, abs(w[node] - trial.w[i, node]) / site.scale)
-            # Never 0/0: a contact begins only at a speed above zero, or has a reference speed (``contact.law.hold``).
+            # Never 0/0: a contact begins only at a speed above zero, and one that touches or is pressed at rest has the
+            # typical speed of waves in its place (``contact.law.hold``).
             change = max(change, abs(v[node] - trial.v[i, node]) / (abs(v[node]) + abs(site.approach)))
         elif i < first_drive(cluster):
             change = max(change, abs(w[node] - trial.w[i, node]))
@@ -322,8 +341,8 @@ def error_ratio(cluster: Cluster, trial: Trial, length: float) -> float:
     Both count, for in a force that is symmetric about the substep's middle every other coefficient vanishes. The error
     of a force becomes one of the site's velocity by the first term g_ii s of the site's own response, the sum of
     H^2/mass over the site's masses. The first term of another site's response is no larger, the same sum over the
-    masses that the two share; later terms bear higher powers of the length. Allowed are ``rtol`` times the approach
-    velocity plus ``atol``; for a spring ``rtol`` times its largest rate instead.
+    masses that belong to both; later terms bear higher powers of the length. Allowed are ``rtol`` |w'_minus| + ``atol``
+    in m/s; for a spring the largest rate at the nodes takes the place of the approach velocity w'_minus.
     """
     worst = 0.0
     for i in trial.closed:

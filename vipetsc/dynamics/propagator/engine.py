@@ -215,9 +215,9 @@ class Propagator(Engine):
         self._forces.begin(motion, energy)
 
     def fill(self, samples: Samples) -> FillResult:
-        """Fill ``samples`` as ``Engine`` says; without room, go to the sample before the first.
+        """Fill ``samples`` as ``Engine`` says; without room, go to the sample before the first. All ranks must call it.
 
-        A stop on request is at the last sample.
+        A stop on request is at the last sample. Raises RuntimeError where PETSc fails to exchange cells.
         """
         sys.audit("vipetsc.step")
         forces = self._forces

@@ -241,7 +241,10 @@ class Forces:
         return {"forces": forces[self._is_logged], "sites": sites[self._is_logged & (sites["number"] >= 0)]}
 
     def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go back to the ``checkpoints`` of all ranks; those that a cluster reaches go on from the same numbers."""
+        """Go back to the ``checkpoints`` of all ranks, each with the tables (dof,) and (site,) of ``checkpoint``.
+
+        All ranks that a cluster reaches go on from the same numbers.
+        """
         tables = join(checkpoints, {"forces": "number", "sites": "number"})
         forces = tables["forces"][np.searchsorted(tables["forces"]["number"], self._numbers)]
         self.clusters.energy[:] = forces["energy"]
@@ -250,7 +253,10 @@ class Forces:
         self.tracker.restore(tables["sites"])
 
     def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go on from the ``checkpoints`` of a run that has the drives alone; the sites stay at rest."""
+        """Go on from the ``checkpoints`` of a run that has the drives alone; the sites stay at rest.
+
+        Each has the table ``forces`` (dof,) of ``checkpoint``.
+        """
         forces = join(checkpoints, {"forces": "number"})["forces"]
         driven = np.flatnonzero(self._numbers < 0)
         rows = forces[np.searchsorted(forces["number"], self._numbers[driven])]

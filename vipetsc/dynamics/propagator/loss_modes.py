@@ -17,7 +17,11 @@ SMALLEST_MODE = 1e-13
 
 
 def mode_count(theta: float) -> int:
-    """Number of polynomials that a function whose rates turn by 2 ``theta`` over the step needs."""
+    """Number of polynomials that a function whose rates turn by 2 ``theta`` over the step needs.
+
+    They are those whose coefficients, over the first one, are not below ``SMALLEST_MODE``, by the bound of the module's
+    docstring. Factorials outgrow powers, so that the loop ends and AssertionError is never raised.
+    """
     bound = 1.0
     for p in count(1):
         bound *= theta / (2 * p + 1)

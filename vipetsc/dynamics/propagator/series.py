@@ -177,9 +177,9 @@ class StepSeries:
             yield from power_rows(np.repeat(self._zeroth, len(batch), axis=0), self.terms, recursion)
 
     def cut(self, rows: np.ndarray, first: int, count: int) -> np.ndarray:
-        """The columns of ``rows`` of ``count`` cells: that ``first`` cells after the row's own (< 0: before), and on.
+        """The columns of ``count`` cells of ``rows`` (dof, term, dof, cell), from ``first`` after the row's own on.
 
-        Columns that ``rows`` do not have are zero.
+        A ``first`` below 0 lies before it. Columns that ``rows`` do not have are zero.
         """
         # Padded by ``count`` on both sides, where the row's own cell has the column ``_outermost`` + ``count``.
         begin = first + self._outermost + count
@@ -214,7 +214,10 @@ class StepSeries:
         return np.append(0, np.cumsum(differs))
 
     def is_interior(self, cells: ArrayLike) -> np.ndarray:
-        """Whether each of ``cells`` has no end within its reach, and no cell that differs there or one further."""
+        """Whether each of ``cells`` (cell,) is far from all that differs, (cell,): it has the interior's rows.
+
+        No end of the lattice lies within its reach, and no cell that differs there or one further.
+        """
         cells = np.asarray(cells, np.int64)
         is_far = ~self._is_near_end(cells)
         if self.chain.variation is None:
@@ -223,7 +226,7 @@ class StepSeries:
         return is_far & (self._differing_before[cells + window] == self._differing_before[cells])
 
     def representatives(self, cells: ArrayLike) -> np.ndarray:
-        """For each of ``cells`` the first one of them that has the same rows."""
+        """For each of ``cells`` (cell,), counted from 0, the first one of them that has the same rows, (cell,)."""
         cells = np.array(cells, np.int64)
         interior = self.is_interior(cells)
         cells[interior] = cells[interior][:1]

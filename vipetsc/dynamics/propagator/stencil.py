@@ -36,7 +36,7 @@ class HaloRegions:
         self._count = 0
 
     def add(self, firsts: ArrayLike, count: int) -> np.ndarray:
-        """Add ``count`` cells from each of ``firsts`` on; returns the columns of these, in the same shape."""
+        """Add ``count`` cells from each of ``firsts`` (...) on; returns the columns (...) at which they begin."""
         firsts = np.asarray(firsts, np.int64)
         self._ranges.append(np.add.outer(firsts, np.arange(count)).ravel())
         columns = self._count + count * np.arange(firsts.size).reshape(firsts.shape)

@@ -37,7 +37,7 @@ def shift(taylor: np.ndarray, s: float, out: np.ndarray) -> None:
 
 @kernel
 def evaluate(series: np.ndarray, s: float) -> tuple[float, float]:
-    """Value and slope of a ``series`` at ``s``, by Horner's scheme."""
+    """Value and slope at ``s`` of a ``series`` (coefficient,) by rising powers of s, by Horner's scheme."""
     value = 0.0
     slope = 0.0
     for k in range(series.size - 1, -1, -1):
@@ -83,9 +83,9 @@ def _onset_on_side(series: np.ndarray, site: Any, side: int, curvature: float, l
 
 @kernel
 def first_onset(series: np.ndarray, site: Any, length: float) -> float:
-    """First s in [0, length] at which w comes within rounding of a clearance of the ``site`` and grows.
+    """First s in [0, length] at which w comes within rounding of a clearance of the ``site`` and grows; 2 if none does.
 
-    2 if none does: more than any length, since the whole step has the length 1.
+    ``series`` (coefficient,) in m is w by powers of s in units of the step, whose length is 1: 2 is beyond any s.
     """
     # On 0 <= s <= length the sum of |a_k| length^k bounds |w|, that of k (k - 1) |a_k| length^(k-2) bounds |w''|.
     bound = 0.0

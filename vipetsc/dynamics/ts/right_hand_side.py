@@ -201,7 +201,10 @@ def compile_callback() -> CFunc:
 
 
 def register(ts: PETSc.TS, lattice: LatticeRecord) -> None:
-    """Make the lattice's right-hand side that of ``ts``, on the states of ``Layout.create_vector``."""
+    """Make the lattice's right-hand side that of ``ts``, on the states of ``Layout.create_vector``.
+
+    Raises RuntimeError where PETSc refuses the function.
+    """
     callback = compile_callback()
     context = np.zeros(1, CONTEXT)
     tables = lattice._asdict() | lattice.drives._asdict()

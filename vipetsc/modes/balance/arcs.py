@@ -92,7 +92,10 @@ def arcs(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
 
 
 def minima(slope: np.ndarray) -> np.ndarray:
-    """Phases of the minima of a periodic motion by the secant of its sampled ``slope``: near enough to cut arcs."""
+    """Phases (minimum,) in rad of the minima of a periodic motion, near enough to cut arcs there.
+
+    ``slope`` (sample,) is its derivative at equal phases of one period; the secant through a change of sign is solved.
+    """
     after = np.roll(slope, -1)
     before_minimum = np.nonzero((slope < 0) & (after >= 0))[0]
     change = slope[before_minimum] - after[before_minimum]
@@ -100,7 +103,10 @@ def minima(slope: np.ndarray) -> np.ndarray:
 
 
 def cut(a: float, b: float, places: np.ndarray) -> Iterator[tuple[float, float]]:
-    """The interval from ``a`` to ``b``, cut at ``places`` of period 2 pi; a whole period stays whole."""
+    """The interval from ``a`` to ``b``, phases in rad, cut at ``places`` (place,) of period 2 pi.
+
+    A whole period stays whole.
+    """
     if b - a >= 2 * np.pi:
         yield a, b
         return

@@ -246,7 +246,10 @@ class HarmonicBalance:
         return float(left_out.max() / np.abs(self.unpack(x)).sum(axis=1).max())
 
     def energy(self, x: np.ndarray, omega: float, shift: np.ndarray) -> float:
-        """Energy in J of a conservative motion."""
+        """Energy in J of a conservative motion at ``omega`` in rad/s.
+
+        ``x`` (size,) are its unknown harmonics in m, ``shift`` (orders, 1, 1) in N/m the stiffnesses of ``shift``.
+        """
         shifted = self._shifted(omega, shift)
         elongation = self.unpack(x).T[self.orders]
         force = self.shifted_force(x, omega, shift)[..., 0]

@@ -188,7 +188,10 @@ class ForceSeries:
         return np.flatnonzero(changes)
 
     def add_load(self, pair: int, stops: Stops, z: np.ndarray) -> None:
-        """Take off what a static load balances of a contact pressed at rest, and what a spring in its place has."""
+        """Take off what a static load balances of a contact pressed at rest, and what a spring in its place has.
+
+        ``z`` (K + 1,) are the harmonics in m of the elongation of the ``pair``.
+        """
         mean = float(z[0].real)
         self.forces[pair, 0] -= stops.load
         self.potential[pair] -= stops.load * mean + stops.energy_at_rest
@@ -200,7 +203,10 @@ class ForceSeries:
         self.potential[pair] -= stops.spring * squared / 2
 
     def add_dashpot(self, pair: int, rate: float, z: np.ndarray) -> None:
-        """Add a force of ``rate`` z' in N of a pair whose elongation has the harmonics ``z`` (K + 1,)."""
+        """Add a force of ``rate`` z' in N of a pair; z' is the derivative by the phase, and ``rate`` is in N/m.
+
+        ``z`` (K + 1,) are the harmonics in m of its elongation.
+        """
         self.forces[pair, : len(z)] += 1j * rate * np.arange(len(z)) * z
         self._rates[pair, 0] += rate
 

@@ -109,7 +109,8 @@ def _peak(energy: np.ndarray, slope: np.ndarray, first: int) -> int | None:
 def fit_slope(energy: np.ndarray, slope: np.ndarray, region: np.ndarray) -> dict[str, dict[str, float]]:
     """df/dE = factor E^exponent in regions II (its falling part), III and IV, where it is without ``doubt``.
 
-    A vertical piece of a branch has no law: its factor leaves the range of numbers, or its adjusted R^2 is NaN.
+    ``energy`` in J, ``slope`` df/dE in Hz/J and ``region``, 1 to 4, are arrays (point,) along the branch. A vertical
+    piece of a branch has no law: its factor leaves the range of numbers, or its adjusted R^2 is NaN.
     """
     laws = {}
     for number, label in ((2, "II"), (3, "III"), (4, "IV")):

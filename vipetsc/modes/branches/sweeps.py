@@ -17,7 +17,10 @@ class ParameterSweep(NamedTuple):
 
 
 def with_stable_folds(stable: np.ndarray, fold: np.ndarray) -> np.ndarray:
-    """The ``stable`` states and the folds that have a stable neighbour: a sweep reaches them."""
+    """Which states (state,) a sweep reaches: the ``stable`` ones and the folds that have a stable neighbour.
+
+    ``stable`` and ``fold`` (state,) mark the states of a curve, in its order.
+    """
     neighbour = np.append(stable[1:], False) | np.insert(stable[:-1], 0, False)
     return stable | (fold & neighbour)
 

@@ -183,7 +183,10 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
         return np.empty(0), np.nan
 
     def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray) -> LatticeFrame:
-        """The frame at any initial values and period, in the chart of lattices whatever the ``chart``."""
+        """The frame at any initial values ``x`` (n,) and period in s, in the chart of lattices whatever the ``chart``.
+
+        ``tangent`` (n + 1,) is the branch's unit tangent there.
+        """
         return LatticeFrame(self, Diagonal(x, period), x, period, tangent)
 
     def relative_chart(self, x: np.ndarray, period: float) -> Diagonal:

@@ -86,7 +86,10 @@ class LatticeFlow:
         )
 
     def arc(self, start: np.ndarray, duration: float) -> LatticeArc:
-        """The orbit from the block ``start`` over ``duration`` seconds; raises FlowError on all ranks."""
+        """The orbit from the block ``start`` (2 dof, owned cell) over ``duration`` seconds; all ranks must call it.
+
+        Raises FlowError on all ranks.
+        """
         engine, end = self._run(start, duration, self.steps(duration))
         intervals, episodes = engine.contacts()
         closed = _union(np.concatenate(self.comm.allgather(intervals)))
@@ -97,9 +100,9 @@ class LatticeFlow:
         return max(int(np.ceil(self._omega * duration / largest)), 1)
 
     def watch(self, start: np.ndarray, duration: float, steps: int, look: Callable[[np.ndarray], None]) -> None:
-        """Let ``look`` see the block at the start of an arc and after each of so many ``steps``; all ranks call it.
+        """Let ``look`` see the block (2 dof, owned cell) ``start`` of an arc and that after each of so many ``steps``.
 
-        Raises FlowError on all ranks.
+        All ranks must call it. Raises FlowError on all ranks.
         """
         look(start)
         engine, _ = self._run(start, duration, steps, look)

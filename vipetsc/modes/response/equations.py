@@ -84,7 +84,10 @@ class SteadyFrame:
         return np.asarray(direction / np.linalg.norm(direction))
 
     def measures(self, attempt: Attempt, direction: np.ndarray) -> Response:
-        """The state that an attempt has converged to, without measures, which are computed once it is accepted."""
+        """The state that an attempt has converged to, without measures, which are computed once it is accepted.
+
+        ``direction`` (n + 1,) is the branch's unit tangent there.
+        """
         return Response(xi=attempt.xi, tangent=direction)
 
 
@@ -118,7 +121,7 @@ class SteadyEquations(ABC):
         return DenseNewton(self.balance.size + 1, self.max_newton)
 
     def shift_near(self, xi: np.ndarray) -> np.ndarray:
-        """The stiffnesses (place,) by which the compliance is shifted for states near the unknowns ``xi`` (n + 1,)."""
+        """The stiffnesses (orders, 1, 1) in N/m by which the compliance is shifted for states near ``xi`` (n + 1,)."""
         omega, _ = self.drive(xi[-1])
         return self.balance.shift(omega)
 
@@ -130,7 +133,11 @@ class SteadyEquations(ABC):
         return p * scale, fixed
 
     def residual(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """The residual (n,) of the harmonics, which vanishes at a steady state, over the clearance."""
+        """The residual (n,) of the harmonics, which vanishes at a steady state, over the clearance.
+
+        ``xi`` (n + 1,) are harmonics over the clearance and the scaled parameter, ``shift`` (orders, 1, 1) in N/m the
+        stiffnesses by which the compliance is shifted. Raises FlowError where the frequency is not positive.
+        """
         omega, amplitude = self.drive(xi[-1])
         if not omega > 0:
             raise FlowError("the frequency is not positive")

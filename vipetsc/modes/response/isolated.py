@@ -87,9 +87,10 @@ def _states_over_amplitude(states: Equations, begin: np.ndarray) -> Iterator[np.
 
 
 def with_amplitude(states: Equations, line: SteadyStates, begin: np.ndarray, p: float) -> Iterator[np.ndarray]:
-    """Unknowns of states at the scaled parameter ``p`` with the curve's amplitude, on the ``line`` through ``begin``.
+    """Unknowns (n + 1,) of states at the scaled parameter ``p`` with the curve's amplitude, found along a ``line``.
 
-    ``begin`` are unknowns of the line, near one of its states, which is left out if it has that amplitude itself.
+    The line is followed in both directions from ``begin`` (n + 1,), unknowns near one of its states, which is left out
+    if it has that amplitude itself.
     """
     _, amplitude = states.drive(p)
     crossed = amplitude / line.parameter.scale

@@ -211,7 +211,10 @@ def _samples(harmonics: np.ndarray) -> np.ndarray:
 
 
 def largest_force(stops: Stops, relative: np.ndarray, episodes: Sequence[Episode], omega: float) -> float:
-    """Largest force in N of a contact whose displacement has the harmonics ``relative`` (K + 1,) in m."""
+    """Largest force in N of a contact whose displacement has the harmonics ``relative`` (K + 1,) in m.
+
+    Each of ``episodes`` is sampled at equal phases; ``omega`` in rad/s is the frequency of the motion.
+    """
     largest = 0.0
     orders = np.arange(len(relative))
     for episode in episodes:
@@ -228,11 +231,17 @@ def largest_force(stops: Stops, relative: np.ndarray, episodes: Sequence[Episode
 
 
 def magnitude(phasors: np.ndarray) -> np.ndarray:
-    """Magnitude of each of ``phasors``; other than of ``np.abs`` its bits do not depend on where they lie in memory."""
+    """Magnitude (...) of each of ``phasors`` (...), complex.
+
+    Other than of ``np.abs`` its bits do not depend on where the numbers lie in memory.
+    """
     return np.hypot(phasors.real, phasors.imag)
 
 
 def lag(phasors: np.ndarray) -> np.ndarray:
-    """Phase in degrees, from 0 to 360, by which each of ``phasors`` is behind the drive; NaN where it is zero."""
+    """Phase (phasor,) in degrees, from 0 to 360, by which each of ``phasors`` (phasor,) is behind the drive.
+
+    It is NaN where a phasor is zero.
+    """
     radians = np.array([cmath.phase(phasor) for phasor in phasors.tolist()])
     return np.where(phasors != 0, np.mod(-np.degrees(radians), 360.0), np.nan)

@@ -136,22 +136,25 @@ class StatesOverKey(SteadyEquations):
         return states.stability(inner)
 
     def determinant(self, xi: np.ndarray, exponent: complex) -> float:
-        """Hill's determinant of a state at an ``exponent`` lambda/Om at which the determinant is real."""
+        """Hill's determinant of the state ``xi`` (n + 1,) at an ``exponent`` lambda/Om at which it is real."""
         states, inner = self._at(xi)
         return states.determinant(inner, exponent)
 
     def growing_pairs(self, xi: np.ndarray) -> list[complex]:
-        """lambda/Om of the complex pairs of perturbations of a state that grow, the slowest first."""
+        """lambda/Om of the complex pairs of perturbations of the state ``xi`` (n + 1,) that grow, the slowest first."""
         states, inner = self._at(xi)
         return states.growing_pairs(inner)
 
     def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
-        """lambda/Om of the pair of perturbations of a state near a ``guess``; raises ArithmeticError without one."""
+        """lambda/Om of the pair of perturbations of the state ``xi`` (n + 1,) near a ``guess``.
+
+        Raises ArithmeticError without one.
+        """
         states, inner = self._at(xi)
         return states.pair_near(inner, guess)
 
     def least_growth(self, xi: np.ndarray) -> float:
-        """Re lambda/Om up to which perturbations of a state count as stable."""
+        """Re lambda/Om up to which perturbations of the state ``xi`` (n + 1,) count as stable."""
         states, inner = self._at(xi)
         return states.least_growth(inner)
 

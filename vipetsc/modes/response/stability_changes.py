@@ -35,16 +35,19 @@ class StatesWithStability(Protocol):
         """The stability of a state ``xi`` (n + 1,)."""
 
     def determinant(self, xi: np.ndarray, exponent: complex) -> float:
-        """Hill's determinant at lambda/Om = ``exponent``, where it is real."""
+        """Hill's determinant of the state ``xi`` (n + 1,) at lambda/Om = ``exponent``, where it is real."""
 
     def growing_pairs(self, xi: np.ndarray) -> list[complex]:
-        """lambda/Om of the complex pairs that grow, the slowest first."""
+        """lambda/Om of the complex pairs of perturbations of the state ``xi`` (n + 1,) that grow, the slowest first."""
 
     def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
-        """lambda/Om of the pair near a ``guess``; raises ArithmeticError without one."""
+        """lambda/Om of the pair of perturbations of the state ``xi`` (n + 1,) near a ``guess``.
+
+        Raises ArithmeticError without one.
+        """
 
     def least_growth(self, xi: np.ndarray) -> float:
-        """Re lambda/Om up to which perturbations count as stable."""
+        """Re lambda/Om up to which perturbations of the state ``xi`` (n + 1,) count as stable."""
 
     def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
         """The measures of a state ``xi`` (n + 1,)."""

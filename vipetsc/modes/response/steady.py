@@ -139,7 +139,7 @@ class SteadyStates(SteadyEquations):
         return LinearMotion(z, wave)
 
     def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
-        """The measures of a state for its file; its ``perturbations`` are counted if they are not given."""
+        """The measures of the state ``xi`` (n + 1,) for its file; its ``perturbations`` are counted if not given."""
         omega, amplitude = self.drive(xi[-1])
         x = xi[:-1] * self.clearance
         z = self.balance.unpack(x)
@@ -202,23 +202,26 @@ class SteadyStates(SteadyEquations):
         return Perturbations(unstable, self.hill(omega).fastest(series))
 
     def determinant(self, xi: np.ndarray, exponent: complex) -> float:
-        """Hill's determinant of a state at lambda/Om = ``exponent``, where it is real."""
+        """Hill's determinant of the state ``xi`` (n + 1,) at lambda/Om = ``exponent``, where it is real."""
         omega, _ = self.drive(xi[-1])
         series = self.balance.series(xi[:-1] * self.clearance, omega)
         return float(self.hill(omega).determinants(series, np.array([exponent]))[0].real)
 
     def growing_pairs(self, xi: np.ndarray) -> list[complex]:
-        """lambda/Om of the complex pairs of perturbations of a state that grow, the slowest first."""
+        """lambda/Om of the complex pairs of perturbations of the state ``xi`` (n + 1,) that grow, the slowest first."""
         omega, _ = self.drive(xi[-1])
         return self.hill(omega).pairs(self.balance.series(xi[:-1] * self.clearance, omega))
 
     def pair_near(self, xi: np.ndarray, guess: complex) -> complex:
-        """lambda/Om of the pair of perturbations of a state near a ``guess``; raises ArithmeticError without one."""
+        """lambda/Om of the pair of perturbations of the state ``xi`` (n + 1,) near a ``guess``.
+
+        Raises ArithmeticError without one.
+        """
         omega, _ = self.drive(xi[-1])
         return self.hill(omega).near(self.balance.series(xi[:-1] * self.clearance, omega), guess)
 
     def least_growth(self, xi: np.ndarray) -> float:
-        """Re lambda/Om up to which perturbations of a state count as stable."""
+        """Re lambda/Om up to which perturbations of the state ``xi`` (n + 1,) count as stable."""
         omega, _ = self.drive(xi[-1])
         return self.hill(omega).least
 

@@ -147,7 +147,10 @@ def observe(step: FlowStep, y: np.ndarray, dy: np.ndarray, motion: np.ndarray) -
 
 @kernel
 def close(system: CompiledSystem, y: np.ndarray, side: np.ndarray) -> None:
-    """The sides on which the contacts are closed at the displacements in column 0 of ``y``, 0 for open ones."""
+    """Put the sides, 1 or -1, on which the contacts are closed into ``side`` (contact,), 0 for open ones.
+
+    Column 0 of ``y`` (2n, 1 + m) is the state, displacements in m before velocities.
+    """
     for c in range(side.size):
         w = elongation(system.rows, c, y, 0, 0, system.inverse_mass.size)
         side[c] = 0
@@ -159,7 +162,7 @@ def close(system: CompiledSystem, y: np.ndarray, side: np.ndarray) -> None:
 
 @njit
 def begin(system: CompiledSystem, y: np.ndarray) -> FlowStep:
-    """The record of a flow's steps, which begins at the state ``y``."""
+    """The record of a flow's steps, which begins at the state in column 0 of ``y`` (2n, 1 + m)."""
     contacts = system.contacts.size
     side = np.empty(contacts, np.int64)
     step = FlowStep(system, side, np.empty((contacts, 3)), np.empty((contacts, 3)))

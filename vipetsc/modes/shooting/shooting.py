@@ -113,7 +113,10 @@ class Shooting(ShootingEquations[Arc]):
         return DenseFrame(self, self.relative_chart(x, period), x, period, np.empty(0))
 
     def relative_chart(self, x: np.ndarray, period: float) -> Relative:
-        """The chart ``relative``, with the gaps of contacts only where the map starts at rest."""
+        """The chart ``relative`` near the initial values ``x`` (n,) and the period in s.
+
+        It has the gaps of contacts only where the map starts at rest.
+        """
         return Relative(self.system, x, period, rest=self.map.starts_at_rest)
 
     def null_vector(self, start: Point) -> np.ndarray:
@@ -159,7 +162,10 @@ class Shooting(ShootingEquations[Arc]):
             yield SpecialKind("grazing", sides_with_right, seek=self.seek_touch, finish=without_touch)
 
     def seek_touch(self, frame: Frame[Point], guess: np.ndarray, left: Point, right: Point) -> np.ndarray:
-        """Unknowns of the orbit near ``guess`` at which a contact grazes that only one of two orbits has."""
+        """Unknowns (n + 1,) of the orbit near ``guess`` (n + 1,) in which one contact grazes.
+
+        It is the contact that only one of the orbits ``left`` and ``right`` has.
+        """
         assert isinstance(frame, DenseFrame)
         touching = max(left, right, key=lambda p: p.episodes)
         touch = Touch.nearest(self.arc(touching.x, touching.period), self.map)

@@ -243,7 +243,10 @@ class ShootingEquations(ABC, Generic[A]):
 
     @abstractmethod
     def relative_chart(self, x: np.ndarray, period: float) -> Chart:
-        """The chart ``relative``, with the gaps of contacts only where they are at the start of the map."""
+        """The chart ``relative`` near the initial values ``x`` (n,) and the period in s.
+
+        It has the gaps of contacts only where they are at the start of the map.
+        """
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
         """Folds of the energy and of the frequency."""
