@@ -142,7 +142,8 @@ def test_derivatives_are_those_of_the_residual(law, symmetry):
     x = balance.pack(random_harmonics(forces, 7, 1, symmetry))
     shift = balance.shift(OMEGA)
 
-    jacobian, rate = balance.derivative(x, OMEGA, shift)
+    jacobian = balance.jacobian(x, OMEGA, shift)
+    rate = balance.rate(x, OMEGA, shift)
 
     assert_derivatives_by_differences(balance, x, shift, jacobian)
     # Of a force with a floor of the approach velocity, a small part of the derivative is left out.
@@ -151,6 +152,21 @@ def test_derivatives_are_those_of_the_residual(law, symmetry):
         ahead = balance.residual(x, OMEGA + step, shift)
         behind = balance.residual(x, OMEGA - step, shift)
         assert rate == pytest.approx((ahead - behind) / (2 * step), abs=2e-8 * np.abs(rate).max())
+
+
+@pytest.mark.parametrize("symmetry", ["odd", "any"])
+def test_a_drive_adds_its_term_to_the_residual_of_every_motion(symmetry):
+    """The residual is linear in the linear motion, and its part is that of all the orders that this motion has."""
+    forces = hardening_forces()
+    balance = random_balance(forces, 5, symmetry)
+    x = balance.pack(random_harmonics(forces, 5, 2, symmetry))
+    shift = balance.shift(OMEGA)
+    linear = balance.unpack(balance.pack(random_harmonics(forces, 5, 3, symmetry)))
+
+    term = balance.drive_term(OMEGA, shift, linear)
+
+    added = balance.residual(x, OMEGA, shift, linear) - balance.residual(x, OMEGA, shift)
+    assert term == pytest.approx(added, abs=1e-13 * np.abs(added).max())
 
 
 def assert_derivatives_by_differences(
@@ -239,7 +255,7 @@ def test_a_weight_multiplies_the_compliance_of_harmonics_above_the_first(symmetr
     shift = balance.shift(OMEGA)
     assert balance.residual(x, OMEGA, shift, linear) == pytest.approx(np.zeros(balance.size), abs=1e-14)
 
-    jacobian, _ = balance.derivative(x, OMEGA, shift)
+    jacobian = balance.jacobian(x, OMEGA, shift)
     assert_derivatives_by_differences(balance, x, shift, jacobian)
 
 

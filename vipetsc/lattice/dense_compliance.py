@@ -32,7 +32,8 @@ class DenseCompliance:
 
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Relative displacements (omega, pair, pair) in m/N at frequencies ``omegas`` in rad/s, real or complex."""
-        return np.einsum("in,wn,jn->wij", self.parts, self._gain(np.atleast_1d(omegas)), self.parts)
+        gain = self._gain(np.atleast_1d(omegas))
+        return np.asarray((self.parts * gain[:, None, :]) @ self.parts.T)
 
     def with_springs(self, omegas: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
         """The compliance with a spring of ``stiffness`` (omega,) in N/m added at each pair, also on a linear mode."""

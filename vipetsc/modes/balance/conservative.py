@@ -14,8 +14,9 @@ import numpy as np
 from scipy.optimize import brentq
 
 from vipetsc.case.nnm_table import NnmTable
-from vipetsc.modes.balance.harmonic_balance import Compliance, HarmonicBalance
+from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import Episode, SiteForces
+from vipetsc.modes.balance.shifted_compliance import Compliance
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, unit
@@ -85,7 +86,9 @@ class HarmonicFrame:
 
     def jacobian(self, xi: np.ndarray) -> np.ndarray:
         """Derivative (n, n + 1) of the residual."""
-        jacobian, rate = self.balance.derivative(*self.motion(xi), self.shift)
+        x, omega = self.motion(xi)
+        jacobian = self.balance.jacobian(x, omega, self.shift)
+        rate = self.balance.rate(x, omega, self.shift)
         return np.column_stack([jacobian, rate * (self.omega / self.size)])
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:

@@ -22,52 +22,29 @@ b^T (K - omega^2 M)^-1 M (K - omega^2 M)^-1 b,
 it is evaluated for the shifted compliance, less the energy of the added springs.
 """
 
-from typing import NamedTuple, Protocol
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from vipetsc.lattice import DenseCompliance
 from vipetsc.modes.balance.harmonics import ForceSeries, SiteForces
+from vipetsc.modes.balance.shifted_compliance import Compliance, ShiftedCompliance
+from vipetsc.modes.latest import LatestValues
 
-# Radius, over the frequency, of a circle on which Cauchy's formula gives the derivative of a real compliance, and the
-# lower half of its nodes.
-RADIUS = 1e-4
-NODES = np.exp(-1j * np.pi / 8 * np.array([1, 3, 5, 7]))
-# Relative step of a difference for a complex compliance, which Cauchy's formula on half a circle does not fit.
-STEP = 1e-6
-# The order 0 has no frequency of its own to scale a step by: this fraction of the highest.
-LEAST_RATE = 1e-3
-# Relative detuning of a frequency at which the compliance has a pole.
-DETUNING = 1e-15
-# Size of the compliance times the stiffness of the shift from which several pairs are taken to be close to a pole.
-NEAR_POLE = 1e3
+# Motions whose forces are kept: the latest one of Newton's method, and the two ends of a difference along its branch.
+KEPT_MOTIONS = 3
 
 
-class Compliance(Protocol):
-    """Interface of ``lattice.compliance``: G (frequencies, pairs, pairs) in m/N, real or complex."""
+class _Columns(NamedTuple):
+    """How harmonics follow from the unknowns of one pair, in the order of its unknowns.
 
-    def at(self, omegas: np.ndarray) -> np.ndarray:
-        """G (frequency, place, place) in m/N at ``omegas`` (frequency,) in rad/s, which may be complex."""
-
-
-class Compliances(NamedTuple):
-    """G at the multiples of a frequency and at points near each of them, for its derivative.
-
-    ``values`` (1 + nodes, orders, pairs, pairs) in m/N; ``circle`` (nodes,) are the distances of these points over
-    ``scale`` (orders,) in rad/s, which has the number of nodes as a factor.
+    ``orders`` (2 orders,) are those of the harmonics and of their conjugates, ``halves`` (orders, 1) is 1/2 for the
+    mean, which one-sided series have once, and 1 for the others; ``same`` (orders, unknowns) is dZ/dx.
     """
 
-    values: np.ndarray
-    scale: np.ndarray
-    circle: np.ndarray
-
-
-class Shifted(NamedTuple):
-    """The shifted compliance G_s (orders, pairs, pairs), its derivative by the frequency, and the factor A."""
-
-    compliance: np.ndarray
-    rate: np.ndarray
-    factor: np.ndarray
+    orders: np.ndarray
+    halves: np.ndarray
+    same: np.ndarray
 
 
 class HarmonicBalance:
@@ -93,13 +70,16 @@ class HarmonicBalance:
         self.orders = np.arange(order + 1)
         if odd:
             self.orders = np.arange(1, order + 1, 2)
-        self._sines = self.orders[self.orders > 0]
+        # The cosines of all orders and the sines of those above 0 have these places among the orders from 0 to K.
+        self._places = slice(int(self.orders[0]), None, 1 + odd)
+        self._sine_places = slice(1, None, 1 + odd)
         if cosines:
-            self._sines = self.orders[:0]
+            self._sine_places = slice(0, 0)
+        self._sines = np.arange(order + 1)[self._sine_places]
         self.size = forces.pairs * (len(self.orders) + len(self._sines))
-        # The latest compliances and forces: Newton's method asks for the same ones several times.
-        self._compliances: tuple[float, Compliances] | None = None
-        self._series: tuple[np.ndarray, float, ForceSeries] | None = None
+        self.shifted = ShiftedCompliance(compliance, forces.pairs, self.orders, weight)
+        # Newton's method asks for the same forces several times.
+        self._series = LatestValues[tuple[bytes, float], ForceSeries](KEPT_MOTIONS)
 
     def weighted(self, weight: float) -> "HarmonicBalance":
         """The equations with another ``weight``."""
@@ -107,130 +87,93 @@ class HarmonicBalance:
 
     def pack(self, z: np.ndarray) -> np.ndarray:
         """Unknowns (size,) of harmonics (pairs, K + 1) complex."""
-        return np.hstack([z[:, self.orders].real, z[:, self._sines].imag]).ravel()
+        return np.hstack([z[:, self._places].real, z[:, self._sine_places].imag]).ravel()
 
     def unpack(self, x: np.ndarray) -> np.ndarray:
         """Harmonics (pairs, K + 1) complex of unknowns."""
         z = np.zeros((self.forces.pairs, self.order + 1), complex)
         parts = x.reshape(self.forces.pairs, -1)
-        z[:, self.orders] = parts[:, : len(self.orders)]
-        z[:, self._sines] += 1j * parts[:, len(self.orders) :]
+        z.real[:, self._places] = parts[:, : len(self.orders)]
+        z.imag[:, self._sine_places] = parts[:, len(self.orders) :]
         return z
 
     def series(self, x: np.ndarray, omega: float) -> ForceSeries:
         """The forces' harmonics and derivatives at the unknowns ``x`` (n,)."""
-        if self._series is None or self._series[1] != omega or not np.array_equal(self._series[0], x):
-            self._series = x.copy(), omega, self.forces.series(self.unpack(x), omega)
-        return self._series[2]
-
-    def compliances(self, omega: float) -> Compliances:
-        """G at the multiples ``orders`` of ``omega`` in rad/s, and near each of them."""
-        if self._compliances is None or self._compliances[0] != omega:
-            self._compliances = omega, self._evaluate(omega)
-        return self._compliances[1]
-
-    def _evaluate(self, omega: float) -> Compliances:
-        rates = self.orders * omega
-        sizes = np.maximum(rates, LEAST_RATE * rates[-1])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            values = self.compliance.at(rates)
-        # On a linear mode the compliance is infinite, and the motion finite.
-        if not np.all(np.isfinite(values)):
-            values = self.compliance.at(rates * (1 + DETUNING))
-
-        # A compliance that is real on the real axis has conjugate values above and below it: half a circle is enough.
-        circle = STEP * np.array([1.0, -1.0])
-        if np.isrealobj(values):
-            circle = RADIUS * NODES
-        near = self.compliance.at((rates + sizes * circle[:, None]).ravel())
-        values = np.concatenate([values[None], near.reshape(len(circle), *values.shape)])
-        values[:, self.orders > 1] *= self.weight
-        return Compliances(values, sizes * len(circle), circle)
+        key = x.tobytes(), omega
+        return self._series.get(key, lambda: self.forces.series(self.unpack(x), omega))
 
     def shift(self, omega: float) -> np.ndarray:
         """The stiffnesses s (orders, 1, 1) in N/m to shift the compliance by for motions near ``omega``."""
-        g = self.compliances(omega).values[0]
-        one = np.eye(self.forces.pairs)
-        squared = np.maximum(self.orders, 1) ** 2
-        # At the highest order inertia alone counts: G = -1/(mass omega^2). Of the two signs of the stiffness the one
-        # that keeps 1 + s G farther from singular has the poles of G_s farther away.
-        mass = 1 / (self.orders[-1] ** 2 * np.abs(np.trace(g[-1])) / self.weight / len(one))  # times omega^2
-        size = (mass * squared)[:, None, None]
-        plus, minus = (np.linalg.svd(one + sign * size * g, compute_uv=False)[:, -1] for sign in (1, -1))
-        return np.where((plus >= minus)[:, None, None], size, -size)
-
-    def _shifted(self, omega: float, shift: np.ndarray) -> Shifted:
-        values, scale, circle = self.compliances(omega)
-        factor = np.linalg.inv(np.eye(self.forces.pairs) + shift * values)
-        shifted = factor @ values
-        self._correct_near_modes(omega, shift, values[0], shifted[0], factor[0])
-        slopes = np.einsum("n,nkij->kij", 1 / circle, shifted[1:]) / scale[:, None, None]
-        if len(circle) == len(NODES):  # the other half of the circle is its conjugate
-            return Shifted(shifted[0].real, slopes.real, factor[0].real)
-        return Shifted(shifted[0], slopes, factor[0])
-
-    def _correct_near_modes(
-        self, omega: float, shift: np.ndarray, values: np.ndarray, shifted: np.ndarray, factor: np.ndarray
-    ) -> None:
-        """Compute ``shifted`` and ``factor`` anew, of orders at which the compliance ``values`` are close to a pole.
-
-        All three are (orders, pairs, pairs). Near the pole of a mode the compliance of several pairs is that of the
-        mode alone, to rounding, and the inverse has lost the rest; of one pair nothing is lost.
-        """
-        if self.forces.pairs < 2 or not isinstance(self.compliance, DenseCompliance):
-            return
-        sizes = np.abs(shift[:, 0, 0]) * np.abs(values).max(axis=(1, 2))
-        (near,) = np.nonzero(sizes > NEAR_POLE)
-        stiffness = shift[near, 0, 0]
-        if near.size and self.weight == 1.0:
-            shifted[near] = self.compliance.with_springs(self.orders[near] * omega, stiffness)
-            factor[near] = np.eye(self.forces.pairs) - stiffness[:, None, None] * shifted[near]
+        return self.shifted.shift(omega)
 
     def shifted_force(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
         """F - s Z (orders, pairs, 1) complex in N."""
-        force = self.series(x, omega).forces.T[self.orders, :, None]
-        elongation = self.unpack(x).T[self.orders, :, None]
+        force = self.series(x, omega).forces[:, : self.order + 1].T[self._places, :, None]
+        elongation = self.unpack(x).T[self._places, :, None]
         return force - shift * elongation
 
     def residual(self, x: np.ndarray, omega: float, shift: np.ndarray, linear: np.ndarray | float = 0.0) -> np.ndarray:
         """Z + G_s (F - s Z) - A Z^linear as unknowns (size,), in m; ``linear`` (pairs, K + 1) complex."""
-        shifted = self._shifted(omega, shift)
+        shifted = self.shifted.at(omega, shift)
         z = self.unpack(x)
-        elongation = z.T[self.orders, :, None]
-        given = np.broadcast_to(linear, z.shape).T[self.orders, :, None]
+        elongation = z.T[self._places, :, None]
+        given = np.broadcast_to(linear, z.shape).T[self._places, :, None]
         out = np.zeros_like(z)
         balance = elongation + shifted.compliance @ self.shifted_force(x, omega, shift) - shifted.factor @ given
-        out[:, self.orders] = balance[..., 0].T
+        out[:, self._places] = balance[..., 0].T
         return self.pack(out)
 
-    def derivative(self, x: np.ndarray, omega: float, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """dR/dx (size, size) and dR/domega (size,) of the ``residual`` with no linear motion given.
+    def drive_term(self, omega: float, shift: np.ndarray, linear: np.ndarray) -> np.ndarray:
+        """-A Z^linear, what a ``linear`` motion (pairs, K + 1) adds to the ``residual``, as unknowns (size,) in m.
 
-        F does not depend on omega, but through a floor of the approach velocity, which is left out.
+        Only the orders that the motion has are computed: nothing is kept, and no forces are evaluated.
         """
-        shifted = self._shifted(omega, shift)
-        series = self.series(x, omega)
+        out = np.zeros_like(linear)
+        for order in np.flatnonzero(linear.any(axis=0)).tolist():
+            out[:, order] = -(self.shifted.factor(order, omega, shift) @ linear[:, order])
+        return self.pack(out)
+
+    def jacobian(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
+        """dR/dx (size, size) of the ``residual``."""
+        shifted = self.shifted.at(omega, shift)
+        columns = self._columns
         count = len(self.orders)
         pairs = self.forces.pairs
 
         # The forces' derivative by the harmonics of orders k and -k, which are conjugate to each other.
-        two_sided = series.jacobian(orders=np.concatenate([self.orders, -self.orders]))[:, :count]
-        two_sided[:, self.orders == 0] *= 0.5  # one-sided series have the mean once
+        two_sided = self.series(x, omega).jacobian(orders=columns.orders, rows=self.orders) * columns.halves
         plus = two_sided[:, :, :count]
         minus = two_sided[:, :, count:]
-        sines = np.isin(self.orders, self._sines)
-        columns = np.concatenate([plus + minus, 1j * (plus - minus)[:, :, sines]], axis=2)
-        same = np.concatenate([np.eye(count), 1j * np.eye(count)[:, sines]], axis=1)
+        changes = np.concatenate([plus + minus, 1j * (plus - minus)[:, :, count - len(self._sines) :]], axis=2)
+        changes -= shift[:, 0] * columns.same
 
-        matrix = np.einsum("kij,jku->ikju", shifted.compliance, columns - shift[:, 0] * same)
-        matrix += np.einsum("ij,ku->ikju", np.eye(pairs), same)
+        # Of pair i and order k by the unknown u of pair j: G_s (dF - s dZ), and dZ of the pair itself.
+        matrix = np.moveaxis(shifted.compliance, 0, 1)[:, :, :, None] * np.moveaxis(changes, 0, 1)
+        for pair in range(pairs):
+            matrix[pair, :, pair] += columns.same
         matrix = matrix.reshape(pairs, count, -1)
-        jacobian = np.concatenate([matrix.real, matrix[:, sines].imag], axis=1).reshape(self.size, self.size)
+        rows = [matrix.real, matrix[:, count - len(self._sines) :].imag]
+        return np.concatenate(rows, axis=1).reshape(self.size, self.size)
 
-        out = np.zeros_like(self.unpack(x))
-        by_omega = self.orders[:, None, None] * shifted.rate @ self.shifted_force(x, omega, shift)
-        out[:, self.orders] = by_omega[..., 0].T
-        return jacobian, self.pack(out)
+    def rate(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
+        """dR/domega (size,) of the ``residual`` with no linear motion given.
+
+        F does not depend on omega, but through a floor of the approach velocity, which is left out.
+        """
+        out = np.zeros((self.forces.pairs, self.order + 1), complex)
+        by_omega = self.shifted.rate(omega, shift) @ self.shifted_force(x, omega, shift)
+        out[:, self._places] = (self.orders[:, None, None] * by_omega)[..., 0].T
+        return self.pack(out)
+
+    @cached_property
+    def _columns(self) -> _Columns:
+        count = len(self.orders)
+        one = np.eye(count)
+        return _Columns(
+            orders=np.concatenate([self.orders, -self.orders]),
+            halves=np.where(self.orders == 0, 0.5, 1.0)[:, None],
+            same=np.concatenate([one, 1j * one[:, count - len(self._sines) :]], axis=1),
+        )
 
     def truncation(self, x: np.ndarray, omega: float) -> float:
         """Estimated size of the harmonics left out of ``x`` (n,), over the largest sum of those kept.
@@ -240,7 +183,7 @@ class HarmonicBalance:
         """
         highest = self.orders[-1]
         forces = np.abs(self.series(x, omega).forces)
-        g = np.abs(self.compliances(omega).values[0, -1]).sum(axis=1)
+        g = np.abs(self.shifted.values(omega)[-1]).sum(axis=1)
         beyond = np.arange(self.order + 1, forces.shape[1])
         left_out = (g[:, None] * forces[:, beyond] * (highest / beyond) ** 2).sum(axis=1) * 4 / 3
         return float(left_out.max() / np.abs(self.unpack(x)).sum(axis=1).max())
@@ -250,10 +193,10 @@ class HarmonicBalance:
 
         ``x`` (size,) are its unknown harmonics in m, ``shift`` (orders, 1, 1) in N/m the stiffnesses of ``shift``.
         """
-        shifted = self._shifted(omega, shift)
-        elongation = self.unpack(x).T[self.orders]
+        shifted = self.shifted.at(omega, shift)
+        elongation = self.unpack(x).T[self._places]
         force = self.shifted_force(x, omega, shift)[..., 0]
-        quadratic = shifted.compliance + (self.orders * omega)[:, None, None] * shifted.rate
+        quadratic = shifted.compliance + (self.orders * omega)[:, None, None] * self.shifted.rate(omega, shift)
         energies = np.einsum("ki,kij,kj->k", force.conj(), quadratic, force).real
         energies -= shift[:, 0, 0] * np.sum(np.abs(elongation) ** 2, axis=1)  # what the added springs hold
         return float(np.where(self.orders == 0, 0.5, 0.25) @ energies + self.series(x, omega).potential.sum())

@@ -106,6 +106,25 @@ def _transform(theta: np.ndarray, weighted: np.ndarray, out: np.ndarray) -> None
 
 
 @lru_cache(maxsize=256)
+def _factors(order: int) -> np.ndarray:
+    """What turns harmonics (K + 1,) up to an ``order`` into the transforms (4, K + 1) of z and three derivatives.
+
+    They are those of uniform samples, up to a factor of half their number.
+    """
+    factors = (1j * np.arange(order + 1)) ** np.arange(4)[:, None]
+    factors[0, 0] = 2.0
+    return factors
+
+
+def _sampled(z: np.ndarray, derivatives: int) -> np.ndarray:
+    """An elongation of harmonics ``z`` (K + 1,) and its first ``derivatives`` by phase (1 + derivatives, samples)."""
+    order = len(z) - 1
+    # A power of two, which transforms fast; 8 are left for a motion that is constant (K = 0).
+    samples = 1 << int(np.ceil(np.log2(DENSITY * order + 8)))
+    return np.fft.irfft(z * (samples / 2) * _factors(order)[: derivatives + 1], samples)
+
+
+@lru_cache(maxsize=256)
 def _panels(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes sin^2 phi in [0, 1] and their weights: ``count`` panels of Gauss's rule in phi from 0 to pi/2."""
     x, weight = np.polynomial.legendre.leggauss(NODES)
@@ -210,24 +229,37 @@ class ForceSeries:
         self.forces[pair, : len(z)] += 1j * rate * np.arange(len(z)) * z
         self._rates[pair, 0] += rate
 
-    def jacobian(self, exponent: complex = 0.0, orders: np.ndarray | None = None) -> np.ndarray:
-        """How f exp(-mu theta) depends on d_k (pairs, orders, orders), if z changes by sum_k d_k exp((i k + mu) theta).
+    @property
+    def dissipates(self) -> bool:
+        """Whether a force depends on a velocity, so that its ``jacobian`` depends on the exponent."""
+        return bool(self._onsets) or bool(np.any(self._rates))
 
-        Rows and columns are ``orders`` within -K..K, all unless given; ``exponent`` is mu = lambda/Om of Hill's method.
-        If nothing dissipates, an entry is the Fourier coefficient of df/dz of the order row minus column.
+    def jacobian(
+        self, exponent: complex = 0.0, orders: np.ndarray | None = None, rows: np.ndarray | None = None
+    ) -> np.ndarray:
+        """How f exp(-mu theta) depends on d_k (pairs, rows, orders), if z changes by sum_k d_k exp((i k + mu) theta).
+
+        Columns are the orders k of d_k, within -K..K, all unless given, ``rows`` those of the force, the same unless
+        given; ``exponent`` is mu = lambda/Om of Hill's method. If nothing dissipates, an entry is the Fourier
+        coefficient of df/dz of the order row minus column.
         """
         if orders is None:
             orders = np.arange(-self.order, self.order + 1)
-        return self.jacobians(np.array([exponent]), orders)[0]
+        return self.jacobians(np.array([exponent]), orders, rows)[0]
 
-    def jacobians(self, exponents: np.ndarray, orders: np.ndarray) -> np.ndarray:
-        """The ``jacobian`` at each of the ``exponents``, of ``orders``: (exponents, pairs, orders, orders)."""
-        lag = orders[:, None] - orders + 2 * self.order  # index in the two-sided series from -2K to 2K
-        rate = 1j * orders + exponents[:, None]
+    def jacobians(self, exponents: np.ndarray, orders: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """The ``jacobian`` at each of the ``exponents``: (exponents, pairs, rows, orders)."""
+        if rows is None:
+            rows = orders
+        lag = rows[:, None] - orders + 2 * self.order  # index in the two-sided series from -2K to 2K
         slopes = np.hstack([self._slopes[:, :0:-1].conj(), self._slopes])
+        matrices = np.repeat(slopes[None, :, lag], len(exponents), axis=0)
+        if not self.dissipates:
+            return matrices
+
+        rate = 1j * orders + exponents[:, None]
         rates = np.hstack([self._rates[:, :0:-1].conj(), self._rates])
-        matrices = rates[:, lag] * rate[:, None, None, :]
-        matrices += slopes[:, lag]
+        matrices += rates[:, lag] * rate[:, None, None, :]
 
         # The change of z'_minus by d_k, (i k + mu - z''/z') exp((i k + mu) phase), times the force that it causes.
         for pair, phase, bend, theta, weights in self._onsets:
@@ -239,8 +271,8 @@ class ForceSeries:
             real, imaginary = np.split(out, 2)
             positive = real + 1j * imaginary
             negative = (real - 1j * imaginary).conj()
-            rows = np.where(orders < 0, negative[:, np.abs(orders)], positive[:, np.abs(orders)])
-            matrices[:, pair] += rows[:, :, None] * ((rate - bend) * turns)[:, None, :]
+            force = np.where(rows < 0, negative[:, np.abs(rows)], positive[:, np.abs(rows)])
+            matrices[:, pair] += force[:, :, None] * ((rate - bend) * turns)[:, None, :]
         return matrices
 
 
@@ -282,14 +314,12 @@ class SiteForces:
 
         Raises ArithmeticError where a dissipative contact never separates: it has no onset.
         """
-        order = z.shape[1] - 1
-        series = ForceSeries(self.pairs, order)
-        motion = self._sampled(z)
+        series = ForceSeries(self.pairs, z.shape[1] - 1)
+        # No motion is larger than the sum of its harmonics: a contact within its clearances needs no samples.
+        largest = np.abs(z).sum(axis=1).tolist()
         for pair, stops in enumerate(self.contacts):
-            for side, clearance in ((1, stops.plus), (-1, stops.minus)):
-                for begin, end in arcs(np.ascontiguousarray(side * motion[pair, :, :3]), clearance):
-                    arc = Episode(pair, side, begin, end - begin, approach=0.0)
-                    self._add_arc(series, arc, motion[pair], z, omega)
+            if stops.clearance < largest[pair]:
+                self._add_contact(series, pair, z, omega)
             if stops.is_pressed:
                 series.add_load(pair, stops, z[pair])
             if stops.drag:
@@ -297,28 +327,26 @@ class SiteForces:
 
         # Uniform samples are exact for springs: f exp(-i k theta) has orders up to 3K + 2K, the energy up to 4K.
         for pair, spring in enumerate(self.springs, len(self.contacts)):
-            x = motion[pair, :, 0]
+            x = _sampled(z[pair], derivatives=0)[0]
             values = [spring.nonlinear_force(x), spring.nonlinear_slope(x), spring.nonlinear_energy(x)]
             series.add_spring(pair, np.array(values))
 
         series.episodes.sort(key=lambda e: (e.pair, e.onset))
         return series
 
-    def _sampled(self, z: np.ndarray) -> np.ndarray:
-        """The elongations and their first three derivatives by phase (pairs, samples, 4) over a period."""
-        order = z.shape[1] - 1
-        # A power of two, which transforms fast; 8 are left for a motion that is constant (K = 0).
-        samples = 1 << int(np.ceil(np.log2(DENSITY * order + 8)))
-        spectrum = np.zeros((self.pairs, samples // 2 + 1), complex)
-        spectrum[:, : order + 1] = z * (samples / 2)
-        spectrum[:, 0] = z[:, 0].real * samples
-        rates = 1j * np.arange(samples // 2 + 1)
-        return np.stack([np.fft.irfft(spectrum * rates**d, samples) for d in range(4)], axis=-1)
+    def _add_contact(self, series: ForceSeries, pair: int, z: np.ndarray, omega: float) -> None:
+        """Add the arcs of contact of a ``pair`` to the ``series``; ``z`` (pairs, K + 1) are the harmonics."""
+        motion = _sampled(z[pair], derivatives=3).T
+        stops = self.contacts[pair]
+        for side, clearance in ((1, stops.plus), (-1, stops.minus)):
+            for begin, end in arcs(np.ascontiguousarray(side * motion[:, :3]), clearance):
+                arc = Episode(pair, side, begin, end - begin, approach=0.0)
+                self._add_arc(series, arc, motion, z, omega)
 
     def _add_arc(self, series: ForceSeries, arc: Episode, motion: np.ndarray, z: np.ndarray, omega: float) -> None:
         """Add one ``arc`` of contact, whose approach velocity is found here, to the ``series``.
 
-        ``motion`` (samples, 4) is that of the pair (``_sampled``), ``z`` (pairs, K + 1) are the harmonics.
+        ``motion`` (samples, 4) is that of the pair and its derivatives, ``z`` (pairs, K + 1) are the harmonics.
         """
         pair = arc.pair
         side = arc.side

@@ -36,8 +36,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import trapezoid
 
-from vipetsc.modes.balance.harmonic_balance import Compliance
 from vipetsc.modes.balance.harmonics import ForceSeries
+from vipetsc.modes.balance.shifted_compliance import Compliance
 
 # Growth rate over Om up to which a motion counts as stable ...
 LEAST = 1e-4
@@ -138,12 +138,12 @@ class Hill:
 
     def determinants(self, series: ForceSeries, exponents: np.ndarray) -> np.ndarray:
         """D (exponents,) at lambda/Om = ``exponents``; large ones keep their phases."""
-        if self._reduced is None or self._reduced[0] is not series:
-            self._reduced = series, [self._eliminated(series, orders) for orders in self._blocks]
         out = np.ones(len(exponents), complex)
         acting = self._acting(series)
         if not acting.size:
             return out
+        if self._reduced is None or self._reduced[0] is not series:
+            self._reduced = series, [self._eliminated(series, orders) for orders in self._blocks]
         for block, (orders, jacobian) in enumerate(zip(self._blocks, self._reduced[1], strict=True)):
             low = orders
             if jacobian is not None:
@@ -169,12 +169,13 @@ class Hill:
         """Numbers of the pairs of which the determinant is taken.
 
         Of a pair that no force acts on the row of J is zero, and it leaves the determinant as it is. Of few pairs all
-        are taken, which costs little.
+        are taken, which costs little, where a force acts on one of them.
         """
+        acting = series.acting
         pairs = len(series.potential)
-        if pairs <= FEW_PAIRS:
+        if acting.size and pairs <= FEW_PAIRS:
             return np.arange(pairs)
-        return series.acting
+        return acting
 
     def _at(self, block: int, orders: np.ndarray, exponents: Sequence[complex]) -> list[np.ndarray]:
         """The compliances (order, pair, pair) of a block's ``orders`` at ``exponents``: new ones all in one call."""
@@ -190,7 +191,7 @@ class Hill:
 
     def _eliminated(self, series: ForceSeries, orders: np.ndarray) -> np.ndarray | None:
         """J (order pair, order pair) of the orders kept, with what the others do; None if it depends on lambda."""
-        if not np.array_equal(series.jacobian(1.0, orders[:2]), series.jacobian(0.0, orders[:2])):
+        if series.dissipates:
             return None
         acting = self._acting(series)
         pairs = len(acting)

@@ -148,20 +148,20 @@ class SteadyEquations(ABC):
     def jacobian(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
         """The derivative (n, n + 1) of the ``residual``."""
         omega, amplitude = self.drive(xi[-1])
-        jacobian, column = self.balance.derivative(xi[:-1] * self.clearance, omega, shift)
+        x = xi[:-1] * self.clearance
+        jacobian = self.balance.jacobian(x, omega, shift)
         if self.parameter.over == "amplitude":
             # The residual is linear in the amplitude: the drive's term for the amplitude 1.
             column = self._drive_term(omega, 1.0, shift)
         else:
             ends = [omega * (1 + sign * SLOPE) for sign in (1, -1)]
             after, before = (self._drive_term(end, amplitude, shift) for end in ends)
-            column = column + (after - before) / (ends[0] - ends[1])
+            column = self.balance.rate(x, omega, shift) + (after - before) / (ends[0] - ends[1])
         return np.column_stack([jacobian, column * self.parameter.scale / self.clearance])
 
     def _drive_term(self, omega: float, amplitude: float, shift: np.ndarray) -> np.ndarray:
-        """The part (n,) of the residual that is due to the drive, in m: the residual at rest."""
-        rest = np.zeros(self.balance.size)
-        return self.balance.residual(rest, omega, shift, amplitude * self.linear_motion(omega).harmonics)
+        """The part (n,) of the residual that is due to the drive, in m."""
+        return self.balance.drive_term(omega, shift, amplitude * self.linear_motion(omega).harmonics)
 
     def frame(self, point: Response, chart: str = "auto") -> SteadyFrame:
         """The frame at a state; there is one ``chart``."""

@@ -1,0 +1,139 @@
+"""The compliance at the multiples of a frequency, shifted by springs that keep its poles away."""
+
+from functools import partial
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from vipetsc.lattice import DenseCompliance
+from vipetsc.modes.latest import LatestValues
+
+# Radius, over the frequency, of a circle on which Cauchy's formula gives the derivative of a real compliance, and the
+# lower half of its nodes.
+RADIUS = 1e-4
+NODES = np.exp(-1j * np.pi / 8 * np.array([1, 3, 5, 7]))
+# Relative step of a difference for a complex compliance, which Cauchy's formula on half a circle does not fit.
+STEP = 1e-6
+# The order 0 has no frequency of its own to scale a step by: this fraction of the highest.
+LEAST_RATE = 1e-3
+# Relative detuning of a frequency at which the compliance has a pole.
+DETUNING = 1e-15
+# Size of the compliance times the stiffness of the shift from which several pairs are taken to be close to a pole.
+NEAR_POLE = 1e3
+# Frequencies whose values are kept: that of a motion, and the two ends of a difference along its branch.
+KEPT = 3
+
+
+class Compliance(Protocol):
+    """Interface of ``lattice.compliance``: G (frequencies, pairs, pairs) in m/N, real or complex."""
+
+    def at(self, omegas: np.ndarray) -> np.ndarray:
+        """G (frequency, place, place) in m/N at ``omegas`` (frequency,) in rad/s, which may be complex."""
+
+
+class Shifted(NamedTuple):
+    """The shifted compliance G_s = A G (orders, pairs, pairs) in m/N, and the factor A = (1 + s G)^-1."""
+
+    compliance: np.ndarray
+    factor: np.ndarray
+
+
+class ShiftedCompliance:
+    """A ``compliance`` of ``pairs`` at the multiples ``orders`` of a frequency, in rad/s, as it is and shifted.
+
+    Stiffnesses s (orders, 1, 1) in N/m are those that ``shift`` chooses. ``weight`` multiplies the compliances of
+    orders above the first. What has been computed at the latest frequencies is kept: Newton's method asks for the
+    same values several times, and along a curve over the amplitude the frequency stays the same.
+    """
+
+    def __init__(self, compliance: Compliance, pairs: int, orders: np.ndarray, weight: float) -> None:
+        self.compliance = compliance
+        self.pairs = pairs
+        self.orders = orders
+        self.weight = weight
+        self._values = LatestValues[float, np.ndarray](KEPT)
+        self._shifted = LatestValues[tuple[float, bytes], Shifted](KEPT)
+        self._rates = LatestValues[tuple[float, bytes], np.ndarray](KEPT)
+
+    def values(self, omega: float) -> np.ndarray:
+        """G (orders, pairs, pairs) in m/N at the multiples of ``omega``."""
+        return self._values.get(omega, partial(self._evaluate, self.orders, omega))
+
+    def shift(self, omega: float) -> np.ndarray:
+        """The stiffnesses s (orders, 1, 1) in N/m to shift the compliance by for motions near ``omega``."""
+        g = self.values(omega)
+        one = np.eye(self.pairs)
+        squared = np.maximum(self.orders, 1) ** 2
+        # At the highest order inertia alone counts: G = -1/(mass omega^2). Of the two signs of the stiffness the one
+        # that keeps 1 + s G farther from singular has the poles of G_s farther away.
+        mass = 1 / (self.orders[-1] ** 2 * np.abs(np.trace(g[-1])) / self.weight / len(one))  # times omega^2
+        size = (mass * squared)[:, None, None]
+        plus, minus = (np.linalg.svd(one + sign * size * g, compute_uv=False)[:, -1] for sign in (1, -1))
+        return np.where((plus >= minus)[:, None, None], size, -size)
+
+    def at(self, omega: float, shift: np.ndarray) -> Shifted:
+        """G_s and A at the multiples of ``omega``."""
+        key = omega, shift.tobytes()
+        return self._shifted.get(key, lambda: self._shift(self.orders, omega, self.values(omega), shift))
+
+    def factor(self, order: int, omega: float, shift: np.ndarray) -> np.ndarray:
+        """The factor A (pairs, pairs) of one of the orders alone."""
+        (place,) = np.nonzero(self.orders == order)
+        orders = self.orders[place]
+        return self._shift(orders, omega, self._evaluate(orders, omega), shift[place]).factor[0]
+
+    def rate(self, omega: float, shift: np.ndarray) -> np.ndarray:
+        """Derivative (orders, pairs, pairs) of G_s by its own frequency, at the multiples of ``omega``."""
+        key = omega, shift.tobytes()
+        return self._rates.get(key, partial(self._differentiate, omega, shift))
+
+    def _evaluate(self, orders: np.ndarray, omega: float) -> np.ndarray:
+        """G (orders, pairs, pairs) at some of the orders."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values = self.compliance.at(orders * omega)
+        # On a linear mode the compliance is infinite, and the motion finite.
+        if not np.all(np.isfinite(values)):
+            values = self.compliance.at(orders * omega * (1 + DETUNING))
+        return self._weighted(values, orders)
+
+    def _weighted(self, values: np.ndarray, orders: np.ndarray) -> np.ndarray:
+        """G (..., orders, pairs, pairs) with the weight of the orders above the first."""
+        if self.weight == 1.0:
+            return values
+        return values * np.where(orders > 1, self.weight, 1.0)[:, None, None]
+
+    def _shift(self, orders: np.ndarray, omega: float, values: np.ndarray, shift: np.ndarray) -> Shifted:
+        """G_s and A of the ``values`` (orders, pairs, pairs) of G at some of the orders."""
+        factor = np.linalg.inv(np.eye(self.pairs) + shift * values)
+        shifted = factor @ values
+        if self.pairs < 2 or not isinstance(self.compliance, DenseCompliance):
+            return Shifted(shifted, factor)
+
+        # Near the pole of a mode the compliance of several pairs is that of the mode alone, to rounding, and the
+        # inverse has lost the rest; of one pair nothing is lost.
+        sizes = np.abs(shift[:, 0, 0]) * np.abs(values).max(axis=(1, 2))
+        (near,) = np.nonzero(sizes > NEAR_POLE)
+        stiffness = shift[near, 0, 0]
+        if near.size and self.weight == 1.0:
+            shifted[near] = self.compliance.with_springs(orders[near] * omega, stiffness)
+            factor[near] = np.eye(self.pairs) - stiffness[:, None, None] * shifted[near]
+        return Shifted(shifted, factor)
+
+    def _differentiate(self, omega: float, shift: np.ndarray) -> np.ndarray:
+        """The derivative of G_s: by Cauchy's formula, or by a central difference where G is complex."""
+        rates = self.orders * omega
+        sizes = np.maximum(rates, LEAST_RATE * rates[-1])
+        is_real = np.isrealobj(self.values(omega))
+
+        # A compliance that is real on the real axis has conjugate values above and below it: half a circle is enough.
+        circle = STEP * np.array([1.0, -1.0])
+        if is_real:
+            circle = RADIUS * NODES
+        near = self.compliance.at((rates + sizes * circle[:, None]).ravel())
+        values = self._weighted(near.reshape(len(circle), len(rates), self.pairs, self.pairs), self.orders)
+
+        factor = np.linalg.inv(np.eye(self.pairs) + shift * values)
+        slopes = np.einsum("n,nkij->kij", 1 / circle, factor @ values) / (sizes * len(circle))[:, None, None]
+        if is_real:
+            return np.asarray(slopes.real)
+        return np.asarray(slopes)
