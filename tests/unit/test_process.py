@@ -1,8 +1,10 @@
-"""The environment in which MPI is started by a process alone."""
+"""A process before MPI: the environment in which it starts MPI alone, and requests to stop until then."""
 
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 
 import pytest
 
@@ -43,3 +45,38 @@ def test_a_rank_of_a_job_starts_mpi_as_its_launcher_says(name, monkeypatch):
     monkeypatch.setenv(name, "0")
     with quick_start_alone():
         assert not ALONE.keys() & os.environ.keys()
+
+
+# The signal comes while the process waits: if the handler returned, it would end with exit code 0.
+REQUESTED = """
+import os, signal
+from vipetsc.process import end_on_request
+end_on_request()
+os.kill(os.getpid(), signal.{name})
+"""
+
+
+@pytest.mark.parametrize(
+    ("launched", "said"), [({}, "vipetsc: stopped on request\n"), ({"OMPI_COMM_WORLD_RANK": "1"}, "")]
+)
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_request_before_anything_has_begun_ends_the_process_with_code_75(name, launched, said):
+    """The code is that of a run that can be resumed, not the signal's; ranks leave the words to their launcher."""
+    ended = subprocess.run(
+        [sys.executable, "-c", REQUESTED.format(name=name)],
+        env=os.environ | launched,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+
+    assert ended.returncode == os.EX_TEMPFAIL == 75
+    assert ended.stderr == said
+
+
+def test_a_signal_that_nohup_has_set_aside_stays_so():
+    """The end of the terminal must not end a run that was started to outlive it."""
+    ignoring = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)"
+    program = ignoring + REQUESTED.format(name="SIGHUP")
+    ended = subprocess.run([sys.executable, "-c", program], check=False)
+    assert ended.returncode == 0
