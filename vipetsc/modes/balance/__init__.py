@@ -1,7 +1,9 @@
 """Harmonic balance: periodic motions condensed onto the contacts and springs where a system is nonlinear.
 
-``harmonics`` gives the forces of contacts and springs in a periodic motion, ``harmonic_balance`` the equations of its
-harmonics, ``breather`` branches of conservative motions, ``hill`` the stability of a motion by Hill's determinant.
+``stops`` says where a contact acts, ``arcs`` on which intervals of phase it does, ``harmonics`` the forces of contacts
+and springs in a periodic motion. ``shifted_compliance`` is the linear system between them, and ``harmonic_balance`` the
+equations of a motion's harmonics. ``conservative`` has branches of conservative motions, ``describing_function`` their
+start in a gap, ``hill`` the stability of a motion by Hill's determinant.
 """
 
 from vipetsc.modes.balance.conservative import ConservativeMotions

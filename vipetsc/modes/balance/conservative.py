@@ -1,19 +1,29 @@
 """Branches of conservative motions by harmonic balance: their start, and the unknowns of their continuation.
 
-The motions are at rest at phase 0 (cosines alone), and symmetric where all forces are odd (odd harmonics alone). The
-number of harmonics is chosen at every point for the next one by the estimate of what is left out. A branch begins at
-a linear mode, or at a frequency in a gap: there a describing function, z = b + a cos(Om t) at one place, gives a from
-1 + G(Om) F_1/a = 0 and the mean from b + G(0) F_0 = 0, and the other harmonics are brought in with a growing weight.
+A *place* is a contact or a smooth spring; z are the elongations of all places, contacts first. Their harmonics Z_k in a
+motion of frequency Om, with the harmonics F_k(Z) of the forces, solve the equations of the package's docstring,
+
+    Z_k + G_s(k Om) (F_k - s_k Z_k) = 0,
+
+where the *shift* s_k is the stiffness of springs that are added to the compliance G and taken off the forces, so that
+G_s has no pole near k Om. The solutions do not depend on it, the residuals do: a step of the continuation, which is a
+``HarmonicFrame``, keeps one. The motions are at rest at phase 0, so that the Z_k are real (cosines alone), and
+symmetric where all forces are odd (odd harmonics alone). The unknowns are Z_k, place by place, and the frequency.
+
+The *truncation* of a motion is the estimated size of the harmonics left out over that of the motion
+(``HarmonicBalance.truncation``). By it the number of harmonics is chosen at every point for the next one.
+
+A branch begins at a linear mode, or at a frequency in a gap. There a describing function, z = b + a cos(Om t) at one
+place, gives a from a + G(Om) F_1 = 0 and the mean from b + G(0) F_0 = 0, and the other harmonics are brought in with a
+growing weight.
 """
 
-import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
 from vipetsc.case.nnm_table import NnmTable
+from vipetsc.modes.balance.describing_function import PlaceCompliance, describing_motion
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonics import Episode, SiteForces
 from vipetsc.modes.balance.shifted_compliance import Compliance
@@ -23,24 +33,23 @@ from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, Special
 
 # Order of the highest harmonic at the start; no motion has fewer harmonics.
 FEWEST = 15
-# The harmonics change where the part left out is outside these fractions of what is allowed, and then so that it
-# becomes the fraction AIM of it: far enough from both ends that they do not change at every point.
+# The number of harmonics changes where the truncation is outside these fractions of the one allowed, and then so that
+# it becomes the fraction AIM: far enough from both ends that the number does not change at every point.
 FEWER = 0.02
 MORE = 0.5
 AIM = 0.2
-# Step along the tangent by whose two ends the energy's slope is taken.
+# The truncation falls as the inverse cube of the order at least (``HarmonicBalance.truncation``). In one step
+# the order grows by this factor at most, since the estimate of a motion with few harmonics may be far off.
+DECAY = 3
+MOST_GROWTH = 2.0
+# Step along the tangent, in the unknowns, by whose two ends the energy's derivative along the branch is taken.
 SLOPE_STEP = 1e-5
-# Largest size of a describing function, in clearances, and the mean over the amplitude that is none.
-LARGEST = 1e3
-LEAST_MEAN = 1e-14
-# Of a contact that is pressed at rest the smallest size, in its depth there, and the sizes that are tried: its force
-# softens as it opens and hardens beyond, so that the two ends do not tell whether there is a motion.
-LEAST_OF_PRESSED = 1e-2
-TRIED_OF_PRESSED = 41
-# As the harmonics above the first are brought in: first step of their weight, how far the motion may change in one,
-# and the smallest.
+# As the harmonics above the first are brought in: first step of their weight, how far the motion may change in one, in
+# its size, factors of the step after success and failure, and the smallest step.
 FIRST_WEIGHT = 0.1
 FURTHEST = 0.1
+LONGER = 1.6
+SHORTER = 0.4
 SMALLEST_WEIGHT = 1e-4
 # A contact episode whose middle lies within this phase (rad) of the arc's ends is on the end: counted once.
 PHASE_ROUNDING = 1e-9
@@ -49,7 +58,8 @@ PHASE_ROUNDING = 1e-9
 class HarmonicFrame:
     """Unknowns at and near a motion: harmonics over their largest ``size`` in m, and the frequency over its ``omega``.
 
-    Its ``balance`` and ``shift`` are those of the step: the number of harmonics stays within it.
+    The equations ``balance``, with their number of harmonics, and their ``shift`` stay the same within a step. The unit
+    ``tangent`` (n + 1,) is there if the branch has one at the motion, which ``correct`` and ``tangent_at`` need.
     """
 
     tangent: np.ndarray
@@ -117,7 +127,7 @@ class HarmonicFrame:
             energies = [balance.energy(*self.motion(xi + s * SLOPE_STEP * direction), self.shift) for s in (1, -1)]
             energy_tangent = (energies[0] - energies[1]) / (2 * SLOPE_STEP)
             by_frequency = direction[-1] * self.omega / (2 * np.pi)
-            # At a fold of the energy the branch is vertical.
+            # The slope is df/dE in Hz/J: infinite at a fold of the energy.
             slope = np.inf
             if energy_tangent:
                 slope = by_frequency / energy_tangent
@@ -141,7 +151,11 @@ class HarmonicFrame:
         )
 
     def _episodes(self, episodes: list[Episode]) -> int:
-        """How often contacts close, or open if they are pressed at rest, in the arc that shooting would cover."""
+        """How often contacts close, or open if they are pressed at rest, from phase 0 to where the motion repeats.
+
+        That is half a period for a motion at rest at phase 0, and a quarter if it is symmetric as well: the arcs that
+        shooting integrates, with whose counts these are compared.
+        """
         end = np.pi
         if self.balance.forces.odd:
             end = np.pi / 2
@@ -207,14 +221,17 @@ class ConservativeMotions:
         """The order of the highest harmonic for motions near ``point``."""
         allowed = self.control.truncation
         order = point.order
+        # The highest order is odd in any case: symmetric motions have no other.
         if point.truncation >= MORE * allowed:
-            # What is left out falls as the inverse cube of the order.
-            order = int(order * min((point.truncation / allowed / AIM) ** (1 / 3), 2.0)) // 2 * 2 + 1
+            growth = (point.truncation / allowed / AIM) ** (1 / DECAY)
+            order = int(order * min(growth, MOST_GROWTH)) // 2 * 2 + 1
         elif point.truncation <= FEWER * allowed:
             sizes = np.abs(point.x.reshape(self.forces.pairs, -1))
             beyond = sizes[:, ::-1].cumsum(axis=1)[:, ::-1]
-            needed = (beyond > AIM * allowed * sizes.sum(axis=1).max()).any(axis=0)
-            order = max(min(int(needed.sum()) * (1 + self.forces.odd) // 2 * 2 + 1, order), FEWEST)
+            needed = int((beyond > AIM * allowed * sizes.sum(axis=1).max()).any(axis=0).sum())
+            if self.forces.odd:
+                needed = 2 * needed
+            order = max(min(needed // 2 * 2 + 1, order), FEWEST)
         return min(order, self.control.harmonics)
 
     def frame(self, point: Point, chart: str = "auto") -> HarmonicFrame:
@@ -236,7 +253,7 @@ class ConservativeMotions:
         return np.append(harmonics, point.tangent[-1]) * sign
 
     def turn(self, before: Point, after: Point) -> float:
-        """Angle between the tangents of two motions in relative units: that of the step, which is guarded anyway."""
+        """0: shooting guards a second angle between tangents here; in these unknowns that of the step is enough."""
         return 0.0
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
@@ -285,7 +302,8 @@ class ConservativeMotions:
             g = PlaceCompliance(float(static[place, place]), float(dynamic[place, place]))
             mean[place], amplitude = describing_motion(self.forces, place, g, omega)
             z[place] = signs[place] * amplitude
-            # The force there moves the places that are not in contact, too.
+            # A first guess: the force at this place moves the places without a force of their own by the ratio of the
+            # compliances; how it moves the others is left to Newton's method.
             z += np.where(signs == 0, dynamic[:, place] / g.dynamic * z[place], 0.0)
 
         x = self.one_harmonic(z, mean)
@@ -302,9 +320,9 @@ class ConservativeMotions:
             if attempt.converged and moved < FURTHEST:
                 x = attempt.xi[:-1] * size
                 weight = tried
-                step = 1.6 * step
+                step = LONGER * step
                 continue
-            step = 0.4 * step
+            step = SHORTER * step
             if step < SMALLEST_WEIGHT:
                 raise ContinuationError(
                     f"no breather at {omega:g} rad/s: with {weight:.3g} of the harmonics above the first, Newton's "
@@ -323,71 +341,3 @@ class ConservativeMotions:
         """A point to be corrected, of unknowns with the fewest harmonics."""
         frame = HarmonicFrame(self, self.balance(FEWEST), x, omega, 1.0)
         return frame.measures(Attempt(False, "", [], frame.xi))
-
-
-class PlaceCompliance(NamedTuple):
-    """Compliance in m/N of one place: ``static``, which the mean of a force meets, and ``dynamic``, at a frequency."""
-
-    static: float
-    dynamic: float
-
-
-class DescribedMotion(NamedTuple):
-    """A motion ``mean`` + ``amplitude`` cos(theta) of one place, in m."""
-
-    mean: float
-    amplitude: float
-
-
-def describing_motion(forces: SiteForces, place: int, g: PlaceCompliance, omega: float) -> DescribedMotion:
-    """The motion z = b + a cos(Om t) at a ``place`` with one of the ``forces``, of which two harmonics balance.
-
-    b + G(0) F_0 = 0 gives the mean b of every amplitude a, which increases with the force; a + G(Om) F_1 = 0 gives a.
-    Raises ContinuationError where there is none.
-    """
-    spring = place - len(forces.contacts)
-    if spring >= 0 and forces.springs[spring].cubic == 0:
-        raise ContinuationError(
-            f"no breather starts at {omega:g} rad/s on a spring without a cubic part: of a harmonic motion its "
-            "quadratic force has a mean and a second harmonic alone; give it a cubic part, or begin at another place"
-        )
-    is_pressed = place < len(forces.contacts) and forces.contacts[place].is_pressed
-    z = np.zeros((forces.pairs, 2), complex)
-
-    def force(mean: float, amplitude: float) -> np.ndarray:
-        z[place] = mean, amplitude
-        return forces.series(z, omega).forces[place].real
-
-    def mean_of(amplitude: float) -> float:
-        def static_balance(mean: float) -> float:
-            return mean + g.static * float(force(mean, amplitude)[0])
-
-        # Odd forces have no mean. Of forces that harden it lies between 0 and that of the force at 0; of others the
-        # balance of all harmonics will find it.
-        without = static_balance(0.0)
-        furthest = -without
-        while is_pressed and static_balance(furthest) * without > 0 and abs(furthest) < LARGEST * amplitude:
-            furthest *= 2
-        if forces.odd or abs(without) <= LEAST_MEAN * amplitude or static_balance(furthest) * without >= 0:
-            return 0.0
-        return float(brentq(static_balance, furthest, 0.0))
-
-    def balance(amplitude: float) -> float:
-        return amplitude + g.dynamic * float(force(mean_of(amplitude), amplitude)[1])
-
-    size = forces.amplitude_scale(place, g.dynamic)
-    sizes = [size, LARGEST * size]
-    if is_pressed:
-        sizes = (size * np.geomspace(LEAST_OF_PRESSED, LARGEST, TRIED_OF_PRESSED)).tolist()
-    for low, high in itertools.pairwise(sizes):
-        if balance(low) * balance(high) < 0:
-            amplitude = float(brentq(balance, low, high, rtol=1e-12))
-            return DescribedMotion(mean=mean_of(amplitude), amplitude=amplitude)
-
-    needs = "a force that hardens needs a negative one of moderate size"
-    if is_pressed:
-        needs = "the force of a contact that is pressed at rest balances it at no amplitude"
-    raise ContinuationError(
-        f"no breather starts at {omega:g} rad/s: the compliance of its site is {g.dynamic:.4g} m/N there, and "
-        f"{needs}; change nnm.start_frequency"
-    )

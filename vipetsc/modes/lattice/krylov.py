@@ -19,7 +19,7 @@ from scipy.sparse import diags
 from scipy.sparse.linalg import splu
 
 from vipetsc.lattice import Chain
-from vipetsc.modes.balance.conservative import PlaceCompliance, describing_motion
+from vipetsc.modes.balance.describing_function import PlaceCompliance, describing_motion
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.newton import BorderedNewton, Equations

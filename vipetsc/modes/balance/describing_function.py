@@ -1,0 +1,96 @@
+"""Describing function: a motion of one place with a mean and one harmonic, from which a branch in a gap begins.
+
+The force at the place is replaced by its mean and its first harmonic, the others are neglected (N. M. Krylov and N. N.
+Bogoliubov, Introduction to Non-Linear Mechanics, Princeton 1947).
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+
+from vipetsc.modes.balance.harmonics import SiteForces
+from vipetsc.modes.problem import ContinuationError
+
+# Amplitudes are sought up to this size, in units of ``SiteForces.amplitude_scale`` (of a contact its clearance), and
+# means up to so many amplitudes.
+LARGEST = 1e3
+# Mean over the amplitude that is none but rounding.
+LEAST_MEAN = 1e-14
+# The force of a contact that is pressed at rest softens as it opens and hardens beyond. Its balance may therefore have
+# the same sign at the smallest and at the largest size, and change it twice between: so many sizes are tried, from this
+# one (in the depth by which it is pressed) on.
+LEAST_OF_PRESSED = 1e-2
+TRIED_OF_PRESSED = 41
+
+
+class PlaceCompliance(NamedTuple):
+    """Compliance in m/N of one place: ``static``, which the mean of a force meets, and ``dynamic``, at a frequency."""
+
+    static: float
+    dynamic: float
+
+
+class DescribedMotion(NamedTuple):
+    """A motion ``mean`` + ``amplitude`` cos(theta) of one place, in m."""
+
+    mean: float
+    amplitude: float
+
+
+def describing_motion(forces: SiteForces, place: int, g: PlaceCompliance, omega: float) -> DescribedMotion:
+    """The motion z = b + a cos(Om t) at a ``place`` with one of the ``forces``, of which two harmonics balance.
+
+    b + G(0) F_0(a, b) = 0 gives the mean b for every amplitude a; with it a + G(Om) F_1(a, b) = 0 gives a. Here ``g``
+    are the compliances of the place at 0 and at ``omega`` (rad/s). Raises ContinuationError where there is none.
+    """
+    spring = place - len(forces.contacts)
+    if spring >= 0 and forces.springs[spring].cubic == 0:
+        raise ContinuationError(
+            f"no breather starts at {omega:g} rad/s on a spring without a cubic part: of a harmonic motion its "
+            "quadratic force has a mean and a second harmonic alone; give it a cubic part, or begin at another place"
+        )
+    is_pressed = place < len(forces.contacts) and forces.contacts[place].is_pressed
+    z = np.zeros((forces.pairs, 2), complex)
+
+    def force(mean: float, amplitude: float) -> np.ndarray:
+        z[place] = mean, amplitude
+        return forces.series(z, omega).forces[place].real
+
+    def mean_of(amplitude: float) -> float:
+        def static_balance(mean: float) -> float:
+            return mean + g.static * float(force(mean, amplitude)[0])
+
+        without = static_balance(0.0)
+        if forces.odd or abs(without) <= LEAST_MEAN * amplitude:
+            return 0.0
+        # Of forces that harden the mean lies between 0 and that of the force without it. The force of a contact that is
+        # pressed at rest softens: its mean may be larger.
+        furthest = -without
+        while is_pressed and static_balance(furthest) * without > 0 and abs(furthest) < LARGEST * amplitude:
+            furthest *= 2
+        if static_balance(furthest) * without >= 0:
+            # There is none so far: 0 is a guess, and the balance of all harmonics decides.
+            return 0.0
+        return float(brentq(static_balance, furthest, 0.0))
+
+    def balance(amplitude: float) -> float:
+        return amplitude + g.dynamic * float(force(mean_of(amplitude), amplitude)[1])
+
+    size = forces.amplitude_scale(place, g.dynamic)
+    sizes = [size, LARGEST * size]
+    if is_pressed:
+        sizes = (size * np.geomspace(LEAST_OF_PRESSED, LARGEST, TRIED_OF_PRESSED)).tolist()
+    for low, high in itertools.pairwise(sizes):
+        if balance(low) * balance(high) < 0:
+            amplitude = float(brentq(balance, low, high, rtol=1e-12))
+            return DescribedMotion(mean=mean_of(amplitude), amplitude=amplitude)
+
+    needs = "a force that hardens needs a negative one of moderate size"
+    if is_pressed:
+        needs = "the force of a contact that is pressed at rest balances it at no amplitude"
+    raise ContinuationError(
+        f"no breather starts at {omega:g} rad/s: the compliance of its site is {g.dynamic:.4g} m/N there, and "
+        f"{needs}; change nnm.start_frequency"
+    )
