@@ -5,11 +5,9 @@ import os
 import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from threading import Timer
 
 from mpi4py import MPI
 
@@ -268,6 +266,23 @@ def held(folder: Path) -> Iterator[subprocess.Popen]:
             process.kill()
 
 
+class Clock:
+    """Stands for the module ``time``: to sleep takes none; ``meanwhile`` is called with the number of the sleep."""
+
+    def __init__(self, meanwhile: Callable[[int], None] = lambda turn: None) -> None:
+        self.meanwhile = meanwhile
+        self.seconds = 0.0
+        self.turns = 0
+
+    def monotonic(self) -> float:
+        return self.seconds
+
+    def sleep(self, seconds: float) -> None:
+        self.seconds += seconds
+        self.turns += 1
+        self.meanwhile(self.turns)
+
+
 def written_at(folder: Path) -> dict[Path, int]:
     """When each file and each folder in a folder was written: a file that comes and goes changes its folder's time."""
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
@@ -306,16 +321,21 @@ def test_a_folder_that_another_process_works_in_is_left_alone(run, in_process, c
 
 
 @pytest.mark.parametrize("folder_is_new", [False, True])
-def test_a_command_waits_for_a_process_that_is_ending(run, tmp_path, caplog, folder_is_new):
+def test_a_command_waits_for_a_process_that_is_ending(run, tmp_path, caplog, monkeypatch, folder_is_new):
     """After ``kill -9`` of a rank, mpirun returns while another rank, which has the lock, is still ending."""
     folder = tmp_path / "new" if folder_is_new else run
     with held(folder) as process, caplog.at_level(logging.INFO, logger="vipetsc"):
-        # The holder ends on its own, a moment after this process has begun to wait.
-        begin = time.monotonic()
-        Timer(0.3, process.stdin.close).start()
+        # The holder ends while this process waits for the third time.
+        def end_the_holder(turn):
+            if turn == 3:
+                process.stdin.close()
+                process.wait()
+
+        clock = Clock(meanwhile=end_the_holder)
+        monkeypatch.setattr(lock, "time", clock)
         with locked(MPI.COMM_SELF, folder):
-            assert time.monotonic() - begin > 0.2
             assert (folder / ".lock").read_text().startswith(f"process {os.getpid()} ")
+    assert clock.turns == 3
 
     # A new folder was created by the other, removed by it, and created and removed again by this one.
     assert folder.exists() != folder_is_new
@@ -361,15 +381,18 @@ def test_a_folder_that_its_holder_removes_while_it_is_created_is_created_again(t
 
 
 def test_a_command_waits_only_as_long_as_announced_for_a_process_that_stays(run, caplog, monkeypatch):
-    monkeypatch.setattr("vipetsc.io.lock.PATIENCE", 0.4)
-    with held(run), caplog.at_level(logging.INFO, logger="vipetsc"):
-        begin = time.monotonic()
-        with pytest.raises(FolderError, match="is working in it; wait until it has ended"), locked(MPI.COMM_SELF, run):
-            pass
-        # Many times the patience, for a machine that is busy.
-        assert 0.4 <= time.monotonic() - begin < 1.5
+    clock = Clock()
+    monkeypatch.setattr(lock, "time", clock)
+    caplog.set_level(logging.INFO, logger="vipetsc")
+    refused = pytest.raises(FolderError, match="is working in it; wait until it has ended")
+    with held(run), refused, locked(MPI.COMM_SELF, run):
+        pass
     # It looks often and logs once.
-    assert len(caplog.messages) == 1
+    (message,) = caplog.messages
+    assert "waiting up to 5 s" in message
+    assert clock.turns >= 20
+    # It gives up at its first look after the time that it has announced.
+    assert 5 <= clock.seconds < 5 + 2 * lock.LOOK_EVERY
 
 
 def test_a_folder_that_cannot_be_locked_is_not_left_behind(tmp_path, monkeypatch):
