@@ -6,11 +6,13 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.optimize import brentq
 
 from tests.conftest import simulated, small_case
 from vipetsc.case import Case
 from vipetsc.dynamics.layout import Layout
+from vipetsc.dynamics.run import Result
 from vipetsc.dynamics.ts.integrator import Integrator
 
 
@@ -86,3 +88,39 @@ def test_a_floor_on_the_approach_velocity_is_counted():
     slow = np.abs(run["impacts/approach_velocity"].values) < 0.3
     assert slow.any()
     assert result.statistics["floored"] == slow.sum()
+
+
+@pytest.fixture(scope="module", params=["ts", "propagator"])
+def clipped_run(request) -> tuple[xr.Dataset, Result]:
+    """A chain in which every cell has a clipped Hertzian contact; samples and the end fall into clipped phases."""
+    springs = [{"start": 1, "end": 2, "stiffness": 1e4}, {"start": 2, "end": 1, "stiffness": 1e4, "next_cell": True}]
+    contacts = {"law": "hertz", "stiffness": 1e7, "restitution": 0.0, "adhesion": "clip", "side": "plus"}
+    return simulated(
+        Case.from_table({
+            "lattice": {"cells": 6, "cell": {"masses": [1e-3, 2e-3], "contact": [1, 2], "springs": springs}},
+            "contacts": contacts | {"sites": list(range(1, 7)), "clearance": 1e-5},
+            "drive": {"amplitude": 30.0, "cycles": 4, "frequency": 2500.0},
+            "time": {"end": 0.00715, "sample_interval": 1e-5, "engine": request.param, "rtol": 1e-12},
+            "output": {"forces": True},
+        })
+    )  # fmt: skip
+
+
+def test_a_clipped_contact_loses_its_elastic_energy(clipped_run):
+    run, result = clipped_run
+    force = run["sites/force"].values
+    # Pressed together without a force: that is a clipped phase.
+    w = np.diff(run["displacement"].values, axis=2)[..., 0]
+    clipped = (w > 1.0001e-5) & (force == 0)
+    assert clipped[-1].any()
+
+    # The loss is the elastic energy's, whatever steps the motion has: the balance closes as it does without clipping.
+    assert result.statistics["clipped"] > 0
+    rounding = {"ts": 1e-11, "propagator": 1e-13}
+    assert result.statistics["ledger_error"] < rounding[result.statistics["engine"]]
+
+    # Energy leaves a site and never returns, at the beginning and at the end of a clipped phase, too.
+    lost = run["energy/dissipated_by_site"].values
+    assert np.diff(lost, axis=0).min() > -1e-15 * lost.max()
+    by_episodes = np.bincount(run["impacts/site"].values - 1, run["impacts/loss"].values, minlength=6)
+    np.testing.assert_allclose(by_episodes, lost[-1], rtol=1e-9, atol=1e-14 * lost.max())

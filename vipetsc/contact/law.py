@@ -240,9 +240,10 @@ def impact_time(site: Any, speed: float) -> float:
 
 @kernel
 def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[float, float]:
-    """Force on the host in N and dissipated power in W of site ``i`` in its present mode, at w in m and w' in m/s.
+    """Force on the host in N and power in W that leaves the ledger, of site ``i`` in its mode at w in m, w' in m/s.
 
-    ``contacts`` (site,) are of dtype ``SITE``; ``rate`` is w'.
+    The power is what the contact dissipates; of a clipped one it is 0: see ``clipped_energy``. ``contacts`` (site,) are
+    of dtype ``SITE``; ``rate`` is w'.
     """
     site = contacts[i]
     if site.mode == FREE:
@@ -254,8 +255,18 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
         # No change of mode at x = 0 is looked for: the force itself has the kink where the masses part.
         return side * elastic_force(site.elastic, max(x, 0.0)), 0.0
 
+    if abs(site.mode) == CLIPPED:
+        # The loss is that of the elastic energy, a function of w: ``clipped_energy``.
+        return 0.0, 0.0
     elastic = elastic_force(site.elastic, x)
-    g = 0.0
-    if abs(site.mode) != CLIPPED:
-        g = 1.0 + site.damping * rate / site.approach
+    g = 1.0 + site.damping * rate / site.approach
     return side * elastic * g, side * elastic * (g - 1.0) * rate
+
+
+@kernel
+def clipped_energy(site: Any, w: float) -> float:
+    """Elastic energy in J that a ``CLIPPED`` ``SITE`` still has at w in m, and loses up to its separation; else 0."""
+    if abs(site.mode) != CLIPPED:
+        return 0.0
+    side = side_of(site.mode)
+    return elastic_energy(site.elastic, side * w - gap_of(site, side))

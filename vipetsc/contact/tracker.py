@@ -13,6 +13,7 @@ from vipetsc.contact.law import (
     FREE,
     PERMANENT,
     RESTING,
+    clipped_energy,
     contact_force,
     elastic_energy,
     elastic_force,
@@ -107,7 +108,10 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
 def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energies: np.ndarray, t: float) -> int:
     """Switch every site that has landed at time ``t`` in s; returns how many. The log must have room.
 
-    ``motion`` (sites, 3) holds w, w', w'', ``energies`` (sites,) what they dissipated so far in J.
+    ``motion`` (sites, 3) holds w, w', w''. ``energies`` (sites,) are the ledger's in J, which change at both ends of a
+    clipped phase: what the sites dissipated so far, and of a clipped one its ``clipped_energy``, too. Their sum is
+    constant while a site is clipped. As an integral the loss would need short steps: its power ends at the separation
+    as Hertz's force does, as the power 3/2 of time, where nothing in the motion asks for them.
     """
     switched = 0
     for i in range(contacts.size):
@@ -120,7 +124,7 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
                 if contacts[i].mode == FREE:
                     tracks.sites[i].counts.grazes += 1
                 continue
-            _set_mode(contacts, tracks, i, mode, motion[i, 1], energies[i], t)
+            _set_mode(contacts, tracks, i, mode, motion[i], energies, t)
             switched += 1
             break
     return switched
@@ -138,7 +142,7 @@ def rest_site(contacts: np.ndarray, tracks: Tracks, i: int, motion: np.ndarray, 
     side = resting_side(site)
     if side == 0 or abs(site.mode) >= PERMANENT or abs(motion[i, 0]) > LANDED_W * site.scale:
         return False
-    _set_mode(contacts, tracks, i, side * RESTING, motion[i, 1], energies[i], t)
+    _set_mode(contacts, tracks, i, side * RESTING, motion[i], energies, t)
     return True
 
 
@@ -180,16 +184,20 @@ def _end_episode(site: Any, track: Any, tracks: Tracks, energy: float, t: float)
 
 
 @njit(error_model="numpy")
-def _set_mode(contacts: np.ndarray, tracks: Tracks, i: int, mode: int, rate: float, energy: float, t: float) -> None:
-    """Give site ``i`` its new mode at w' = ``rate``; begin or end its episode, ``energy`` in J dissipated so far."""
+def _set_mode(
+    contacts: np.ndarray, tracks: Tracks, i: int, mode: int, motion: np.ndarray, energies: np.ndarray, t: float
+) -> None:
+    """Give site ``i`` its new mode at its ``motion`` (3,); begin or end its episode; ``energies`` as a ledger's."""
     site = contacts[i]
     track = tracks.sites[i]
     had_episode = in_episode(site.mode)
     rested = abs(site.mode) == RESTING
+    energy = energies[i] - clipped_energy(site, motion[0])
     site.mode = mode
+    energies[i] = energy + clipped_energy(site, motion[0])
 
     if not had_episode and in_episode(mode):
-        _begin_episode(site, track, rate, t, rested)
+        _begin_episode(site, track, motion[1], t, rested)
         # What the site will have dissipated by the episode's end is added to this.
         track.episode.loss = -energy
     elif had_episode and not in_episode(mode):
@@ -272,6 +280,13 @@ class ImpactTracker:
         episodes["separation"][closed] = np.nan
         return closed
 
+    def clipped_energies(self, motion: np.ndarray) -> np.ndarray:
+        """The ``clipped_energy`` (sites,) in J of all sites at their ``motion`` (sites, 3)."""
+        energies = np.zeros(len(self.contacts))
+        for i in np.flatnonzero(np.abs(self.contacts["mode"]) == CLIPPED):
+            energies[i] = clipped_energy(self.contacts[i], motion[i, 0])
+        return energies
+
     @property
     def counts(self) -> np.ndarray:
         """Number of times that each limit of the contact law acted on each site, of dtype ``COUNTS``."""
@@ -289,7 +304,7 @@ class ImpactTracker:
     def switch(self, t: float, energies: np.ndarray) -> int:
         """Switch every site that has landed at time ``t`` in s (motion in ``start``); returns how many.
 
-        ``energies`` (sites,) are the dissipated energies in J.
+        ``energies`` (sites,) are the ledger's in J, and change as in ``switch_sites``.
         """
         self.tracks = with_room(self.tracks)
         return switch_sites(self.contacts, self.tracks, self.start, energies, t)
@@ -306,7 +321,7 @@ class ImpactTracker:
     def take_episodes(self, energies: np.ndarray, unfinished: bool = False) -> np.ndarray:
         """Episodes (episode,) of dtype ``EPISODE`` closed since the last call, and ``unfinished`` ones as they are.
 
-        ``energies`` (sites,) are the dissipated energies in J.
+        ``energies`` (sites,) are what the sites have dissipated in J.
         """
         closed = self.tracks.log[: self.tracks.closed[0]].copy()
         self.tracks.closed[:] = 0

@@ -150,6 +150,12 @@ def add_energy(sums: np.ndarray, energy: float, unit: float) -> None:
     _add_one(sums, _SPRING, energy, unit)
 
 
+@kernel
+def add_loss(sums: np.ndarray, energy: float, unit: float) -> None:
+    """Add an ``energy`` in J to what contacts have dissipated in the ``sums`` of ``measure``."""
+    _add_one(sums, _DISSIPATED, energy, unit)
+
+
 @dataclass(frozen=True)
 class Energies:
     """Energies in J of samples, arrays (sample,): kinetic, spring and contact energy, work of the drives, dissipated.

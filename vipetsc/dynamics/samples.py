@@ -8,9 +8,9 @@ from petsc4py import PETSc
 import numpy as np
 
 from vipetsc.compiled import kernel, njit
-from vipetsc.contact.law import contact_force
+from vipetsc.contact.law import CLIPPED, clipped_energy, contact_force
 from vipetsc.dynamics.drives import wall_energy
-from vipetsc.dynamics.energies import LARGEST, Energies, add_energy, measure
+from vipetsc.dynamics.energies import LARGEST, Energies, add_energy, add_loss, measure
 from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.site_dofs import relative_motion
 
@@ -69,6 +69,7 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
             add_energy(samples.sums[k], energy, samples.unit)
     for i in range(samples.losses.shape[1]):
         samples.losses[k, i] = y[shape.dissipated + i]
+    _take_clipped(y, k, samples, contacts, rows)
 
     # By the number in the run, not in the block: blocks may begin anywhere, and a resumed run records the same samples.
     if number % samples.stride == 0:
@@ -79,6 +80,19 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
         for row in range(2 * shape.dofs):
             samples.motion[k, row, i] = y[row * shape.cells + samples.watched[i]]
     return _is_finite(samples, k)
+
+
+@kernel
+def _take_clipped(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> None:
+    """Take from the losses of sample ``k`` what clipped sites still have; contacts and their rows as above."""
+    lattice = samples.lattice
+    for i in range(lattice.site_dofs.size):
+        column = lattice.site_dofs[i].ledger - lattice.shape.dissipated
+        if column >= 0 and abs(contacts[rows[column]].mode) == CLIPPED:
+            w, _ = relative_motion(y, lattice.site_dofs, i)
+            energy = clipped_energy(contacts[rows[column]], w)
+            samples.losses[k, column] -= energy
+            add_loss(samples.sums[k], -energy, samples.unit)
 
 
 @kernel

@@ -18,7 +18,7 @@ import numpy as np
 from vipetsc.case import Model
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.changes import Extremes
-from vipetsc.contact.law import impact_time
+from vipetsc.contact.law import clipped_energy, impact_time
 from vipetsc.contact.tracker import (
     LIMITS,
     ImpactTracker,
@@ -185,6 +185,8 @@ class Forces:
         clusters = self.clusters
         clusters.energy[self._numbers == -1] = energy
         for i in self.tracker.begin(motion).tolist():
+            w = motion[self._numbers[i], 0]
+            clusters.energy[i] = clipped_energy(clusters.contacts[i], w)
             # As if the contact were old: its force is smooth.
             duration = impact_time(clusters.contacts[i], abs(clusters.contacts["approach"][i]))
             clusters.history["onset"][i] = -duration
@@ -218,7 +220,8 @@ class Forces:
         """Episodes closed since the last call, and ``unfinished`` ones as they are, that this rank logs."""
         if unfinished:
             _update_open_episodes(self.clusters.contacts, self.clusters.history, self.tracker.tracks)
-        episodes = self.tracker.take_episodes(self.clusters.energy, unfinished)
+        losses = self.clusters.energy - self.tracker.clipped_energies(self.clusters.site_motion)
+        episodes = self.tracker.take_episodes(losses, unfinished)
         return episodes[self._logs_number[episodes["site"]]]
 
     def statistics(self) -> dict[str, Any]:

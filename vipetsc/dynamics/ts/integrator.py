@@ -116,6 +116,7 @@ class Integrator(Engine):
         self.layout.place(cells, energy, self.state.array)
         self.tracker.begin(motion)
         self._restart(True)
+        self._put_losses(self.tracker.clipped_energies(self.tracker.start))
 
     def fill(self, samples: Samples) -> FillResult:
         """Go on through ``samples`` and take them; a sample at which it stops is not taken."""
@@ -324,17 +325,25 @@ class Integrator(Engine):
             number = int(self.tracker.tracks.sites["number"][change.site])
         number = self.comm.bcast(number, owner)
         was_free = not self._any_open
-        self.tracker.rest(number, self.time, self.layout.losses(self.state.array_r))
+        losses = self.layout.losses(self.state.array_r)
+        self.tracker.rest(number, self.time, losses)
+        self._put_losses(losses)
         self._restart(was_free)
 
     def _switch(self) -> None:
         """Switch modes of all landed sites and set the step with which to go on."""
         was_free = not self._any_open
         before = self.tracker.contacts["mode"].copy()
-        self.tracker.switch(self.time, self.layout.losses(self.state.array_r))
+        losses = self.layout.losses(self.state.array_r)
+        self.tracker.switch(self.time, losses)
+        self._put_losses(losses)
         switched = before != self.tracker.contacts["mode"]
         self.counts["switches"] += int(switched[self._logged].sum())
         self._restart(was_free)
+
+    def _put_losses(self, losses: np.ndarray) -> None:
+        """Put the ledger's ``losses`` (site,) in J of this rank's own sites into the state."""
+        self.state.array[self.layout.dissipated : self.layout.size] = losses[self._logged]
 
     def _restart(self, was_free: bool) -> None:
         """Set the step with which to go on from a state whose sites have new modes."""
@@ -351,7 +360,8 @@ class Integrator(Engine):
 
     def take_episodes(self, unfinished: bool = False) -> np.ndarray:
         """Episodes of the owned sites closed since the last call, ``unfinished`` ones too."""
-        episodes = self.tracker.take_episodes(self.layout.losses(self.state.array_r), unfinished)
+        losses = self.layout.losses(self.state.array_r) - self.tracker.clipped_energies(self.tracker.start)
+        episodes = self.tracker.take_episodes(losses, unfinished)
         if not episodes.size:
             return episodes
         return episodes[np.isin(episodes["site"], self.layout.sites)]
