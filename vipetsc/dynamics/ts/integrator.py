@@ -23,7 +23,7 @@ from vipetsc.dynamics.samples import Samples, take_sample
 from vipetsc.dynamics.ts.onset import onset_fraction
 from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs
 from vipetsc.dynamics.ts.sums import register_sums
-from vipetsc.dynamics.ts.time_stepper import create_time_stepper
+from vipetsc.dynamics.ts.time_stepper import TimeStepper
 from vipetsc.parallel import StopRequest
 
 # Measured on the built-in case up to 0.3 s, with Hertz's law (3,800 steps, 510 rejected) and the bilinear one (3,470,
@@ -77,6 +77,9 @@ class Integrator(Engine):
         self._own_rows = np.flatnonzero(self._logged)
         self._stop = stop or StopRequest()
         self._any_open = False
+        # Whether the next step begins at an onset, after which a force is not smooth in time.
+        self._after_onset = False
+        self._is_rough = any(law.onset_exponent != 1 for law in model.used_laws)
 
         self.time = 0.0
         self.state = layout.create_vector()
@@ -85,10 +88,10 @@ class Integrator(Engine):
         self.rates = self.state
         if model.chain.pairs:
             self.rates = layout.create_vector()
-        self.saved = self.state.duplicate()
         self.step = given_first_step(FREE_STEP / model.drive.frequency)
         self.free_step = self.step
-        self.ts = create_time_stepper(model, layout, self.state, self.lattice)
+        self._stepper = TimeStepper(model, layout, self.state, self.lattice)
+        self.ts = self._stepper.ts
 
         self._first_step = FIRST_STEP / model.drive.frequency
         self._fixed_step = PETSc.Options().getString("ts_adapt_type", "basic") == "none"
@@ -196,6 +199,7 @@ class Integrator(Engine):
         else:
             self.tracker.accept_step(h)
             self.time = end
+            self._after_onset = False
         return stop == 0.0
 
     def _longest_step(self) -> float:
@@ -204,9 +208,10 @@ class Integrator(Engine):
 
     def _try_step(self, h: float) -> bool:
         """Try a step of ``h`` s and go on with the length that PETSc suggests; False if it was rejected, and undone."""
-        self.state.copy(self.saved)
-        suggestion = self._trial(h)
-        if suggestion is None:
+        trial = self._stepper.try_step(self.time, h, self._after_onset)
+        suggestion = trial.suggestion
+        if not trial.accepted:
+            self.step = suggestion
             self.counts["rejected"] += 1
             return False
 
@@ -220,24 +225,6 @@ class Integrator(Engine):
         """The first change of this rank's sites in the step of ``h`` s that was just tried."""
         tracker = self.tracker
         return first_change(tracker.contacts, tracker.start, tracker.end, h, np.empty((2, 6)))
-
-    def _trial(self, h: float) -> float | None:
-        """Try one step of ``h`` s from ``saved``: PETSc's next step size; None if it was rejected, and is undone."""
-        ts = self.ts
-        ts.setTime(self.time)
-        ts.setTimeStep(h)
-        ts.step()
-        suggestion = ts.getTimeStep()
-        if np.isfinite(suggestion) and ts.getConvergedReason() >= 0:
-            return suggestion
-
-        # The error of a trial that overflows is not finite, and no step follows from it: a much shorter one is tried.
-        self.step = suggestion
-        if not np.isfinite(suggestion):
-            self.step = 0.1 * h
-        self.saved.copy(self.state)
-        ts.restartStep()
-        return None
 
     def _land(self, h: float, position: float, change: ModeChange) -> None:
         """Step from the saved state onto the change at ``position`` in the step just tried, and switch there.
@@ -262,12 +249,13 @@ class Integrator(Engine):
         sys.audit("vipetsc.landing")
         while outcome == RETRY:
             length = attempt.length
-            self.saved.copy(self.state)
-            self.ts.restartStep()
             if length <= SHORTEST_STEP * max(self.time, self.free_step):
+                self._stepper.undo_step()
                 self._switch_at_start(owner, change)
                 return
-            if self._trial(length) is None:
+            trial = self._stepper.repeat_step(self.time, length, self._after_onset)
+            if not trial.accepted:
+                self.step = trial.suggestion
                 return
             self.observe(tracker.end, self.time + length)
             if comm.rank == owner:
@@ -276,6 +264,7 @@ class Integrator(Engine):
 
         tracker.accept_step(length)
         self.time += length
+        self._after_onset = False
         if outcome == LANDED:
             self._switch()
         elif outcome == RESTS:
@@ -349,6 +338,8 @@ class Integrator(Engine):
         """Set the step with which to go on from a state whose sites have new modes."""
         shortest = self.comm.allreduce(self.tracker.contact_time(), MPI.MIN)
         self._any_open = bool(np.isfinite(shortest))
+        # After any change: where no contact has just begun the root of time does no harm, and ranks need not agree.
+        self._after_onset = self._any_open and self._is_rough
         if self._any_open and not self._fixed_step:
             if was_free:
                 self.free_step = self.step
@@ -378,7 +369,7 @@ class Integrator(Engine):
         return self.layout.checkpoint(self.state.array_r) | {
             "sites": self.tracker.checkpoint()[self._logged],
             "time": np.array(self.time),
-            "steps": np.array([self.step, self.free_step, float(self._any_open)]),
+            "steps": np.array([self.step, self.free_step, float(self._any_open), float(self._after_onset)]),
             "counts": np.array([list(self.counts.values())]),
         }
 
@@ -388,8 +379,9 @@ class Integrator(Engine):
         self.layout.restore(checkpoints, self.state.array)
         self.tracker.restore(tables["sites"])
         self.time = float(common["time"])
-        self.step, self.free_step, any_open = common["steps"].tolist()
+        self.step, self.free_step, any_open, after_onset = common["steps"].tolist()
         self._any_open = bool(any_open)
+        self._after_onset = bool(after_onset)
         self.counts = dict(zip(self.counts, common["counts"][0].tolist(), strict=True))
         # A rank counts the switches of its own sites: those so far are rank 0's from now on.
         self.counts["switches"] = 0
@@ -399,5 +391,6 @@ class Integrator(Engine):
         self.observe(self.tracker.start)
 
     def destroy(self) -> None:
-        for petsc_object in (self.ts, self.state, self.rates, self.saved):
-            petsc_object.destroy()
+        self._stepper.destroy()
+        for vector in (self.state, self.rates):
+            vector.destroy()

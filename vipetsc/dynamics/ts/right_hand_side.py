@@ -136,16 +136,23 @@ def _c_struct(record: type) -> np.dtype:
     return np.dtype(list(get_type_hints(record).items()), align=True)
 
 
+ONSET = np.dtype([("time", np.float64), ("duration", np.float64)])
+"""A step after the onset of a contact at ``time``, whose length is ``duration``, both in s; 0 in other steps.
+
+PETSc's time is then z, 0 <= z <= duration, of which the time is t = time + z^2/duration. After the onset Hertz's force
+goes as the power 3/2 of t, which no method of high order resolves; in z it is smooth (Brunner 2004, sec. 6.2).
+"""
 CONTEXT = np.dtype(
     [
         ("array", np.int64),  # receives the address of a vector's array; first, so that its address is the context's
+        ("onset", ONSET),
         ("shape", _c_struct(Shape)),
         ("address", np.dtype([(name, np.int64) for name in _TABLES])),
         ("length", np.dtype([(name, np.int64) for name in _TABLES])),
     ],
     align=True,
 )
-"""A ``LatticeRecord`` behind one pointer: its values, and the addresses and lengths of its tables."""
+"""A ``LatticeRecord`` behind one pointer: its values, and the addresses and lengths of its tables; and an ``ONSET``."""
 
 
 def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
@@ -181,7 +188,15 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     )
     y = carray(pointer(state), (shape.ghosted,), np.float64)
     rate = carray(pointer(context.array), (shape.owned,), np.float64)
-    right_hand_side(t, y, rate, lattice)
+    onset = context.onset
+    if onset.duration > 0.0:
+        right_hand_side(onset.time + t * t / onset.duration, y, rate, lattice)
+        # dt/dz of the step's own time z.
+        speed = 2.0 * t / onset.duration
+        for k in range(rate.size):
+            rate[k] *= speed
+    else:
+        right_hand_side(t, y, rate, lattice)
 
     # PETSc wants the same address back that it gave, at the place where it put it.
     error = native.restore_write(f, address)
@@ -200,10 +215,11 @@ def compile_callback() -> CFunc:
     return cfunc("i4(i8, f8, i8, i8, i8)")(_callback)
 
 
-def register(ts: PETSc.TS, lattice: LatticeRecord) -> None:
+def register(ts: PETSc.TS, lattice: LatticeRecord) -> np.ndarray:
     """Make the lattice's right-hand side that of ``ts``, on the states of ``Layout.create_vector``.
 
-    Raises RuntimeError where PETSc refuses the function.
+    Returns its context, one record of dtype ``CONTEXT``, in which ``onset`` may be set before a step. Raises
+    RuntimeError where PETSc refuses the function.
     """
     callback = compile_callback()
     context = np.zeros(1, CONTEXT)
@@ -221,3 +237,4 @@ def register(ts: PETSc.TS, lattice: LatticeRecord) -> None:
     )
     if error:
         raise RuntimeError(f"TSSetRHSFunction failed with PETSc error {error}")
+    return context

@@ -1,6 +1,10 @@
 """PETSc's time stepper for a lattice: one trial of an explicit Runge-Kutta step at a time."""
 
+from typing import NamedTuple
+
 from petsc4py import PETSc
+
+import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.dynamics.lattice_record import LatticeRecord
@@ -13,34 +17,96 @@ NO_TOLERANCE = 1e30
 NO_END = 1e300
 
 
-def create_time_stepper(model: Model, layout: Layout, state: PETSc.Vec, lattice: LatticeRecord) -> PETSc.TS:
-    """The time stepper of ``model`` on its ``state``, with the options that the user gave; collective."""
-    tolerances = state.duplicate()
-    half = layout.dofs * layout.owned
-    tolerances.array[:half], tolerances.array[half : 2 * half] = model.atol
-    tolerances.array[2 * half :] = NO_TOLERANCE
+class StepOutcome(NamedTuple):
+    """Whether a step was ``accepted``, and the length in s that the controller suggests for the next one."""
 
-    ts = PETSc.TS().create(layout.comm)
-    ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
-    ts.setType(PETSc.TS.Type.RK)
-    ts.setRKType(model.method)
-    ts.setTolerances(rtol=model.rtol, atol=tolerances)
-    ts.setMaxTime(NO_END)
-    ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
-    # One trial a call: the engine undoes a rejected one, from its saved copy.
-    ts.setMaxStepRejections(0)
-    ts.setErrorIfStepFails(False)
-    ts.setSolution(state)
-    register(ts, lattice)
+    accepted: bool
+    suggestion: float
 
-    # The step must depend neither on the lattice's length nor on the ranks: the largest error decides. PETSc takes the
-    # norm from its options alone, where it must not stay for the next time stepper of the process.
-    options = PETSc.Options()
-    norm = "ts_adapt_wnormtype"
-    if options.hasName(norm):
-        ts.setFromOptions()
-    else:
-        options[norm] = "infinity"
-        ts.setFromOptions()
-        options.delValue(norm)
-    return ts
+
+class TimeStepper:
+    """Steps of ``model`` from its ``state``, tried one at a time; creation is collective, as is every step.
+
+    ``ts`` is PETSc's time stepper with the options that the user gave.
+    """
+
+    def __init__(self, model: Model, layout: Layout, state: PETSc.Vec, lattice: LatticeRecord) -> None:
+        tolerances = state.duplicate()
+        half = layout.dofs * layout.owned
+        tolerances.array[:half], tolerances.array[half : 2 * half] = model.atol
+        tolerances.array[2 * half :] = NO_TOLERANCE
+
+        ts = PETSc.TS().create(layout.comm)
+        ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
+        ts.setType(PETSc.TS.Type.RK)
+        ts.setRKType(model.method)
+        ts.setTolerances(rtol=model.rtol, atol=tolerances)
+        ts.setMaxTime(NO_END)
+        ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
+        # One trial a call: a rejected one is undone here, from the saved copy.
+        ts.setMaxStepRejections(0)
+        ts.setErrorIfStepFails(False)
+        ts.setSolution(state)
+        self.ts = ts
+        self._state = state
+        self._saved = state.duplicate()
+        self._onset = register(ts, lattice)["onset"]
+
+        # The step must depend neither on the lattice's length nor on the ranks: the largest error decides. PETSc takes
+        # the norm from its options alone, where it must not stay for the next time stepper of the process.
+        options = PETSc.Options()
+        norm = "ts_adapt_wnormtype"
+        if options.hasName(norm):
+            ts.setFromOptions()
+        else:
+            options[norm] = "infinity"
+            ts.setFromOptions()
+            options.delValue(norm)
+
+    def try_step(self, time: float, h: float, after_onset: bool) -> StepOutcome:
+        """Try a step of ``h`` s from the state at ``time`` in s; a rejected one is undone.
+
+        ``after_onset`` of a contact the step goes as the root of time: see ``ONSET``.
+        """
+        self._state.copy(self._saved)
+        return self._try(time, h, after_onset)
+
+    def repeat_step(self, time: float, h: float, after_onset: bool) -> StepOutcome:
+        """As ``try_step``, from the state that the last step began with."""
+        self.undo_step()
+        return self._try(time, h, after_onset)
+
+    def _try(self, time: float, h: float, after_onset: bool) -> StepOutcome:
+        ts = self.ts
+        ts.setTime(time)
+        ts.setTimeStep(h)
+        if after_onset:
+            ts.setTime(0.0)
+            self._onset[0] = (time, h)
+        ts.step()
+        suggestion = ts.getTimeStep()
+        if after_onset:
+            self._onset[0] = (0.0, 0.0)
+            # The last stage of a first-same-as-last pair is a rate by z.
+            ts.restartStep()
+        if np.isfinite(suggestion) and ts.getConvergedReason() >= 0:
+            return StepOutcome(True, suggestion)
+
+        self.undo_step()
+        # The error of a trial that overflows is not finite, and no step follows from it: a much shorter one is tried.
+        if not np.isfinite(suggestion):
+            return StepOutcome(False, 0.1 * h)
+        if after_onset:
+            # Lengths in z are roots of those in t.
+            return StepOutcome(False, suggestion * suggestion / h)
+        return StepOutcome(False, suggestion)
+
+    def undo_step(self) -> None:
+        """Go back to the state that the last step began with."""
+        self._saved.copy(self._state)
+        self.ts.restartStep()
+
+    def destroy(self) -> None:
+        """Free PETSc's objects, but for the state."""
+        self.ts.destroy()
+        self._saved.destroy()
