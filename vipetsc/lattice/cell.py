@@ -112,6 +112,7 @@ class UnitCell:
             cells = int(s.next_cell)
             for mass, offset, other in ((s.start, cells, s.end), (s.end, -cells, s.start)):
                 ends.append(Coupling(mass, offset, other, stiffness=s.stiffness, damping=s.damping, spring=i))
+        # Stable: couplings of one mass stay in the order of the springs.
         return sorted(ends, key=lambda c: c.mass)
 
     def stiffness_matrix(self, kappa: ArrayLike) -> np.ndarray:
@@ -128,8 +129,10 @@ class UnitCell:
         return self._bloch(kappa, [c.damping for c in self.couplings()]) + grounding
 
     def _bloch(self, kappa: ArrayLike, values: list[float]) -> np.ndarray:
-        """The Bloch matrix of the couplings' ``values``."""
+        """The Bloch matrix (..., dofs, dofs) of the couplings' ``values``, at wavenumbers ``kappa`` (...)."""
         kappa = np.asarray(kappa, float)
+        # Every spring is met from both its ends, and each time adds to the row of that end alone: u of the other end is
+        # exp(i kappa offset) times u of the same mass in this cell.
         k = np.zeros((*kappa.shape, self.dofs, self.dofs), complex)
         for (mass, offset, other, *_), value in zip(self.couplings(), values, strict=True):
             k[..., mass, mass] += value
@@ -144,6 +147,7 @@ def cell_problems(
 
     Messages count masses from 1, as case files do.
     """
+    # All of them, not the first: who writes a case file mends it once.
     n = len(masses)
     problems = []
     for i, m in enumerate(masses, 1):
@@ -156,6 +160,7 @@ def cell_problems(
             problems.append(("contact", f"{name} {index + 1} is not one of the cell's {n} masses"))
     problems += _dashpot_problems(grounding, n)
 
+    # A cell of one mass has no pair of its own: its contacts are between cells or with ground, and name their masses.
     if host == resonator and n > 1:
         problems.append(("contact", "host and resonator must be two different masses"))
     if springs and not any(s.next_cell for s in springs):
@@ -192,6 +197,7 @@ def _dashpot_problems(grounding: tuple[float, ...], n: int) -> list[tuple[str, s
 @lru_cache
 def connected_groups(n: int, pairs: tuple[tuple[int, int], ...]) -> list[int]:
     """Numbers of the groups into which ``pairs`` tie ``n`` nodes (0-based): that of each node, in their order."""
+    # Asked once for each kind of cell: sweeps and searches have thousands of one kind.
     graph = coo_matrix((np.ones(len(pairs)), np.transpose(pairs)), (n, n))
     return scipy.sparse.csgraph.connected_components(graph, directed=False)[1].tolist()
 
@@ -202,6 +208,7 @@ def diatomic(reading: Reading = "printed") -> UnitCell:
     The calibrated reading divides both stiffnesses by ten, which brings the onset of contact to the
     amplitudes that the paper reports (0.58 N instead of 5.3 N).
     """
+    # Both springs alike: all frequencies scale together, and the bands keep their shape.
     k = {"printed": 9e4, "calibrated": 9e3}[reading]
     springs = (Spring(0, 0, k, next_cell=True), Spring(0, 1, k))
     return UnitCell(masses=(0.01, 0.08), springs=springs, host=0, resonator=1)
@@ -217,5 +224,6 @@ def four_band(reading: Reading = "printed", lam: float = 0.1, eta: float = 0.5) 
     k = 2e4
     k2 = 1e4
     k3 = lam * {"printed": k, "calibrated": k2}[reading]
+    # eta divides one mass m into the host's and the resonator's part: the cell weighs the same for every eta.
     springs = (Spring(3, 0, k, next_cell=True), Spring(0, 1, k2), Spring(1, 3, k2), Spring(1, 2, k3))
     return UnitCell(masses=(m, m * (1 - eta), m * eta, m), springs=springs, host=1, resonator=2)

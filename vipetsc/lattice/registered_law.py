@@ -52,7 +52,8 @@ def _address(function: Callable[..., float], count: int) -> int:
 
 
 def evaluate(address: int, stiffness: float, parameters: tuple[float, ...], x: np.ndarray) -> np.ndarray:
-    """Values of the function at an ``address`` at each indentation ``x`` in m, an array of the shape of ``x``."""
+    """Values (...) of the function at an ``address`` at each indentation ``x`` (...) in m."""
+    # One signature for all laws: what a law does not take is zero and not read.
     numbers = np.zeros(1 + MOST_PARAMETERS)
     numbers[0] = stiffness
     numbers[1 : 1 + len(parameters)] = parameters

@@ -47,6 +47,7 @@ class Variation:
 
     def __post_init__(self) -> None:
         for name, array in self.items():
+            # A digest stands for the arrays in caches, and would not know of a change.
             copy = np.array(array, float)
             copy.flags.writeable = False
             object.__setattr__(self, name, copy)

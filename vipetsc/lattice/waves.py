@@ -20,7 +20,9 @@ from scipy.linalg import lapack
 
 from vipetsc.lattice.cell import UnitCell
 
-NEUTRAL = 1e-7  # |log |lambda|| below which a wave's direction is that of its energy
+# |log |lambda|| below which a wave's direction is that of its energy: the root of rounding, by which the double
+# |lambda| = 1 at a band's edge is off. 5e-8 to 1e-5 sort the waves of the four-band cell alike.
+NEUTRAL = 1e-7
 PORT = 1j  # s; any imaginary number will do
 RANK = 1e-13  # singular values of B below this fraction of the largest are rounding
 
