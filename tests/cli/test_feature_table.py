@@ -18,6 +18,8 @@ import tomli_w
 from tests.conftest import run_of
 from vipetsc.case import Case
 from vipetsc.cli.feature_table import BASE, COLUMNS, FEATURES, UNREAD, YES, Column, Feature, answers, chapter, merged
+from vipetsc.figures import registry
+from vipetsc.lattice import UnitCell
 
 BY_HEADING = {column.heading: column for column in COLUMNS}
 PLAIN = next(feature for feature in FEATURES if feature.name == "burst")
@@ -80,7 +82,22 @@ def numbers_of(folder: Path) -> dict[str, np.ndarray]:
     return numbers
 
 
-@pytest.mark.usefixtures("plain_pictures")
+@pytest.fixture
+def picture_of_each_cell(monkeypatch):
+    """Bands are drawn once for each cell and frequency, on which alone their picture depends."""
+    draw = registry.draw_bands
+    drawn: dict[Any, Path] = {}
+
+    def draw_once(cell: UnitCell, path: Path, frequency: float | None) -> Path:
+        key = cell, frequency
+        if key not in drawn:
+            drawn[key] = draw(cell, path, frequency)
+        return drawn[key]
+
+    monkeypatch.setattr(registry, "draw_bands", draw_once)
+
+
+@pytest.mark.usefixtures("plain_pictures", "picture_of_each_cell")
 @pytest.mark.parametrize("column", STUDIES, ids=lambda column: column.heading)
 def test_every_yes_is_computed(column, tmp_path, in_process):
     """The verb ends well, and its results differ from those without the feature: no yes is one that is ignored."""
