@@ -105,6 +105,7 @@ def test_keys_of_a_record_are_checked(tmp_path, changes, key, part):
         ({"quantity": "clearance", "bounds": [1e-5, 1e-4], "start": 1e-3}, "start", "within the bounds"),
         ({"quantity": "dashpot", "bounds": [1e-3, 1.0]}, "start", "springs without a dashpot"),
         ({"quantity": "grounding", "bounds": [1e-3, 1.0]}, "start", "masses without a dashpot"),
+        ({"quantity": "dashpot", "bounds": [-1.0, 1.0], "scale": "linear", "start": 0.5}, "bounds", "not be negative"),
         ({"quantity": "clearance_minus", "bounds": [1e-3, 1.0]}, "quantity", "set contacts.clearance_minus"),
     ],
 )

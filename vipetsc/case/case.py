@@ -13,7 +13,7 @@ import numpy as np
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, read_section
 from vipetsc.case.contacts import check_pairs, check_touching, contact_of, gaps_of_sites, laws_of_sites, values_of_sites
 from vipetsc.case.disorder import DisorderTable, with_drawn
-from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_speed
+from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_frequency
 from vipetsc.case.features import refusals
 from vipetsc.case.html import case_html
 from vipetsc.case.inhomogeneity import check_inhomogeneity, check_right_wall
@@ -159,7 +159,7 @@ class Case(CaseFile):
             rtol=time.rtol,
             atol=self._tolerances(scale, drives[0].waveform.frequency),
             scale=scale,
-            speed=packet_speed(chain.cell, drive),
+            packet=packet_frequency(drive),
             initial=self.initial,
             laws=laws_of_sites(contacts, len(chain.sites)),
             gaps=gaps_of_sites(contacts, list(chain.clearances)),

@@ -177,14 +177,19 @@ def _wave(cell: UnitCell, frequency: float | None, wavenumber: float | None, ban
 
 def packet_speed(cell: UnitCell, drive: OneDrive) -> float:
     """Speed in cells/s of the wave of a resolved ``drive``; without a sine, the speed of the fastest wave."""
+    return wave_speed(cell, packet_frequency(drive))
+
+
+def packet_frequency(drive: OneDrive) -> float:
+    """Frequency in rad/s of the wave of a resolved ``drive`` that arrives first; infinite without a sine."""
     # A pulse has waves of all frequencies, of which the fastest arrive first.
     if drive.is_sine and drive.frequency:
-        return wave_speed(cell, drive.frequency)
-    return wave_speed(cell, np.inf)
+        return drive.frequency
+    return np.inf
 
 
 def wave_speed(cell: UnitCell, frequency: float) -> float:
-    """Group velocity in cells/s of the fastest wave at ``frequency``; in a gap, the cell's fastest."""
+    """Group velocity in cells/s of the fastest wave at ``frequency`` in rad/s; in a gap, the cell's fastest."""
     # The fastest, since what arrives first decides how long a run lasts.
     speed = max((wave[2] for wave in waves_at(cell, frequency)), default=0.0)
     return speed or fastest_speed(cell)

@@ -27,6 +27,7 @@ from vipetsc.case.sought import (
     values_of,
 )
 from vipetsc.case.study import StudyCase
+from vipetsc.case.trial import TrialCases
 from vipetsc.case.warnings import loss_warnings, unit_warnings
 from vipetsc.lattice.contact import LAWS
 
@@ -148,13 +149,12 @@ class IdentifyCase(StudyCase):
         """The case with the ``values`` (parameter,); raises CaseError if it is impossible."""
         return changed_case(self.base, self.parameters, values, name)
 
-    def record_case(self, case: Case, number: int) -> Case:
-        """The ``case`` with the drive and the initial motion of the record of that ``number`` (from 0)."""
-        changes = _varied_sections(self.options.records[number])
-        return case.varied(**changes) if changes else case
+    def trials(self, number: int) -> TrialCases:
+        """Cases of the record of that ``number`` (from 0), with its drive and its initial motion."""
+        return TrialCases(self.base, self.parameters, _varied_sections(self.options.records[number]))
 
 
-def _varied_sections(record: RecordTable) -> dict[str, Any]:
+def _varied_sections(record: RecordTable) -> dict[str, Table]:
     """The sections of a case in which a ``record`` differs from it."""
     sections = {}
     if record.drive:
@@ -266,6 +266,8 @@ def _bounds_problems(unknown: UnknownTable, at: str) -> Iterator[Problem]:
         yield Problem(f"{at}.bounds", unknown.bounds, "must be positive")
     elif quantity in DASHPOTS and low <= 0 and unknown.scale != "linear":
         yield Problem(f"{at}.bounds", unknown.bounds, 'must be positive, or give scale = "linear"')
+    elif quantity in DASHPOTS and low < 0:
+        yield Problem(f"{at}.bounds", unknown.bounds, "a dashpot must not be negative")
 
 
 def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:

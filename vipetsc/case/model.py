@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vipetsc.case.contacts import Gaps
+from vipetsc.case.drive import wave_speed
 from vipetsc.case.initial import InitialTable
 from vipetsc.lattice import Chain, Contact, Drive, Waveform
 
@@ -14,9 +15,9 @@ class Model:
     """A case in the terms of ``vipetsc.lattice``: 0-based indices, seconds, newtons, everything decided.
 
     ``atol`` is the pair (displacement m, velocity m/s); ``scale`` the displacement in m of the drive's
-    linear wave or of the ``initial`` state, ``speed`` the group velocity in cells/s that ``traverse`` uses. The law of
-    each site is in ``laws`` (() if all have ``contact``), its clearances in m on the sides + and - are in ``gaps`` (()
-    if the chain's are those of both).
+    linear wave or of the ``initial`` state, ``packet`` the frequency in rad/s of the wave that arrives first, infinite
+    for a pulse. The law of each site is in ``laws`` (() if all have ``contact``), its clearances in m on the sides +
+    and - are in ``gaps`` (() if the chain's are those of both).
     """
 
     chain: Chain
@@ -28,10 +29,16 @@ class Model:
     rtol: float
     atol: tuple[float, float]
     scale: float
-    speed: float
+    packet: float
     initial: InitialTable | None = None
     laws: tuple[Contact, ...] = ()
     gaps: Gaps = ()
+
+    @property
+    def speed(self) -> float:
+        """The group velocity in cells/s that ``traverse`` uses."""
+        # Only where it is asked for: the bands of a cell take longer than all else in a model.
+        return wave_speed(self.chain.cell, self.packet)
 
     @property
     def used_laws(self) -> tuple[Contact, ...]:

@@ -11,7 +11,7 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import Section, Table
 from vipetsc.case.contacts import values_of_sites
 from vipetsc.case.disorder import with_cell
-from vipetsc.lattice import UnitCell
+from vipetsc.lattice import UnitCell, pass_bands
 
 OF_SITES = ("clearance", "clearance_minus", "stiffness", "exponent", "restitution")
 OF_SPRINGS = {"spring": "stiffness", "dashpot": "damping", "quadratic": "quadratic", "cubic": "cubic"}
@@ -198,21 +198,28 @@ def parameters_of(unknown: UnknownTable, base: Case) -> list[SoughtParameter]:
     return parameters
 
 
+def numbers_of(base: Case, parameters: Sequence[SoughtParameter], values: Iterable[float]) -> dict[str, list[float]]:
+    """The numbers (member,) by quantity that is sought: ``values`` (parameter,), and those of ``base`` elsewhere."""
+    of_quantity: dict[str, list[float]] = {}
+    for parameter, value in zip(parameters, values, strict=True):
+        # The beginning of a record's drive is no number of the case.
+        if parameter.quantity == "offset":
+            continue
+        numbers = of_quantity.setdefault(parameter.quantity, list(values_of(base, parameter.quantity)))
+        for member in parameter.members:
+            numbers[member] = float(value)
+    return of_quantity
+
+
 def changed_case(base: Case, parameters: Sequence[SoughtParameter], values: Iterable[float], name: str) -> Case:
     """The case ``base`` with the ``values`` (parameter,) of its ``parameters``; raises CaseError."""
     contacts: Table = {}
     drive: Table = {}
     cell = base.lattice.undamped_cell()
     changed_cell = cell
-    of_quantity: dict[str, list[float]] = {}
-    for parameter, value in zip(parameters, values, strict=True):
-        if parameter.quantity != "offset":
-            numbers = of_quantity.setdefault(parameter.quantity, list(values_of(base, parameter.quantity)))
-            for member in parameter.members:
-                numbers[member] = float(value)
 
     # By quantity, since a section takes all values of one at once: those that are not sought keep theirs.
-    for quantity, numbers in of_quantity.items():
+    for quantity, numbers in numbers_of(base, parameters, values).items():
         if quantity == "amplitude":
             drive["amplitude"] = numbers[0]
         elif quantity in OF_CELL:
@@ -232,4 +239,7 @@ def changed_case(base: Case, parameters: Sequence[SoughtParameter], values: Iter
     if changed_cell is not cell:
         lattice = base.lattice.model_dump(by_alias=True, exclude_none=True)
         changes["lattice"] = dict.fromkeys(lattice) | with_cell(lattice, changed_cell, {})
+        # Samples are those of the measurement; for the bands of this cell, a run's may be too coarse.
+        if base.time.sample_interval * pass_bands(changed_cell)[-1].high >= np.pi:
+            changes["time"] = {"sample_interval": None}
     return base.varied(name=name, **changes)

@@ -1,11 +1,11 @@
 """Residuals of measured records and their Jacobian, over windows from the beginning of each record."""
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 
-from vipetsc.case import Case, CaseError, Model
+from vipetsc.case import CaseError, Model
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import Measured
 from vipetsc.dynamics.drives import create_drives, drive_forces
@@ -50,8 +50,7 @@ class Misfit:
         self.plan = plan
         self.records = records
         self.compute = compute
-        # Residuals, derivatives and onsets are asked for at the same values, one after the other.
-        self._case_of = lru_cache(maxsize=16)(plan.case_of)
+        self._trials = [plan.trials(number) for number in range(len(records))]
         self.noise = [np.sqrt(np.mean(record.values**2, axis=0)) for record in records]
         base = plan.base
         dofs = base.lattice.unit_cell().dofs
@@ -73,7 +72,7 @@ class Misfit:
                     for mass, sensor, size in zip(self.watched[number], table.sensors, self.noise[number], strict=True)
                     if sensor.quantity != "force"
                 ]
-                state = initial_state(plan.record_case(base, number).model(), self.size, sensors)
+                state = initial_state(self._trials[number].base.model(), self.size, sensors)
                 self.states[number] = state
                 self.size = state.stop
 
@@ -82,9 +81,9 @@ class Misfit:
         """The number of parameters."""
         return len(self.plan.parameters)
 
-    def case(self, z: np.ndarray) -> Case:
-        """The case at the coordinates ``z`` (coordinate,); raises CaseError if it is impossible."""
-        return self._case_of(tuple(self.values(z).tolist()))
+    def model(self, z: np.ndarray, number: int) -> Model:
+        """The model of record ``number`` at ``z`` (coordinate,); raises CaseError if it is impossible."""
+        return self._trials[number].case(self.values(z)).model()
 
     def values(self, z: np.ndarray) -> np.ndarray:
         """The values (parameter,) at the coordinates ``z``."""
@@ -107,6 +106,7 @@ class Misfit:
         lower: list[Model] = []
         upper: list[Model] = []
         widths: list[float] = []
+        values = self.values(z)
         for p in which:
             parameter = self.plan.parameters[p]
             # At a bound the difference is one-sided.
@@ -115,9 +115,9 @@ class Misfit:
             widths.append(above - below)
 
             for models, coordinate in ((lower, below), (upper, above)):
-                moved = z.copy()
-                moved[p] = coordinate
-                models.append(self.plan.record_case(self.case(moved), number).model())
+                moved = values.copy()
+                moved[p] = parameter.from_coordinate(coordinate)
+                models.append(self._trials[number].case(moved).model())
         return lower, upper, np.array(widths)
 
     def columns(self, number: int, active: Iterable[int]) -> tuple[list[int], list[int]]:
@@ -145,7 +145,7 @@ class Misfit:
         Raises CaseError, MotionError.
         """
         table = self.plan.options.records[number]
-        model = self.plan.record_case(self.case(z), number).model()
+        model = self.model(z, number)
         if watched is None:
             watched = self.watched[number]
 
@@ -254,7 +254,7 @@ class Misfit:
 
     def _force(self, z: np.ndarray, number: int, end: float, drive: int) -> tuple[np.ndarray, np.ndarray]:
         """The force (sample,) in N of a ``drive`` and its rate in N/s."""
-        model = self.plan.record_case(self.case(z), number).model()
+        model = self.model(z, number)
         drives = create_drives(model.drives, range(len(model.drives)))
         times = self.times(z, number, end)
         short = SHORT / model.drives[drive].waveform.highest

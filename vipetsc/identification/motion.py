@@ -1,6 +1,7 @@
 """The motion of a lattice with its derivatives: coefficients from models, and the call of the kernels."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,8 @@ from vipetsc.dynamics.spring_law import spring_laws
 from vipetsc.identification.motion_begin import MotionBegin, begin_contacts
 from vipetsc.identification.motion_rates import CurvedSprings, Lattice, MotionState, Slopes
 from vipetsc.identification.motion_steps import DONE, integrate
-from vipetsc.lattice import Chain, nonlinear_places
+from vipetsc.lattice import Chain, UnitCell, nonlinear_places
+from vipetsc.lattice.chain import Ends
 from vipetsc.modes.shooting.dop853 import STAGES
 
 # Errors are relative to a motion, and to derivatives, of at least this fraction of the linear wave: derivatives begin
@@ -44,30 +46,54 @@ class MotionCoefficients(NamedTuple):
     def of(cls, model: Model) -> "MotionCoefficients":
         """The coefficients of a ``model``."""
         chain = model.chain
-        stiffness = chain.stiffness_rows(0, chain.cells).tocoo()
-        damping = chain.damping_rows(0, chain.cells).tocoo()
-        masses = chain.masses()
-        n = len(masses)
+        # Trial cases differ in their contacts more often than in their cells. Cells that vary are never sought, and
+        # arrays that vary cannot be looked up.
+        matrices = _matrices(chain)
+        if chain.variation is None:
+            matrices = _matrices_of_equal_cells(chain.cell, chain.cells, chain.ends)
+        return cls(*matrices, sites=site_records(model, np.arange(len(chain.sites))), gains=gains_of(model))
 
-        # One pattern for both matrices: places are numbered row by row, and the springs have every place of a dashpot
-        # between masses.
-        diagonal = np.arange(n) * (n + 1)
-        places = [matrix.row.astype(np.int64) * n + matrix.col for matrix in (stiffness, damping)]
-        pattern = np.unique(np.concatenate([*places, diagonal]))
-        values = []
-        for matrix, place in zip((stiffness, damping), places, strict=True):
-            sums = np.bincount(np.searchsorted(pattern, place), matrix.data, len(pattern))
-            # Sums of no entries, as of a lattice without dashpots, are integers.
-            values.append(sums.astype(float))
-        return cls(
-            masses=masses,
-            first=np.searchsorted(pattern, np.arange(n + 1) * n),
-            columns=pattern % n,
-            stiffness=values[0],
-            damping=values[1],
-            sites=site_records(model, np.arange(len(chain.sites))),
-            gains=gains_of(model),
-        )
+
+class MatrixEntries(NamedTuple):
+    """Masses, stiffness and damping of a lattice, as of ``MotionCoefficients``."""
+
+    masses: np.ndarray
+    first: np.ndarray
+    columns: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+
+
+def _matrices(chain: Chain) -> MatrixEntries:
+    """The matrices of a ``chain``, whose contacts have no part in them."""
+    stiffness = chain.stiffness_rows(0, chain.cells).tocoo()
+    damping = chain.damping_rows(0, chain.cells).tocoo()
+    masses = chain.masses()
+    n = len(masses)
+
+    # One pattern for both matrices: places are numbered row by row, and the springs have every place of a dashpot
+    # between masses.
+    diagonal = np.arange(n) * (n + 1)
+    places = [matrix.row.astype(np.int64) * n + matrix.col for matrix in (stiffness, damping)]
+    pattern = np.unique(np.concatenate([*places, diagonal]))
+    values = []
+    for matrix, place in zip((stiffness, damping), places, strict=True):
+        sums = np.bincount(np.searchsorted(pattern, place), matrix.data, len(pattern))
+        # Sums of no entries, as of a lattice without dashpots, are integers.
+        values.append(sums.astype(float))
+    return MatrixEntries(
+        masses=masses,
+        first=np.searchsorted(pattern, np.arange(n + 1) * n),
+        columns=pattern % n,
+        stiffness=values[0],
+        damping=values[1],
+    )
+
+
+@lru_cache(maxsize=64)
+def _matrices_of_equal_cells(cell: UnitCell, cells: int, ends: Ends) -> MatrixEntries:
+    """The matrices of a lattice of equal cells; nothing changes them."""
+    return _matrices(Chain(cell, cells, ends))
 
 
 def gains_of(model: Model) -> np.ndarray:

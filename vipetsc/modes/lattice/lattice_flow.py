@@ -80,7 +80,7 @@ class LatticeFlow:
             rtol=RTOL,
             atol=(0.0, 0.0),
             scale=1.0,
-            speed=1.0,
+            packet=np.inf,
             laws=self._laws if len(set(self._laws)) > 1 else (),
             gaps=self._gaps,
         )

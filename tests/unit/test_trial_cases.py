@@ -1,0 +1,158 @@
+"""Trial cases of an identification against the same cases read from their tables, bit by bit."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+
+from tests.conftest import with_sections
+from tests.identified import lattice_table
+from vipetsc.case import Case, CaseError
+from vipetsc.case.sought import SoughtParameter, UnknownTable, parameters_of, values_of
+from vipetsc.case.trial import TrialCases
+from vipetsc.identification.motion import MotionCoefficients
+
+QUANTITIES = get_args(UnknownTable.model_fields["quantity"].annotation)
+CELL = {
+    "masses": [0.01, 0.02],
+    "springs": [
+        {"start": 2, "end": 1, "stiffness": 2e4, "next_cell": True, "damping": 0.1, "quadratic": 1e5},
+        {"start": 1, "end": 2, "stiffness": 1e4, "cubic": 1e8},
+    ],
+    "grounding": [0.1, 0.0],
+}
+POWER = {"law": "power", "exponent": 1.4, "stiffness": 2e6}
+AT_REST = {"amplitude": 0.0, "cycles": None}
+CASES: dict[str, dict[str, Any]] = {
+    "preset": {},
+    "two sides": {"contacts": {"clearance_minus": 6e-4}},
+    "own cell": {"lattice": {"preset": None, "cell": CELL}, "drive": {"frequency": 900.0}},
+    "lists over sites": {
+        "contacts": {"stiffness": None, "each": {"restitution": [0.7, 0.8, 0.9], "stiffness": [1e6, 2e6, 3e6]}}
+    },
+    "proportional dashpots": {"lattice": {"damping": {"mass": 1.0, "stiffness": 1e-6}}},
+    "loss of a band": {"lattice": {"damping": {"loss": {"2": 0.02}}}},
+    "struck": {"drive": AT_REST, "initial": {"kind": "velocity", "cell": 2, "velocity": 0.5}},
+    "mode": {"drive": AT_REST, "initial": {"kind": "mode", "number": 3, "energy": 1e-4}},
+    "wall": {"drive": {"waveform": "harmonic", "end": "left", "amplitude": 1e-4, "cycles": None, "frequency": 500.0}},
+}
+RECORDS: dict[str, dict[str, Any]] = {
+    "as the case": {},
+    "another drive": {"drive": {"cycles": 3, "frequency": 800.0}},
+    "an amplitude of its own": {"drive": {"amplitude": 5.0}},
+    "a mode of an energy": {"initial": {"kind": "mode", "number": 3, "energy": 1e-4}},
+}
+
+
+def base_of(name: str) -> Case:
+    """The case of that ``name`` in ``CASES``, with a power law."""
+    table = with_sections(lattice_table(contacts=POWER), CASES[name])
+    for section in ("lattice", "contacts", "drive"):
+        table[section] = {key: value for key, value in table[section].items() if value is not None}
+    return Case.from_table(table)
+
+
+def sought(base: Case, quantity: str, of: str) -> list[SoughtParameter]:
+    """The parameters of an unknown with generous bounds."""
+    unknown = UnknownTable(quantity=quantity, of=of, bounds=[-1e30, 1e30], scale="linear")  # type: ignore[arg-type]
+    return parameters_of(unknown, base)
+
+
+def assert_same(trials: TrialCases, values: list[float]) -> None:
+    """Both paths give the same case: text, model and coefficients of the motion, to the last bit."""
+    cheap = trials.case(values)
+    read = trials.read(values)
+    assert cheap.to_toml() == read.to_toml()
+    assert cheap == read
+    assert cheap.model() == read.model()
+    for quick, anew in zip(MotionCoefficients.of(cheap.model()), MotionCoefficients.of(read.model()), strict=True):
+        assert quick.tobytes() == anew.tobytes()
+
+
+def trial_values(base: Case, parameters: list[SoughtParameter], factor: float) -> list[float]:
+    """Values ``factor`` times those of the ``base``, all different; small ones where it has zeros."""
+    values = []
+    for number, parameter in enumerate(parameters):
+        start = np.mean([values_of(base, parameter.quantity)[member] for member in parameter.members])
+        values.append(float(start or 1e-3) * factor * (1 - 0.01 * number))
+    return values
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("name", CASES)
+def test_trial_cases_are_those_that_are_read(name, quantity):
+    """Every quantity, of all members and of each; of two values in turn, the second is no longer read."""
+    base = base_of(name)
+    if quantity == "clearance_minus" and base.contacts.clearance_minus is None:
+        pytest.skip("identify seeks the clearance on the side w < 0 where the case has one")
+    if quantity == "amplitude" and base.drive.amplitude == 0:
+        pytest.skip("nothing is driven")
+    if name == "wall" and quantity in ("dashpot", "quadratic", "cubic"):
+        pytest.skip("a wall moves linear springs alone")
+    # A read cell costs its bands: one value of all members is tried where there is nothing but the cell.
+    for of in ("all", "each") if name == "preset" else ("each",):
+        parameters = sought(base, quantity, of)
+        trials = TrialCases(base, parameters, {})
+        trials.case(trial_values(base, parameters, factor=0.98))
+        assert_same(trials, trial_values(base, parameters, factor=1.02))
+
+
+@pytest.mark.parametrize("record", RECORDS)
+def test_trial_cases_of_records_are_those_that_are_read(record):
+    """With a record's own drive and initial motion, several quantities at once."""
+    base = base_of("two sides")
+    quantities = ("clearance", "restitution", "mass", "spring", "amplitude")
+    parameters = [parameter for quantity in quantities for parameter in sought(base, quantity, "all")]
+    trials = TrialCases(base, parameters, RECORDS[record])
+    trials.case(trial_values(base, parameters, factor=0.98))
+    assert_same(trials, trial_values(base, parameters, factor=1.02))
+
+
+def test_sites_may_come_to_have_one_number():
+    """Equal numbers of all sites stand in another place of the case than different ones."""
+    base = base_of("preset")
+    trials = TrialCases(base, sought(base, "restitution", "each"), {})
+    for values in ([0.5, 0.6, 0.7], [0.6, 0.6, 0.6], [0.8, 0.8, 0.8], [0.7, 0.6, 0.5]):
+        assert_same(trials, values)
+
+
+def test_a_part_of_a_spring_may_vanish():
+    """A part that is zero does not stand in a case."""
+    base = base_of("own cell")
+    trials = TrialCases(base, sought(base, "quadratic", "each"), {})
+    for values in ([1e5, 2e5], [1e5, 0.0]):
+        assert_same(trials, values)
+
+
+@pytest.mark.parametrize(
+    ("name", "contacts", "quantity", "valid", "wrong"),
+    [
+        ("wall", {}, "quadratic", 0.0, 1e5),
+        ("preset", {"damping": "flores"}, "restitution", 0.9, 1e-9),
+        ("preset", {"precompression": 1e-4, "side": "plus"}, "clearance", 2e-4, 5e-5),
+    ],
+)
+def test_impossible_trial_cases_are_refused_as_those_that_are_read(name, contacts, quantity, valid, wrong):
+    base = base_of(name)
+    if contacts:
+        base = base.varied(contacts=contacts | {"restitution": 0.9})
+    trials = TrialCases(base, sought(base, quantity, "all"), {})
+    trials.case([valid])
+    with pytest.raises(CaseError) as cheap:
+        trials.case([wrong])
+    with pytest.raises(CaseError) as read:
+        trials.read([wrong])
+    assert [problem.key for problem in cheap.value.problems] == [problem.key for problem in read.value.problems]
+
+
+def test_a_lattice_may_come_out_too_fast_for_the_samples_of_the_case():
+    """Samples are those of the measurement: a light mass is no reason to refuse a trial, nor the case that is found."""
+    base = base_of("preset").varied(time={"sample_interval": 8e-4})
+    mass = values_of(base, "mass")[0]
+    trials = TrialCases(base, sought(base, "mass", "all"), {})
+    trials.case([mass])
+    assert trials.case([0.5 * mass]).lattice.unit_cell().masses == (0.5 * mass,) * 4
+    found = trials.read([0.5 * mass])
+    assert found.time.sample_interval < 8e-4

@@ -1,0 +1,137 @@
+"""Cases with trial values of the parameters that ``identify`` seeks, without reading a table for each of them.
+
+A fit asks for hundreds of cases that differ from each other in a few numbers. To read one is to check and resolve all
+of its sections, and the bands of a lattice with other masses or springs take more time than its motion. The sections
+of a resolved case are fixed but for the numbers that are sought: a trial case is a copy of one that was read, with
+other numbers in their places. Tests compare both, case by case and bit by bit.
+"""
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
+
+from vipetsc.case.case import Case
+from vipetsc.case.case_file import CaseError, Problem, Table
+from vipetsc.case.drive import check_drives
+from vipetsc.case.resolve import check_cell, check_contacts
+from vipetsc.case.schema import LatticeTable
+from vipetsc.case.sought import OF_CELL, OF_SPRINGS, SoughtParameter, changed_case, numbers_of
+
+FOLLOWING = ("kind", "energy", "near")
+"""Keys of ``[initial]`` from which numbers of the motion follow by the lattice: of its kind, energy or frequency."""
+KEPT = 32
+"""Cases that are kept. Residuals, contacts and derivatives are asked for at the same values, one after the other.
+
+Half as many are read twice where eight parameters are differentiated in two parts; twice as many change nothing.
+"""
+
+
+class TrialCases:
+    """Cases like ``base`` with other values of ``parameters``, and with the ``changes`` of a record by section."""
+
+    def __init__(self, base: Case, parameters: Sequence[SoughtParameter], changes: Mapping[str, Table]) -> None:
+        self._base = base
+        self._parameters = parameters
+        self._changes = changes
+        # A motion that is resolved by the lattice's masses, springs or contacts has other numbers with each of them.
+        self._follows = bool(set(FOLLOWING) & set(changes.get("initial", {})))
+        # A record's own amplitude holds whatever that of the case is.
+        self._has_amplitude = "amplitude" in changes.get("drive", {})
+        self._read: dict[tuple[str, ...], Case] = {}
+        self._case = lru_cache(maxsize=KEPT)(self._new_case)
+
+    def case(self, values: Iterable[float]) -> Case:
+        """The case with the ``values`` (parameter,); raises CaseError if it is impossible."""
+        return self._case(tuple(float(value) for value in values))
+
+    @property
+    def base(self) -> Case:
+        """The case without trial values."""
+        return self._with_changes(self._base)
+
+    def read(self, values: Sequence[float]) -> Case:
+        """The same case as ``case`` gives, read from its table; raises CaseError."""
+        return self._with_changes(changed_case(self._base, self._parameters, values, "model"))
+
+    def _with_changes(self, case: Case) -> Case:
+        """The ``case`` with what the record changes."""
+        if not self._changes:
+            return case
+        # A copy: tables are changed as they are read.
+        return case.varied(**copy.deepcopy(self._changes))
+
+    def _new_case(self, values: tuple[float, ...]) -> Case:
+        if self._follows:
+            return self.read(values)
+
+        numbers = numbers_of(self._base, self._parameters, values)
+        # Sites that all have one number have it in another place than sites with several.
+        form = tuple(quantity for quantity, several in numbers.items() if len(set(several)) == 1)
+        if form not in self._read:
+            self._read[form] = self.read(values)
+        return self._with_numbers(self._read[form], numbers)
+
+    def _with_numbers(self, case: Case, numbers: dict[str, list[float]]) -> Case:
+        """The ``case`` with other ``numbers`` by quantity; raises CaseError."""
+        contacts = case.contacts
+        lattice = case.lattice
+        drive = case.drive
+        for quantity, several in numbers.items():
+            if quantity in OF_CELL:
+                lattice = _with_cell_numbers(lattice, quantity, several)
+            elif quantity == "clearance":
+                contacts = contacts.model_copy(update={"clearance": several})
+            elif quantity != "amplitude":
+                each = contacts.each
+                if each and getattr(each, quantity):
+                    contacts = contacts.model_copy(update={"each": each.model_copy(update={quantity: several})})
+                else:
+                    contacts = contacts.model_copy(update={quantity: several[0]})
+            elif not self._has_amplitude:
+                drive = drive.model_copy(update={"amplitude": several[0]})
+
+        trial = case.model_copy(update={"contacts": contacts, "lattice": lattice, "drive": drive})
+        problems = _problems(trial, case)
+        if problems:
+            raise CaseError(problems, trial.name)
+        return trial
+
+
+def _with_cell_numbers(lattice: LatticeTable, quantity: str, numbers: list[float]) -> LatticeTable:
+    """The ``lattice`` with other ``numbers`` of a ``quantity`` of its cell's masses or springs."""
+    cell = lattice.cell
+    assert cell is not None  # changed_case writes a preset's cell out
+    if quantity == "mass":
+        update: Table = {"masses": numbers}
+    elif quantity == "grounding":
+        update = {"grounding": numbers}
+    else:
+        key = OF_SPRINGS[quantity]
+        springs = []
+        for spring, number in zip(cell.springs, numbers, strict=True):
+            # As with_cell writes a spring: a part that it lacks is not written.
+            value = number if number or key == "stiffness" else None
+            springs.append(spring.model_copy(update={key: value}))
+        update = {"springs": springs}
+    return lattice.model_copy(update={"cell": cell.model_copy(update=update)})
+
+
+def _problems(trial: Case, case: Case) -> list[Problem]:
+    """What is wrong with a ``trial`` by its numbers alone; the ``case`` is valid, and differs in nothing else.
+
+    A case that is read is also refused where its samples are too coarse for the bands, and where nothing is driven at
+    a frequency of the bands: samples and frequencies of an identification are those that were measured.
+    """
+
+    def valid(*keys: str) -> bool:
+        return True
+
+    problems: list[Problem] = []
+    cell = None
+    if trial.lattice is not case.lattice:
+        cell, problems = check_cell(trial.lattice)
+        if cell is not None:
+            problems += check_drives(trial.drive, trial.lattice, cell, trial.lattice.cells, valid)
+    if not problems:
+        problems = list(check_contacts(trial.lattice, trial.contacts, trial.initial, valid))
+    return problems
