@@ -25,11 +25,17 @@ def with_tables(chapter: str, measured: str) -> tuple[str, list[str]]:
     blocks = []
     placed = set()
     for is_table, block in _blocks(chapter):
-        titles = _titles(block) if is_table else ""
+        titles = ""
+        if is_table:
+            # The first two titles recognise a table: later ones, such as a commit, change from bench to bench.
+            titles = _titles(block)
         if titles in found:
             placed.add(titles)
-            # The first two titles recognise a table: later ones, such as a commit, change from bench to bench.
-            block = _with_goals(block, found[titles]) if titles == GOALS else found[titles]
+            before = block
+            block = found[titles]
+            # Goals of parts that were not measured remain.
+            if titles == GOALS:
+                block = _with_goals(before, block)
         blocks.append(block)
 
     left = [titles for titles in found if titles not in placed]

@@ -166,10 +166,14 @@ def programs(folder: Path, rounds: int, commit: str, names: Iterable[str]) -> li
     rows = []
     for name in names:
         program = PROGRAMS[name]
+        # The first turn is not counted: it loads files and kernels into memory.
+        first = 1
+        turns = rounds
         # A program that compiles is measured as a user meets it first: with empty caches, and once, since it takes a
         # minute.
-        first = 0 if program.compiles else 1
-        turns = 1 if program.compiles else rounds
+        if program.compiles:
+            first = 0
+            turns = 1
         measured: dict[str, list[tuple[float, float]]] = {label: [] for label in versions}
         try:
             for turn in range(first + turns):

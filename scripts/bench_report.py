@@ -122,7 +122,9 @@ def _seconds_and_ratio(seconds: float | None, ratio: float | None) -> str:
     """An entry of the table: CPU seconds, with the ratio if there is one; "-" for none."""
     if seconds is None:
         return "-"
-    return f"{seconds:.3g} ({ratio:.3g})" if ratio else f"{seconds:.3g}"
+    if ratio:
+        return f"{seconds:.3g} ({ratio:.3g})"
+    return f"{seconds:.3g}"
 
 
 def _whole_table(found: dict[str, Any]) -> str:
@@ -180,7 +182,10 @@ def _scaling_table(found: dict[str, Any]) -> str:
         if "failure" in row:
             lines.append(f"| {row['engine']} | {row['cells']:,} | | failed | | | |")
             continue
-        gain = f"{row['speedup']:.2f} ({row['memory_speedup']:.2f})" if "speedup" in row else ""
+        # One rank is what the others are compared with.
+        gain = ""
+        if "speedup" in row:
+            gain = f"{row['speedup']:.2f} ({row['memory_speedup']:.2f})"
         lines.append(
             f"| {row['engine']} | {row['cells']:,} | {row['ranks']} | {row['wall_ms']:.3g} | {gain}"
             f" | {row['peak_gib_a_rank']:.2f} | {100 * row['fraction_of_bandwidth_limit']:.2g} % |"
@@ -239,10 +244,10 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
     left, right = figure.subplots(1, 2)
     for engine in dict.fromkeys(row["engine"] for row in found["scaling"]):
         colour, marker, _ = _LOOKS.get(f"vipetsc {engine}", _OTHER)
-        for ranks, line in ((1, "-"), (2, "--")):
+        for ranks, line, words in ((1, "-", "1 rank"), (2, "--", "2 ranks")):
             rows = [r for r in found["scaling"] if r["engine"] == engine and r["ranks"] == ranks]
             cells = [r["cells"] for r in rows]
-            label = f"{engine}, {ranks} rank{'s' if ranks > 1 else ''}"
+            label = f"{engine}, {words}"
             left.loglog(cells, [r["wall_ms"] for r in rows], line, color=colour, marker=marker, ms=3, label=label)
             right.semilogx(cells, [r["peak_gib_a_rank"] for r in rows], line, color=colour, marker=marker, ms=3)
 

@@ -20,7 +20,9 @@ class Target:
     @property
     def met(self) -> bool:
         """Whether the number is as it should be."""
-        return self.value >= self.target if self.at_least else self.value <= self.target
+        if self.at_least:
+            return self.value >= self.target
+        return self.value <= self.target
 
 
 def targets(found: dict[str, Any]) -> list[Target]:
@@ -78,7 +80,9 @@ def _whole_programs(rows: list[dict[str, Any]]) -> list[Target]:
         # A failed program has no time; its row in the table of programs says so.
         if "failure" in row or program.target is None:
             continue
-        kind = "cpu" if program.by_cpu else "wall"
+        kind = "wall"
+        if program.by_cpu:
+            kind = "cpu"
         name = f"{row['program']}, {kind} time over that of {row['baseline']}"
         measured.append(Target(name, row[f"{kind}_ratio"], round(program.target, 2), at_least=False))
     return measured

@@ -152,11 +152,12 @@ def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float
         # Up to the next impact, before which the number is the one that is printed.
         window = times < onsets[impacts]
         largest = float(np.abs(slopes[window]).max())
-        error = float(np.abs(slopes - differences)[window].max()) / largest if largest else 0.0
-        missed = float(np.abs(1e-3 * slopes - change)[window].max() / np.abs(change)[window].max())
         # Before the clearance is first touched nothing depends on it, and a relative error has no meaning.
-        if largest:
-            rows.append((int(impacts), largest, error, missed))
+        if not largest:
+            continue
+        error = float(np.abs(slopes - differences)[window].max()) / largest
+        missed = float(np.abs(1e-3 * slopes - change)[window].max() / np.abs(change)[window].max())
+        rows.append((int(impacts), largest, error, missed))
     return rows
 
 

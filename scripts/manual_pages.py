@@ -101,8 +101,11 @@ def write_sources(folder: Path, packages: list[str]) -> None:
 
 def contents(caption: str, names: list[str], hidden: bool = True) -> str:
     """A table of contents, in the margin alone if ``hidden``."""
-    options = f":caption: {caption}\n" if caption else ""
-    options += ":hidden:\n" if hidden else ":maxdepth: 1\n"
+    options = ":maxdepth: 1\n"
+    if hidden:
+        options = ":hidden:\n"
+    if caption:
+        options = f":caption: {caption}\n{options}"
     return f"\n```{{toctree}}\n{options}\n" + "\n".join(names) + "\n```\n"
 
 
@@ -203,7 +206,10 @@ def described(node: Named, depth: int = 6) -> Iterator[str]:
     elif {ast.unparse(decorator) for decorator in node.decorator_list} & {"property", "cached_property"}:
         kind = "property"
     else:
-        kind = "function" if depth == 6 else "method"
+        # Members of a class stand one level below it.
+        kind = "method"
+        if depth == 6:
+            kind = "function"
         signature += f"({ast.unparse(node.args)})"
         if node.returns:
             signature += f" -> {ast.unparse(node.returns)}"

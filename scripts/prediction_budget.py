@@ -115,7 +115,9 @@ class Budget:
         impacts = (run[f"impacts/{name}"].values for name in ("site", "onset", "separation"))
         for site, onset, separation in zip(*impacts, strict=True):
             # A contact at the end of the run has no separation.
-            until = separation if np.isfinite(separation) else burst.time[-1]
+            until = burst.time[-1]
+            if np.isfinite(separation):
+                until = separation
             on[site - 1] |= (network.time >= onset - period / 2) & (network.time <= until + period / 2)
         return Simulation(np.array(waves) * network.during, on & network.during)
 
@@ -126,7 +128,9 @@ class Budget:
         for _ in range(ROUNDS):
             z = (np.abs(waves) + np.abs(third)) / network.clearance[:, None]
             release = self.sites.over_bursts(z.max(axis=1)).release
-            touching = in_contact(z, release) & network.during if on is None else on
+            touching = on
+            if on is None:
+                touching = in_contact(z, release) & network.during
             force = self.sites.at(z).third * np.abs(waves) * unit_phase(waves) ** 3 * touching
             sent = network._sent(network.received3, force) * network.centre
             # Half of each step: the sites' third harmonics drive each other, and whole steps may swing about the

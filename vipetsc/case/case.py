@@ -262,7 +262,7 @@ def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem
         return None, []
     lattice = sections["lattice"]
     frequency = None
-    # A drive that gives its wave gives the motion's frequency, too; a pulse has no frequency that it would share.
+    # A drive that gives its wave gives the motion's frequency, too; a pulse has none that others could have.
     if drive.wave_choices:
         frequency, _ = driven_wave(lattice.unit_cell(), drive)
 

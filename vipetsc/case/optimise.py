@@ -31,7 +31,7 @@ class OptimiseTable(Section):
     ``start``: the case, or clearances ``matched`` to its wave by the scattering law of a site; ``budget`` in designs,
     the case among them; ``population``: designs a generation; ``step``: first standard deviation over the range between
     the bounds; ``samples`` of what ``[disorder]`` draws are run of every design, and their mean counts; ``curve``:
-    amplitudes in N at which the best designs are compared; ``ranks`` share a run.
+    amplitudes in N at which the best designs are compared; ``ranks`` compute a run together.
     """
 
     variables: VariablesTable = Field(default_factory=lambda: VariablesTable.model_validate({}))

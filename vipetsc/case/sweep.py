@@ -35,7 +35,7 @@ class SweepTable(Section):
     ``measures``: what is measured of every run: ``entropy`` over wavenumbers (the paper's section II), ``transfer``
     between bands (section III); ``motion`` asks for neither, but for what every run is measured for: the largest force
     and the motion of named points. ``fields``: keep every run's full fields and analysis. ``ranks``: how many ranks
-    share a run. ``zip``: groups of keys that vary together.
+    compute a run together. ``zip``: groups of keys that vary together.
     """
 
     measures: list[Literal["entropy", "transfer", "motion"]] = Field(["entropy", "transfer"], min_length=1)
@@ -139,7 +139,7 @@ class Sweep(StudyCase):
         problems: list[Problem] = []
         for axis, i in zip(self.axes, index, strict=True):
             for key, values in axis.items():
-                # A copy, since members must not share a value that is a list or a table.
+                # A copy, since members must not have one list or table in common.
                 problems += put(table, key, copy.deepcopy(values[i]))
         return table, problems
 

@@ -1,4 +1,4 @@
-"""Which engine simulates a case; known before any kernel is loaded."""
+"""Which engine simulates a case, decided before any kernel is loaded."""
 
 from typing import NamedTuple
 

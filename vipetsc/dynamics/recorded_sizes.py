@@ -1,4 +1,4 @@
-"""What of a run is recorded, by which ranks, and in chunks of how many samples; known before any kernel is loaded."""
+"""What of a run is recorded, by which ranks, and in chunks of how many samples: computed without any kernel."""
 
 import h5py
 

@@ -178,7 +178,7 @@ def figure_names(
 
 
 def with_ensemble(folders: Iterable[Path]) -> list[Path]:
-    """Return the folders of sweeps; others that share a page with them hold branches."""
+    """Return the folders of sweeps; others on one page with them hold branches."""
     return [folder for folder in folders if (folder / "ensemble.h5").exists()]
 
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 # Bytes of fields above which writer = "auto" has every rank write its own part. Below, one rank copies them in some
-# seconds, and a file that is written in parallel needs a file system that all ranks share.
+# seconds, and a file that is written in parallel needs a file system that all ranks see.
 GATHER_LIMIT = 2 * 2**30
 
 

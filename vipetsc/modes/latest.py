@@ -10,7 +10,7 @@ Value = TypeVar("Value")
 class LatestValues(Generic[Argument, Value]):
     """The ``count`` values that were computed last, by their arguments.
 
-    A cache of ``functools`` around a method would keep its object alive until the collector of cycles comes by, and
+    A cache of ``functools`` on a method would keep its object alive until the collector of cycles comes by, and
     with it matrices of a whole lattice.
     """
 

@@ -98,7 +98,7 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
     """
     from vipetsc.cli.verbs.verb_list import study_verbs
 
-    # Verbs that leave the same kind of folder share their pictures.
+    # Verbs that leave the same kind of folder have their pictures in common.
     by_source = {verb.pictures.source: verb.pictures for verb in study_verbs() if verb.pictures}
     files = {pictures.file for pictures in by_source.values()}
     folders = list(paths)

@@ -41,7 +41,7 @@ def report_of(options: argparse.Namespace, ranks: int) -> str:
     if disorder:
         rows += disorder_rows(*disorder)
 
-    # Verbs share rows and warnings of the lattice that they have in common.
+    # Rows and warnings of the lattice are the same for all verbs that have one.
     lines = [table([*dict.fromkeys(rows)])]
     lines += [f"warning: {warning}" for warning in dict.fromkeys(warnings)]
     return "\n".join(lines)

@@ -21,7 +21,7 @@ SMALL = 1e-12
 
 
 class _Gramian:
-    """Tables of S (2 dof, 2 dof, cell), from a cell to itself and to those on its right, by the kinds around it."""
+    """Tables of S (2 dof, 2 dof, cell), from a cell to itself and to those on its right, by the kinds near it."""
 
     def __init__(self, dashpots: DashpotRows) -> None:
         self._dashpots = dashpots

@@ -1,8 +1,8 @@
 """The nodes at which forces are collocated within a substep, and the integrals between them.
 
 The force of a contact is represented by its values at eight Gauss nodes of a substep (sec. 3 of the derivation in the
-package's docstring), and all that must be known of it are integrals of its interpolant times powers of time: numbers
-that do not depend on the lattice and are tabulated once. With Hertz's law a force begins and ends as the power 3/2 of
+package's docstring). It enters the motion by integrals of its interpolant times powers of time: numbers that do not
+depend on the lattice and are tabulated once. With Hertz's law a force begins and ends as the power 3/2 of
 time, which a polynomial in time follows badly: eight nodes integrate it to 5e-6. In the root of the time since the
 onset, or before the separation, it is smooth. There are therefore three kinds of nodes: ``PLAIN`` ones at s = z,
 ``ONSET`` at s = z^2 and ``EXIT`` at s = z (2 - z), where z are Gauss's nodes.

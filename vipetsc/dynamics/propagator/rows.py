@@ -1,11 +1,11 @@
-"""Rows of the powers of which free motion consists: what a mass's Taylor coefficients take from the cells around it.
+"""Rows of the powers of which free motion consists: what a mass's Taylor coefficients take from the cells near it.
 
 Let c be the row vector that picks a mass from all displacements u, and H the step in s. The term of order 2m of the
 series of c u in t/H is c (-A)^m u/(2m)! with A = H^2 M^-1 K (sec. 1 of the derivation in the package's docstring): a
 row c (-A)^m says what this term takes from every displacement. With dashpots the rows c P_k and c Q_k say what the term
 of order k takes from displacements and from velocities times H (sec. 7). Rows are multiplied by one power after another
 from the right, each time for many cells at once, and each time they grow by a cell on either side. Where cells differ
-(sec. 8) every row takes the masses, springs and dashpots that lie around its own cell. ``Bounds`` has what no cell
+(sec. 8) every row takes the masses, springs and dashpots that lie near its own cell. ``Bounds`` has what no cell
 exceeds: the largest frequency, from Gershgorin's circles, decides how many powers count, the largest entries how far
 the rows reach.
 """

@@ -45,7 +45,7 @@ class StepSeries:
     """Series of the motion of ``chain`` over a step of ``interval`` H in s, to a relative ``tolerance``.
 
     Rows are arrays (..., term, dof, cell): what the term (-A)^m of a displacement takes from every displacement in the
-    cells around it, for an even power of time; the same rows times H say what the next, odd power takes from the
+    cells near it, for an even power of time; the same rows times H say what the next, odd power takes from the
     velocities. With dashpots rows are (..., 2 term, 2 dof, cell), one for each power of time: what it takes from
     displacements (P_k, the first dof) and from H times velocities (Q_k). A chain must have at least ``width`` cells.
     With ``spans_cells`` forces act between masses of two cells, be they no contacts of ``chain`` that join cells.
@@ -231,7 +231,7 @@ class StepSeries:
         interior = self.is_interior(cells)
         cells[interior] = cells[interior][:1]
 
-        # Rows near an end are like no others; elsewhere equal coefficients around a cell make equal rows.
+        # Rows near an end are like no others; elsewhere equal coefficients near a cell make equal rows.
         near = self.reach + 1
         first: dict[bytes, int] = {}
         for i in np.flatnonzero(~interior & ~self._is_near_end(cells)):

@@ -138,7 +138,7 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
     # Vectors of cells need so many; shorter ranges are left to the dense rows.
     interior = interior[interior @ [-1, 1] >= LANES]
 
-    # Consecutive dense cells share their part of the halo.
+    # Consecutive dense cells have one part of the halo in common.
     is_dense = np.ones(len(inner), bool)
     for start, stop in interior - first:
         is_dense[start:stop] = False

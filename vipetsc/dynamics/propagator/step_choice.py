@@ -1,4 +1,4 @@
-"""The length of a linear step, and which lattices such steps do not suit; known before any kernel is loaded.
+"""The length of a linear step, and which lattices such steps do not suit: decided before any kernel is loaded.
 
 The step H is a sample interval over a whole number: long, because a step costs the same whatever its length, but not so
 long that many sites feel one another within it. Springs that are not linear act in every step: where they are so many

@@ -160,7 +160,7 @@ class Hill:
                 g = _of_pairs(np.array(compliances[part]), acting)
                 # As phase and logarithm: at large exponents the product of so many pivots overflows.
                 phases, logs = np.linalg.slogdet(_plus_one(g, matrix))
-                # One by one: products of complex arrays are rounded in another way on some processors.
+                # One by one: products of complex arrays are rounded otherwise on some processors.
                 for i, value in enumerate(phases * np.exp(np.minimum(logs, LARGEST_LOG)), begin):
                     out[i] *= value
         return out

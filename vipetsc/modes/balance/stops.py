@@ -8,7 +8,7 @@ from vipetsc.lattice import Contact
 class Stops(NamedTuple):
     """The ``law`` of a contact, and where its stops are: clearances in m on the sides ``plus`` and ``minus``.
 
-    inf: there is no stop; negative: it is pressed at rest, where a static load balances its force. On the way to a
+    inf: there is no stop; negative: it is pressed at rest, where a static load balances its force. In the homotopy to a
     state with stops that touch at rest the force has a factor ``weight``, and a dashpot of ``drag`` in N s/m parallel
     to it. A linear system may have a ``spring`` in N/m in the place of a pressed contact: harmonics are then those of
     the force less the spring's.

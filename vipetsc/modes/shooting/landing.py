@@ -47,8 +47,8 @@ class Change(NamedTuple):
 def correct(change: Change, motion: np.ndarray, floor: float) -> tuple[Change, int]:
     """The next attempt after one that ended with (w, w', w'') = ``motion``: Newton's method, or bisection.
 
-    The outcome is CROSSING when the length is known to ``floor`` seconds, EXTREMUM when the gap's largest value is
-    known so and not above zero, and NONE when another attempt is needed. ``contact.search`` stops at a tolerance on
+    The outcome is CROSSING when the length is found to ``floor`` seconds, EXTREMUM when the gap's largest value is
+    found so and not above zero, and NONE when another attempt is needed. ``contact.search`` stops at a tolerance on
     w; the sensitivities of an orbit with many contacts need the length to rounding.
     """
     contact, side, sign, offset, extremum, low, high, length, attempts = change
