@@ -7,7 +7,7 @@ import sys
 from importlib.util import find_spec
 
 from vipetsc.cli.streams import check_standard_streams
-from vipetsc.process import collect_seldom, end_on_request, quick_start_alone
+from vipetsc.process import collect_seldom, end_on_request, quick_start
 
 BUILT_FOR_MPI = "mpi4py", "petsc4py", "h5py"  # which no wheel brings
 
@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
     import petsc4py
 
     # Signals are ours: SIGTERM ends a run at its next step, with a checkpoint.
-    with quick_start_alone():
+    with quick_start():
         petsc4py.init([sys.argv[0], "-no_signal_handler", *arguments[end + 1 :]])
         from petsc4py import PETSc
 

@@ -17,6 +17,9 @@ STOP_SIGNALS = signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1
 RANKS = "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"
 # For Open MPI, where one process runs alone: no daemon is started for it, and no network is looked for.
 ALONE = {"OMPI_MCA_ess_singleton_isolated": "1", "OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self"}
+# For Open MPI, where all ranks run on one machine: their messages go through its memory, and no network is looked for,
+# which takes a fifth of a second (.29 s of MPI's start become .08).
+ONE_MACHINE = {"OMPI_MCA_pml": "ob1"}
 
 # Objects that may hold others, allocated between two searches for garbage. With Python's own 700 the searches take a
 # tenth of a run's time.
@@ -41,15 +44,25 @@ def launched_rank() -> int | None:
     return None
 
 
-@contextmanager
-def quick_start_alone() -> Iterator[None]:
-    """Let MPI be started within the block in a tenth of a second instead of half a one, if this process is alone.
+def all_on_this_machine() -> bool:
+    """Whether this process was launched by Open MPI as one of several, all of which are on this machine."""
+    size = os.environ.get("OMPI_COMM_WORLD_SIZE")
+    return size is not None and os.environ.get("OMPI_COMM_WORLD_LOCAL_SIZE") == size
 
-    What the environment already says stays as it is.
+
+@contextmanager
+def quick_start() -> Iterator[None]:
+    """Let MPI be started within the block in a tenth of a second instead of half a one, where it needs no network.
+
+    That is where this process is alone, and where all ranks are on one machine. What the environment already says stays
+    as it is.
     """
-    added: dict[str, str] = {}
+    wanted: dict[str, str] = {}
     if launched_rank() is None:
-        added = {name: value for name, value in ALONE.items() if name not in os.environ}
+        wanted = ALONE
+    elif all_on_this_machine():
+        wanted = ONE_MACHINE
+    added = {name: value for name, value in wanted.items() if name not in os.environ}
     os.environ.update(added)
     try:
         yield

@@ -1,4 +1,4 @@
-"""A process before MPI: the environment in which it starts MPI alone, and requests to stop until then."""
+"""A process before MPI: the environment in which it starts MPI, and requests to stop until then."""
 
 from __future__ import annotations
 
@@ -8,26 +8,29 @@ import sys
 
 import pytest
 
-from vipetsc.process import ALONE, RANKS, quick_start_alone
+from vipetsc.process import ALONE, ONE_MACHINE, RANKS, quick_start
 
 pytestmark = pytest.mark.parallel(1)
+
+# Open MPI's number of all ranks, and of those on the machine of a rank.
+SIZES = "OMPI_COMM_WORLD_SIZE", "OMPI_COMM_WORLD_LOCAL_SIZE"
 
 
 @pytest.fixture(autouse=True)
 def alone(monkeypatch):
     """No launcher and no setting of the user, whatever has started the tests."""
-    for name in (*RANKS, *ALONE):
+    for name in (*RANKS, *SIZES, *ALONE):
         monkeypatch.delenv(name, raising=False)
 
 
 def test_a_process_alone_starts_mpi_without_daemon_and_network():
-    with quick_start_alone():
+    with quick_start():
         assert os.environ.items() >= ALONE.items()
 
 
 def test_processes_started_later_do_not_inherit_it():
     """With these settings an mpirun's ranks could not reach one another."""
-    with pytest.raises(RuntimeError), quick_start_alone():
+    with pytest.raises(RuntimeError), quick_start():
         raise RuntimeError
     assert not ALONE.keys() & os.environ.keys()
 
@@ -35,7 +38,7 @@ def test_processes_started_later_do_not_inherit_it():
 def test_what_a_user_has_set_stays(monkeypatch):
     name = "OMPI_MCA_pml"
     monkeypatch.setenv(name, "ucx")
-    with quick_start_alone():
+    with quick_start():
         assert os.environ[name] == "ucx"
     assert os.environ[name] == "ucx"
 
@@ -43,8 +46,18 @@ def test_what_a_user_has_set_stays(monkeypatch):
 @pytest.mark.parametrize("name", RANKS)
 def test_a_rank_of_a_job_starts_mpi_as_its_launcher_says(name, monkeypatch):
     monkeypatch.setenv(name, "0")
-    with quick_start_alone():
+    with quick_start():
         assert not ALONE.keys() & os.environ.keys()
+
+
+@pytest.mark.parametrize(("here", "expected"), [("4", {**ONE_MACHINE}), ("2", {})])
+def test_ranks_look_for_a_network_unless_one_machine_has_them_all(here, expected, monkeypatch):
+    """All ranks of a job choose alike: each sees these numbers."""
+    for name, value in zip((RANKS[0], *SIZES), ("1", "4", here), strict=True):
+        monkeypatch.setenv(name, value)
+
+    with quick_start():
+        assert {name: os.environ[name] for name in ALONE if name in os.environ} == expected
 
 
 # The signal comes while the process waits: if the handler returned, it would end with exit code 0.
