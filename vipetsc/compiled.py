@@ -20,7 +20,7 @@ from numba.core import event
 from numba.core.caching import FunctionCache
 from numba.core.runtime import rtsys
 
-from vipetsc.kernel import Kernel
+from vipetsc.kernel import EntryCompiler, Kernel
 from vipetsc.process import cache_folder, compiling, launched_rank, say
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -41,11 +41,12 @@ def njit(*signature: Any, **options: Any) -> Any:
     """``numba.njit`` with a cache; without a signature, a ``Kernel`` that is compiled at the first call."""
     if signature and callable(signature[0]):
         return njit()(signature[0])
+    disjoint = options.pop("disjoint", False)
     # No C code calls these.
-    compile_entry = _decorator(numba.njit, *signature, no_cfunc_wrapper=True, **options)
+    compile_entry = _decorator(numba.njit, *signature, no_cfunc_wrapper=True, pipeline_class=EntryCompiler, **options)
     if signature:
         return compile_entry
-    return lambda function: Kernel(function, compile_entry, options)
+    return lambda function: Kernel(function, compile_entry, options, disjoint)
 
 
 def cfunc(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -211,5 +212,8 @@ def _imports(package: Path, path: Path) -> list[Path]:
 # For functions that make no arrays but views: numba counts no references to theirs, which costs more than short sums do
 # (each array of a tuple, at each access). ``inlined`` ones are put in place of their calls, with the constants there.
 kernel = njit(error_model="numpy", _nrt=False)
+# For loops over arrays of which none overlaps one that is written to: LLVM, which cannot know that, keeps sums in
+# registers then, where it would store each one before it reads the next number. They keep their order and their bits.
+disjoint = njit(error_model="numpy", _nrt=False, disjoint=True)
 inlined = njit(error_model="numpy", _nrt=False, inline="always")
 allocating = njit(error_model="numpy", _nrt=True)  # makes arrays, also where it is called from those

@@ -15,8 +15,11 @@ from numba import _dynfunc  # type: ignore[attr-defined]
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.lowering import Lower
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering
+
+from vipetsc.lowering import TupleLower
 
 
 class _LinkedLibrary(JITCodeLibrary):
@@ -33,8 +36,20 @@ class _LinkedLibrary(JITCodeLibrary):
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
-class _LinkedLowering(NativeLowering):
-    """Lowering to a ``_LinkedLibrary``."""
+class _EntryLowering(NativeLowering):
+    """Lowering by ``TupleLower``."""
+
+    _name = "entry_lowering"
+
+    @property
+    def lowering_class(self) -> type[Lower]:
+        """What translates a function."""
+        return TupleLower
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LinkedLowering(_EntryLowering):
+    """The same to a ``_LinkedLibrary``."""
 
     _name = "linked_lowering"
 
@@ -58,24 +73,53 @@ class _LinkedLowering(NativeLowering):
         return True
 
 
-class _LinkedCompiler(CompilerBase):
-    """Numba's compiler with the lowering above."""
+class EntryCompiler(CompilerBase):
+    """Numba's compiler of what Python calls, with the lowering above."""
+
+    _lowering: type[NativeLowering] = _EntryLowering
 
     def define_pipelines(self) -> list[PassManager]:
         """The passes of numba, of which the last but one is replaced."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
         kinds = [kind for kind, _ in passes.passes]
-        passes.passes[kinds.index(NativeLowering)] = (_LinkedLowering, "linked lowering")
+        passes.passes[kinds.index(NativeLowering)] = (self._lowering, "lowering of tuples by address")
         passes.finalize()
         return [passes]
 
 
-class Kernel(CPUDispatcher):
-    """A function that kernels and Python can call; ``decorator`` compiles what Python calls."""
+class _LinkedCompiler(EntryCompiler):
+    """The compiler of kernels."""
 
-    def __init__(self, function: Callable[..., Any], decorator: Callable[..., Any], options: dict[str, Any]) -> None:
+    _lowering = _LinkedLowering
+
+
+class _DisjointCompiler(_LinkedCompiler):
+    """The compiler of kernels whose arrays do not overlap."""
+
+    def define_pipelines(self) -> list[PassManager]:
+        """The passes of kernels, with the arrays' addresses marked so for LLVM."""
+        self.state.flags.noalias = True
+        return super().define_pipelines()
+
+
+class Kernel(CPUDispatcher):
+    """A function that kernels and Python can call; ``decorator`` compiles what Python calls.
+
+    Of the arrays that a ``disjoint`` one takes none overlaps one that it writes to.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        decorator: Callable[..., Any],
+        options: dict[str, Any],
+        disjoint: bool = False,
+    ) -> None:
         linked = {"nopython": True, "boundscheck": None, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-        super().__init__(function, locals={}, targetoptions=options | linked, pipeline_class=_LinkedCompiler)
+        compiler: type[CompilerBase] = _LinkedCompiler
+        if disjoint:
+            compiler = _DisjointCompiler
+        super().__init__(function, locals={}, targetoptions=options | linked, pipeline_class=compiler)
         self._decorator = decorator
 
     @cached_property

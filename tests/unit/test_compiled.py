@@ -15,7 +15,7 @@ import numba
 import pytest
 
 import vipetsc
-from vipetsc import compiled, kernel, process
+from vipetsc import compiled, kernel, lowering, process
 from vipetsc.dynamics.ts.right_hand_side import compile_callback
 from vipetsc.process import cache_folder
 
@@ -71,6 +71,7 @@ def package(tmp_path):
     (folder / "plain.py").write_text("import numpy\n")
     shutil.copy(compiled.__file__, folder)
     shutil.copy(kernel.__file__, folder)
+    shutil.copy(lowering.__file__, folder)
     shutil.copy(process.__file__, folder)
 
     def ask() -> list:

@@ -18,7 +18,7 @@ MOST_LINES_IN_A_FILE = 400
 MOST_STATEMENTS_IN_A_FUNCTION = 50
 MOST_ARGUMENTS = 7
 # Decorators of compiled functions.
-COMPILED = {"njit", "jit", "cfunc", "kernel", "inlined"}
+COMPILED = {"njit", "jit", "cfunc", "kernel", "disjoint", "inlined"}
 # Words that were a dialect of this package; the field has names for what they held.
 DIALECT = {"awake", "again", "loud", "heard", "alike", "letter", "found", "own", "words", "kept", "there"}
 DIALECT |= {"told", "made", "way", "beside", "around", "known", "lot"}

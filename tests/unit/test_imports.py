@@ -30,6 +30,7 @@ FLOORS = (
     "parallel",
     "compiled",
     "kernel",
+    "lowering",
     "plugins",
     "register",
     "progress",

@@ -45,7 +45,7 @@ Whether a function is a ``kernel`` or ``inlined``, put in place of its calls, ma
 import numpy as np
 from scipy.special import binom
 
-from vipetsc.compiled import inlined, kernel
+from vipetsc.compiled import disjoint, inlined, kernel
 from vipetsc.contact.law import contact_force
 from vipetsc.dynamics.drives import drive_force
 from vipetsc.dynamics.propagator.nodes import NODES
@@ -201,6 +201,15 @@ def _prepare_nodes(cluster: Cluster, trial: Trial, substep: Substep) -> None:
             sums.reaches[target, source] = node_responses(cluster, substep, active[target], active[source], to_w, to_v)
 
 
+@disjoint
+def _add_responses(to_w: np.ndarray, to_v: np.ndarray, forces: np.ndarray, w: np.ndarray, v: np.ndarray) -> None:
+    """Add to ``w`` and ``v`` (node,) what the ``forces`` (node k,) add by their responses (node k, node)."""
+    for k in range(NODES):
+        for node in range(NODES):
+            w[node] += to_w[k, node] * forces[k]
+            v[node] += to_v[k, node] * forces[k]
+
+
 @inlined
 def _move(cluster: Cluster, trial: Trial) -> float:
     """Move the active DoFs at the nodes by the forces there.
@@ -222,11 +231,7 @@ def _move(cluster: Cluster, trial: Trial) -> float:
 
         for source in range(active.size):
             if sums.reaches[target, source]:
-                for k in range(NODES):
-                    force = trial.force[active[source], k]
-                    for node in range(NODES):
-                        w[node] += sums.to_w[target, source, k, node] * force
-                        v[node] += sums.to_v[target, source, k, node] * force
+                _add_responses(sums.to_w[target, source], sums.to_v[target, source], trial.force[active[source]], w, v)
         change = max(change, _replace(cluster, active[target], w, v, trial))
     return change
 
