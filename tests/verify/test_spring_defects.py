@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
+
+from mpi4py import MPI
 
 import numpy as np
 import pytest
@@ -13,8 +16,10 @@ from tests.rigs import after_a_period
 from tests.steady_states import motion_at
 from vipetsc.case import Case, CaseError, CaseFile, LawCase, NnmCase
 from vipetsc.case.nfrc import NfrcCase
+from vipetsc.dynamics import simulate
 from vipetsc.identification.motion import MotionCoefficients, respond, slopes_between
 from vipetsc.identification.motion_begin import MotionBegin
+from vipetsc.io.store import RunMemory
 from vipetsc.lattice import linear_modes, nonlinear_places
 from vipetsc.modes.response.steady import SteadyStates
 from vipetsc.modes.response.steps import first_state
@@ -269,3 +274,33 @@ def test_a_right_wall_moves_a_linear_spring():
 def test_a_wrong_name_is_answered_with_the_names_that_there_are():
     with pytest.raises(CaseError, match=r"springs\[1\]\.cubic"):
         changed(lattice={"profiles": {"springs[3].cubic": {"cells": [6], "value": 4e9}}})
+
+
+@pytest.mark.parametrize(
+    ("cell", "number", "name", "initial", "spring"),
+    [
+        (6, 2, "quadratic", 7, "spring 2 of cell 6"),
+        (9, 1, "cubic", 9, "spring 1 of cell 9"),
+        # To the wall on the right: it is compressed by a motion towards it, on the side where its force falls off.
+        (CELLS, 1, "quadratic", CELLS, f"spring 1 of cell {CELLS}"),
+    ],
+)
+def test_a_run_that_tears_a_spring_off_names_it(cell, number, name, initial, spring):
+    """A softening spring pulls back up to z = -k/q, or (k/|c|)^(1/2): beyond, it pushes its masses apart for ever."""
+    k = STIFFNESS[number - 1]
+    value = {"quadratic": -1e4 * k, "cubic": -1e8 * k}[name]
+    if initial == CELLS:
+        value = -value
+    profile = {f"springs[{number}].{name}": {"cells": [cell], "value": value}}
+    case = changed(
+        lattice={"profiles": profile},
+        initial={"kind": "velocity", "cell": initial, "velocity": 10.0},
+        time={"end": 0.02, "sample_interval": 2e-4, "engine": "ts"},
+    )
+
+    result = simulate(case, RunMemory(MPI.COMM_SELF))
+
+    assert not result.complete
+    # Both limits are 1e-4 m here.
+    assert f"{spring} is at the elongation " in result.sentence
+    assert re.search(r"beyond -?0\.0001 m, from where on its force", result.sentence)

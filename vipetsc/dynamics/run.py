@@ -19,7 +19,7 @@ from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine, FillResult
 from vipetsc.dynamics.engine_choice import EngineChoice, choose_engine
-from vipetsc.dynamics.fastest_cell import fastest_cell
+from vipetsc.dynamics.failing_place import failing_place
 from vipetsc.dynamics.initial import set_in_motion
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.memory import check_memory
@@ -318,7 +318,7 @@ class Run:
                 good = "none"
                 if self.last is not None:
                     good = f"t = {self.last:.6g} s"
-                where = f"at t = {failure.time:.6g} s ({fastest_cell(setup)})"
+                where = f"at t = {failure.time:.6g} s ({failing_place(setup)})"
                 return FAILED, f"{failure.reason}, {where}; last good sample: {good}"
             if filled.stopped and self.samples < total:
                 return STOPPED, f"stopped on request at t = {engine.time:.6g} s"

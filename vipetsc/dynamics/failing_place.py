@@ -1,11 +1,17 @@
-"""The cell that moves fastest, for the sentence about a run that fails."""
+"""Where a run fails: the cell that moves fastest, and a spring that no longer pulls back."""
 
 import numpy as np
 
 from vipetsc.dynamics.observers import Setup
+from vipetsc.dynamics.torn_spring import torn_spring
 
 
-def fastest_cell(setup: Setup) -> str:
+def failing_place(setup: Setup) -> str:
+    """The place of a failure in words, at the engine's state; all ranks must call it."""
+    return "; ".join(filter(None, [_fastest_cell(setup), torn_spring(setup)]))
+
+
+def _fastest_cell(setup: Setup) -> str:
     """The cell that moves fastest, or is not finite, and the site nearest to it; all ranks must call it."""
     layout = setup.layout
     u, v = setup.engine.state.array_r[: 2 * layout.dofs * layout.owned].reshape(2, layout.dofs, layout.owned)

@@ -1,0 +1,91 @@
+"""Which spring no longer pulls back, where a run fails."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.dynamics.observers import Setup
+from vipetsc.lattice import nonlinear_numbers
+from vipetsc.lattice.chain import Chain
+
+
+class _Torn(NamedTuple):
+    """A spring beyond the elongation ``limit`` in m at which its force vanishes: how many times, where, and its z."""
+
+    ratio: float
+    cell: int
+    number: int
+    elongation: float
+    limit: float
+
+
+def torn_spring(setup: Setup) -> str:
+    """A clause on the nonlinear spring that is farthest beyond the point where its force vanishes; empty if none is.
+
+    Beyond such a point the force k z + q z^2 + c z^3 pushes the masses further apart, and nothing need hold them. All
+    ranks must call it, at the state at which the run has failed; a spring whose elongation is not finite is not judged.
+    """
+    layout = setup.layout
+    chain = setup.model.chain
+    places = nonlinear_numbers(chain)
+    if not len(places):
+        return ""
+
+    state = setup.engine.state
+    state.ghostUpdate()
+    with state.localForm() as local:
+        y = local.array_r.copy()
+    # The first rank has the springs to the wall on the left, too, whose cell is -1.
+    first = layout.start - (layout.start == 0)
+    own = places[(places[:, 0] >= first) & (places[:, 0] < layout.stop)]
+    worst = None
+    if len(own):
+        worst = _worst(chain, own, _elongations(setup, own, y))
+    torn = [each for each in layout.comm.allgather(worst) if each]
+    if not torn:
+        return ""
+    worst = max(torn)
+    place = "at the left wall"
+    if worst.cell >= 0:
+        place = f"of cell {worst.cell + 1}"
+    return (
+        f"spring {worst.number + 1} {place} is at the elongation {worst.elongation:.4g} m, beyond"
+        f" {worst.limit:.4g} m, from where on its force k z + quadratic z^2 + cubic z^3 pushes its masses further apart"
+    )
+
+
+def _elongations(setup: Setup, places: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Elongations (spring,) in m of this rank's springs at ``places`` (spring, 2), from its state ``y`` with ghosts."""
+    layout = setup.layout
+    cell = setup.model.chain.cell
+    # The displacements of the cell on the left, of a wall there, then of the owned cells and the next one or a wall.
+    u = np.zeros((layout.owned + 2, layout.dofs))
+    u[1:-1] = y[: layout.dofs * layout.owned].reshape(layout.dofs, layout.owned).T
+    left, right = layout.neighbours()
+    if right is not None:
+        ghost = layout.size + layout.ghost_rows * (left is not None)
+        u[-1] = y[ghost : ghost + layout.dofs]
+
+    rows = places[:, 0] - layout.start + 1
+    springs = [cell.springs[number] for number in places[:, 1].tolist()]
+    start = np.array([spring.start for spring in springs], np.int64)
+    end = np.array([spring.end for spring in springs], np.int64)
+    next_cell = np.array([spring.next_cell for spring in springs], np.int64)
+    return u[rows + next_cell, end] - u[rows, start]
+
+
+def _worst(chain: Chain, places: np.ndarray, elongations: np.ndarray) -> _Torn | None:
+    """Of the springs at ``places`` (spring, 2) the one farthest beyond the zero of its force; None if none is."""
+    worst = None
+    for (cell, number), z in zip(places.tolist(), elongations.tolist(), strict=True):
+        spring = chain.spring(cell, number)
+        # The force over z, k + q z + c z^2, is positive at rest: it pulls back up to its first zero on either side.
+        zeros = np.roots([spring.cubic, spring.quadratic, spring.stiffness])
+        ahead = [float(zero.real) for zero in zeros if zero.imag == 0 and 0 < zero.real / z < 1] if z else []
+        pushes = spring.stiffness + (spring.quadratic + spring.cubic * z) * z < 0
+        if not ahead or not pushes:
+            continue
+        limit = min(ahead, key=abs)
+        candidate = _Torn(z / limit, cell, number, z, limit)
+        worst = candidate if worst is None else max(worst, candidate)
+    return worst
