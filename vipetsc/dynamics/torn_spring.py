@@ -37,10 +37,10 @@ def torn_spring(setup: Setup) -> str:
         y = local.array_r.copy()
     # The first rank has the springs to the wall on the left, too, whose cell is -1.
     first = layout.start - (layout.start == 0)
-    own = places[(places[:, 0] >= first) & (places[:, 0] < layout.stop)]
+    here = places[(places[:, 0] >= first) & (places[:, 0] < layout.stop)]
     worst = None
-    if len(own):
-        worst = _worst(chain, own, _elongations(setup, own, y))
+    if len(here):
+        worst = _worst(chain, here, _elongations(setup, here, y))
     torn = [each for each in layout.comm.allgather(worst) if each]
     if not torn:
         return ""
