@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
-from scipy.optimize import brentq, root
+from scipy.optimize import brentq
 
 from vipetsc import Case, open, simulate
 from vipetsc.cli.main import main
@@ -199,35 +199,41 @@ def periodic(omega: float, amplitude: float, chain) -> float:
     pair[chain.cell.host] = -1
     pair[chain.cell.resonator] = 1
 
-    def rate(t, y, strength):
-        u, v = y.reshape(2, -1)
-        w = pair @ u
-        push = np.sign(w) * force(max(abs(w) - D, 0.0), SOFT, STEADY_B)
-        pull = stiffness @ u + push * pair
-        pull[0] -= strength * np.cos(omega * t)
-        return np.concatenate([v, -pull / masses])
-
-    def orbit(u, strength):
-        # Nothing dissipates: the orbit is even in time, and so about half a period.
-        times = np.linspace(0, np.pi / omega, 201)
-        start = np.concatenate([u, 0 * u])
-        return solve_ivp(rate, times[[0, -1]], start, "DOP853", times, args=(strength,), rtol=1e-8, atol=1e-12).y
-
     n = len(masses)
+
+    def rate(t, y, strength):
+        # Of all orbits at once, which are the columns.
+        u, v = y.reshape(2, n, -1)
+        w = pair @ u
+        push = np.sign(w) * force(np.maximum(np.abs(w) - D, 0.0), SOFT, STEADY_B)
+        pull = stiffness @ u + pair[:, None] * push
+        pull[0] -= strength * np.cos(omega * t)
+        return np.concatenate([v, -pull / masses[:, None]]).ravel()
+
+    def orbits(starts, strength):
+        """Displacements and velocities (2, mass, orbit, time) of orbits that begin at rest at ``starts``."""
+        # Nothing dissipates: an orbit is even in time, and so about half a period.
+        times = np.linspace(0, np.pi / omega, 201)
+        begin = np.concatenate([starts, 0 * starts]).ravel()
+        solved = solve_ivp(rate, times[[0, -1]], begin, "DOP853", times, args=(strength,), rtol=1e-8, atol=1e-12)
+        return solved.y.reshape(2, n, -1, len(times))
+
     linear = np.linalg.solve(stiffness - omega**2 * np.diag(masses), np.eye(n)[0])
     last = D / abs(pair @ linear)
     u = linear * last
     # From the linear motion that touches in three steps: Newton's method does not reach the orbit in one.
     for strength in np.linspace(last, amplitude, 4)[1:]:
-
-        def speeds_after_half_a_period(u, strength=strength):
-            return orbit(u, strength)[n:, -1] / (omega * D)
-
-        solved = root(speeds_after_half_a_period, u * strength / last, tol=1e-7)
-        assert solved.success, solved.message
-        u = solved.x
+        u = u * strength / last
         last = strength
-    return float(np.abs(pair @ orbit(u, amplitude)[:n]).max())
+        for _ in range(10):
+            # Differences between orbits of one integration do not contain the errors of its steps.
+            starts = u[:, None] + np.column_stack([np.zeros(n), 1e-6 * D * np.eye(n)])
+            speeds = orbits(starts, strength)[1, :, :, -1] / (omega * D)
+            if np.abs(speeds[:, 0]).max() < 1e-7:
+                break
+            u = u - 1e-6 * D * np.linalg.solve(speeds[:, 1:] - speeds[:, :1], speeds[:, 0])
+        assert np.abs(speeds[:, 0]).max() < 1e-7
+    return float(np.abs(pair @ orbits(u[:, None], amplitude)[0, :, 0]).max())
 
 
 def steady() -> dict:

@@ -56,6 +56,18 @@ def test_its_resonance_is_that_of_a_bilinear_oscillator(tmp_path):
         assert point.measured.unstable == growing
 
 
+def test_below_twice_its_resonance_a_motion_of_twice_the_period_grows():
+    """Stiff for half a period and soft for the other, the stop drives a motion of twice the period: it is unstable."""
+    case = touching(range=[4.5, 5.0], harmonics=31)
+    states = SteadyStates(case, 1.0, 0.2)
+    point = first_state(states)
+    error, growing = error_of_a_period(states, point)
+    assert error < 1e-3
+    measured = states.measured(point.xi)
+    assert measured.unstable == growing == 1
+    assert measured.sideband == 0.5
+
+
 def test_it_is_proportional_to_the_drive(tmp_path):
     _, points = followed(touching(over="amplitude", range=[0.1, 5.0], fixed=[1.5], largest_step=1.0), tmp_path / "two")
     first, last = (point.measured for point in (points[0], points[-1]))
