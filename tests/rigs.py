@@ -61,7 +61,8 @@ def rate_of(states: SteadyStates, omega: float, amplitude: float):
     joins = []
     for site, pair, stops in zip(chain.sites, chain.contact_pairs, states.forces.contacts, strict=True):
         host = site * d + pair.host if pair.host >= 0 else None
-        joins.append((host, (site + pair.next_cell) % chain.cells * d + pair.resonator, stops))
+        sides = [(side, gap) for side, gap in ((1, stops.plus), (-1, stops.minus)) if gap < np.inf]
+        joins.append((host, (site + pair.next_cell) % chain.cells * d + pair.resonator, stops.law, sides, stops.load))
 
     beyond = []
     for cell, number in itertools.product(range(-1, chain.cells), range(len(chain.cell.springs))):
@@ -79,9 +80,9 @@ def rate_of(states: SteadyStates, omega: float, amplitude: float):
         v = y[..., n:]
         force = drive * np.cos(omega * t) - u @ stiffness.T - v @ damping.T
 
-        for host, resonator, stops in joins:
+        for host, resonator, law, sides, load in joins:
             w = u[..., resonator] - (0.0 if host is None else u[..., host])
-            push = stops.law.elastic_force(w - stops.plus) - stops.law.elastic_force(-w - stops.minus) - stops.load
+            push = sum(side * law.elastic_force(side * w - gap) for side, gap in sides) - load
             force[..., resonator] -= push
             if host is not None:
                 force[..., host] += push

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
@@ -124,9 +126,16 @@ def test_where_there_is_none_no_file_is_left(tmp_path):
     assert len(follow_all(absorber(0.15), tmp_path, MPI.COMM_SELF)) == 1
 
 
+def put_main(curves, folder: Path) -> None:
+    """Put the curve from the beginning of the range into another folder, whose search then goes on from there."""
+    begun, (main, _) = curves
+    shutil.copy(begun / f"branch-{main.name}.h5", folder)
+
+
 def test_a_stopped_isola_goes_on_to_the_same_bits(curves, tmp_path):
     _, (_, isola) = curves
-    first = follow_all(absorber(points=40), tmp_path, MPI.COMM_SELF)
+    put_main(curves, tmp_path)
+    first = follow_all(absorber(points=40), tmp_path, MPI.COMM_SELF, resume=True)
     assert [curve.complete for curve in first] == [True, False]
     more = follow_all(absorber(), tmp_path, MPI.COMM_SELF, resume=True)
     assert [point.xi.tolist() for point in more[1].points] == [point.xi.tolist() for point in isola.points]
@@ -250,7 +259,8 @@ def test_at_resonance_the_force_makes_up_for_the_loss(sign):
 
 def test_breathers_lead_to_the_isolated_curve_too(curves, tmp_path):
     _, (main, isola) = curves
-    other = follow_all(absorber(isola_search=["breathers"]), tmp_path, MPI.COMM_SELF)
+    put_main(curves, tmp_path)
+    other = follow_all(absorber(isola_search=["breathers"]), tmp_path, MPI.COMM_SELF, resume=True)
     assert [(curve.name, curve.ending) for curve in other] == [(curve.name, curve.ending) for curve in (main, isola)]
     folds = [
         [point.measured.frequency for point in curve.points if point.kind == "fold"] for curve in (isola, other[1])

@@ -39,6 +39,12 @@ def case_of(changes: dict[str, Any], **nfrc: Any) -> NfrcCase:
     return NfrcCase.from_table(table | {"nfrc": table["nfrc"] | nfrc})
 
 
+@pytest.fixture(scope="module")
+def with_pair(tmp_path_factory):
+    """The curve on which a pair grows, and its equations."""
+    return followed(case_of(PAIR), tmp_path_factory.mktemp("pair") / "rig")
+
+
 def multipliers_at(states, point) -> np.ndarray:
     """Floquet multipliers of a state by differences of the map of a period."""
     state = np.ravel(motion_at(states, point.xi, np.arange(2)))
@@ -50,8 +56,11 @@ def multipliers_at(states, point) -> np.ndarray:
     ("changes", "kind", "count"),
     [(PAIR, "neimark-sacker", 2), (FLIP, "period-doubling", 2), (UNEVEN, "branch-point", 1)],
 )
-def test_a_special_point_has_the_multiplier_of_its_kind(changes, kind, count, tmp_path):
-    states, points = followed(case_of(changes), tmp_path / "rig")
+def test_a_special_point_has_the_multiplier_of_its_kind(changes, kind, count, tmp_path, request):
+    if changes is PAIR:
+        states, points = request.getfixturevalue("with_pair")
+    else:
+        states, points = followed(case_of(changes), tmp_path / "rig")
     special = [point for point in points if point.kind != "regular"]
     assert [point.kind for point in special] == [kind] * count
     for point in special:
@@ -100,8 +109,8 @@ def test_points_between_unstable_states_are_located_if_all_are_asked_for(tmp_pat
 
 
 @pytest.mark.slow
-def test_a_pair_is_located_by_its_number_where_it_cannot_be_followed(tmp_path, monkeypatch):
-    _, points = followed(case_of(PAIR), tmp_path / "followed")
+def test_a_pair_is_located_by_its_number_where_it_cannot_be_followed(with_pair, tmp_path, monkeypatch):
+    _, points = with_pair
     at = [point.measured.frequency for point in points if point.kind == "neimark-sacker"]
     monkeypatch.setattr("vipetsc.modes.response.steady.SteadyStates.growing_pairs", lambda self, xi: [])
     _, points = followed(case_of(PAIR), tmp_path / "counted")

@@ -49,7 +49,7 @@ class Spring:
 
     def nonlinear_energy(self, z: np.ndarray) -> np.ndarray:
         """Integral (...) of ``nonlinear_force`` from 0 to the elongations ``z`` (...) in m, in J."""
-        return np.asarray(self.quadratic * z**3 / 3 + self.cubic * z**4 / 4)
+        return np.asarray(z * z * z * (self.quadratic / 3 + self.cubic / 4 * z))
 
 
 class Coupling(NamedTuple):

@@ -126,7 +126,7 @@ class HarmonicBalance:
     def drive_term(self, omega: float, shift: np.ndarray, linear: np.ndarray) -> np.ndarray:
         """-A Z^linear, what a ``linear`` motion (pairs, K + 1) adds to the ``residual``, as unknowns (size,) in m.
 
-        Only the orders that the motion has are computed: nothing is kept, and no forces are evaluated.
+        Only the orders that the motion has are computed, and no forces.
         """
         out = np.zeros_like(linear)
         for order in np.flatnonzero(linear.any(axis=0)).tolist():

@@ -53,6 +53,7 @@ class ShiftedCompliance:
         self.weight = weight
         self._values = LatestValues[float, np.ndarray](KEPT)
         self._shifted = LatestValues[tuple[float, bytes], Shifted](KEPT)
+        self._factors = LatestValues[tuple[int, float, bytes], np.ndarray](KEPT)
         self._rates = LatestValues[tuple[float, bytes], np.ndarray](KEPT)
 
     def values(self, omega: float) -> np.ndarray:
@@ -80,7 +81,11 @@ class ShiftedCompliance:
         """The factor A (pairs, pairs) of one of the orders alone."""
         (place,) = np.nonzero(self.orders == order)
         orders = self.orders[place]
-        return self._shift(orders, omega, self._evaluate(orders, omega), shift[place]).factor[0]
+
+        def compute() -> np.ndarray:
+            return self._shift(orders, omega, self._evaluate(orders, omega), shift[place]).factor[0]
+
+        return self._factors.get((order, omega, shift.tobytes()), compute)
 
     def rate(self, omega: float, shift: np.ndarray) -> np.ndarray:
         """Derivative (orders, pairs, pairs) of G_s by its own frequency, at the multiples of ``omega``."""
