@@ -25,6 +25,7 @@ from vipetsc.compiled import kernel, njit
 from vipetsc.contact.law import CLIPPED, PERMANENT, elastic_force_and_slope, gap_of, side_of
 from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
 from vipetsc.dynamics.propagator.collocation import accumulate_moments, node_responses, update_taylor
+from vipetsc.dynamics.propagator.linear_system import solve_in_place
 from vipetsc.dynamics.propagator.nodes import NODES
 from vipetsc.dynamics.propagator.stencil import Halo, Stencil, apply_propagator, exchange
 from vipetsc.dynamics.propagator.substeps import Cluster, Substep, Trial, select_cluster
@@ -107,14 +108,18 @@ def _force_variations(
         for node in range(NODES):
             w = motion[target, 0, node]
             v = motion[target, 1, node]
-            slopes[node] = _slopes(cluster.contacts[row.site], row, w, v)
+            by_w, by_rate, by_approach = _slopes(cluster.contacts[row.site], row, w, v)
+            slopes[node, 0] = by_w
+            slopes[node, 1] = by_rate
+            slopes[node, 2] = by_approach
         _fill_free_forces(cluster, substep, row.site, slopes, x, right[of_target])
 
         for source in range(sites):
             if node_responses(cluster, substep, row.site, rows[source].site, to_w, to_v):
                 of_source = slice(source * NODES, (source + 1) * NODES)
                 _subtract_responses(slopes, to_w, to_v, left[of_target, of_source])
-    return np.linalg.solve(left, right)
+    solve_in_place(left, right)
+    return right
 
 
 @kernel
@@ -238,8 +243,11 @@ def linearise(
         position = row.position + row.length
 
     for j in range(columns):
-        out[:size, j] = moments[j].reshape(size)
-        out[size:columns, j] = x[j, size:]
+        moment = moments[j].reshape(size)
+        for i in range(size):
+            out[i, j] = moment[i]
+        for i in range(size, columns):
+            out[i, j] = x[j, i]
 
 
 @njit(error_model="numpy")
@@ -253,7 +261,15 @@ def _contact_step(dofs: DofTables, c: int, variations: Variations, j: int, numbe
     sites = dofs.sites[c]
     terms = variations.taylor.shape[1]
     size = (stop - first) * terms
-    before = np.concatenate((variations.taylor[first:stop].flatten(), variations.approach[j, first : first + sites]))
+    # The series of the DoFs, then w'_minus of the sites. Loops in place of array functions, which take seconds to
+    # compile.
+    series = variations.taylor[first:stop].reshape(size)
+    approach = variations.approach[j, first : first + sites]
+    before = np.empty(size + sites)
+    for i in range(size):
+        before[i] = series[i]
+    for i in range(sites):
+        before[size + i] = approach[i]
 
     matrix = variations.matrices[number]
     after = np.zeros(before.size)
@@ -262,7 +278,8 @@ def _contact_step(dofs: DofTables, c: int, variations: Variations, j: int, numbe
         for k in range(before.size):
             after[row] += matrix[row, k] * before[k]
     apply_impulses(dofs, first, after[:size].reshape(stop - first, terms), cells)
-    variations.approach[j, first : first + sites] = after[size:]
+    for i in range(sites):
+        approach[i] = after[size + i]
 
 
 @njit(error_model="numpy")
