@@ -206,7 +206,7 @@ needs_parallel_hdf5 = pytest.mark.skipif(
 )
 in_parallel = pytest.param("parallel", marks=needs_parallel_hdf5)
 
-# One rank shares the cores with other tests; mpirun has them to itself.
+# One rank is a serial test, which gives the cores to mpirun.
 alone_and_on_two_ranks = pytest.mark.parametrize("ranks", [0, pytest.param(2, marks=pytest.mark.mpirun)])
 
 

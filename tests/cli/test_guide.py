@@ -95,8 +95,7 @@ def run_together(files: list[str]) -> list[str]:
     return [f'python -c "{runner}" {" ".join(files)}'] if files else []
 
 
-# Few of its commands are for two ranks, and none has to be fast: it need not have the machine to itself.
-@pytest.mark.slow
+@pytest.mark.mpirun
 def test_the_guide_does_what_it_says(tmp_path):
     """The session ends well in a fresh clone, and leaves the results, numbers and the picture that the guide shows."""
     type_session(tmp_path)

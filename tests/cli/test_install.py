@@ -118,8 +118,7 @@ def test_the_top_level_holds_what_it_may():
     assert {name.partition("/")[0] for name in tracked()} <= TOP
 
 
-# One command of it is for two ranks, and need not be fast: it need not have the machine to itself.
-@pytest.mark.slow
+@pytest.mark.mpirun
 def test_the_wheel_runs_away_from_the_source(site, tmp_path):
     """The console script of the wheel prints its version, runs on two ranks, draws, and lists the paper's steps."""
     program = site / "bin" / "vipetsc"

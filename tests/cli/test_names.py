@@ -46,7 +46,7 @@ def by_shell(tmp_path):
         # In a process: the locale is read once, at its start.
         command = [sys.executable, "-m", "vipetsc", *words]
         environment = clean_environment() | C_LOCALE
-        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, timeout=100, check=False)
+        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, timeout=300, check=False)
 
     return call
 

@@ -123,7 +123,7 @@ def test_a_request_to_stop_ends_with_75_and_the_same_command_goes_on(in_process,
     while process.poll() is None and not (out / "optimum-runs-0.jsonl").exists():
         time.sleep(0.01)
     process.send_signal(signal.SIGTERM)
-    _, message = process.communicate(timeout=120)
+    _, message = process.communicate(timeout=300)
 
     assert process.returncode == 75, message
     assert "the same command continues" in message

@@ -135,7 +135,7 @@ def test_the_second_process_ends_with_the_one_that_asks():
         "second = SecondProcess()\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60)
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=300)
     assert ended.returncode == -signal.SIGKILL
     assert not ended.stderr
 

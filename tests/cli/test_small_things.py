@@ -66,7 +66,7 @@ def test_a_run_that_another_program_writes_is_one(in_process, tmp_path, verb):
     ) as other:
         assert other.stdout.readline() == "open\n"
         ended = in_process(verb, out)
-        other.communicate("\n", timeout=60)
+        other.communicate("\n", timeout=300)
 
     assert ended.returncode == 2
     assert "run.h5 cannot be opened as a run: another program has it open for writing" in ended.stderr

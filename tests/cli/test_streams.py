@@ -46,7 +46,7 @@ def by_shell(tmp_path):
             *words,
         ]
         return subprocess.run(
-            command, cwd=tmp_path, env=clean_environment(), capture_output=True, text=True, timeout=100, check=False
+            command, cwd=tmp_path, env=clean_environment(), capture_output=True, text=True, timeout=300, check=False
         )
 
     return call
@@ -78,7 +78,7 @@ def test_no_file_takes_the_number_of_a_closed_stream(tmp_path):
     script += "os.write(os.open('file', os.O_WRONLY | os.O_CREAT), b'content'); os.write(1, b'message')"
     command = ["bash", "-c", '"$@" >&-', "bash", sys.executable, "-c", script]
     ended = subprocess.run(
-        command, cwd=tmp_path, env=clean_environment(), capture_output=True, text=True, timeout=100, check=False
+        command, cwd=tmp_path, env=clean_environment(), capture_output=True, text=True, timeout=300, check=False
     )
     assert (tmp_path / "file").read_text() == "content"
     assert "Bad file descriptor" in ended.stderr
@@ -134,6 +134,6 @@ def test_all_ranks_end_with_the_code_of_the_first(tmp_path):
     # A rank whose code is another than 0 has the others ended: both say how they ended before they end.
     of_rank = f"{sys.executable} -m vipetsc manual >/dev/full; echo $? >{tmp_path}/code-$OMPI_COMM_WORLD_RANK"
     command = ["mpirun", "--oversubscribe", "-n", "2", "bash", "-c", of_rank]
-    ended = subprocess.run(command, capture_output=True, text=True, env=clean_environment(), timeout=100, check=False)
+    ended = subprocess.run(command, capture_output=True, text=True, env=clean_environment(), timeout=300, check=False)
     assert ended.stderr.count("vipetsc: stdout: No space left on device") == 1
     assert [(tmp_path / f"code-{rank}").read_text() for rank in range(2)] == ["1\n", "1\n"]

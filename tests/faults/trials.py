@@ -124,8 +124,10 @@ class Crew:
         command = ["mpirun", "--oversubscribe", "-n", str(self.ranks), *worker]
         environment = clean_environment() | {"PYTHONPATH": str(ROOT)}
         with (self.folder / "mpirun.log").open("w") as file:
+            # A group can be killed. Linux gives a session of its own a fair part of the cores: priorities, by which
+            # scripts/test has mpirun come before serial tests, hold within a session alone.
             self.worker = subprocess.Popen(
-                command, cwd=ROOT, env=environment, start_new_session=True,
+                command, cwd=ROOT, env=environment, process_group=0,
                 stdin=subprocess.PIPE, stdout=file, stderr=file, text=True,
             )  # fmt: skip
         self.left = AT_ONCE

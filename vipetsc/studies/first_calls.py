@@ -40,7 +40,7 @@ def compile_kernels(comm: MPI.Comm) -> float:
     """Compile the kernels of runs and branches that are not kept yet; returns the seconds of the slowest rank.
 
     The calls are divided over the ranks in turn. Of two, the first compiles the branches and the second the runs, which
-    take as long as those (s of CPU: 8 and 39, 29 and 8) and need some kernels in common. All ranks must call it.
+    take about as long and need some kernels in common. All ranks must call it.
     """
     calls: list[Callable[[], object]] = [
         partial(follow, CELL),
