@@ -34,11 +34,10 @@ class Joint(NamedTuple):
 class LatticeMatrices:
     """``stiffness`` in N/m and ``mass`` in kg of ``chain`` without contacts, on the ranks of ``comm``.
 
-    ``joints`` are springs besides those of the cells, as contacts that are pressed at rest are for small motions.
-
-    This rank has the cells ``start`` to ``stop``; ``rows`` counts all rows, no squared frequency in (rad/s)^2 is above
-    ``largest`` (Gershgorin). Raises CaseError on all ranks where PETSc's indices do not count the
-    rows or a rank's entries.
+    ``joints`` are springs in addition to those of the cells: for small motions a contact that is pressed at rest is
+    one. This rank has the cells ``start`` to ``stop``; ``rows`` counts all rows, and no squared frequency in (rad/s)^2
+    is above ``largest`` (Gershgorin's circles of M^-1 K). All ranks must call it. Raises CaseError, on all ranks, where
+    PETSc's indices do not count the rows or a rank's entries.
     """
 
     def __init__(self, chain: Chain, comm: MPI.Comm, joints: Sequence[Joint] = ()) -> None:
@@ -69,13 +68,14 @@ class LatticeMatrices:
         self.largest = comm.allreduce(float(np.max(reaches / masses, initial=0.0)), MPI.MAX)
 
     def _joined_rows(self, joints: Sequence[Joint]) -> csr_matrix:
-        """The rows of this rank of the stiffness of ``joints``."""
+        """The rows (owned row, row) of the stiffness of ``joints`` that this rank has."""
         first = self.start * self.chain.cell.dofs
         last = self.stop * self.chain.cell.dofs
         rows: list[int] = []
         columns: list[int] = []
         values: list[float] = []
         for joint in joints:
+            # k at both ends, -k between them; the ground has no row.
             ends = [end for end in (joint.host, joint.resonator) if end >= 0]
             for row, column in itertools.product(ends, ends):
                 if not first <= row < last:

@@ -14,7 +14,8 @@ from vipetsc.dynamics.lattice_record import LatticeRecord
 from vipetsc.dynamics.spring_law import nonlinear_energy, nonlinear_force
 
 # Cells in one pass: a pass over the springs of a mass touches a row of each of its neighbours and one of the result,
-# 4 kB each of so many cells, which stay in a first-level cache of 32 kB.
+# 4 kB each of so many cells, which stay in a first-level cache of 32 kB. Not sharp where the second level is near: 256
+# to 2048 take the same CPU time of ``ts`` at 20,000 cells, to the 7 % of its scatter, and give the same bits.
 CHUNK = 512
 
 

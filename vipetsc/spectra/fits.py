@@ -44,10 +44,14 @@ def doubt(points: float, r2: float) -> str:
 
 
 def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:
-    """1 - (1 - R^2)(n - 1)/(n - 2) of a fit with two parameters, a constant among them; NaN if y is constant."""
+    """1 - (1 - R^2)(n - 1)/(n - 2) of values ``fitted`` (n,) to ``y`` (n,) with two parameters; NaN if y is constant.
+
+    One of the parameters must be a constant or a factor, so that R^2 is measured against the mean of y.
+    """
     y = np.asarray(y, dtype=float)
     fitted = np.asarray(fitted, dtype=float)
     scatter = np.sum((y - y.mean()) ** 2)
+    # A constant explains nothing: no fit is better or worse than the mean.
     if scatter == 0:
         return float("nan")
     return float(1 - np.sum((y - fitted) ** 2) / scatter * (len(y) - 1) / (len(y) - 2))
@@ -55,7 +59,7 @@ def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:
 
 @np.errstate(over="ignore", invalid="ignore")
 def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLaw:
-    """Fit y = a x^b to points (n).
+    """Fit y = a x^b to points ``x`` (n,) and ``y`` (n,), positive both.
 
     The log-log line minimises relative errors, the nonlinear fit errors, starting from the line. A nonlinear fit
     without a minimum, whose exponent runs away to leave a single point standing, is all NaN.
@@ -83,6 +87,7 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
     v = ly - cy
     w = y / np.exp(cy)
 
+    # The line passes through the centre of the logarithms: there v = b u has no constant, and c = 1.
     freedom = len(x) - 2
     c = 1.0
     b = float(u @ v / (u @ u))
@@ -119,11 +124,12 @@ def _gradient(u: np.ndarray, c: float, b: float) -> np.ndarray:
 
 
 def normalised(y: ArrayLike, low: float = 0.01, high: float = 1.0) -> np.ndarray:
-    """A curve (n) scaled linearly to run from ``low`` to ``high``; NaN stays. Raises ValueError if it is constant."""
+    """A curve ``y`` (n,) scaled linearly to run from ``low`` to ``high``; NaN stays. Raises ValueError if constant."""
     y = np.asarray(y, dtype=float)
     least = np.nanmin(y)
     most = np.nanmax(y)
     if not most > least:
         raise ValueError(f"normalised: the curve is constant, {least:g}")
+    # Not low + (high - low) position: so both ends are exact.
     position = (y - least) / (most - least)
     return np.asarray(low * (1 - position) + high * position)

@@ -278,9 +278,9 @@ class Propagator(Engine):
         state = self._layout.checkpoint(self._components[self.steps % 2])
         return state | {"steps": np.array(self.steps)} | self._forces.checkpoint()
 
-    def restore(self, shares: Sequence[Mapping[str, np.ndarray]]) -> None:
-        self._forces.restore(shares)
-        self._begin_after(int(shares[0]["steps"]), shares)
+    def restore(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
+        self._forces.restore(checkpoints)
+        self._begin_after(int(checkpoints[0]["steps"]), checkpoints)
 
     def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
         self._forces.open(checkpoints)

@@ -1,6 +1,8 @@
 """Compiled right-hand side of the lattice, also as a C function that PETSc calls without entering Python.
 
-Springs and dashpots are ``springs``; a site and the drive add to single masses.
+The accelerations of all masses by springs and dashpots come from ``dynamics.springs``, mass by mass over all cells. The
+force of a contact and that of a drive are then added to the few masses on which they act, and the powers that the
+ledger integrates fill the components behind the velocities (the equations are in the package's docstring).
 """
 
 import ctypes
