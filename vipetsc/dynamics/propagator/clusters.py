@@ -174,7 +174,8 @@ def _form_rows(cells: np.ndarray, forms: np.ndarray, series: StepSeries) -> np.n
     for k in range(span):
         for row, form, mass_rows in zip(rows, forms[:, k], series.rows(cells[:, k]), strict=True):
             part = series.cut(mass_rows, -series.reach, band).astype(float)
-            # The rows of a mass in the next cell lie one cell further on.
+            # The rows of a mass in the next cell lie one cell further on: where there are such, ``width`` is one more
+            # than the band.
             row[:, k : k + band] += np.einsum("i,imjc->jcm", form, part)
     return rows
 
