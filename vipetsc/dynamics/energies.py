@@ -152,7 +152,10 @@ def add_energy(sums: np.ndarray, energy: float, unit: float) -> None:
 
 @kernel
 def add_loss(sums: np.ndarray, energy: float, unit: float) -> None:
-    """Add an ``energy`` in J to what contacts have dissipated in the ``sums`` of ``measure``."""
+    """Add an ``energy`` in J to what contacts have dissipated.
+
+    ``sums`` (energy, 2) are multiples of ``unit`` in J and of unit/2^40, as ``measure`` fills them.
+    """
     _add_one(sums, _DISSIPATED, energy, unit)
 
 

@@ -89,7 +89,10 @@ class HarmonicFrame:
         return np.append(harmonics, -2 * np.pi / point.period**2 * point.tangent[-1] / self.omega)
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
-        """The residual (n,), which vanishes at a solution, over the size."""
+        """The residual (n,) at the unknowns ``xi`` (n + 1,), which vanishes at a solution, over the size.
+
+        Raises FlowError where the frequency has changed by a factor of 2 or more.
+        """
         if not np.all(np.isfinite(xi)) or not 0.5 < xi[-1] < 2:
             raise FlowError("Newton's method left the domain: the frequency changed by a large factor")
         return self.balance.residual(*self.motion(xi), self.shift) / self.size
@@ -116,7 +119,10 @@ class HarmonicFrame:
         return unit(np.linalg.solve(border, np.append(np.zeros(len(xi) - 1), 1.0)))
 
     def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
-        """The motion that an attempt has converged to, where ``direction`` is the branch's unit tangent or empty."""
+        """The motion that an attempt has converged to.
+
+        ``direction`` (n + 1,) is the branch's unit tangent there; without one, None, the motion has no slope.
+        """
         balance = self.balance
         xi = attempt.xi
         x, omega = self.motion(xi)

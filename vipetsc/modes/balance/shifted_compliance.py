@@ -73,7 +73,7 @@ class ShiftedCompliance:
         return np.where((plus >= minus)[:, None, None], size, -size)
 
     def at(self, omega: float, shift: np.ndarray) -> Shifted:
-        """G_s and A at the multiples of ``omega``."""
+        """G_s and A at the multiples of ``omega`` in rad/s, of a ``shift`` (orders, 1, 1) in N/m."""
         key = omega, shift.tobytes()
         return self._shifted.get(key, lambda: self._shift(self.orders, omega, self.values(omega), shift))
 
