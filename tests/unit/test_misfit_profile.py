@@ -27,7 +27,10 @@ class BentValley:
     def distance(self, z: np.ndarray) -> float:
         return float(z[1] - z[0] - BEND * z[0] ** 2)
 
-    def onsets(self, z: np.ndarray, number: int) -> np.ndarray:
+    def tolerances(self, precision: Any) -> None:
+        """Nothing is integrated."""
+
+    def onsets(self, z: np.ndarray, number: int, end: float, tolerances: Any = None) -> np.ndarray:
         return np.zeros(2 if abs(self.distance(z)) < WIDTH else 1)
 
     def solve(self, z: np.ndarray, ends: Any, active: list[int], precision: Any) -> np.ndarray:
@@ -39,7 +42,7 @@ class BentValley:
         return np.array([z[0], z[1] - self.distance(z)])
 
     def cost(self, z: np.ndarray, ends: Any) -> float:
-        missing = len(self.onsets(z, 0)) < 2
+        missing = len(self.onsets(z, 0, 1.0)) < 2
         return float(z[0] ** 2 + self.distance(z) ** 2 + JUMP * missing)
 
 
@@ -57,7 +60,7 @@ def test_a_contact_that_no_motion_keeps_is_given_up():
     """Beyond some place the motion has one contact whatever the others are, and the profile shows the jump."""
 
     class Lost(BentValley):
-        def onsets(self, z: np.ndarray, number: int) -> np.ndarray:
+        def onsets(self, z: np.ndarray, number: int, end: float, tolerances: Any = None) -> np.ndarray:
             return np.zeros(2 if z[0] > -2 else 1)
 
     profile = MisfitProfile(np.linspace(-3, 3, 5)[None], np.ones((1, 2)))

@@ -154,7 +154,7 @@ class IdentifyCase(StudyCase):
         return TrialCases(self.base, self.parameters, _varied_sections(self.options.records[number]))
 
 
-def _varied_sections(record: RecordTable) -> dict[str, Table]:
+def _varied_sections(record: RecordTable) -> dict[str, Any]:
     """The sections of a case in which a ``record`` differs from it."""
     sections = {}
     if record.drive:

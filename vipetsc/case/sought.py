@@ -240,6 +240,7 @@ def changed_case(base: Case, parameters: Sequence[SoughtParameter], values: Iter
         lattice = base.lattice.model_dump(by_alias=True, exclude_none=True)
         changes["lattice"] = dict.fromkeys(lattice) | with_cell(lattice, changed_cell, {})
         # Samples are those of the measurement; for the bands of this cell, a run's may be too coarse.
+        assert base.time.sample_interval != "auto"  # resolved
         if base.time.sample_interval * pass_bands(changed_cell)[-1].high >= np.pi:
             changes["time"] = {"sample_interval": None}
     return base.varied(name=name, **changes)

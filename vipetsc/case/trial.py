@@ -9,6 +9,7 @@ other numbers in their places. Tests compare both, case by case and bit by bit.
 import copy
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
+from typing import Any
 
 from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, Problem, Table
@@ -29,7 +30,7 @@ Half as many are read twice where eight parameters are differentiated in two par
 class TrialCases:
     """Cases like ``base`` with other values of ``parameters``, and with the ``changes`` of a record by section."""
 
-    def __init__(self, base: Case, parameters: Sequence[SoughtParameter], changes: Mapping[str, Table]) -> None:
+    def __init__(self, base: Case, parameters: Sequence[SoughtParameter], changes: Mapping[str, Any]) -> None:
         self._base = base
         self._parameters = parameters
         self._changes = changes
@@ -58,7 +59,7 @@ class TrialCases:
         if not self._changes:
             return case
         # A copy: tables are changed as they are read.
-        return case.varied(**copy.deepcopy(self._changes))
+        return case.varied(**copy.deepcopy(dict(self._changes)))
 
     def _new_case(self, values: tuple[float, ...]) -> Case:
         if self._follows:

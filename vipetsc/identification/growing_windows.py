@@ -4,14 +4,14 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from vipetsc.case import CaseError
 from vipetsc.case.sought import SoughtParameter, differs_by_side
 from vipetsc.identification.initial_state import NARROW, WIDTH
+from vipetsc.identification.least_residuals import least_residuals
 from vipetsc.identification.misfit import Misfit
 from vipetsc.identification.motion import MotionError
-from vipetsc.identification.precision import FINAL, GROWING, TOLERANCE, Precision
+from vipetsc.identification.precision import EXACT, FINAL, GROWING, Precision, Tolerances
 
 # While windows grow, what the data do not tell yet stays: a deviation of one of a coordinate weighs as one datum that
 # misses by its noise. The last fit has no such rows.
@@ -88,16 +88,14 @@ class GrowingWindows:
         self._solutions = 0
         self.last = [float(record.times[-1]) for record in misfit.records]
 
-        # The noise that no sensor states is a fraction of the signal at first; later it follows from the residuals.
-        options = misfit.plan.options
-        self._is_given = []
-        for number, table in enumerate(options.records):
-            given = np.array([sensor.noise is not None for sensor in table.sensors])
-            sizes = misfit.noise[number]
+        # The misfit begins with the sizes of channels for their noise. What no sensor states is a fraction of them.
+        self._sizes = misfit.noise
+        tables = misfit.plan.options.records
+        self._is_given = [np.array([sensor.noise is not None for sensor in table.sensors]) for table in tables]
+        misfit.noise = []
+        for table, sizes in zip(tables, self._sizes, strict=True):
             noise = [sensor.noise or ASSUMED_NOISE * size for sensor, size in zip(table.sensors, sizes, strict=True)]
-            self._is_given.append(given)
-            misfit.noise[number] = np.array(noise)
-        self._sizes = [np.sqrt(np.mean(record.values**2, axis=0)) for record in misfit.records]
+            misfit.noise.append(np.array(noise))
 
         # Initial states have no bounds, only a prior.
         bounds = [(p.to_coordinate(p.low), p.to_coordinate(p.high)) for p in misfit.plan.parameters]
@@ -125,7 +123,7 @@ class GrowingWindows:
             for _ in range(REWEIGHTINGS):
                 self._estimate_noise(z)
                 z = self.solve(z, self.last, self._every())
-        windows.append(self._window(z, self.last))
+        windows.append(self._window(z, self.last, FINAL))
         return Fit(z, self.deviance(z), windows, self.misfit.noise.copy())
 
     def deviance(self, z: np.ndarray) -> float:
@@ -135,9 +133,9 @@ class GrowingWindows:
             total += 2 * len(record.times) * float(np.sum(np.log(noise)))
         return total
 
-    def cost(self, z: np.ndarray, ends: Sequence[float]) -> float:
+    def cost(self, z: np.ndarray, ends: Sequence[float], tolerances: Tolerances = EXACT) -> float:
         """The sum of squares at ``z`` (coordinate,) of residuals over the noise, and of the initial states' prior."""
-        data = self.misfit.residuals(z, ends)
+        data = self.misfit.residuals(z, ends, tolerances)
         return float(np.sum(data**2)) + float(np.sum((self.misfit.prior() @ z) ** 2))
 
     def _every(self) -> list[int]:
@@ -165,8 +163,11 @@ class GrowingWindows:
             for record, end, is_silent in zip(self.misfit.records, self.last, silent, strict=True):
                 first = float(record.times[0])
                 ends.append(first + fraction * (end - first) if is_silent else -np.inf)
-            z = self.solve(z, ends, active, GROWING if fraction < 1 else FINAL)
-            windows.append(self._window(z, ends))
+            precision = FINAL
+            if fraction < 1:
+                precision = GROWING
+            z = self.solve(z, ends, active, precision)
+            windows.append(self._window(z, ends, precision))
             fraction = 0.0 if fraction == 1 else min(fraction * plan.options.growth, 1.0)
         return z
 
@@ -181,14 +182,14 @@ class GrowingWindows:
             is_last = ends == self.last
             precision = FINAL if is_last else GROWING
             fitted = self.solve(z, ends, self._every(), precision)
-            window = self._window(fitted, ends)
+            window = self._window(fitted, ends, precision)
             other = None
             if window.misfit > 1 or is_last:
                 # Otherwise the noise explains the misfit, and there is nothing to look for.
-                other = self._other_contacts(fitted, ends)
+                other = self._other_contacts(fitted, ends, precision)
             if other is not None:
                 fitted = self.solve(other, ends, self._every(), precision)
-                window = self._window(fitted, ends)
+                window = self._window(fitted, ends, precision)
 
             # A misfit that rises shows that the window has grown past the reach of the last fit: it is shortened.
             shorter = [(a + b) / 2 for a, b in zip(begin, ends, strict=True)]
@@ -234,37 +235,38 @@ class GrowingWindows:
         for number, (first, last, length) in enumerate(zip(self._first(), self.last, lengths, strict=True)):
             if number in self.misfit.states:
                 last = min(last, first + length)
-            onsets = self.onsets(z, number)
+            onsets = self.onsets(z, number, self.last[number], self.tolerances(GROWING))
             if len(onsets) > impacts:
                 last = min(last, float(onsets[impacts]) + self.misfit.offset(z, number))
             # However soon contacts follow each other, a window has data.
             ends.append(max(last, float(self.misfit.records[number].times[LEAST_SAMPLES - 1])))
         return ends
 
-    def onsets(self, z: np.ndarray, number: int) -> np.ndarray:
-        """The onsets (episode,) in s of the model's contacts in a record, from its first sample on."""
+    def onsets(self, z: np.ndarray, number: int, end: float, tolerances: Tolerances = EXACT) -> np.ndarray:
+        """The onsets (episode,) in s of the model's contacts in a record, from its first sample to its time ``end``."""
         try:
-            onsets = self.misfit.respond(z, number, self.last[number]).episodes["onset"]
+            onsets = self.misfit.alone(z, number, end, tolerances).episodes["onset"]
         except (CaseError, MotionError):
             return np.zeros(0)
-        first = self.misfit.times(z, number, self.last[number])[0]
+        first = self.misfit.times(z, number, end)[0]
         return np.asarray(onsets[onsets > first])
 
-    def _window(self, z: np.ndarray, ends: Sequence[float]) -> Window:
-        """The window up to ``ends`` with its misfit."""
+    def _window(self, z: np.ndarray, ends: Sequence[float], precision: Precision) -> Window:
+        """The window up to ``ends`` with its misfit, in a motion as exact as ``precision``'s."""
+        tolerances = self.tolerances(precision)
         impacts = 0
-        for number, end in enumerate(ends):
-            if end > -np.inf:
-                impacts += int(np.sum(self.onsets(z, number) <= end - self.misfit.offset(z, number)))
-        residuals = self.misfit.residuals(z, ends)
+        for number, (record, end) in enumerate(zip(self.misfit.records, ends, strict=True)):
+            if end >= record.times[0]:
+                impacts += len(self.onsets(z, number, end, tolerances))
+        residuals = self.misfit.residuals(z, ends, tolerances)
         return Window(max(ends), impacts, float(np.sqrt(np.mean(residuals**2))), z.copy())
 
-    def reached(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray:
+    def reached(self, z: np.ndarray, ends: Sequence[float], tolerances: Tolerances = EXACT) -> np.ndarray:
         """The largest w and -w (site, 2) in m of any record in the model up to ``ends``; NaN where a stop is met."""
         largest = np.zeros((len(self.misfit.plan.base.model().chain.sites), 2))
         for number, (table, end) in enumerate(zip(self.misfit.plan.options.records, ends, strict=True)):
             if table.contact and (self.misfit.records[number].times <= end).any():
-                response = self.misfit.respond(z, number, end)
+                response = self.misfit.alone(z, number, end, tolerances)
                 largest = np.maximum(largest, response.reached)
                 touched = response.episodes["site"], (response.episodes["side"] < 0).astype(int)
                 largest[touched] = np.nan
@@ -286,18 +288,19 @@ class GrowingWindows:
         towards = [reached[i, side] for i in parameter.members for side in sides if np.isfinite(gaps[i, side])]
         return float(np.max(towards, initial=0.0))
 
-    def _other_contacts(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray | None:
+    def _other_contacts(self, z: np.ndarray, ends: Sequence[float], precision: Precision = FINAL) -> np.ndarray | None:
         """Coordinates with a clearance within the motion or out of its reach, if that lowers the misfit; else None.
 
         No derivative leads from a stop that is not met to one that is, nor out of a contact that was not there.
         """
         best = None
-        least = self.cost(z, ends)
+        tolerances = self.tolerances(precision)
+        least = self.cost(z, ends, tolerances)
         for number, parameter in enumerate(self.misfit.plan.parameters):
             if parameter.quantity not in SIDES:
                 continue
-            for moved in self._clearances_tried(z, ends, number):
-                cost = self.cost(moved, ends)
+            for moved in self._clearances_tried(z, ends, number, tolerances):
+                cost = self.cost(moved, ends, tolerances)
                 if cost < least:
                     best = moved
                     least = cost
@@ -306,13 +309,15 @@ class GrowingWindows:
                 z = best
         return best
 
-    def _clearances_tried(self, z: np.ndarray, ends: Sequence[float], number: int) -> list[np.ndarray]:
+    def _clearances_tried(
+        self, z: np.ndarray, ends: Sequence[float], number: int, tolerances: Tolerances
+    ) -> list[np.ndarray]:
         """The coordinates ``z`` with other values of the clearance ``number``, by the motion without its stops."""
         parameter = self.misfit.plan.parameters[number]
         free = z.copy()
         free[number] = self.high[number]
         try:
-            beyond = self.beyond(parameter, self.reached(free, ends))
+            beyond = self.beyond(parameter, self.reached(free, ends, tolerances))
         except (CaseError, MotionError):
             return []
 
@@ -353,31 +358,27 @@ class GrowingWindows:
             full[active] = x
             return full
 
+        tolerances = self.tolerances(precision)
+
         def residuals(x: np.ndarray) -> np.ndarray:
             self.check()
-            data = self.misfit.residuals(whole(x), ends)
+            data = self.misfit.residuals(whole(x), ends, tolerances)
             return np.concatenate([data, weights * (x - centre)])
 
         def jacobian(x: np.ndarray) -> np.ndarray:
-            data = self.misfit.jacobian(whole(x), ends, active)
+            data = self.misfit.jacobian(whole(x), ends, active, tolerances)
             # The first is at the start, where the residuals of the prior are zero with any weight.
             weights[is_parameter] = np.maximum(weights[is_parameter], RIDGE * np.linalg.norm(data))
             return np.concatenate([data, np.diag(weights)])
 
-        solution = least_squares(
-            residuals,
-            # A start on a bound is moved inside by the method, and a start outside is refused.
-            np.clip(start, self.low[active], self.high[active]),
-            jac=jacobian,
-            bounds=(self.low[active], self.high[active]),
-            method="trf",
-            x_scale=1.0,
-            xtol=precision.step,
-            ftol=precision.cost,
-            gtol=TOLERANCE,
-            max_nfev=precision.steps or self.misfit.plan.options.steps,
-        )
-        return whole(solution.x)
+        bounds = (self.low[active], self.high[active])
+        steps = precision.steps or self.misfit.plan.options.steps
+        return whole(least_residuals(residuals, jacobian, start, bounds, precision, steps))
+
+    def tolerances(self, precision: Precision) -> Tolerances:
+        """The tolerances of motions in a fit of that ``precision``, by the noise of the channels."""
+        ratios = [np.min(noise / sizes) for noise, sizes in zip(self.misfit.noise, self._sizes, strict=True)]
+        return precision.tolerances(float(min(ratios)))
 
     def _estimate_noise(self, z: np.ndarray) -> None:
         """Estimate the noise of the channels for which none is given from their residuals."""

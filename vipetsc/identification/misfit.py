@@ -1,7 +1,7 @@
 """Residuals of measured records and their Jacobian, over windows from the beginning of each record."""
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -9,21 +9,31 @@ from vipetsc.case import CaseError, Model
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import Measured
 from vipetsc.dynamics.drives import create_drives, drive_forces
+from vipetsc.identification.coefficient_slopes import CoefficientSlopes, ParameterSlope, values_at
 from vipetsc.identification.initial_state import WIDTH, InitialState, initial_state, state_of
-from vipetsc.identification.motion import MotionCoefficients, MotionError, RecordedMotion, respond, slopes_between
+from vipetsc.identification.motion import (
+    MotionCoefficients,
+    MotionError,
+    RecordedMotion,
+    no_slopes,
+    respond,
+    stacked_slopes,
+)
 from vipetsc.identification.motion_begin import MotionBegin
-from vipetsc.identification.motion_rates import SHORT
+from vipetsc.identification.motion_rates import SHORT, Slopes
+from vipetsc.identification.precision import EXACT, Tolerances
 
-# Half the distance of the coordinates between which coefficients of the motion are differenced.
-HALF_WIDTH = 1e-5
 # Rows of a response, by the quantity of a sensor; the derivative with respect to time is in the row after it.
 ROWS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 # Residual of a motion that cannot be computed: a step that leads there is rejected.
 REJECTED = 1e8
 # Derivatives of a record are integrated in so many parts at most, of so many coordinates at least. The parts do not
-# depend on the number of ranks that work on them, and so the steps, and all bits, do not.
+# depend on the number of ranks that work on them, and so the steps, and all bits, do not. Each part has the motion of
+# its own: seven derivatives in two parts cost 1.3 times as much as in one.
 MOST_PARTS = 8
-LEAST_PART = 4
+LEAST_PART = 8
+# Motions without derivatives that are kept: residuals, contacts and cost at the end of a fit are those of one motion.
+KEPT = 8
 
 Job = Callable[[], np.ndarray]
 
@@ -51,6 +61,8 @@ class Misfit:
         self.records = records
         self.compute = compute
         self._trials = [plan.trials(number) for number in range(len(records))]
+        self._alone = lru_cache(maxsize=KEPT)(self._new_alone)
+        self._slopes = [CoefficientSlopes(plan.parameters, trials) for trials in self._trials]
         self.noise = [np.sqrt(np.mean(record.values**2, axis=0)) for record in records]
         base = plan.base
         dofs = base.lattice.unit_cell().dofs
@@ -87,7 +99,7 @@ class Misfit:
 
     def values(self, z: np.ndarray) -> np.ndarray:
         """The values (parameter,) at the coordinates ``z``."""
-        return np.array([p.from_coordinate(x) for p, x in zip(self.plan.parameters, z[: self.count], strict=True)])
+        return values_at(self.plan.parameters, z)
 
     def offset(self, z: np.ndarray, number: int) -> float:
         """The time in s of the record ``number``'s clock at which its drive begins, at ``z`` (coordinate,)."""
@@ -101,25 +113,6 @@ class Misfit:
             if parameter.quantity == "offset" and parameter.members == (number,)
         )
 
-    def _models(self, z: np.ndarray, number: int, which: Sequence[int]) -> tuple[list[Model], list[Model], np.ndarray]:
-        """The models below and above ``z`` in each of the parameters ``which``, and how far apart these are."""
-        lower: list[Model] = []
-        upper: list[Model] = []
-        widths: list[float] = []
-        values = self.values(z)
-        for p in which:
-            parameter = self.plan.parameters[p]
-            # At a bound the difference is one-sided.
-            below = max(z[p] - HALF_WIDTH, parameter.to_coordinate(parameter.low))
-            above = min(z[p] + HALF_WIDTH, parameter.to_coordinate(parameter.high))
-            widths.append(above - below)
-
-            for models, coordinate in ((lower, below), (upper, above)):
-                moved = values.copy()
-                moved[p] = parameter.from_coordinate(coordinate)
-                models.append(self._trials[number].case(moved).model())
-        return lower, upper, np.array(widths)
-
     def columns(self, number: int, active: Iterable[int]) -> tuple[list[int], list[int]]:
         """The ``active`` coordinates that have a column in the motion of record ``number``.
 
@@ -130,6 +123,19 @@ class Misfit:
         state = self.states.get(number)
         return inner, [p for p in active if state and p in state.indices]
 
+    def alone(self, z: np.ndarray, number: int, end: float, tolerances: Tolerances = EXACT) -> RecordedMotion:
+        """The motion of record ``number`` at its sensors up to its time ``end``, without derivatives.
+
+        Raises CaseError, MotionError.
+        """
+        samples = int(np.sum(self.records[number].times <= end))
+        return self._alone(tuple(z.tolist()), number, samples, tolerances)
+
+    def _new_alone(self, z: tuple[float, ...], number: int, samples: int, tolerances: Tolerances) -> RecordedMotion:
+        """The motion over so many ``samples``."""
+        end = float(self.records[number].times[samples - 1])
+        return self.respond(np.array(z), number, end, tolerances=tolerances)
+
     def respond(
         self,
         z: np.ndarray,
@@ -138,6 +144,7 @@ class Misfit:
         active: Iterable[int] = (),
         watched: np.ndarray | None = None,
         stride: int = 1,
+        tolerances: Tolerances = EXACT,
     ) -> RecordedMotion:
         """The motion of record ``number`` up to its time ``end``, with derivatives by its ``columns`` of ``active``.
 
@@ -149,11 +156,15 @@ class Misfit:
         if watched is None:
             watched = self.watched[number]
 
-        # Derivatives of the equations of motion, as differences between two models for each parameter.
-        inner, estimated = self.columns(number, active)
-        lower, upper, widths = self._models(z, number, inner)
         coefficients = MotionCoefficients.of(model)
-        slopes = slopes_between(lower, upper, widths, model, coefficients, others=len(estimated))
+        inner, estimated = self.columns(number, active)
+        by_parameter = [self._slopes[number].at(z, p, model, coefficients) for p in inner]
+        none = no_slopes(model, coefficients)
+        # Behind the parameters come coordinates of the initial state, on which no coefficient depends.
+        rows = [slope.coefficients for slope in by_parameter] + [none] * len(estimated)
+        slopes = stacked_slopes(rows or [none])
+        if not rows:
+            slopes = Slopes(*(array[:0] for array in slopes))
         return respond(
             model,
             coefficients,
@@ -161,37 +172,30 @@ class Misfit:
             times=self.times(z, number, end)[::stride],
             watched=watched,
             touches=table.contact,
-            begin=self._begin(z, number, model, (lower, upper, widths), estimated),
+            begin=self._begin(z, number, model, by_parameter, estimated),
+            tolerances=tolerances,
         )
 
     def _begin(
-        self,
-        z: np.ndarray,
-        number: int,
-        model: Model,
-        neighbours: tuple[list[Model], list[Model], np.ndarray],
-        estimated: Sequence[int],
+        self, z: np.ndarray, number: int, model: Model, by_parameter: Sequence[ParameterSlope], estimated: Sequence[int]
     ) -> MotionBegin | None:
         """The beginning of the motion of record ``number``; None for rest.
 
-        ``neighbours`` are the lower and upper models of each parameter's difference, and its width.
+        ``by_parameter`` are derivatives; those by the ``estimated`` coordinates of the initial state follow.
         """
-        lower, upper, widths = neighbours
         state = self.states.get(number)
         if state is not None:
             matrix = state.matrix
-            slopes = np.zeros((len(matrix), len(widths) + len(estimated)))
-            slopes[:, len(widths) :] = matrix[:, [p - state.first for p in estimated]]
+            slopes = np.zeros((len(matrix), len(by_parameter) + len(estimated)))
+            slopes[:, len(by_parameter) :] = matrix[:, [p - state.first for p in estimated]]
             return MotionBegin(self._earliest(number), matrix @ z[state.first : state.stop], slopes)
         if model.initial is None:
             return None
 
         begin = state_of(model)
-        slopes = np.zeros((len(begin), len(widths)))
-        # Only modes and packets depend on the cell.
-        if model.initial.kind in ("mode", "packet"):
-            for p, (low, high, width) in enumerate(zip(lower, upper, widths, strict=True)):
-                slopes[:, p] = (state_of(high) - state_of(low)) / width
+        slopes = np.zeros((len(begin), len(by_parameter)))
+        for column, slope in enumerate(by_parameter):
+            slopes[:, column] = slope.state
         return MotionBegin(0.0, begin, slopes)
 
     def _earliest(self, number: int) -> float:
@@ -211,13 +215,16 @@ class Misfit:
         return np.asarray(times[times <= end] - self.offset(z, number))
 
     def predicted(
-        self, z: np.ndarray, number: int, end: float, active: Sequence[int] = ()
+        self, z: np.ndarray, number: int, end: float, active: Sequence[int] = (), tolerances: Tolerances = EXACT
     ) -> tuple[np.ndarray, np.ndarray]:
         """What the sensors of a record measure (sample, sensor), and derivatives (sample, sensor, active).
 
         Raises CaseError, MotionError.
         """
-        response = self.respond(z, number, end, active)
+        if active:
+            response = self.respond(z, number, end, active, tolerances=tolerances)
+        else:
+            response = self.alone(z, number, end, tolerances)
         table = self.plan.options.records[number]
         motion = response.motion
         inner, estimated = self.columns(number, active)
@@ -263,7 +270,7 @@ class Misfit:
         started = times > 0
         return force * started, (after - before) / (2 * short) * started
 
-    def residuals(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray:
+    def residuals(self, z: np.ndarray, ends: Sequence[float], tolerances: Tolerances = EXACT) -> np.ndarray:
         """Residuals (datum,) up to the time ``ends`` of each record's clock; REJECTED where there is no motion.
 
         Data are ordered by record, sample, sensor; a record with an end of -inf is left out.
@@ -273,18 +280,20 @@ class Misfit:
             record = self.records[number]
             measured = record.values[record.times <= ends[number]]
             try:
-                values, _ = self.predicted(z, number, ends[number])
+                values, _ = self.predicted(z, number, ends[number], tolerances=tolerances)
             except (CaseError, MotionError):
                 return np.full(measured.size, REJECTED)
             return np.asarray((values - measured) / self.noise[number]).ravel()
 
         return np.concatenate(self.compute([partial(residuals_of, number) for number in self._used(ends)]))
 
-    def jacobian(self, z: np.ndarray, ends: Sequence[float], active: Sequence[int]) -> np.ndarray:
+    def jacobian(
+        self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], tolerances: Tolerances = EXACT
+    ) -> np.ndarray:
         """Derivatives (datum, active) of ``residuals``; raises CaseError, MotionError."""
 
         def slopes_of(number: int, part: Sequence[int]) -> np.ndarray:
-            _, slopes = self.predicted(z, number, ends[number], part)
+            _, slopes = self.predicted(z, number, ends[number], part, tolerances)
             return np.asarray(slopes / self.noise[number][:, None]).reshape(-1, len(part))
 
         parts = []

@@ -16,7 +16,7 @@ from vipetsc.identification.uncertainty import uncertainty_of
 # Distance in standard errors of the outermost values of a profile.
 REACH = 3.0
 # A profile rises by about ten over its reach. The tolerance is relative to the cost, which is about the number of data.
-PRECISION = Precision(steps=30, cost=1e-5)
+PRECISION = Precision(steps=30, cost=1e-5, derivatives=1e-5, is_rough=True)
 # Smallest part of the distance to the next value that is taken in one step to keep the contacts.
 SMALLEST_STEP = 1 / 16
 # Coordinates that differ by rounding.
@@ -106,4 +106,5 @@ def _follow(
 
 def _contacts(windows: GrowingWindows, z: np.ndarray) -> list[int]:
     """The numbers of the model's contacts, one a record."""
-    return [len(windows.onsets(z, number)) for number in range(len(windows.misfit.records))]
+    tolerances = windows.tolerances(PRECISION)
+    return [len(windows.onsets(z, number, end, tolerances)) for number, end in enumerate(windows.last)]

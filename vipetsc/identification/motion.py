@@ -14,6 +14,7 @@ from vipetsc.dynamics.spring_law import spring_laws
 from vipetsc.identification.motion_begin import MotionBegin, begin_contacts
 from vipetsc.identification.motion_rates import CurvedSprings, Lattice, MotionState, Slopes
 from vipetsc.identification.motion_steps import DONE, integrate
+from vipetsc.identification.precision import EXACT, Tolerances
 from vipetsc.lattice import Chain, UnitCell, nonlinear_places
 from vipetsc.lattice.chain import Ends
 from vipetsc.modes.shooting.dop853 import STAGES
@@ -66,20 +67,19 @@ class MatrixEntries(NamedTuple):
 
 def _matrices(chain: Chain) -> MatrixEntries:
     """The matrices of a ``chain``, whose contacts have no part in them."""
-    stiffness = chain.stiffness_rows(0, chain.cells).tocoo()
-    damping = chain.damping_rows(0, chain.cells).tocoo()
+    matrices = (chain.stiffness_entries(), chain.damping_entries())
     masses = chain.masses()
     n = len(masses)
 
     # One pattern for both matrices: places are numbered row by row, and the springs have every place of a dashpot
     # between masses.
     diagonal = np.arange(n) * (n + 1)
-    places = [matrix.row.astype(np.int64) * n + matrix.col for matrix in (stiffness, damping)]
+    places = [matrix.rows * n + matrix.columns for matrix in matrices]
     pattern = np.unique(np.concatenate([*places, diagonal]))
     values = []
-    for matrix, place in zip((stiffness, damping), places, strict=True):
-        sums = np.bincount(np.searchsorted(pattern, place), matrix.data, len(pattern))
-        # Sums of no entries, as of a lattice without dashpots, are integers.
+    for matrix, place in zip(matrices, places, strict=True):
+        sums = np.bincount(np.searchsorted(pattern, place), matrix.values, len(pattern))
+        # Sums of no entries, as of a cell without springs, are integers.
         values.append(sums.astype(float))
     return MatrixEntries(
         masses=masses,
@@ -101,56 +101,65 @@ def gains_of(model: Model) -> np.ndarray:
     return np.array([drive.waveform.amplitude * (drive.stiffness or 1.0) for drive in model.drives])
 
 
-def slopes_between(
-    lower: Sequence[Model],
-    upper: Sequence[Model],
-    widths: np.ndarray,
-    model: Model,
-    middle: MotionCoefficients,
-    others: int = 0,
-) -> Slopes:
-    """Derivatives of ``middle``, the coefficients of ``model``, by central differences between models (parameter,).
+def no_slopes(model: Model, middle: MotionCoefficients) -> Slopes:
+    """The derivatives of ``middle``, the coefficients of ``model``, by a parameter on which none of them depends.
 
-    ``widths`` (parameter,) are the distances of the parameter's values in ``lower`` and ``upper``; parameters are
-    numbers of order one, so that all derivatives of a motion have its magnitude. MotionCoefficients are affine in most
-    parameters and smooth in the others, so that no truncation is seen. Behind these parameters come ``others``, on
-    which no coefficient depends.
+    Arrays have no axis of parameters.
     """
-    count = len(widths) + others
-    number = len(middle.sites)
-    slopes = Slopes(
-        masses=np.zeros((count, len(middle.masses))),
-        stiffness=np.zeros((count, len(middle.stiffness))),
-        damping=np.zeros((count, len(middle.damping))),
-        gaps=np.zeros((count, number, 2)),
-        laws=np.zeros((count, number, 3)),
-        drives=np.zeros((count, len(middle.gains))),
-        curves=np.zeros((count, len(model.chain.cell.springs), 2)),
-        linear=np.zeros(count, bool),
+    sites = len(middle.sites)
+    return Slopes(
+        masses=np.zeros(len(middle.masses)),
+        stiffness=np.zeros(len(middle.stiffness)),
+        damping=np.zeros(len(middle.damping)),
+        gaps=np.zeros((sites, 2)),
+        laws=np.zeros((sites, 3)),
+        drives=np.zeros(len(middle.gains)),
+        curves=np.zeros((len(model.chain.cell.springs), 2)),
+        linear=np.array(False),
     )
-    for p, (low, high, width) in enumerate(zip(lower, upper, widths, strict=True)):
-        sites = [site_records(at, np.arange(len(at.chain.sites))) for at in (low, high)]
-        # Matrices take most of the time, and contacts have no part in them.
-        if low.chain.cell != high.chain.cell:
-            before = MotionCoefficients.of(low)
-            after = MotionCoefficients.of(high)
-            slopes.masses[p] = (after.masses - before.masses) / width
-            slopes.stiffness[p] = (after.stiffness - before.stiffness) / width
-            slopes.damping[p] = (after.damping - before.damping) / width
-            laws = [spring_laws(at.chain.cell.springs) for at in (low, high)]
-            for k, name in enumerate(("quadratic", "cubic")):
-                slopes.curves[p, :, k] = (laws[1][name] - laws[0][name]) / width
-            slopes.linear[p] = True
-        gains = gains_of(high) - gains_of(low)
-        slopes.drives[p] = gains / width / np.where(middle.gains != 0, middle.gains, 1.0)
-        for k, name in enumerate(("clearance", "clearance_minus")):
-            # Where there is no stop both are infinite.
-            stops = np.isfinite(middle.sites[name])
-            slopes.gaps[p, stops, k] = (sites[1][name][stops] - sites[0][name][stops]) / width
-        for k, name in enumerate(("stiffness", "exponent")):
-            slopes.laws[p, :, k] = (sites[1]["elastic"][name] - sites[0]["elastic"][name]) / width
-        slopes.laws[p, :, 2] = (sites[1]["damping"] - sites[0]["damping"]) / width
+
+
+def slopes_between(low: Model, high: Model, width: float, model: Model, middle: MotionCoefficients) -> Slopes:
+    """Derivatives of ``middle``, the coefficients of ``model``, by central differences between two models.
+
+    ``width`` is the distance of the parameter, or of its coordinate, in ``low`` and ``high``. Coefficients are affine
+    in most parameters and smooth in the others, so that no truncation is seen. Arrays have no axis of parameters.
+    """
+    slopes = no_slopes(model, middle)
+    # Matrices take most of the time, and contacts have no part in them.
+    if low.chain.cell != high.chain.cell:
+        before = MotionCoefficients.of(low)
+        after = MotionCoefficients.of(high)
+        slopes.masses[:] = (after.masses - before.masses) / width
+        slopes.stiffness[:] = (after.stiffness - before.stiffness) / width
+        slopes.damping[:] = (after.damping - before.damping) / width
+        laws = [spring_laws(at.chain.cell.springs) for at in (low, high)]
+        for k, name in enumerate(("quadratic", "cubic")):
+            slopes.curves[:, k] = (laws[1][name] - laws[0][name]) / width
+        slopes.linear[...] = True
+
+    gains = gains_of(high) - gains_of(low)
+    slopes.drives[:] = gains / width / np.where(middle.gains != 0, middle.gains, 1.0)
+    sites = [site_records(at, np.arange(len(at.chain.sites))) for at in (low, high)]
+    for k, name in enumerate(("clearance", "clearance_minus")):
+        # Where there is no stop both are infinite.
+        stops = np.isfinite(middle.sites[name])
+        slopes.gaps[stops, k] = (sites[1][name][stops] - sites[0][name][stops]) / width
+    for k, name in enumerate(("stiffness", "exponent")):
+        slopes.laws[:, k] = (sites[1]["elastic"][name] - sites[0]["elastic"][name]) / width
+    slopes.laws[:, 2] = (sites[1]["damping"] - sites[0]["damping"]) / width
     return slopes
+
+
+def scaled_slopes(slopes: Slopes, factor: float) -> Slopes:
+    """Derivatives by a parameter, ``factor`` times those of ``slopes``."""
+    scaled = {name: factor * array for name, array in slopes._asdict().items() if name != "linear"}
+    return slopes._replace(**scaled)
+
+
+def stacked_slopes(rows: Sequence[Slopes]) -> Slopes:
+    """The derivatives ``rows`` of each parameter in arrays with an axis of parameters."""
+    return Slopes(*(np.stack(arrays) for arrays in zip(*rows, strict=True)))
 
 
 class RecordedMotion(NamedTuple):
@@ -174,6 +183,7 @@ def respond(
     watched: np.ndarray,
     touches: bool = True,
     begin: MotionBegin | None = None,
+    tolerances: Tolerances = EXACT,
 ) -> RecordedMotion:
     """The motion of ``model`` and its derivatives at the rising ``times`` (sample,) in s.
 
@@ -211,7 +221,7 @@ def respond(
     columns = 1 + len(slopes.linear)
     rows = 2 * len(coefficients.masses)
     tracker = ImpactTracker(sites, range(len(sites)))
-    state = create_motion(rows, columns, len(sites), model.scale)
+    state = create_motion(rows, columns, len(sites), model.scale, tolerances)
     instant = 0.0
     if begin is not None:
         instant = begin.time
@@ -241,7 +251,7 @@ def _curved_springs(chain: Chain, slopes: Slopes) -> CurvedSprings:
     )
 
 
-def create_motion(rows: int, columns: int, sites: int, scale: float) -> MotionState:
+def create_motion(rows: int, columns: int, sites: int, scale: float, tolerances: Tolerances = EXACT) -> MotionState:
     """The state of rest and the workspace of so many ``rows``, 2n, and ``columns``; ``scale`` in m is that of waves."""
     return MotionState(
         state=np.zeros((rows, columns)),
@@ -253,6 +263,7 @@ def create_motion(rows: int, columns: int, sites: int, scale: float) -> MotionSt
         before=np.zeros((sites, 3)),
         after=np.zeros((sites, 3)),
         largest=np.full(columns, FLOOR * scale),
+        tolerances=np.array(tolerances),
         room=np.zeros((2, 6)),
     )
 

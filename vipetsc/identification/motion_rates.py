@@ -73,7 +73,8 @@ class MotionState(NamedTuple):
 
     ``state`` and ``end`` (2n, column), ``stages`` (stage, 2n, column), ``rates`` (2n, column) at the end; ``estimates``
     (2, 2n, column) are those of errors, ``approach`` (site, column) derivatives of w'_minus; ``before`` and ``after``
-    (site, 3) hold w, w', w'' at both ends of a step, ``largest`` (column,) the largest values so far.
+    (site, 3) hold w, w', w'' at both ends of a step, ``largest`` (column,) the largest values so far; ``tolerances``
+    (2,) are the errors allowed per step, relative to the largest motion and the largest derivative so far.
     """
 
     state: np.ndarray
@@ -85,6 +86,7 @@ class MotionState(NamedTuple):
     before: np.ndarray
     after: np.ndarray
     largest: np.ndarray
+    tolerances: np.ndarray
     room: np.ndarray
 
 

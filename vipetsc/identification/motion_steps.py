@@ -21,11 +21,6 @@ from vipetsc.modes.shooting.dop853 import E3, E5, STAGES, A, B
 # to 0.8 and 0.95: CPU time changes by 9 % at most. The error against a tolerance of 1e-13 stays 7e-11 to 2e-9 of the
 # motion and 2e-7 to 4e-6 of the derivatives; with the bilinear law, whose impacts amplify errors more, 8e-6 to 3e-5 and
 # .8 to 3 %.
-#
-# Errors allowed per step, relative to the largest motion and the largest derivative so far; 1e-13 and 1e-12 cost 1.6 to
-# 1.9 times the CPU time. Derivatives serve the steps of a fit, for which three digits are enough.
-RTOL = 1e-11
-RTOL_DERIVATIVE = 1e-9
 # A step is at most one radian of the fastest mode, and this fraction of the duration of an impact in contact.
 OF_IMPACT = 0.25
 # First step after an onset, as a fraction of the impact: Hertz's force begins as a power 3/2.
@@ -48,7 +43,7 @@ DONE, STUCK = range(2)
 
 @kernel
 def _scaled_error(motion: MotionState, n: int, omega: float, h: float) -> float:
-    """The largest error of a column over what is allowed."""
+    """The largest error of a column over what is allowed, in a step of ``h`` s; infinite if it overflowed."""
     size = motion.end.size
     stages = motion.stages.reshape(STAGES, size)
     estimates = motion.estimates
@@ -74,7 +69,7 @@ def _scaled_error(motion: MotionState, n: int, omega: float, h: float) -> float:
         if not np.isfinite(fifth + third):
             return np.inf
         if fifth > 0.0:
-            allowed = (RTOL if j == 0 else RTOL_DERIVATIVE) * scale
+            allowed = motion.tolerances[min(j, 1)] * scale
             error = max(error, h * fifth * fifth / np.sqrt(fifth * fifth + 0.01 * third * third) / allowed)
     return error
 

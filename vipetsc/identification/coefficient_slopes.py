@@ -1,0 +1,102 @@
+"""Derivatives of the coefficients of a record's motion with respect to parameters, by differences of trial cases."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from vipetsc.case import CaseError, Model
+from vipetsc.case.sought import SoughtParameter
+from vipetsc.case.trial import TrialCases
+from vipetsc.identification.initial_state import state_of
+from vipetsc.identification.motion import MotionCoefficients, scaled_slopes, slopes_between
+from vipetsc.identification.motion_rates import Slopes
+
+# Half the distance of the coordinates between which coefficients of the motion are differenced.
+HALF_WIDTH = 1e-5
+AFFINE = ("clearance", "clearance_minus", "stiffness", "mass", "spring", "quadratic", "cubic", "dashpot", "grounding")
+"""Quantities in which coefficients of the motion are affine: their derivatives by the value are always the same."""
+FOLLOWING_CELL = ("mode", "packet")
+"""Initial motions whose displacements and velocities depend on the cell."""
+
+
+class ParameterSlope(NamedTuple):
+    """Derivatives by a parameter: of the ``coefficients`` of the motion, without an axis of parameters.
+
+    ``state`` (2n,) is that of the state in which the motion begins, 0 where it does not depend on the parameter.
+    """
+
+    coefficients: Slopes
+    state: np.ndarray | float = 0.0
+
+
+def values_at(parameters: Sequence[SoughtParameter], z: np.ndarray) -> np.ndarray:
+    """The values (parameter,) at the coordinates ``z`` (coordinate,), of which those of parameters are the first."""
+    first = z[: len(parameters)]
+    return np.array([parameter.from_coordinate(x) for parameter, x in zip(parameters, first, strict=True)])
+
+
+class CoefficientSlopes:
+    """Derivatives by ``parameters`` of the coefficients of a record's motion, whose cases are ``trials``."""
+
+    def __init__(self, parameters: Sequence[SoughtParameter], trials: TrialCases) -> None:
+        self._parameters = parameters
+        self._trials = trials
+        self._by_value = lru_cache(maxsize=None)(self._new_by_value)
+
+    def at(self, z: np.ndarray, p: int, model: Model, middle: MotionCoefficients) -> ParameterSlope:
+        """Derivatives of ``middle``, the coefficients of the ``model`` at ``z`` (coordinate,), by parameter number p.
+
+        Raises CaseError.
+        """
+        parameter = self._parameters[p]
+        if parameter.quantity in AFFINE:
+            by_value = self._by_value(p)
+            if by_value is not None:
+                return ParameterSlope(scaled_slopes(by_value, parameter.slope(z[p])))
+
+        below, above = self._neighbours(z, p)
+        low, high = (self._trials.case(self._values_with(z, p, x)).model() for x in (below, above))
+        slopes = slopes_between(low, high, above - below, model, middle)
+        # Of all beginnings only modes and packets depend on the cell.
+        if model.initial is not None and model.initial.kind in FOLLOWING_CELL:
+            return ParameterSlope(slopes, (state_of(high) - state_of(low)) / (above - below))
+        return ParameterSlope(slopes)
+
+    def _neighbours(self, z: np.ndarray, p: int) -> tuple[float, float]:
+        """Coordinates below and above ``z`` (coordinate,) in parameter ``p``; at a bound one of them is that of z."""
+        parameter = self._parameters[p]
+        below = max(z[p] - HALF_WIDTH, parameter.to_coordinate(parameter.low))
+        above = min(z[p] + HALF_WIDTH, parameter.to_coordinate(parameter.high))
+        return below, above
+
+    def _values_with(self, z: np.ndarray, p: int, coordinate: float) -> np.ndarray:
+        """The values (parameter,) at ``z`` (coordinate,) with another ``coordinate`` of parameter ``p``."""
+        values = values_at(self._parameters, z)
+        values[p] = self._parameters[p].from_coordinate(coordinate)
+        return values
+
+    def _new_by_value(self, p: int) -> Slopes | None:
+        """Derivatives of a record's coefficients by the value of parameter ``p``, where they are the same everywhere.
+
+        They are those at the start of the case, so that a fit which goes on after a stop has the same. None where
+        they are not the same, or where there is no such case.
+        """
+        z = np.array([each.to_coordinate(each.start) for each in self._parameters])
+        below, above = self._neighbours(z, p)
+        low, high = (self._values_with(z, p, x) for x in (below, above))
+        try:
+            model = self._trials.case(values_at(self._parameters, z)).model()
+            lower = self._trials.case(low).model()
+            upper = self._trials.case(high).model()
+        except CaseError:
+            return None
+        if model.initial is not None and model.initial.kind in FOLLOWING_CELL:
+            return None
+
+        slopes = slopes_between(lower, upper, float(high[p] - low[p]), model, MotionCoefficients.of(model))
+        # A moved wall acts by the stiffness of its spring: its force is a product of what is sought.
+        if slopes.drives.any():
+            return None
+        return slopes
