@@ -77,6 +77,9 @@ def on_one_machine(comm: MPI.Comm) -> bool:
 
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T:
     """Value of ``function`` called on rank 0, on all ranks; what it raises is raised on all ranks."""
+    # A rank alone keeps the value as it is: a copy of a case, as messages make, would be resolved again.
+    if comm.size == 1:
+        return _value_or_raise(_attempt(function))
     attempt = _attempt(function) if comm.rank == 0 else None
     wait_for_all(comm)  # before the broadcast, in which ranks would wait at full speed
     return _value_or_raise(comm.bcast(attempt))

@@ -13,7 +13,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from inspect import Parameter, Signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args
 import tomli_w
 from pydantic import ValidationError
 
+from vipetsc.case.case_error import CaseError as CaseError
 from vipetsc.case.changes import has_more_keys, value_of
 from vipetsc.case.changes import put as put
 from vipetsc.case.named_files import with_absolute_names
@@ -33,7 +34,6 @@ from vipetsc.case.section import Section as Section
 from vipetsc.io.names import readable
 from vipetsc.plugins import only
 from vipetsc.register import PartError
-from vipetsc.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -43,18 +43,6 @@ LARGEST = 1e50  # products of six larger numbers overflow, and those of six belo
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
 Table = dict[str, Any]  # a parsed TOML table
 Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid
-
-
-class CaseError(ValueError):
-    """An invalid case; ``problems`` contains all reasons."""
-
-    def __init__(self, problems: Iterable[Problem], source: str = "case") -> None:
-        self.problems = list(problems)
-        self.source = source
-        super().__init__(self.problems, source)  # the arguments of unpickling on other ranks
-
-    def __str__(self) -> str:
-        return "\n  ".join([f"{self.source}: {counted(len(self.problems), 'problem')}", *map(str, self.problems)])
 
 
 AnySection = TypeVar("AnySection", bound=Section)
@@ -125,7 +113,11 @@ class CaseFile(Section):
     @classmethod
     def of(cls, run: "xr.Dataset") -> Self:
         """The resolved case that a file of results carries in its attribute ``case``."""
-        return cls.from_toml(run.attrs["case"])
+        case = _kept_case(cls, run.attrs["case"])
+        assert isinstance(case, cls)
+        # The modules of a case that was read before may have gone since.
+        case.import_plugins()
+        return case
 
     @classmethod
     def from_table(cls, table: Table, overrides: Iterable[str] = (), source: str = "case") -> Self:
@@ -229,6 +221,12 @@ class CaseFile(Section):
     def to_toml(self) -> str:
         """The resolved case as TOML; reading it back gives the same case."""
         return tomli_w.dumps(self.model_dump(by_alias=True, exclude_none=True))
+
+
+@lru_cache(maxsize=4)  # each measure and picture of a run asks for its case
+def _kept_case(kind: type[CaseFile], text: str) -> CaseFile:
+    """The resolved case of a ``kind`` in a ``text`` of TOML."""
+    return kind.from_toml(text)
 
 
 def _declared_sections(kind: type[CaseFile]) -> Iterator[str]:

@@ -92,19 +92,22 @@ def analyse(
     arrival: float | None = None,
     options: AnalysisTable | None = None,
     comm: MPI.Comm = MPI.COMM_SELF,
+    case: Case | None = None,
 ) -> xr.Dataset:
     """The content of ``analysis.h5``, from a ``run``, open or in memory, with its case in the attribute ``case``.
 
     Those ``measures`` of ``FULL`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
     paper's t_hat in s, the time of the largest host velocity at the first site in the linear run; by default it is
     estimated from the group velocity: half the burst and the time to the site. ``options`` are the case's where none
-    are given. Measures that the run does not allow (no sites, a single cell) are left out and named in the attribute
-    ``left_out``; those that the stored samples and cells do not resolve are also named in the list ``warnings``.
+    are given. ``case`` is the run's, where the caller has it. Measures that the run does not allow (no sites, a single
+    cell) are left out and named in the attribute ``left_out``; those that the stored samples and cells do not resolve
+    are also named in the list ``warnings``.
 
     The ranks of ``comm`` take different measures of the same run; all must call it, and all get all measures.
     """
     sys.audit("vipetsc.analyse")
-    case = Case.of(run)
+    if case is None:
+        case = Case.of(run)
     options = options or case.analysis or AnalysisTable.model_validate({})
     about = {
         "format_version": FORMAT_VERSION,

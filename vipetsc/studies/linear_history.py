@@ -62,9 +62,8 @@ class LinearHistory(NamedTuple):
 
         envelope = None
         if memory.dataset is not None:
-            largest = np.sqrt(np.maximum.accumulate(envelope_squares(memory.dataset), axis=0))
-            last = [int(parts[0]["samples"]) - 1 for parts in memory.states]
-            envelope = largest[last]
+            stops = [int(parts[0]["samples"]) for parts in memory.states]
+            envelope = np.sqrt(np.maximum.accumulate(envelope_squares(memory.dataset, stops), axis=0))
         run = xr.Dataset() if memory.dataset is None else memory.dataset
         return cls(run, memory.states, comm.bcast(envelope), result.statistics)
 

@@ -5,8 +5,9 @@ its square. The linear run, under 1 N and without contacts, shows which members 
 it.
 """
 
+import itertools
 import json
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -22,12 +23,12 @@ from vipetsc.lattice.chain import Pair, cells_between
 from vipetsc.spectra.measures import MEASURES as REGISTRY
 from vipetsc.spectra.measures import PART, UNSETTLED, group_of, is_measure, row_of
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.pair_motion import PairMotion
 from vipetsc.studies.recorded_runs import RecordPaths
 
 # A member is scaled where its linear wave stays below this fraction of every clearance: the largest w between samples
 # exceeds the sampled envelope by less than what is left, for any burst of a few cycles.
 MARGIN = 0.9
+BLOCK = 64  # samples of which the envelope is taken together; any number that leaves arrays in the cache serves
 REFERENCE = 1.0  # amplitude of a linear run, in N or m
 MEMBERS = "members"  # what the records of a sweep are called
 
@@ -55,9 +56,11 @@ class LinearRun(NamedTuple):
 
         They are measured for each of the first ``sites`` (cells; 0 for none).
         """
+        samples = run.sizes["time"]
+        blocks = [*range(BLOCK, samples, BLOCK), samples]
         host_velocity = run["velocity"].values[..., Case.of(run).model().chain.cell.host]
         wave = cls(
-            envelope=np.sqrt(np.max(envelope_squares(run), axis=0)),
+            envelope=np.sqrt(np.max(envelope_squares(run, blocks), axis=0)),
             arrival=field_time(run)[np.argmax(np.abs(host_velocity), axis=0)],
             statistics=statistics | {"work": float(run["energy/work"][-1])},
             measures={},
@@ -105,12 +108,26 @@ class LinearRun(NamedTuple):
         )
 
 
-def envelope_squares(run: xr.Dataset) -> np.ndarray:
-    """Squares (t, cell) in m^2 of w^2 + (w'/Om)^2 of each cell's contact pair in a linear ``run`` with both fields."""
+def envelope_squares(run: xr.Dataset, stops: Sequence[int]) -> np.ndarray:
+    """Largest w^2 + (w'/Om)^2 in m^2 of each cell's contact pair in blocks of a linear ``run`` with both fields.
+
+    The first block begins at the first sample, and each (block, cell) ends before one of the ``stops``.
+    """
     model = Case.of(run).model()
-    motion = PairMotion.of(run, model.chain.cell)
-    # With the rate in it, the envelope does not depend on where the samples fall.
-    return np.asarray(motion.displacement**2 + (motion.velocity / model.drive.frequency) ** 2)
+    host = model.chain.cell.host
+    resonator = model.chain.cell.resonator
+    displacement = run["displacement"].values
+    velocity = run["velocity"].values
+    largest = np.zeros((len(stops), displacement.shape[1]))
+    # Block by block, since temporary arrays of all samples would not fit into the cache.
+    for number, (first, stop) in enumerate(itertools.pairwise([0, *stops])):
+        block = slice(first, stop)
+        w = displacement[block, :, resonator] - displacement[block, :, host]
+        rate = velocity[block, :, resonator] - velocity[block, :, host]
+        # With the rate in it, the envelope does not depend on where the samples fall.
+        squares = w**2 + (rate / model.drive.frequency) ** 2
+        largest[number] = squares.max(axis=0, initial=0.0)
+    return largest
 
 
 def reached(envelope: np.ndarray, case: Case) -> np.ndarray:

@@ -188,7 +188,7 @@ class SweepRuns:
             if run is None:
                 run = open_run(folder / "run.h5")
             with run:
-                analysis = analyse(run, self.measures, arrival)
+                analysis = analyse(run, self.measures, arrival, case=simulated)
                 if fields and not all_kept:
                     write_netcdf(folder / "run.h5", thinned(run, case).assign_attrs(case=case.to_toml()))
             if fields:

@@ -9,6 +9,7 @@ that results have the same bits on any partition.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 from petsc4py import PETSc
@@ -149,13 +150,13 @@ def create_stencil(series: StepSeries, layout: Layout, halo: HaloRegions) -> Ste
     # Cells near an end all read the same columns, from the end on: (first column's cell, first of the cells, last).
     left_end = (0, layout.start, min(layout.stop, first))
     right_end = (layout.cells - 2 * reach, max(layout.start, last), layout.stop)
-    ends = []
+    ends: list[tuple[int, int]] = []
     for begin, start, stop in (left_end, right_end):
         if start < stop:
             columns.append(np.repeat(halo.add(begin, 2 * reach + 1), stop - start))
         ends += [(begin, cell) for cell in range(start, stop)]
 
-    borders, table = _dense_rows(series, inner[is_dense], ends)
+    borders, table = _dense_rows(series, inner[is_dense], tuple(ends))
     cells = np.append(inner[is_dense], [cell for _, cell in ends]).astype(np.int64)
     sparse = sparse_rows(series.interior(), layout.dofs, reach)
     return Stencil(
@@ -211,7 +212,9 @@ def ranges_of(is_in: np.ndarray, first: int) -> np.ndarray:
     return np.flatnonzero(np.diff(np.concatenate([[False], is_in, [False]]))).reshape(-1, 2) + first
 
 
-def _dense_rows(series: StepSeries, cells: np.ndarray, ends: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+def _dense_rows(
+    series: StepSeries, cells: np.ndarray, ends: tuple[tuple[int, int], ...]
+) -> tuple[np.ndarray, np.ndarray]:
     """Tables of P's rows (table, 2 dof, 2 reach + 1, 2 dof) and which of them is that of each cell.
 
     ``cells`` read as many cells on either side, ``ends`` are (first cell that is read, cell) near the lattice's ends.
@@ -220,18 +223,28 @@ def _dense_rows(series: StepSeries, cells: np.ndarray, ends: list[tuple[int, int
     dofs = series.chain.cell.dofs
     band = 2 * reach + 1
     examples, table = np.unique(series.representatives(cells), return_inverse=True)
-    tables = np.zeros((len(examples) + len(ends), 2 * dofs, band, 2 * dofs))
+    tables = np.zeros((len(examples), 2 * dofs, band, 2 * dofs))
 
     # Columns before rows: the sums of ``apply_propagator`` run over one cell's outputs at a time.
     is_shared = series.is_interior(examples)
-    tables[: len(examples)][is_shared] = series.interior().transpose(1, 2, 0)
+    tables[is_shared] = series.interior().transpose(1, 2, 0)
     for i, rows in zip(np.flatnonzero(~is_shared), series.rows(examples[~is_shared]), strict=True):
         tables[i] = series.stencil(series.cut(rows, -reach, band)).transpose(1, 2, 0)
+    numbers = np.append(table, len(examples) + np.arange(len(ends)))
+    return np.concatenate([tables, _end_rows(series, ends)]), numbers
+
+
+@lru_cache(maxsize=4)  # members of a sweep have the same ends
+def _end_rows(series: StepSeries, ends: tuple[tuple[int, int], ...]) -> np.ndarray:
+    """The tables of ``_dense_rows`` of the ``ends``, in their order."""
+    reach = series.reach
+    dofs = series.chain.cell.dofs
+    tables = np.zeros((len(ends), 2 * dofs, 2 * reach + 1, 2 * dofs))
     for i, rows in enumerate(series.rows([cell for _, cell in ends])):
         begin, cell = ends[i]
         part = series.cut(rows, begin - cell, 2 * reach)
-        tables[len(examples) + i, :, : 2 * reach] = series.stencil(part).transpose(1, 2, 0)
-    return tables, np.append(table, len(examples) + np.arange(len(ends)))
+        tables[i, :, : 2 * reach] = series.stencil(part).transpose(1, 2, 0)
+    return tables
 
 
 @njit(error_model="numpy")

@@ -5,6 +5,7 @@ long that many sites feel one another within it. Springs that are not linear act
 that ``ts`` costs less, linear steps are refused.
 """
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -65,12 +66,20 @@ def step_series(model: Model) -> StepSeries | None:
 
 def _series(model: Model, parts: int) -> StepSeries:
     """The series over a step of a sample interval over ``parts``, in which springs are linear."""
-    return StepSeries(
-        chain=model.chain.linearised(),
+    # Free motion knows no contacts: members of a sweep that differ in these have one series, and compute it once.
+    chain = replace(model.chain.linearised(), sites=(), clearances=(), pairs=())
+    return _kept_series(
+        chain,
         interval=model.sample_interval / parts,
         tolerance=max(SERIES_TOLERANCE * model.rtol, LEAST_TOLERANCE),
         spans_cells=spans_cells(model.chain),
     )
+
+
+@lru_cache(maxsize=8)
+def _kept_series(chain: Chain, interval: float, tolerance: float, spans_cells: bool) -> StepSeries:
+    """The series with these values; a series keeps what it computes."""
+    return StepSeries(chain=chain, interval=interval, tolerance=tolerance, spans_cells=spans_cells)
 
 
 def _no_step(model: Model) -> str:
