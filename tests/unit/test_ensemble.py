@@ -17,7 +17,7 @@ from vipetsc.io.records import RecordFile
 from vipetsc.lattice import four_band
 from vipetsc.studies.engines import agreement, sampled
 from vipetsc.studies.ensemble import FAILED, MISSING, SCALED, Results, fit_curve
-from vipetsc.studies.linear_run import LinearRun, leading_cell, linear_name, read_linear
+from vipetsc.studies.linear_run import LinearRun, envelope_squares, leading_cell, linear_name, read_linear
 from vipetsc.studies.sweep import conclude, summarise
 
 SWEEP = {
@@ -190,6 +190,13 @@ def test_a_linear_wave_arrives_with_its_host_and_reaches_clearances_by_its_envel
     assert leading_cell(case) == 7
     assert wave.arrival_at(7) == wave.arrival[6]
     assert wave.arrival_at(0) is None
+
+    # Block by block it is that of all samples; the case is read once for all of them.
+    samples = data.sizes["time"]
+    blocks = np.sqrt(envelope_squares(data, [3, samples // 2, samples]))
+    assert np.array_equal(blocks.max(axis=0), wave.envelope)
+    assert np.array_equal(np.maximum(blocks[0], blocks[1]), np.sqrt(envelope_squares(data, [samples // 2])[0]))
+    assert Case.of(data) is Case.of(data)
 
     # The envelope of w is that of an oscillation with the largest w and the largest w'.
     velocity = data["velocity"].values

@@ -15,7 +15,7 @@ from vipetsc.io import chunks
 from vipetsc.io.atomic import load_arrays, save_arrays
 from vipetsc.io.chunks import LOSSES, SAMPLED, Recording
 from vipetsc.io.netcdf import open_netcdf, write_netcdf
-from vipetsc.io.store import RunMemory
+from vipetsc.io.store import FieldMemory, RunMemory
 
 PART = {"output": {"window": [3, 17], "every": 4, "stride": 5}}
 
@@ -200,3 +200,18 @@ def test_engines_are_given_contiguous_room_whatever_is_kept_already(monkeypatch)
         assert len(values) == 11
         assert values[-1].any()
         assert values.tobytes() == blocks[name].values.tobytes(), name
+
+
+def test_runs_in_a_common_memory_have_the_bits_of_runs_in_their_own():
+    """The second run is shorter, and finds what the first one has left; runs in memory of their own outlive others."""
+    fields = FieldMemory()
+    own = RunMemory()
+    own_runs = []
+    for case in (small_case(), small_case(contacts={"clearance": 1.0}, time={"end": 0.02})):
+        common = RunMemory(fields=fields)
+        for memory in (common, own):
+            simulate(case, memory)
+        own_runs.append(own.dataset)
+        assert common.dataset is not None
+        assert common.dataset.equals(own.dataset)
+    assert not np.may_share_memory(own_runs[0]["velocity"].values, own_runs[1]["velocity"].values)

@@ -100,7 +100,6 @@ def draw_pictures(
             drawn_ahead = pictures.unmeasured
         second.ask(pictures.source, folders, divided=True, formats=formats, newest=newest, omit=drawn_ahead)
 
-    load_matplotlib()
     from vipetsc.figures.registry import draw
     from vipetsc.figures.sweep_members import Files
 
@@ -156,6 +155,8 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
 
     Raises FolderError for an unknown picture, before any file is written.
     """
+    # Before any module that loads it as it is.
+    load_matplotlib()
     from vipetsc.figures.registry import figure_names
 
     try:

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, NamedTuple
@@ -17,9 +17,11 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from vipetsc.figures.figure_data import figure_data
+from vipetsc.figures.kept_formulas import kept_formulas
 from vipetsc.figures.kept_ticks import kept_ticks
 from vipetsc.figures.layout import apply_aspects, lay_out, pixel_canvas
 from vipetsc.figures.log_ticks import label_log_axes
+from vipetsc.figures.pdf_fonts import plain_fonts
 from vipetsc.io.atomic import atomic_write, write_text
 
 COLUMN = 3.4  # width of one journal column in inches
@@ -81,9 +83,11 @@ def band_number(part: str) -> int | None:
     return int(numbers.split("+")[0]) if kind == "band" else None
 
 
-def rc_style() -> AbstractContextManager[None]:
+@contextmanager
+def rc_style() -> Iterator[None]:
     """The house style, for making and for saving figures; leaves matplotlib's settings as they were."""
-    return mpl.rc_context(fname=Path(__file__).with_name("house.mplstyle"))
+    with mpl.rc_context(fname=Path(__file__).with_name("house.mplstyle")), kept_formulas():
+        yield
 
 
 def with_prefix(value: float, unit: str) -> str:
@@ -132,10 +136,11 @@ def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
     with kept_ticks(figure), atomic_write(path) as partial_path:
         # The figure's own canvas suffices where nothing is added to its box, and takes less time than ``savefig``.
         if path.suffix == ".pdf" and not lines:
-            # Loads the tools for fonts, which take a quarter of the time that matplotlib itself takes.
+            # Imported here: the tools for fonts take a quarter of the time that matplotlib itself takes.
             from matplotlib.backends.backend_pdf import FigureCanvasPdf
 
-            FigureCanvasPdf(figure).print_pdf(partial_path)
+            with plain_fonts():
+                FigureCanvasPdf(figure).print_pdf(partial_path)
         elif path.suffix == ".png" and not lines:
             figure.set_dpi(SCREEN)
             canvas = pixel_canvas(figure)

@@ -186,7 +186,7 @@ def _contents(files: CachingFileManager) -> tuple[Variables, dict[str, Any]]:
         for group in _groups(file):
             attributes |= {_path(group.name, key): value for key, value in _attributes(group).items()}
             for dataset in _datasets(group):
-                dims = [_dimension(file, dataset, axis) for axis in range(dataset.ndim)]
+                dims = _dimensions(file, dataset)
                 # Texts are short, and an array of numpy's has to know the longest.
                 if h5py.check_string_dtype(dataset.dtype):
                     data = dataset.asstr()[...].astype(str)
@@ -223,17 +223,23 @@ def _members(group: h5py.Group) -> Iterator[Any]:
             yield group[name]
 
 
-def _dimension(file: h5py.File, dataset: h5py.Dataset, axis: int) -> str:
-    """The dimension along an ``axis`` of a ``dataset``: the path of the scale that is attached to it.
+def _dimensions(file: h5py.File, dataset: h5py.Dataset) -> list[str]:
+    """The dimensions of a ``dataset``: along each axis the path of the scale that is attached to it.
 
     A scale is its own dimension; an axis without a scale is one of its own.
     """
-    if dataset.attrs.get("CLASS") == b"DIMENSION_SCALE" and dataset.ndim == 1:
-        return _path(dataset.name)
-    scales = dataset.attrs["DIMENSION_LIST"][axis] if "DIMENSION_LIST" in dataset.attrs else []
-    if len(scales):
-        return _path(file[scales[0]].name)
-    return _path(dataset.name, f"axis_{axis}")
+    if dataset.ndim == 1 and dataset.attrs.get("CLASS") == b"DIMENSION_SCALE":
+        return [_path(dataset.name)]
+    # Read once: a list of references takes longer than the name that one stands for.
+    lists = dataset.attrs.get("DIMENSION_LIST", [[]] * dataset.ndim)
+    dims = []
+    for axis, scales in enumerate(lists):
+        if len(scales):
+            name = h5py.h5r.get_name(scales[0], file.id).decode()
+            dims.append(_path(name))
+        else:
+            dims.append(_path(dataset.name, f"axis_{axis}"))
+    return dims
 
 
 def _attributes(node: h5py.Group | h5py.Dataset) -> dict[str, Any]:

@@ -109,17 +109,23 @@ def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str,
 
 def small(image: Image.Image) -> bytes:
     """The picture as WebP: with all pixels in few colours, or, where that is larger, narrower and with losses."""
-    lines = io.BytesIO()
     few = image.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    few.convert("RGB").save(lines, "webp", lossless=True, quality=60, method=4)
+    lines = _webp(few.convert("RGB"), lossless=True, quality=60, method=2)
 
-    maps = io.BytesIO()
     narrow = image
     if image.width > WIDTH:
         narrow = image.resize((WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS)
-    narrow.save(maps, "webp", quality=QUALITY, method=4)
-    # Which kind a picture is shows by which encoding is shorter.
-    return min(lines.getvalue(), maps.getvalue(), key=len)
+    # Which kind a picture is shows by which encoding is shorter. A quick one first: a slow one shortens it by a fifth.
+    if len(lines) < 0.6 * len(_webp(narrow, quality=QUALITY, method=0)):
+        return lines
+    return min(lines, _webp(narrow, quality=QUALITY, method=4), key=len)
+
+
+def _webp(image: Image.Image, **options: Any) -> bytes:
+    """The ``image`` as WebP, with Pillow's ``options``."""
+    encoded = io.BytesIO()
+    image.save(encoded, "webp", **options)
+    return encoded.getvalue()
 
 
 def numbers(named: Mapping[str, float | None]) -> list[str]:

@@ -20,7 +20,7 @@ from vipetsc.io.folder import origin
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_run
 from vipetsc.io.records import Record
-from vipetsc.io.store import RunFolder, RunMemory
+from vipetsc.io.store import FieldMemory, RunFolder, RunMemory
 from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.measures import can_be_scaled
 from vipetsc.studies.analysis import WHOLE, analyse
@@ -51,6 +51,8 @@ class SweepRuns:
         self.recorded = RecordedRuns(MEMBERS, folder, comm, stop, plan.options.ranks, failures=(Exception,))
         self.linear: dict[str, LinearRun | str] = {}
         self._histories = LinearHistories()
+        # A member's fields are gone when it is measured.
+        self._fields = FieldMemory()
 
     def make_linear(self, case: Case, sites: Collection[int]) -> None:
         """Simulate the linear run of ``case``, and measure it for members with each of the first ``sites`` (cells).
@@ -173,7 +175,7 @@ class SweepRuns:
 
         on_root(self.recorded.team, begin)
         # Measures need all samples and cells, also those that the member does not keep.
-        memory = RunMemory(self.recorded.team)
+        memory = RunMemory(self.recorded.team, fields=self._fields)
         output: RunMemory | RunFolder = memory
         simulated = _with_everything(case, ["velocity"])
         if fields:
