@@ -197,6 +197,9 @@ def test_a_linear_wave_arrives_with_its_host_and_reaches_clearances_by_its_envel
     assert np.array_equal(blocks.max(axis=0), wave.envelope)
     assert np.array_equal(np.maximum(blocks[0], blocks[1]), np.sqrt(envelope_squares(data, [samples // 2])[0]))
     assert Case.of(data) is Case.of(data)
+    first = data.isel(time=[0])
+    assert np.array_equal(envelope_squares(data, [1]), envelope_squares(first, [1]))
+    assert envelope_squares(first, [1]).any()
 
     # The envelope of w is that of an oscillation with the largest w and the largest w'.
     velocity = data["velocity"].values
