@@ -12,7 +12,7 @@ OF_TYPESETTING = ("GSUB", "GPOS", "GDEF")
 def plain_fonts() -> Iterator[None]:
     """Embed fonts without the tables of typesetting within the block."""
     # Loads the tools for fonts, which take a quarter of the time that matplotlib itself takes.
-    from fontTools.subset import Options
+    from fontTools.subset import Options  # type: ignore[import-untyped]
 
     dropped = Options._drop_tables_default
     Options._drop_tables_default = [*dropped, *OF_TYPESETTING]
