@@ -12,6 +12,7 @@ import pytest
 import xarray as xr
 from scipy.integrate import solve_ivp
 
+from tests.conftest import simulated
 from vipetsc.case import Case, CaseError
 from vipetsc.dynamics import simulate
 from vipetsc.io.store import RunMemory
@@ -184,3 +185,26 @@ def test_a_touching_site_that_nothing_presses_is_not_said_to_be_unreached():
     memory = RunMemory(MPI.COMM_SELF)
     result = simulate(case, memory)
     assert "no contact: nothing pressed the site that touches its stop at rest" in result.warnings
+
+
+@pytest.mark.parametrize(("law", "bound"), [("bilinear", 1e-9), ("hertz", 1e-8)])
+@pytest.mark.parametrize("precompression", [0.0, 1e-7])
+def test_steps_end_where_pressed_contacts_open_and_close(law, bound, precompression):
+    """A ring of beads that part and meet a hundred times: within a step each time would cost 1e-8 to 5e-7."""
+    springs = [{"start": 1, "end": 2, "stiffness": 1e2}, {"start": 2, "end": 1, "stiffness": 1e2, "next_cell": True}]
+    each = {"pair": [[1, 2]] * 2 + [[2, 1]] * 2, "next_cell": [False] * 2 + [True] * 2}
+    stiffness = {"hertz": 1e9, "bilinear": 1e6}[law]
+    contacts = {"law": law, "stiffness": stiffness, "clearance": 0.0, "side": "minus", "sites": [1, 2, 1, 2]}
+    if precompression:
+        contacts["precompression"] = precompression
+    case = Case.from_table({
+        "lattice": {"cells": 2, "ends": "periodic", "cell": {"masses": MASSES, "springs": springs}},
+        "contacts": contacts | {"each": each},
+        "drive": {"amplitude": 1.0, "cycles": 1, "frequency": 2e4},
+        "time": {"end": 5e-3, "sample_interval": 1e-5, "engine": "ts"},
+    })  # fmt: skip
+
+    _, result = simulated(case)
+
+    assert result.statistics["landings"] > 80
+    assert result.statistics["ledger_error"] < bound

@@ -78,10 +78,13 @@ def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
     if site.mode == FREE:
         side = 1 - 2 * function
         return AffineForm(0, float(side), -gap_of(site, side), tolerance, side * CLOSED)
-    if abs(site.mode) == PERMANENT:
-        return AffineForm(1, 0.0, -np.inf, 0.0, site.mode)
-
     side = side_of(site.mode)
+    if abs(site.mode) == PERMANENT:
+        # Its force has a kink at D, where the masses meet (function 0) or part.
+        rises = 1 - 2 * function
+        near = MOVED_W * site.scale
+        return AffineForm(0, float(rises * side), -rises * gap_of(site, side), near, site.mode)
+
     if abs(site.mode) == RESTING:
         # Not on D itself: there the many landings would begin again by which the site came to rest.
         moved = MOVED_W * site.scale
@@ -138,23 +141,56 @@ def stays_landed(site: Any, start: np.ndarray, end: np.ndarray, h: float, b: np.
 
 
 @kernel
-def first_change(contacts: np.ndarray, start: np.ndarray, end: np.ndarray, h: float, room: np.ndarray) -> ModeChange:
+def _passes_kink(site: Any, b: np.ndarray) -> bool:
+    """Whether a permanent ``site`` may open or close in a step with the Bernstein form ``b`` of w, before its end."""
+    side = side_of(site.mode)
+    gap = gap_of(site, side)
+    near = MOVED_W * site.scale
+    lowest = np.inf
+    highest = -np.inf
+    for w in b:
+        lowest = min(lowest, side * w - gap)
+        highest = max(highest, side * w - gap)
+    # A step that ends on the kink has it not inside; near the kink the force is no force.
+    return highest > near and lowest < 0.0 and abs(side * b[5] - gap) > near
+
+
+@kernel
+def _next_kink(site: Any, motion: np.ndarray) -> int:
+    """The switching function of a permanent ``site`` that crosses zero next: 0 meets, 1 parts; ``motion`` (3,)."""
+    side = side_of(site.mode)
+    depth = side * motion[0] - gap_of(site, side)
+    near = MOVED_W * site.scale
+    is_closed = depth > near or (depth >= -near and side * motion[1] > 0.0)
+    return 1 if is_closed else 0
+
+
+@kernel
+def first_change(
+    contacts: np.ndarray, start: np.ndarray, end: np.ndarray, h: float, room: np.ndarray, kinks: bool = False
+) -> ModeChange:
     """The first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3).
 
-    ``room`` (2, 6) is overwritten.
+    With ``kinks`` also where a permanent contact opens or closes, which changes no mode. ``room`` (2, 6) is
+    overwritten.
     """
     first = ModeChange(2.0, -1, 0)
     b = room[0]
     c = room[1]
     for i in range(contacts.size):
-        if abs(contacts[i].mode) == PERMANENT:
+        permanent = abs(contacts[i].mode) == PERMANENT
+        if permanent and not kinks:
             continue
         bernstein(start[i], end[i], h, b)
+        if permanent and not _passes_kink(contacts[i], b):
+            continue
         # The coefficients bound the motion: nearly all free sites are done here, without a search.
         if _stays_free(contacts[i], b):
             continue
 
         for function in range(2):
+            if permanent and function != _next_kink(contacts[i], start[i]):
+                continue
             form = _affine_form(contacts, i, function)
             if form.offset == -np.inf:
                 continue

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vipetsc.compiled import kernel, njit
-from vipetsc.contact.changes import LANDED_G, LANDED_W, Extremes, extremes, switching
+from vipetsc.contact.changes import LANDED_G, LANDED_W, MOVED_W, Extremes, extremes, switching
 from vipetsc.contact.law import (
     CLIPPED,
     CLOSED,
@@ -115,6 +115,9 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
     """
     switched = 0
     for i in range(contacts.size):
+        # A step may end on the kink of a permanent contact, whose mode stays.
+        if abs(contacts[i].mode) == PERMANENT:
+            continue
         for function in range(2):
             value, rate, tolerance, mode = switching(contacts, i, function, motion[i])
             if value < -tolerance:
@@ -206,6 +209,20 @@ def _set_mode(
         track.counts.clipped += 1
 
 
+@njit(error_model="numpy")
+def shortest_beginning(contacts: np.ndarray, motion: np.ndarray) -> float:
+    """As ``shortest_impact``, of the permanent contacts that close at this ``motion`` (sites, 3)."""
+    shortest = np.inf
+    for i in range(contacts.size):
+        site = contacts[i]
+        if abs(site.mode) == PERMANENT:
+            side = side_of(site.mode)
+            rate = side * motion[i, 1]
+            if rate > 0.0 and abs(side * motion[i, 0] - gap_of(site, side)) <= MOVED_W * site.scale:
+                shortest = min(shortest, impact_time(site, rate))
+    return shortest
+
+
 @kernel
 def shortest_impact(contacts: np.ndarray) -> float:
     """The smallest ``impact_time`` in s of the ``contacts`` (site,) that are closed; inf if none is.
@@ -293,8 +310,11 @@ class ImpactTracker:
         return self.tracks.sites["counts"]
 
     def contact_time(self) -> float:
-        """Shortest duration in s of a contact now open, by its approach velocity; inf if none is open."""
-        return shortest_impact(self.contacts)
+        """Shortest duration in s of a contact that is closed now, by its approach velocity; inf if none is.
+
+        Of permanent contacts those count that close at the motion in ``start``, by the velocity there.
+        """
+        return min(shortest_impact(self.contacts), shortest_beginning(self.contacts, self.start))
 
     def accept_step(self, h: float) -> None:
         """Take the step of ``h`` seconds as done: update the open episodes; its end is the next one's start."""

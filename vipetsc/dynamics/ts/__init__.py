@@ -19,6 +19,8 @@ control off where they occur, hence:
 - after each accepted step every site is searched for a change (see ``vipetsc.contact``), and one reduction finds the
   earliest over all ranks; the state returns to a saved copy and the step is repeated so that it ends on the change,
   to |w - D| <= 1e-10 D, where modes switch;
+- contacts that touch or are pressed at rest keep their mode and have a kink where they open or close: steps end there,
+  too, to 1e-8 of their scale: the impulse of what is left of the kink goes with the square of that;
 - a rejected trial also returns to the saved copy: PETSc rolls back by subtraction, which loses digits where the trial
   was far too long for a contact;
 - TSRK restarts after every change, so that a first-same-as-last pair does not reuse a stage of the old modes, and at
