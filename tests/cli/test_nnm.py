@@ -69,12 +69,12 @@ def test_a_branch_leaves_its_files_and_its_picture_and_is_not_computed_twice(vip
 
 
 def test_resumed_branch_is_the_uninterrupted_one(in_process, case, tmp_path):
-    """A branch of 30 points that is resumed to 80 has the bits of one that was followed to 80 at once."""
+    """A branch of 20 points that is resumed to 48 has the bits of one that was followed to 48 at once."""
     whole = tmp_path / "whole"
     parts = tmp_path / "parts"
-    assert in_process("nnm", case, "--out", whole, "--set", "nnm.points=80").returncode == 0
-    assert in_process("nnm", case, "--out", parts, "--set", "nnm.points=30").returncode == 0
-    assert in_process("nnm", case, "--out", parts, "--set", "nnm.points=80", "--resume").returncode == 0
+    assert in_process("nnm", case, "--out", whole, "--set", "nnm.points=48").returncode == 0
+    assert in_process("nnm", case, "--out", parts, "--set", "nnm.points=20").returncode == 0
+    assert in_process("nnm", case, "--out", parts, "--set", "nnm.points=48", "--resume").returncode == 0
 
     expected = datasets(whole / "branch-out-of-phase.h5")
     assert_same_bits(datasets(parts / "branch-out-of-phase.h5"), expected)
