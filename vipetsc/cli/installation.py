@@ -40,7 +40,7 @@ PACKAGES = (
     Package("scipy", "1.10", "1.17"),
     Package("matplotlib", "3.6", "3.11"),
     Package("jinja2", "3.1", "3.1"),
-    Package("numba", "0.60", "0.68"),
+    Package("numba", "0.63", "0.68"),
     Package("pillow", "9", "13", module="PIL"),
     Package("pydantic", "2.9", "2.14"),
     Package("tqdm", "4.66", "4.70"),
