@@ -49,7 +49,7 @@ class _EntryLowering(NativeLowering):
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _LinkedLowering(_EntryLowering):
-    """The same to a ``_LinkedLibrary``."""
+    """Lowering by ``TupleLower`` to a ``_LinkedLibrary``."""
 
     _name = "linked_lowering"
 

@@ -126,7 +126,8 @@ def test_a_member_that_fails_is_an_outcome_and_a_full_disk_an_end(folder, inject
         assert expected[kind] in reason
         assert not result.complete
         assert not result.resumable
-        assert result.count(2) < 6
+        # A rank alone fails in its linear run, and may have drawn all members before the other rank has its own.
+        assert 1 <= result.count(2) < 6 + (team == 1)
 
     injector.disarm()
     comm.Barrier()

@@ -142,3 +142,25 @@ def test_many_conservative_hertzian_contacts_keep_the_energy():
     assert result.statistics["switches"] > 400
     # 3.2e-8 if the first step of each contact went in time and not in its root.
     assert result.statistics["ledger_error"] < 1e-8
+
+
+def test_a_checkpoint_at_an_onset_goes_on_to_the_same_bits():
+    """Where an onset falls on a sample, the step after it still goes in the root of time."""
+    model = small_case(contacts={"law": "hertz", "sites": [5], "clearance": 1e-3}, time={"engine": "ts"}).model()
+    layout = Layout(model, MPI.COMM_SELF)
+    whole = Integrator(model, layout)
+    # The resonator of the site stands on its stop and moves on: a contact begins.
+    cells = np.zeros((layout.cells, 2 * layout.dofs))
+    resonator = model.chain.cell.resonator
+    cells[4, resonator] = 1e-3
+    cells[4, layout.dofs + resonator] = 1.0
+    whole.begin(cells, np.array([[1e-3, 1.0]]), 0.0)
+
+    parts = Integrator(model, layout)
+    parts.restore([whole.checkpoint()])
+    for engine in (whole, parts):
+        engine.advance(1e-3)
+
+    assert whole.tracker.contacts["mode"][0] != 0 or len(whole.take_episodes()) > 0
+    np.testing.assert_array_equal(parts.state.array_r, whole.state.array_r)
+    assert parts.counts == whole.counts

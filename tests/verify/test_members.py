@@ -185,3 +185,17 @@ def test_modal_energies_of_members_are_what_work_and_losses_leave(sweep):
 
     upper = energy.values[:, [4, 6]].sum(axis=1) / work
     assert ensemble["upper_share_at_end"].values == pytest.approx(upper, rel=1e-12)
+
+
+def test_all_members_say_alike_why_their_linear_run_failed(tmp_path, monkeypatch):
+    """The member that makes the linear run and those that find it failed: the error's type says what was too little."""
+
+    def fail(self, case):
+        raise MemoryError("Unable to allocate 1.00 TiB")
+
+    monkeypatch.setattr(SweepRuns, "_make_history", fail)
+    table = TABLE | {"sweep": {"drive": {"amplitude": [1e-3, 2e-3, 3e-3]}}}
+    run_sweep(Sweep.from_table(table), tmp_path / "out")
+
+    failed = json.loads((tmp_path / "out" / "index.json").read_text())["failed"]
+    assert [row["reason"] for row in failed] == ["MemoryError: Unable to allocate 1.00 TiB"] * 3

@@ -157,12 +157,17 @@ def _passes_kink(site: Any, b: np.ndarray) -> bool:
 
 @kernel
 def _next_kink(site: Any, motion: np.ndarray) -> int:
-    """The switching function of a permanent ``site`` that crosses zero next: 0 meets, 1 parts; ``motion`` (3,)."""
+    """The switching function of a permanent ``site`` that crosses zero next.
+
+    It is 0 where the masses will meet and 1 where they will part. ``motion`` (3,) are w, w', w''; on the kink itself
+    the direction decides.
+    """
     side = side_of(site.mode)
     depth = side * motion[0] - gap_of(site, side)
     near = MOVED_W * site.scale
-    is_closed = depth > near or (depth >= -near and side * motion[1] > 0.0)
-    return 1 if is_closed else 0
+    if depth > near or (depth >= -near and side * motion[1] > 0.0):
+        return 1
+    return 0
 
 
 @kernel

@@ -138,8 +138,8 @@ def rest_site(contacts: np.ndarray, tracks: Tracks, i: int, motion: np.ndarray, 
     """Let site ``i`` rest in contact if it touches a stop without clearance; whether it does. The log must have room.
 
     ``contacts`` (site,) are of dtype ``SITE``; ``motion`` (site, 3) has w, w' and w'' at the time ``t`` in s, and
-    ``energies`` (site,) in J are what sites have dissipated. Motion below the tolerance of a landing can ask for one
-    landing after the other at the same time: the force of a site at rest needs none.
+    ``energies`` (site,) in J are the ledger's, which change as in ``switch_sites``. Motion below the tolerance of a
+    landing can ask for one landing after the other at the same time: the force of a site at rest needs none.
     """
     site = contacts[i]
     side = resting_side(site)
@@ -332,7 +332,7 @@ class ImpactTracker:
     def rest(self, number: int, t: float, energies: np.ndarray) -> None:
         """Let the site of that ``number`` in the log rest in contact at ``t`` in s, if it is here.
 
-        ``energies`` (sites,) are the dissipated energies in J; the motion is that in ``start``.
+        ``energies`` (sites,) are the ledger's in J, and change as in ``switch_sites``; the motion is that in ``start``.
         """
         self.tracks = with_room(self.tracks)
         for i in np.flatnonzero(self.tracks.sites["number"] == number):

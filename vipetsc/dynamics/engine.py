@@ -33,7 +33,6 @@ class Engine(ABC):
     """
 
     name: ClassVar[str]
-    opens: ClassVar[bool] = False  # whether a run may ``open`` with samples of another one
     state: PETSc.Vec
     time: float
 
@@ -74,14 +73,17 @@ class Engine(ABC):
         A part has the arrays that ``checkpoint`` returned on its rank; all ranks must call it.
         """
 
-    def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Go on from a checkpoint of a run without sites, given the parts of all its ranks; sites stand at rest.
-
-        A part has the arrays that ``checkpoint`` returned on its rank. Raises NotImplementedError, on all ranks, for an
-        engine whose ``opens`` is false; ``simulate`` asks it for none.
-        """
-        raise NotImplementedError(f"{self.name} does not open with samples of another run")
-
     @abstractmethod
     def destroy(self) -> None:
         """Free the PETSc objects now, on all ranks together, rather than whenever each rank's collector runs."""
+
+
+class OpeningEngine(Engine):
+    """An engine that can begin with the samples of a run without sites, of which the state after them is kept."""
+
+    @abstractmethod
+    def open(self, checkpoints: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Go on from a checkpoint of a run without sites, given the parts of all its ranks; sites stand at rest.
+
+        A part has the arrays that ``checkpoint`` returned on its rank; all ranks must call it.
+        """

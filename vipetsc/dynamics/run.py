@@ -17,7 +17,7 @@ from vipetsc.case import Case, Model
 from vipetsc.case.html import html_table
 from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
-from vipetsc.dynamics.engine import Engine, FillResult
+from vipetsc.dynamics.engine import Engine, FillResult, OpeningEngine
 from vipetsc.dynamics.engine_choice import EngineChoice, choose_engine
 from vipetsc.dynamics.failing_place import failing_place
 from vipetsc.dynamics.initial import set_in_motion
@@ -174,7 +174,7 @@ def simulate(
     watching: list[type[Observer]] = [Guard, *observers, Ledger]
     if progress:
         watching.append(ProgressReport)
-    if observers or not ENGINES[choice.name].opens:
+    if observers or not issubclass(ENGINES[choice.name], OpeningEngine):
         opening = None
     simulation = Simulation(case, model, choice, stop, watching, opening)
     if isinstance(target, RunOutput):
@@ -286,9 +286,11 @@ class Run:
 
     def open(self, opening: Opening) -> None:
         """Begin with the samples of an ``opening``; all ranks must call it."""
+        engine = self.setup.engine
+        assert isinstance(engine, OpeningEngine)  # ``simulate`` has an opening for no other
         checkpoints = opening.checkpoint()
         self.recorder.record(opening)
-        self.setup.engine.open(checkpoints)
+        engine.open(checkpoints)
         self._go_on(checkpoints[0])
 
     def _go_on(self, state: Mapping[str, np.ndarray]) -> None:

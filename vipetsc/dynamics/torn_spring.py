@@ -38,13 +38,13 @@ def torn_spring(setup: Setup) -> str:
     # The first rank has the springs to the wall on the left, too, whose cell is -1.
     first = layout.start - (layout.start == 0)
     here = places[(places[:, 0] >= first) & (places[:, 0] < layout.stop)]
-    worst = None
+    worst_here = None
     if len(here):
-        worst = _worst(chain, here, _elongations(setup, here, y))
-    torn = [each for each in layout.comm.allgather(worst) if each]
-    if not torn:
+        worst_here = _worst(chain, here, _elongations(setup, here, y))
+    worst_of_ranks = [worst for worst in layout.comm.allgather(worst_here) if worst]
+    if not worst_of_ranks:
         return ""
-    worst = max(torn)
+    worst = max(worst_of_ranks)
     place = "at the left wall"
     if worst.cell >= 0:
         place = f"of cell {worst.cell + 1}"
@@ -75,17 +75,20 @@ def _elongations(setup: Setup, places: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _worst(chain: Chain, places: np.ndarray, elongations: np.ndarray) -> _Torn | None:
-    """Of the springs at ``places`` (spring, 2) the one farthest beyond the zero of its force; None if none is."""
-    worst = None
+    """Of the springs at ``places`` (spring, 2) the one farthest beyond the zero of its force; None if none is.
+
+    ``elongations`` (spring,) are in m.
+    """
+    torn = []
     for (cell, number), z in zip(places.tolist(), elongations.tolist(), strict=True):
         spring = chain.spring(cell, number)
-        # The force over z, k + q z + c z^2, is positive at rest: it pulls back up to its first zero on either side.
-        zeros = np.roots([spring.cubic, spring.quadratic, spring.stiffness])
-        ahead = [float(zero.real) for zero in zeros if zero.imag == 0 and 0 < zero.real / z < 1] if z else []
-        pushes = spring.stiffness + (spring.quadratic + spring.cubic * z) * z < 0
-        if not ahead or not pushes:
+        # The force over z, k + q z + c z^2, is positive at rest: up to its first zero on that side it pulls back.
+        if spring.stiffness + (spring.quadratic + spring.cubic * z) * z >= 0 or not np.isfinite(z):
             continue
-        limit = min(ahead, key=abs)
-        candidate = _Torn(z / limit, cell, number, z, limit)
-        worst = candidate if worst is None else max(worst, candidate)
-    return worst
+        zeros = np.roots([spring.cubic, spring.quadratic, spring.stiffness])
+        passed = [float(zero.real) for zero in zeros if zero.imag == 0 and 0 < zero.real / z < 1]
+        # A spring that pushes from rest on has no such zero.
+        if passed:
+            limit = min(passed, key=abs)
+            torn.append(_Torn(ratio=z / limit, cell=cell, number=number, elongation=z, limit=limit))
+    return max(torn, default=None)

@@ -173,12 +173,16 @@ class TaskPool:
 
     def _judge(self, error: Exception) -> JobEnd:
         """Whether an ``error`` is a failure of its job alone or ends all jobs, and how it is reported."""
-        is_failure = isinstance(error, self.failures) and not is_disk_full(error)
-        text = str(error)
-        # Errors of this program are sentences; of others the type says what they are about.
-        is_sentence = isinstance(error, RuntimeError) or (isinstance(error, OSError) and not is_failure)
-        if not is_sentence:
-            text = f"{type(error).__name__}: {text}"
-        if is_failure:
-            return JobEnd(Ending.FAILED, text)
-        return JobEnd(Ending.FATAL, text)
+        if isinstance(error, self.failures) and not is_disk_full(error):
+            return JobEnd(Ending.FAILED, reason_of(error))
+        if isinstance(error, OSError):
+            return JobEnd(Ending.FATAL, str(error))
+        return JobEnd(Ending.FATAL, reason_of(error))
+
+
+def reason_of(error: Exception) -> str:
+    """Why a job failed, in words: the message of its ``error``, after the type where another program worded it."""
+    # RuntimeErrors of this program are sentences; of others the type says what they are about.
+    if isinstance(error, RuntimeError):
+        return str(error)
+    return f"{type(error).__name__}: {error}"

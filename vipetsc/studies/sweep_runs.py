@@ -27,6 +27,7 @@ from vipetsc.studies.analysis import WHOLE, analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
 from vipetsc.studies.linear_history import LinearHistories, LinearHistory, begins_linearly
 from vipetsc.studies.linear_run import MARGIN, MEMBERS, LinearRun, factor, leading_cell, linear_name, measured
+from vipetsc.studies.pool import reason_of
 from vipetsc.studies.recorded_runs import RecordedRuns
 
 FIELDS = ("displacement", "velocity")
@@ -76,7 +77,7 @@ class SweepRuns:
             self._keep(name, history, case)
         except Exception as error:
             # Every member that needs it fails with this reason, without another try.
-            self.linear[name] = str(error) or type(error).__name__
+            self.linear[name] = reason_of(error)
             raise
 
     def _make_history(self, case: Case) -> LinearHistory:

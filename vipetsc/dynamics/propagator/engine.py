@@ -17,7 +17,7 @@ from vipetsc.case import Model
 from vipetsc.compiled import kernel, njit
 from vipetsc.contact.tracker import Tracks
 from vipetsc.dynamics.drives import Drives
-from vipetsc.dynamics.engine import Engine, FillResult
+from vipetsc.dynamics.engine import FillResult, OpeningEngine
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.log import PROPAGATOR
 from vipetsc.dynamics.propagator.clusters import DofTables, apply_impulses, expand_free_motion
@@ -160,11 +160,10 @@ def take_steps(
     return error, tracks.log
 
 
-class Propagator(Engine):
+class Propagator(OpeningEngine):
     """Advances a lattice from sample to sample; see ``Engine``."""
 
     name = "propagator"
-    opens = True
 
     def __init__(self, model: Model, layout: Layout, stop: StopRequest | None = None) -> None:
         series = step_series(model)

@@ -224,7 +224,8 @@ class Integrator(Engine):
     def _first_change(self, h: float) -> ModeChange:
         """The first change of this rank's sites in the step of ``h`` s that was just tried."""
         tracker = self.tracker
-        return first_change(tracker.contacts, tracker.start, tracker.end, h, np.empty((2, 6)), True)
+        room = np.empty((2, 6))
+        return first_change(tracker.contacts, tracker.start, tracker.end, h, room, kinks=True)
 
     def _land(self, h: float, position: float, change: ModeChange) -> None:
         """Step from the saved state onto the change at ``position`` in the step just tried, and switch there.

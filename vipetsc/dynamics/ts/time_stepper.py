@@ -78,11 +78,13 @@ class TimeStepper:
 
     def _try(self, time: float, h: float, after_onset: bool) -> StepOutcome:
         ts = self.ts
-        ts.setTime(time)
-        ts.setTimeStep(h)
+        begin = time
         if after_onset:
-            ts.setTime(0.0)
+            # PETSc's time is z, from 0 to h as well.
+            begin = 0.0
             self._onset[0] = (time, h)
+        ts.setTime(begin)
+        ts.setTimeStep(h)
         ts.step()
         suggestion = ts.getTimeStep()
         if after_onset:
@@ -90,16 +92,17 @@ class TimeStepper:
             # The last stage of a first-same-as-last pair is a rate by z.
             ts.restartStep()
         if np.isfinite(suggestion) and ts.getConvergedReason() >= 0:
-            return StepOutcome(True, suggestion)
+            # After an onset it is a length in z. That is a cautious one in t: at the end of the step dt/dz = 2.
+            return StepOutcome(accepted=True, suggestion=suggestion)
 
         self.undo_step()
         # The error of a trial that overflows is not finite, and no step follows from it: a much shorter one is tried.
         if not np.isfinite(suggestion):
-            return StepOutcome(False, 0.1 * h)
+            return StepOutcome(accepted=False, suggestion=0.1 * h)
         if after_onset:
-            # Lengths in z are roots of those in t.
-            return StepOutcome(False, suggestion * suggestion / h)
-        return StepOutcome(False, suggestion)
+            # From z = 0 on, a length in t is z^2/h.
+            suggestion = suggestion * suggestion / h
+        return StepOutcome(accepted=False, suggestion=suggestion)
 
     def undo_step(self) -> None:
         """Go back to the state that the last step began with."""
