@@ -19,7 +19,6 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.dynamics import simulate
 from vipetsc.identification.motion import MotionCoefficients, no_slopes, respond, stacked_slopes
 from vipetsc.identification.motion_begin import MotionBegin
-from vipetsc.identification.motion_rates import Slopes
 from vipetsc.io.store import RunMemory
 from vipetsc.lattice import linear_modes, nonlinear_places
 from vipetsc.modes.response.steady import SteadyStates
@@ -124,7 +123,7 @@ def test_the_motion_of_identification_is_that_of_scipy(run, exact):
     begin = MotionBegin(time=0.0, state=exact[0], slopes=np.zeros((4 * CELLS, 0)))
     watched = np.arange(2 * CELLS)
     coefficients = MotionCoefficients.of(model)
-    slopes = Slopes(*(array[:0] for array in stacked_slopes([no_slopes(model, coefficients)])))
+    slopes = stacked_slopes([], no_slopes(model, coefficients))
     motion = respond(model, coefficients, slopes, run["time"].values, watched, begin=begin).motion
     assert np.abs(motion[:, :, 0, 0] - exact[:, : 2 * CELLS]).max() < 1e-7 * np.abs(exact[:, : 2 * CELLS]).max()
 

@@ -7,6 +7,7 @@ import numpy as np
 from vipetsc.dynamics.observers import Setup
 from vipetsc.lattice import nonlinear_numbers
 from vipetsc.lattice.chain import Chain
+from vipetsc.parallel import on_every_rank
 
 
 class _Torn(NamedTuple):
@@ -38,9 +39,7 @@ def torn_spring(setup: Setup) -> str:
     # The first rank has the springs to the wall on the left, too, whose cell is -1.
     first = layout.start - (layout.start == 0)
     here = places[(places[:, 0] >= first) & (places[:, 0] < layout.stop)]
-    worst_here = None
-    if len(here):
-        worst_here = _worst(chain, here, _elongations(setup, here, y))
+    worst_here = on_every_rank(layout.comm, lambda: _worst(chain, here, _elongations(setup, here, y)))
     worst_of_ranks = [worst for worst in layout.comm.allgather(worst_here) if worst]
     if not worst_of_ranks:
         return ""

@@ -20,7 +20,7 @@ from vipetsc.identification.motion import (
     stacked_slopes,
 )
 from vipetsc.identification.motion_begin import MotionBegin
-from vipetsc.identification.motion_rates import SHORT, Slopes
+from vipetsc.identification.motion_rates import SHORT
 from vipetsc.identification.precision import EXACT, Tolerances
 
 # Rows of a response, by the quantity of a sensor; the derivative with respect to time is in the row after it.
@@ -162,13 +162,10 @@ class Misfit:
         none = no_slopes(model, coefficients)
         # Behind the parameters come coordinates of the initial state, on which no coefficient depends.
         rows = [slope.coefficients for slope in by_parameter] + [none] * len(estimated)
-        slopes = stacked_slopes(rows or [none])
-        if not rows:
-            slopes = Slopes(*(array[:0] for array in slopes))
         return respond(
             model,
             coefficients,
-            slopes,
+            stacked_slopes(rows, none),
             times=self.times(z, number, end)[::stride],
             watched=watched,
             touches=table.contact,

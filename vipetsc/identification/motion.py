@@ -157,9 +157,13 @@ def scaled_slopes(slopes: Slopes, factor: float) -> Slopes:
     return slopes._replace(**scaled)
 
 
-def stacked_slopes(rows: Sequence[Slopes]) -> Slopes:
-    """The derivatives ``rows`` of each parameter in arrays with an axis of parameters."""
-    return Slopes(*(np.stack(arrays) for arrays in zip(*rows, strict=True)))
+def stacked_slopes(rows: Sequence[Slopes], none: Slopes) -> Slopes:
+    """The derivatives ``rows`` of each parameter in arrays with an axis of parameters.
+
+    ``none`` are those of ``no_slopes``, which give the arrays their shapes where there is no parameter.
+    """
+    stacked = (np.stack(arrays) for arrays in zip(none, *rows, strict=True))
+    return Slopes(*(array[1:] for array in stacked))
 
 
 class RecordedMotion(NamedTuple):
