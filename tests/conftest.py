@@ -34,7 +34,7 @@ from vipetsc.case import Case, Sweep
 from vipetsc.cli.main import main
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.observers import Observer
-from vipetsc.dynamics.run import Result
+from vipetsc.dynamics.result import Result
 from vipetsc.io.records import RecordFile
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from tests.conftest import simulated, small_case
 from vipetsc.case import Case
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.run import Result
+from vipetsc.dynamics.result import Result
 from vipetsc.dynamics.ts.integrator import Integrator
 
 

@@ -11,7 +11,7 @@ from tests.conftest import small_case
 from vipetsc.case import Case
 from vipetsc.cli.main import main
 from vipetsc.dynamics import simulate
-from vipetsc.dynamics.run import Result
+from vipetsc.dynamics.result import Result
 
 HALF = {"time": {"end": 0.04}}
 

@@ -4,7 +4,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from vipetsc.dynamics.run import Result, simulate
+    from vipetsc.dynamics.result import Result
+    from vipetsc.dynamics.run import simulate
 
 
 def __getattr__(name: str) -> object:

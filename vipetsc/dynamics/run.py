@@ -4,17 +4,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 from mpi4py import MPI
 
 import numpy as np
 
 from vipetsc.case import Case, Model
-from vipetsc.case.html import html_table
 from vipetsc.dynamics import log
 from vipetsc.dynamics.energies import EnergyMeter
 from vipetsc.dynamics.engine import Engine, FillResult, OpeningEngine
@@ -28,32 +26,19 @@ from vipetsc.dynamics.opening import Opening
 from vipetsc.dynamics.options import check_options, options_of, petsc_options, with_database
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.recorder import Recorder
+from vipetsc.dynamics.result import Result
 from vipetsc.dynamics.samples import Block, Samples
 from vipetsc.dynamics.ts.integrator import Integrator
 from vipetsc.io.folder import RUN, claimed, provenance
-from vipetsc.io.read import open_results
 from vipetsc.io.store import RunFolder, RunMemory, RunOutput
 from vipetsc.parallel import StopRequest, install_abort_hook, on_every_rank
 from vipetsc.process import compiling
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Propagator, Integrator)}
 # Cells times samples between two looks at requests to stop: a fraction of a second.
 BLOCK_CELLS = 1_000_000
 NOTICED = 1.0  # s of the compiler's clock, in which kernels that are there may be loaded
 COMPLETE, STOPPED, FAILED = "complete", "stopped", "failed"
-# Statistics that a notebook shows, with their words.
-SHOWN = {
-    "engine": "engine",
-    "samples": "samples",
-    "episodes": "impacts",
-    "work": "work in J",
-    "dissipated": "dissipated in J",
-    "ledger_error": "error of the energy balance",
-    "wall_seconds": "wall time in s",
-}
 
 
 class Failure(NamedTuple):
@@ -69,42 +54,6 @@ class Begin(NamedTuple):
     wall: float
     cpu: float
     compiled: float
-
-
-@dataclass(frozen=True)
-class Result:
-    """Result of a run.
-
-    ``complete``: the whole case was simulated; ``resumable``: it was stopped and can go on from its last
-    checkpoint; neither: it failed, and ``run.h5`` holds the samples up to the last good one. ``sentence`` says
-    it in words, ``statistics`` in numbers; ``warnings`` are sentences about results that are not what they seem. All
-    are the same on all ranks, but for ``held``, the run of a simulation without a folder, which rank 0 has.
-    """
-
-    complete: bool
-    resumable: bool
-    sentence: str
-    statistics: dict[str, Any]
-    warnings: list[str]
-    folder: Path | None
-    held: "xr.Dataset | None" = field(default=None, repr=False, compare=False)
-
-    @cached_property
-    def dataset(self) -> "xr.Dataset | None":
-        """The run: opened in its folder, or the one in memory, which only rank 0 has; None for one that was stopped.
-
-        Raises OSError if the file is gone.
-        """
-        if self.folder is None or self.resumable:
-            return self.held
-        return open_results(self.folder / "run.h5")
-
-    def _repr_html_(self) -> str:
-        """The ending, warnings and some numbers, as a notebook shows them."""
-        rows = [(text, self.statistics.get(key)) for key, text in SHOWN.items()]
-        rows += [("run", self.folder or "in memory, as `dataset`")]
-        rows += [("warning", warning) for warning in self.warnings]
-        return html_table(self.sentence, rows)
 
 
 def simulate(
@@ -188,24 +137,12 @@ def simulate(
         # A run that a kill has ended between its file and its publication is published now.
         ended = output.ending()
         if ended:
-            result = result_of(ended, False, output.folder)
+            result = Result.from_attributes(ended, resumable=False, folder=output.folder)
         else:
             result = simulation.make(output)
         if not result.resumable:
             claim.publish()
     return replace(result, folder=claim.path)
-
-
-def result_of(attributes: Mapping[str, Any], resumable: bool, folder: Path | None) -> Result:
-    """The result that the ``attributes`` of a run state."""
-    return Result(
-        complete=attributes["complete"],
-        resumable=resumable,
-        sentence=attributes["status"],
-        statistics=attributes["statistics"],
-        warnings=attributes.get("warnings", []),
-        folder=folder,
-    )
 
 
 @dataclass(frozen=True)
@@ -365,7 +302,7 @@ class Run:
             state |= {f"{observer.name}/{key}": value for key, value in observer.checkpoint().items()}
         self.setup.output.save_state(state)
 
-    def finish(self, ending: str, sentence: str, begin: "Begin", note: dict[str, str]) -> Result:
+    def finish(self, ending: str, sentence: str, begin: Begin, note: dict[str, str]) -> Result:
         """Write the last checkpoint of a run that was stopped, or the files of one that ended."""
         engine = self.setup.engine
         output = self.setup.output
@@ -398,4 +335,4 @@ class Run:
             output.end = np.concatenate(motions) if motions else None
         if ending != STOPPED:
             output.finish(attributes, {"case": self.setup.case.model_dump(by_alias=True)})
-        return result_of(attributes, ending == STOPPED, output.folder)
+        return Result.from_attributes(attributes, resumable=ending == STOPPED, folder=output.folder)

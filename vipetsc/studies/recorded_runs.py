@@ -16,7 +16,7 @@ import vipetsc
 from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.opening import Opening
-from vipetsc.dynamics.run import Result
+from vipetsc.dynamics.result import Result
 from vipetsc.io.records import Line, Record, RecordFile, merge_records, read_records
 from vipetsc.io.store import RunMemory, RunOutput
 from vipetsc.parallel import StoppedError, StopRequest, on_root
