@@ -12,7 +12,8 @@ from vipetsc.contact.law import CLIPPED, FREE, elastic_force_and_slope, gap_of, 
 from vipetsc.dynamics.drives import Drives, drive_force
 from vipetsc.dynamics.spring_law import nonlinear_force, nonlinear_slope
 
-# Fraction of a period over which the rate of a drive's force is differenced.
+# Half the time, in 1/omega of a drive's highest frequency, over which its force is differenced for a rate. The error of
+# the difference is 1e-12/6, that of rounding 1e-10.
 SHORT = 1e-6
 
 
@@ -107,7 +108,12 @@ def difference(y: np.ndarray, ends: np.ndarray, i: int, first: int, j: int) -> f
 
 @kernel
 def _add_contact(lattice: Lattice, i: int, y: np.ndarray, approach: np.ndarray, out: np.ndarray) -> None:
-    """Add the force of the closed site ``i`` and its derivatives to ``out`` (2n, column), in the rows of velocities."""
+    """Add the force of the closed site ``i`` and its derivatives to ``out`` (2n, column), in the rows of velocities.
+
+    F = sigma f(x) g with x = sigma w - D and g = 1 + c v/q, where v = w', q = w'_minus and c is the damping. Hence
+
+        F_w = f' g,    F_v = sigma f c/q,    F_q = -F_v v/q,    F_D = -sigma f' g,    F_c = sigma f v/q.
+    """
     n = lattice.inverse_mass.size
     site = lattice.contacts[i]
     slopes = lattice.slopes
@@ -120,7 +126,7 @@ def _add_contact(lattice: Lattice, i: int, y: np.ndarray, approach: np.ndarray, 
     g = 1.0 + site.damping * rate / site.approach
     by_rate = side * elastic * site.damping / site.approach
     by_approach = -by_rate * rate / site.approach
-    # x^n log x vanishes at the onset, before which the law is continued as an odd function.
+    # The derivative of k x^n by n is k x^n log x. It vanishes at the onset; a landing may end at an x just below zero.
     by_exponent = elastic * np.log(x) if x > 0.0 else 0.0
 
     host = lattice.ends[i, 0]
@@ -239,8 +245,7 @@ def jerk(lattice: Lattice, motion: MotionState, t: float, i: int) -> float:
     for k in range(lattice.curved.numbers.size):
         ends = lattice.curved.ends
         if ends[k, 0] == i or ends[k, 1] == i:
-            law = lattice.curved.laws[lattice.curved.numbers[k]]
-            slope = nonlinear_slope(law, difference(motion.state, ends, k, 0, 0))
+            slope = nonlinear_slope(lattice.curved.laws[k], difference(motion.state, ends, k, 0, 0))
             change = slope * difference(rates, ends, k, 0, 0)
             total += change if ends[k, 0] == i else -change
 
