@@ -60,13 +60,17 @@ def test_schema_and_texts_have_the_keys_of_the_validator():
 def test_the_chapter_on_keys_has_those_of_the_validator():
     """The manual's table of each section has the keys that the validator takes there, once."""
     validator = classes()
+    chapter = keys.chapter()
     shown = {}
-    for path, text in re.findall(r"^## \[(\S+)\]\n(.*?)(?=^## |\Z)", keys.chapter(), flags=re.M | re.S):
+    for path, text in re.findall(r"^## \[(\S+)\]\n(.*?)(?=^## |\Z)", chapter, flags=re.M | re.S):
         shown.setdefault(path, set()).update(re.findall(r"^\| `(\w+)` \|", text, flags=re.M))
     for section, table in SECTIONS.items():
         assert shown[section] == validator[table.__name__], section
     # Counted as well: a key that stands twice would be lost in the sets.
     assert sum(map(len, shown.values())) == sum(map(len, validator.values()))
+    # An empty list is no default: ``nfrc.fixed`` without values has the drive's frequency, as its text says.
+    assert "| `[]` |" not in chapter
+    assert re.search(r"^\| `fixed` \| list of number > 0 \|  \|  \| .*default: that of the drive", chapter, flags=re.M)
 
 
 def test_a_refused_key_names_those_of_the_schema():

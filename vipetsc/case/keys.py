@@ -172,10 +172,12 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
     for key, item in rows:
         unit, text = unit_and_text(name, key)
         default = item.get("default")
+        # An empty list stands for a key that is not given: the text says what holds then, as that of an optional key
+        # does. A table is shown by itself.
         shown_default = ""
         if key in schema.get("required", ()):
             shown_default = "required"
-        elif default is not None and "{" not in str(default):  # a table is shown by itself
+        elif default not in (None, []) and "{" not in str(default):
             shown_default = f"`{_toml(default)}`"
         yield f"| `{key}` | {_kind(item)} | {unit} | {shown_default} | {text} |"
         inner += [(f"{path}.{key}", reference) for reference in _references(item)]

@@ -19,10 +19,11 @@ class NfrcTable(Section):
 
     Curves run ``over`` the amplitude (of a wave: the relative displacement that it alone would make at the first site,
     over the clearance there; of a force: N; of a wall: m) or the frequency (rad/s), within the ``range`` [low, high].
-    There is one for each value of the other in ``fixed`` (frequencies: by default the drive's), each of the
-    ``restitutions`` (by default that of ``[contacts]``), and each combination of the values of further keys in
-    ``family``, which are lists or ranges as in ``[sweep]``. Over the path of a key (``contacts.clearance``, in the
-    key's unit) ``fixed`` are amplitudes, at the drive's frequency, and the case is resolved anew at each value.
+    There is one for each value of the other in ``fixed`` (frequencies: by default the drive's; amplitudes must be
+    given), each of the ``restitutions`` (by default that of ``[contacts]``), and each combination of the values of
+    further keys in ``family``, which are lists or ranges as in ``[sweep]``. Over the path of a key
+    (``contacts.clearance``, in the key's unit) ``fixed`` are amplitudes, at the drive's frequency, and the case is
+    resolved anew at each value.
 
     The lattice is ``infinite``, or ends where its cells do: always if it has dashpots or cells that differ, and under a
     force also by default if contacts join other masses than the cell's pair. With ``open_ends`` it goes on for ever as
