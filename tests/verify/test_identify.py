@@ -9,6 +9,7 @@ from tests.conftest import run_of
 from tests.identified import identify_table, lattice_table, measured_table
 from vipetsc.case import Case
 from vipetsc.case.identify import IdentifyCase
+from vipetsc.identification.clearance_search import other_contacts
 from vipetsc.identification.precision import Precision
 from vipetsc.identification.uncertainty import errors_with_sensor, quantile, uncertainty_of
 from vipetsc.identification.whiteness import ljung_box
@@ -187,7 +188,7 @@ def test_a_clearance_on_the_wrong_side_of_the_motion_is_moved(tmp_path, truth, s
     unknowns = [{"quantity": "clearance", "of": [[3]], "bounds": [5e-5, 6e-3], "start": start}]
     work = fits_of(identify_table(table, record, unknowns=unknowns))
     windows = work.windows()
-    moved = windows._other_contacts(work.starts()[0], windows.last)
+    moved = other_contacts(windows.misfit, work.starts()[0], windows.last, windows.high)
 
     base = Case.from_table(free)
     cell = base.lattice.unit_cell()

@@ -13,41 +13,46 @@ the derivative s = du/dp with respect to a parameter p solves the variational eq
 q = w'_minus. Contact forces are continuous and steps end on every change of a mode, so that the saltation of the state
 is the identity (Leine and Nijmeijer 2004, ch. 7). At an onset sigma w = D the instant moves by -(c s - sigma D_p)/w',
 and dq = c s' - w'' (c s - sigma D_p)/w'. At t_0 the derivative is that of x_0 (``motion_begin``): zero for a lattice at
-rest. Motion and derivatives are integrated together. The derivatives of the
-coefficients are central differences between models of two cases, exact for all but the restitution's damping: whatever
-a case may vary needs no formula of its own. The tangent flow of the engine, ``dynamics.propagator.tangent``, moves
-variations of the initial state of an undriven lattice; it has no right-hand side f_p - K_p u, which acts in all cells.
-That is why this is an integration of its own; tests compare it with central differences of both engines.
+rest. Motion and derivatives are integrated together.
+
+The derivatives of the coefficients are central differences between models of two cases, so that a parameter needs no
+formula of its own. They are exact to about 1e-10: most coefficients are affine in a parameter, the others smooth.
+
+The tangent flow of the engine, ``dynamics.propagator.tangent``, moves variations of the initial state of an undriven
+lattice; it has no right-hand side f_p - K_p u, which acts in all cells. Motion and derivatives therefore have an
+integration of their own here, which tests compare with central differences of both engines.
 
 **2. Windows** (``growing_windows``). A motion after many impacts says nothing of its parameters: it is too sensitive,
 and the sum of squares has many valleys. In multiple shooting (Bock 1987) each window has an initial state of its own,
 estimated with the parameters, and continuity is a constraint. A lattice of n masses has 2n unknowns in each such state,
-and a few sensors in a short window do not tell them. Here all windows of a record have one initial state, and the
+and a few sensors in a short window do not determine them. Here all windows of a record have one initial state, and the
 continuity constraints are solved exactly: the state at which a window would begin is a function of the parameters and
 of that one state, with the derivatives of 1. A lattice that begins at rest, or in a motion that the case gives, has no
-unknown state at all. The window begins with the record and ends after a few contacts; it grows as the fit gets better,
-by fewer contacts where a longer window is fitted worse. So few new contacts are added at a time that their instants are
-nearly right. What a window does not tell stays where it is by a weak prior, which the last fit lacks.
+unknown state at all.
+
+The first window begins with the record and ends after a few contacts. Each next one has more contacts, but so few more
+that their instants in the model are nearly right; where a longer window is fitted worse, fewer are added. A weak prior
+holds the parameters that a window does not determine at their last values; the fit over the whole record has none.
 
 A record that begins while the lattice moves has 2n more unknowns (``initial_state``). They are amplitudes of modes,
-with a wide prior about rest that the last fit keeps, since a few sensors may not tell all of them. The first window has
-more data than unknowns.
+with a wide prior about rest that the last fit keeps, since a few sensors may not determine all of them. The first
+window has more data than unknowns.
 
-**3. A clearance that is not reached** has no derivative, and none leads out of a contact that the lattice did not have.
-Each clearance is therefore tried at some fractions of the motion without its stop, within reach and just out of reach,
-and kept where that explains the record better. At the end, the largest motion
-towards a stop that is not met is a lower bound of the clearance, and all that the record says.
+**3. A clearance that is not reached** (``clearance_search``) has no derivative, and none leads out of a contact that
+the lattice did not have. Each clearance is therefore tried at some fractions of the motion without its stop, within
+reach and just out of reach, and kept where that explains the record better. At the end, the largest motion towards a
+stop that is not met is a lower bound of the clearance: a record without contact there says no more.
 
 **4. Least squares** (``misfit``): the residuals over the noise, by the trust-region method of SciPy within the bounds
 (Branch, Coleman and Li 1999), in the logarithms of positive parameters. Noise that is not given is estimated from the
 residuals of each channel, and the fit is repeated with it, which is the maximum of the likelihood.
 
-**5. What the data tell** (``uncertainty``, ``whiteness``). (J^T J)^-1 is the covariance, J the Jacobian of the
+**5. Uncertainty** (``uncertainty``, ``whiteness``). (J^T J)^-1 is the covariance, J the Jacobian of the
 residuals over the noise, of parameters with the initial states left free; its singular values s are 1 over the standard
 errors along its right singular vectors. An error of more than half a unit of a coordinate, a factor of 1.6, counts as
 not determined. A profile (``misfit_profile``) holds one parameter at several values and fits all others, so that an
-interval that is no multiple of the standard error can be seen. Residuals that are not white (Ljung and Box 1978) show a
-model that lacks something.
+interval that is no multiple of the standard error can be seen. Residuals that are not white (Ljung and Box 1978) show
+that the model is incomplete.
 
 References
 ----------

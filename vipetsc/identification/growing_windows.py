@@ -1,4 +1,10 @@
-"""The fit over windows that grow, from one start."""
+"""The fit over windows that grow, from one start.
+
+The order of the fits is: parameters of the linear lattice over records without contact; all parameters over windows
+with more and more of the model's contacts, the last of which are the whole records; twice more over the whole records
+with noise that is estimated from the residuals, where it is not given; and all windows once more from there. Section 2
+of the package's docstring says why windows grow, section 3 why clearances are also tried.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -6,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vipetsc.case import CaseError
-from vipetsc.case.sought import SoughtParameter, differs_by_side
+from vipetsc.identification.clearance_search import other_contacts
 from vipetsc.identification.initial_state import NARROW, WIDTH
 from vipetsc.identification.least_residuals import least_residuals
 from vipetsc.identification.misfit import Misfit
@@ -20,9 +26,6 @@ PRIOR = 1.0
 ASSUMED_NOISE = 0.01
 # Smallest noise over the size of a channel.
 LEAST_NOISE = 1e-9
-# Clearances that are tried, over the motion without the stop: out of reach, where the lattice may not have touched,
-# just within it, where derivatives begin, and further in.
-OF_REACH = (1.02, 0.98, 0.8, 0.6, 0.4)
 # Least weight of the prior over the size of the Jacobian. Where a clearance is not reached, a column is zero; without
 # full rank, SciPy makes every step as long as the trust region is, and does not converge.
 RIDGE = 1e-10
@@ -32,8 +35,6 @@ RISE = 2.0
 SHORTEST = 0.01
 # First window of records without contact, and of those whose initial state is estimated, over the last one.
 FIRST = 0.1
-# Sides, 0 of w > 0, on which a clearance has its stops.
-SIDES = {"clearance": [0], "clearance_minus": [1]}
 # Samples of a window, at least; every record has as many.
 LEAST_SAMPLES = 4
 # Data of a first window, at least, for each number that is unknown.
@@ -68,7 +69,7 @@ class Fit(NamedTuple):
 
 
 class GrowingWindows:
-    """Fits a ``misfit`` over windows; ``check`` is called before every evaluation, and may raise.
+    """Fits of a ``misfit`` over windows; ``check`` is called before every evaluation, and may raise.
 
     ``keep`` is called with the solution (coordinate,) of every window. A fit that is given them as ``solved`` takes
     the first ones as they are and goes on with the next window, to the same bits.
@@ -128,15 +129,10 @@ class GrowingWindows:
 
     def deviance(self, z: np.ndarray) -> float:
         """Minus twice the log-likelihood at ``z`` (coordinate,) but for a constant, by which fits can be compared."""
-        total = self.cost(z, self.last)
+        total = self.misfit.cost(z, self.last)
         for record, noise in zip(self.misfit.records, self.misfit.noise, strict=True):
             total += 2 * len(record.times) * float(np.sum(np.log(noise)))
         return total
-
-    def cost(self, z: np.ndarray, ends: Sequence[float], tolerances: Tolerances = EXACT) -> float:
-        """The sum of squares at ``z`` (coordinate,) of residuals over the noise, and of the initial states' prior."""
-        data = self.misfit.residuals(z, ends, tolerances)
-        return float(np.sum(data**2)) + float(np.sum((self.misfit.prior() @ z) ** 2))
 
     def _every(self) -> list[int]:
         """The numbers of all coordinates."""
@@ -185,8 +181,8 @@ class GrowingWindows:
             window = self._window(fitted, ends, precision)
             other = None
             if window.misfit > 1 or is_last:
-                # Otherwise the noise explains the misfit, and there is nothing to look for.
-                other = self._other_contacts(fitted, ends, precision)
+                # A smaller misfit is explained by the noise alone, and no contact is missing.
+                other = other_contacts(self.misfit, fitted, ends, self.high, self.tolerances(precision))
             if other is not None:
                 fitted = self.solve(other, ends, self._every(), precision)
                 window = self._window(fitted, ends, precision)
@@ -261,75 +257,6 @@ class GrowingWindows:
         residuals = self.misfit.residuals(z, ends, tolerances)
         return Window(max(ends), impacts, float(np.sqrt(np.mean(residuals**2))), z.copy())
 
-    def reached(self, z: np.ndarray, ends: Sequence[float], tolerances: Tolerances = EXACT) -> np.ndarray:
-        """The largest w and -w (site, 2) in m of any record in the model up to ``ends``; NaN where a stop is met."""
-        largest = np.zeros((len(self.misfit.plan.base.model().chain.sites), 2))
-        for number, (table, end) in enumerate(zip(self.misfit.plan.options.records, ends, strict=True)):
-            if table.contact and (self.misfit.records[number].times <= end).any():
-                response = self.misfit.alone(z, number, end, tolerances)
-                largest = np.maximum(largest, response.reached)
-                touched = response.episodes["site"], (response.episodes["side"] < 0).astype(int)
-                largest[touched] = np.nan
-        return largest
-
-    def beyond(self, parameter: SoughtParameter, reached: np.ndarray) -> float:
-        """The largest motion in m towards the stops of a clearance if none of them is met, else NaN.
-
-        ``reached`` (site, 2) is that of the method of this name. The clearance of other parameters is NaN.
-        """
-        if parameter.quantity not in SIDES:
-            return np.nan
-        base = self.misfit.plan.base
-        gaps = np.array(base.model().gaps or [(gap, gap) for gap in base.model().chain.clearances])
-        sides = SIDES[parameter.quantity]
-        if parameter.quantity == "clearance" and not differs_by_side(base):
-            sides = [0, 1]  # it is that of both
-        # A stop on one side only has no other side; NaN of any stop that is met is that of all.
-        towards = [reached[i, side] for i in parameter.members for side in sides if np.isfinite(gaps[i, side])]
-        return float(np.max(towards, initial=0.0))
-
-    def _other_contacts(self, z: np.ndarray, ends: Sequence[float], precision: Precision = FINAL) -> np.ndarray | None:
-        """Coordinates with a clearance within the motion or out of its reach, if that lowers the misfit; else None.
-
-        No derivative leads from a stop that is not met to one that is, nor out of a contact that was not there.
-        """
-        best = None
-        tolerances = self.tolerances(precision)
-        least = self.cost(z, ends, tolerances)
-        for number, parameter in enumerate(self.misfit.plan.parameters):
-            if parameter.quantity not in SIDES:
-                continue
-            for moved in self._clearances_tried(z, ends, number, tolerances):
-                cost = self.cost(moved, ends, tolerances)
-                if cost < least:
-                    best = moved
-                    least = cost
-            # The next clearance is tried together with what has lowered the misfit so far.
-            if best is not None:
-                z = best
-        return best
-
-    def _clearances_tried(
-        self, z: np.ndarray, ends: Sequence[float], number: int, tolerances: Tolerances
-    ) -> list[np.ndarray]:
-        """The coordinates ``z`` with other values of the clearance ``number``, by the motion without its stops."""
-        parameter = self.misfit.plan.parameters[number]
-        free = z.copy()
-        free[number] = self.high[number]
-        try:
-            beyond = self.beyond(parameter, self.reached(free, ends, tolerances))
-        except (CaseError, MotionError):
-            return []
-
-        tried = []
-        for fraction in OF_REACH:
-            # Not of a stop that is met even at its upper bound: the motion without it cannot be had.
-            if parameter.low <= fraction * beyond <= parameter.high:
-                moved = z.copy()
-                moved[number] = parameter.to_coordinate(fraction * beyond)
-                tried.append(moved)
-        return tried
-
     def solve(
         self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision = FINAL
     ) -> np.ndarray:
@@ -346,7 +273,7 @@ class GrowingWindows:
         """The coordinates with the least squares over a window, computed."""
         active = list(active)
         start = z[active].copy()
-        # Parameters may be held near the start, states always have their own prior, about rest.
+        # While windows grow, parameters have a prior about the start of this fit; states always have one about rest.
         is_parameter = np.array(active) < self.misfit.count
         weights = np.where(is_parameter, 0.0, 1 / WIDTH)
         if precision.has_prior:

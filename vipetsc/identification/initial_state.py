@@ -5,10 +5,12 @@ lattice without contacts,
 
     u = sqrt(e) sum_k a_k phi_k/W_k,    u' = sqrt(e) sum_k b_k phi_k,
 
-e(a_k^2 + b_k^2)/2 is the energy of mode k. The scale e in J is that at which modes of equal energy, a_k and b_k normal
-with variance 1, move the liveliest sensor as much as it was measured: coordinates are numbers of order one wherever in
-the lattice the energy is. A few sensors may not tell all of them. A weak prior, normal with a standard deviation of
-``WIDTH``, keeps what they do not tell finite: no mode has more than some hundred times the energy that was measured.
+e(a_k^2 + b_k^2)/2 is the energy of mode k. With a_k and b_k normal of variance 1, a sensor of the derivative of order
+r of u_i has the mean square e sum_k (phi_ki W_k^(r-1))^2. The scale e in J is the largest for which a sensor's mean
+square is the measured one, so that coordinates are numbers of order one wherever in the lattice the energy is.
+
+A few sensors may not determine all coordinates. A weak prior, normal with a standard deviation of ``WIDTH``, keeps the
+others finite: no mode has more than some hundred times the energy that was measured.
 """
 
 from collections.abc import Sequence
@@ -27,9 +29,11 @@ from vipetsc.identification.motion import MotionCoefficients
 WIDTH = 10.0
 # ... and while windows grow, when data are few: modes as lively as the liveliest sensor.
 NARROW = 1.0
-# A mode without stiffness has this fraction of the lowest frequency for its displacement, which no spring limits.
+# A mode without stiffness has an infinite 1/W: this fraction of the lowest elastic frequency takes the place of W. Its
+# displacement may then be ten times that of the slowest elastic mode.
 SLOW = 0.1
-# Frequencies below this fraction of the highest one are those of modes without stiffness.
+# Frequencies below this fraction of the highest one are those of modes without stiffness: rounding of squared
+# frequencies, 1e-16, leaves them 1e-8.
 RIGID = 1e-6
 
 
@@ -56,6 +60,7 @@ def initial_state(model: Model, first: int, sensors: Sequence[tuple[int, int, fl
     ``sensors`` are the mass (0-based), the order of the derivative of its displacement that is measured, and the root
     mean square of what was measured.
     """
+    # Modes of the lattice whose contacts are open.
     coefficients = MotionCoefficients.of(model)
     n = len(coefficients.masses)
     rows = np.repeat(np.arange(n), np.diff(coefficients.first))
@@ -64,11 +69,13 @@ def initial_state(model: Model, first: int, sensors: Sequence[tuple[int, int, fl
     roots = np.sqrt(coefficients.masses)
     squares, vectors = scipy.linalg.eigh(stiffness / np.outer(roots, roots))
     frequencies = np.sqrt(np.maximum(squares, 0.0))
+
     elastic = frequencies > RIGID * frequencies[-1]
     slowest = SLOW * (frequencies[elastic].min() if elastic.any() else model.drive.frequency)
     frequencies = np.maximum(frequencies, slowest)
     shapes = vectors / roots[:, None]
 
+    # sqrt(e), from the sensor that needs the largest.
     scale = 0.0
     for mass, order, size in sensors:
         deviation = np.sqrt(np.sum((shapes[mass] * frequencies ** (order - 1)) ** 2))

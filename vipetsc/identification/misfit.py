@@ -214,7 +214,7 @@ class Misfit:
     def predicted(
         self, z: np.ndarray, number: int, end: float, active: Sequence[int] = (), tolerances: Tolerances = EXACT
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What the sensors of a record measure (sample, sensor), and derivatives (sample, sensor, active).
+        """Values of the model at the sensors of a record (sample, sensor), and derivatives (sample, sensor, active).
 
         Raises CaseError, MotionError.
         """
@@ -310,6 +310,11 @@ class Misfit:
                     block[:, [place[p] for p in part]] = values
             blocks.append(block)
         return np.concatenate(blocks)
+
+    def cost(self, z: np.ndarray, ends: Sequence[float], tolerances: Tolerances = EXACT) -> float:
+        """The sum of squares at ``z`` (coordinate,) of residuals over the noise, and of the initial states' prior."""
+        data = self.residuals(z, ends, tolerances)
+        return float(np.sum(data**2)) + float(np.sum((self.prior() @ z) ** 2))
 
     def _used(self, ends: Sequence[float]) -> list[int]:
         """The numbers of the records that have samples up to ``ends``."""

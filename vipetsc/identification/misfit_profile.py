@@ -17,9 +17,10 @@ from vipetsc.identification.uncertainty import uncertainty_of
 REACH = 3.0
 # A profile rises by about ten over its reach. The tolerance is relative to the cost, which is about the number of data.
 PRECISION = Precision(steps=30, cost=1e-5, derivatives=1e-5, is_rough=True)
-# Smallest part of the distance to the next value that is taken in one step to keep the contacts.
+# Where a step to the next value changes the contacts it is halved, down to this part of the distance: four halvings.
+# Contacts that change within a smaller step are taken to do so in the motion of the least misfit, too.
 SMALLEST_STEP = 1 / 16
-# Coordinates that differ by rounding.
+# Coordinates, numbers of order one, count as equal within their rounding.
 SAME = 1e-12
 
 Side = Literal["below", "above"]
@@ -69,7 +70,7 @@ def profile_costs(
     costs = []
     for place in profile.outwards(number, float(z[number]), side):
         held, slope = _follow(windows, held, slope, number, float(profile.places[number, place]))
-        costs.append(windows.cost(held, windows.last))
+        costs.append(windows.misfit.cost(held, windows.last))
     return costs
 
 

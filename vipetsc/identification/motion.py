@@ -1,4 +1,8 @@
-"""The motion of a lattice with its derivatives: coefficients from models, and the call of the kernels."""
+"""The motion of a lattice with its derivatives: coefficients from models, and the call of the kernels.
+
+``motion_rates`` has the equations, ``motion_steps`` their integration, ``motion_begin`` the contacts that are closed
+when the motion begins; the docstring of the package derives them.
+"""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -19,8 +23,9 @@ from vipetsc.lattice import Chain, UnitCell, nonlinear_places
 from vipetsc.lattice.chain import Ends
 from vipetsc.modes.shooting.dop853 import STAGES
 
-# Errors are relative to a motion, and to derivatives, of at least this fraction of the linear wave: derivatives begin
-# at an onset as a root of time, and no step would resolve that relative to themselves.
+# Errors are relative to the largest value so far, and to this fraction of the linear wave at least. Derivatives by a
+# clearance are zero up to an onset; behind it their acceleration grows as the root of time, by Hertz's law, and no step
+# would resolve that relative to values near zero.
 FLOOR = 1e-2
 
 
@@ -138,6 +143,7 @@ def slopes_between(low: Model, high: Model, width: float, model: Model, middle: 
             slopes.curves[:, k] = (laws[1][name] - laws[0][name]) / width
         slopes.linear[...] = True
 
+    # Forces of drives are multiplied by a factor, so that their derivatives are relative to it.
     gains = gains_of(high) - gains_of(low)
     slopes.drives[:] = gains / width / np.where(middle.gains != 0, middle.gains, 1.0)
     sites = [site_records(at, np.arange(len(at.chain.sites))) for at in (low, high)]

@@ -8,7 +8,8 @@ from vipetsc.contact.law import CLIPPED, FREE, elastic_energy, elastic_force, ga
 from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.identification.motion_rates import Lattice, MotionState, difference
 
-# Fraction of an exponent over which the elastic energy is differenced.
+# Half the distance of exponents between which the elastic energy is differenced: h^2 of it is the error of the formula,
+# 1e-16/h that of rounding, both below what a fit sees of an exponent.
 SHORT = 1e-6
 
 
@@ -37,7 +38,7 @@ def begin_contacts(lattice: Lattice, motion: MotionState, tracker: ImpactTracker
         side = int(np.sign(site["mode"]))
         which = 0 if side > 0 else 1
         speed = abs(float(site["approach"]))
-        # At the floor w'_minus is held and does not vary.
+        # At the floor w'_minus is constant; in the other modes there is no force that depends on it.
         if speed <= site["floor"] or abs(site["mode"]) in (FREE, CLIPPED):
             continue
 

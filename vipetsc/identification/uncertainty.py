@@ -1,14 +1,14 @@
-"""What the data tell about the parameters: covariance, correlation, singular values, and the sensor that is missing."""
+"""Uncertainty of fitted parameters: covariance, correlation, singular values, and the effect of one more sensor."""
 
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-# A coordinate is determined if its standard error is at most this: one is a factor e of a logarithmic parameter, and
-# the whole range between the bounds of a linear one.
+# A coordinate is determined if its standard error is at most this: 0.5 is a factor of 1.6 of a logarithmic parameter,
+# and half the range between the bounds of a linear one. With more, a linearised interval means nothing.
 DETERMINED = 0.5
-# Singular values below this fraction of the largest one are rounding.
+# Singular values below this fraction of the largest one are rounding. They are raised to it, so that errors are finite.
 SMALLEST = 1e-12
 
 
@@ -71,7 +71,7 @@ def errors_with_sensor(uncertainty: Uncertainty, slopes: np.ndarray, noise: floa
     """
     scaled = uncertainty.directions * uncertainty.singular[:, None]
     information = scaled.T @ scaled
-    # What no datum tells must not make the matrix singular: an error of 1e6 stands for it.
+    # Directions that the data do not determine would make the matrix singular: they are given an error of 1e6.
     information = information + 1e-12 * np.eye(len(information))
     errors = []
     for mass in range(slopes.shape[1]):

@@ -1,13 +1,14 @@
-"""What ``identified.h5`` holds: parameters with their uncertainty, windows, starts, residuals, and what it all says."""
+"""Content of ``identified.h5``: parameters with their uncertainty, windows, starts, residuals, warnings and a table."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import UNITS
+from vipetsc.identification.clearance_search import largest_towards, reached_by
 from vipetsc.identification.growing_windows import GrowingWindows
 from vipetsc.identification.misfit import ROWS
 from vipetsc.identification.uncertainty import (
@@ -53,7 +54,7 @@ def identified_values(
 
     places, costs = profile
     parameters = windows.misfit.plan.parameters
-    cost = windows.cost(z, windows.last)
+    cost = windows.misfit.cost(z, windows.last)
     rows = [[parameter.from_coordinate(x) for x in row] for parameter, row in zip(parameters, places, strict=True)]
     return values | {
         "place": np.arange(places.shape[1]),
@@ -66,10 +67,10 @@ def _parameter_values(windows: GrowingWindows, z: np.ndarray, uncertainty: Uncer
     """Parameters with their uncertainty, and what is not determined."""
     misfit = windows.misfit
     parameters = misfit.plan.parameters
-    reached = windows.reached(z, windows.last)
+    reached = reached_by(misfit, z, windows.last)
     z = z[: misfit.count]
     # A group whose stops are all out of reach is at least as wide as the largest motion towards any.
-    at_least = np.array([windows.beyond(parameter, reached) for parameter in parameters])
+    at_least = np.array([largest_towards(misfit.plan, parameter, reached) for parameter in parameters])
 
     determined = uncertainty.determined & np.isnan(at_least)
     slopes = np.array([parameter.slope(x) for parameter, x in zip(parameters, z, strict=True)])
@@ -324,28 +325,56 @@ def _warnings_of_starts(data: xr.Dataset) -> Iterator[str]:
 
 def summary_of(data: xr.Dataset) -> str:
     """A table of the results, with a line for every parameter, and the warnings."""
-    confidence = f"{100 * IdentifyCase.of(data).options.confidence:g} % interval"
     lines = [
         f"{data.sizes['parameter']} parameters from {data.sizes['datum']} values of {data.sizes['channel']} channels;"
-        f" {data.sizes['start']} starts, {int(data['starts/valley'].max())} valleys",
-        f"  {'parameter':<16}{'value':>14}{'error':>12}  {confidence:<26} unit",
+        f" {data.sizes['start']} starts, {int(data['starts/valley'].max())} valleys"
     ]
-    lines += [_parameter_line(data.isel(parameter=row)) for row in range(data.sizes["parameter"])]
+    lines += parameter_lines(data, IdentifyCase.of(data).options.confidence)
     lines += [_channel_line(data.isel(channel=row)) for row in range(data.sizes["channel"])]
     return "\n".join([*lines, *(f"  warning: {text}" for text in data.attrs["warnings"])])
 
 
-def _parameter_line(parameter: xr.Dataset) -> str:
-    """The line of one parameter: name, value, standard error, interval, unit."""
-    value = f"{float(parameter['value']):>14.7g}"
-    if np.isfinite(parameter["at_least"]):
-        shown = f"{'':>14}{'':>12}  at least {float(parameter['at_least']):<17.6g}"
-    elif not parameter["determined"]:
-        shown = f"{value}{'':>12}  {'not determined':<26}"
-    else:
-        interval = f"{float(parameter['interval_low']):.7g} to {float(parameter['interval_high']):.7g}"
-        shown = f"{value}{float(parameter['standard_error']):>12.2g}  {interval:<26}"
-    return f"  {parameter['parameter'].values!s:<16}{shown} {parameter['unit'].values}"
+class _ParameterRow(NamedTuple):
+    """Texts in the row of a parameter, or in the headings above them."""
+
+    name: str
+    value: str
+    error: str
+    interval: str
+    unit: str
+
+    @classmethod
+    def of(cls, parameter: xr.Dataset) -> "_ParameterRow":
+        """The row of one ``parameter``."""
+        value = f"{float(parameter['value']):.7g}"
+        error = ""
+        if np.isfinite(parameter["at_least"]):
+            value = ""
+            interval = f"at least {float(parameter['at_least']):.6g}"
+        elif not parameter["determined"]:
+            interval = "not determined"
+        else:
+            error = f"{float(parameter['standard_error']):.2g}"
+            interval = f"{float(parameter['interval_low']):.7g} to {float(parameter['interval_high']):.7g}"
+        return cls(str(parameter["parameter"].values), value, error, interval, unit=str(parameter["unit"].values))
+
+
+def parameter_lines(data: xr.Dataset, confidence: float) -> list[str]:
+    """A line of headings and one of each parameter, with its interval of that ``confidence``, from 0 to 1.
+
+    ``data`` has the variables of ``LAYOUT`` over (parameter,). Columns are as wide as their longest text.
+    """
+    rows = [_ParameterRow("parameter", "value", "error", f"{100 * confidence:g} % interval", "unit")]
+    rows += [_ParameterRow.of(data.isel(parameter=row)) for row in range(data.sizes["parameter"])]
+
+    # No width is enough for every text: groups of sites are named after all their numbers.
+    columns = zip(_ParameterRow._fields, zip(*rows, strict=True), strict=True)
+    width = {field: max(map(len, column)) for field, column in columns}
+    return [
+        f"  {row.name:<{width['name']}}  {row.value:>{width['value']}}  {row.error:>{width['error']}}"
+        f"  {row.interval:<{width['interval']}}  {row.unit}"
+        for row in rows
+    ]
 
 
 def _channel_line(channel: xr.Dataset) -> str:
