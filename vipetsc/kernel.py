@@ -43,7 +43,7 @@ class _EntryLowering(NativeLowering):
 
     @property
     def lowering_class(self) -> type[Lower]:
-        """What translates a function."""
+        """The class that translates a function."""
         return TupleLower
 
 

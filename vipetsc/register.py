@@ -49,7 +49,7 @@ class Parameter(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RegisteredPart:
-    """What a module registers: its ``name``, the source ``file`` and its ``sha256``.
+    """A part that a module registers: its ``name``, the source ``file`` and its ``sha256``.
 
     ``modules`` are those in Python that register it: copies of a file are modules of their own, with one part.
     """

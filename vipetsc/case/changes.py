@@ -83,7 +83,7 @@ def _divided(place: Any, path: str) -> tuple[str, str]:
 
 
 def _below(place: Any, key: str, put_missing: bool = False) -> Any:
-    """What the table ``place`` has at ``key``, perhaps an entry of a list; where nothing is, an empty table or None."""
+    """The value of the table ``place`` at ``key``, perhaps an entry of a list; an empty table or None without one."""
     if not isinstance(place, dict):
         return place
     item = ITEM.fullmatch(key)

@@ -119,7 +119,7 @@ class IdentifyCase(StudyCase):
 
     @cached_property
     def parameters(self) -> list[SoughtParameter]:
-        """What is sought: the unknowns one by one, then offsets of records."""
+        """The parameters that are sought: the unknowns one by one, then offsets of records."""
         parameters = []
         for unknown in self.options.unknowns:
             parameters += parameters_of(unknown, self.base)

@@ -22,7 +22,7 @@ DIGITS = 12  # of the ratio of two clearances: sites of one kind differ by round
 
 
 class SiteKind(NamedTuple):
-    """What sites of one kind have in common.
+    """The properties that sites of one kind have in common.
 
     ``sides`` are the clearances on the sides + and - over the lesser of both, inf without a stop.
     """

@@ -59,7 +59,7 @@ def of_nearest_type(errors: Sequence[Any]) -> list[Any]:
 
 
 def _expected_type(error: Any) -> str:
-    """What the type of an ``error`` expects in place of the value; "" of an error within a value of the type."""
+    """The type that was expected where an ``error`` is; "" if the type is right and the error lies within the value."""
     if error["type"] == "literal_error":
         return str(error["ctx"]["expected"])
     return NAMES_OF_TYPES.get(error["type"], "")

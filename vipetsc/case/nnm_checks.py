@@ -157,7 +157,7 @@ def is_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps
 
 
 def _gaps_to_ground(contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> list[tuple[float, float]]:
-    """Those of the clearances ``gaps`` that belong to contacts with the ground."""
+    """The clearances, out of all ``gaps``, of contacts with the ground."""
     # There are no pairs where all sites join the cell's own, of which none is the ground.
     pairs = pairs_of_sites(contacts, cell, len(gaps))
     return [gaps[number] for number, pair in enumerate(pairs) if pair.host < 0]

@@ -69,7 +69,7 @@ class MeasuredTable(Section):
         return str(self.measure).startswith(RESPONSE)
 
     def at_amplitudes(self, unit: str) -> str:
-        """Which amplitudes count, in words; they have a ``unit``."""
+        """Words that name the amplitudes of the objective, in their ``unit``, after its name; "" without any."""
         if not self.amplitudes:
             return ""
         amplitudes = ", ".join(f"{amplitude:g}" for amplitude in self.amplitudes)
@@ -102,7 +102,7 @@ class ConstraintTable(MeasuredTable):
         return f"{self.name} {' and '.join(bounds)}{self.at_amplitudes(unit)}"
 
     def excess(self, value: float) -> float:
-        """By how much a ``value`` is outside the bounds, over the bound's size (or 1 for a bound of 0); 0 inside."""
+        """Distance of a ``value`` beyond the bounds, over the bound's size (or 1 for a bound of 0); 0 inside."""
         below = above = 0.0
         if self.at_least is not None:
             below = (self.at_least - value) / (abs(self.at_least) or 1.0)

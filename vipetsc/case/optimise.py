@@ -141,7 +141,7 @@ class OptimiseCase(StudyCase):
 
     @cached_property
     def space(self) -> SearchSpace:
-        """What varies."""
+        """The variables of the search with their ranges."""
         return search_space(self.options.variables, self.table, self.base)
 
     def variables(self) -> list[Variable]:

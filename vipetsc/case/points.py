@@ -21,7 +21,7 @@ class PointTable(Section):
 
 
 def masses_remedy(dofs: int) -> str:
-    """What to say of a mass beyond the ``dofs`` masses of a cell."""
+    """The remedy for a mass beyond the ``dofs`` masses of a cell: a sentence on the masses that a cell has."""
     if dofs == 1:
         return "a cell has the one mass 1"
     return f"a cell has the masses 1 to {dofs}"

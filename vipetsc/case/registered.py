@@ -63,7 +63,7 @@ def check_law_parameters(
 
 
 def check_law(law: Contact) -> str:
-    """What is wrong with the formulas of a registered ``law`` with its parameters; empty if nothing is."""
+    """The first defect of the formulas of a registered ``law`` with its parameters, in words; empty without one."""
     try:
         force = law.elastic_force(DEPTHS)
         slope = law.elastic_slope(DEPTHS)

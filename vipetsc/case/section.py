@@ -1,4 +1,4 @@
-"""What every section of a case file is: a strict table; and what is wrong with one."""
+"""Base class of the sections of a case file, a strict table, and the problems that are found in one."""
 
 from dataclasses import dataclass
 from typing import Any

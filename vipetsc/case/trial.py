@@ -118,7 +118,7 @@ def _with_cell_numbers(lattice: LatticeTable, quantity: str, numbers: list[float
 
 
 def _problems(trial: Case, case: Case) -> list[Problem]:
-    """What is wrong with a ``trial`` by its numbers alone; the ``case`` is valid, and differs in nothing else.
+    """Problems with the numbers of a ``trial``; the ``case`` is valid, and differs in nothing else.
 
     A case that is read is also refused where its samples are too coarse for the bands, and where nothing is driven at
     a frequency of the bands: samples and frequencies of an identification are those that were measured.

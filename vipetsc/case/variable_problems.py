@@ -1,4 +1,4 @@
-"""What is wrong with the variables of a search."""
+"""Problems with the variables of a search."""
 
 import copy
 from collections.abc import Iterable, Iterator
@@ -70,7 +70,7 @@ def _of_each_site(name: str, key: str, given: Any, base: Case) -> Iterator[Probl
 
 
 def _tried(key: str, row: VariableRow, table: Table) -> Iterator[Problem]:
-    """What is wrong with a key itself at the bounds or with the values of its first variable, all others as they are.
+    """Problems with a key itself at the bounds or with the values of its first variable, while all others stay.
 
     A case that is impossible because of other keys may be possible where these vary too.
     """

@@ -34,7 +34,7 @@ def table_at(table: Table, value: float) -> tuple[Table, list[Problem]]:
 
 
 def key_problems(table: Table) -> list[Problem]:
-    """What is wrong with the key that varies, its range and what is fixed, before any value of it is tried."""
+    """Problems with the key that varies, its range and the fixed values, before any value of the key is tried."""
     nfrc = table["nfrc"]
     key = nfrc["over"]
     problems = []

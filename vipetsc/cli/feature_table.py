@@ -1,4 +1,4 @@
-"""Which verb accepts which feature of a case: a table that follows from checking a small case for each pair of them.
+"""Features of cases that each verb accepts: a table that follows from checking a small case for each pair of the two.
 
 A verb accepts a feature if its case with this feature is valid, and if the checks that follow the reading of the case
 (of an engine, of linear modes) accept it too. Otherwise the message that refuses it stands in the table.
@@ -104,7 +104,7 @@ def merged(table: Mapping[str, Any], changes: Mapping[str, Any]) -> Table:
 
 
 def _sentences(error: CaseError) -> str:
-    """What the messages of ``error`` say, each once, without the keys and the values of the small case."""
+    """The remedies of ``error``, each once, without the keys and the values of the small case."""
     return "; ".join(dict.fromkeys(problem.remedy for problem in error.problems))
 
 

@@ -175,7 +175,7 @@ def check_mpirun() -> Check:
 
 
 def check_blas(libraries: list[str]) -> Check:
-    """Which BLAS numpy and PETSc use, of ``libraries`` that are loaded; the reference BLAS is correct, but slow."""
+    """The BLAS that numpy and PETSc use, out of the loaded ``libraries``; the reference BLAS is correct, but slow."""
     note = ""
     if any(Path(library).parent.name == REFERENCE_BLAS for library in libraries):
         note = "the reference BLAS: analyses, nnm and nfrc are faster with OpenBLAS (Debian: libopenblas0-serial)"

@@ -39,8 +39,11 @@ TRACKED = np.dtype(
         ("episode", EPISODE),
     ]
 )
-"""A site: its number in the log; in a checkpoint its mode and w'_minus in m/s; counts of limits; whether it was seen to
-pull in its episode, which it has unless it is free, and of which the separation is NaN."""
+"""A site: its ``number`` in the log, ``counts`` of limits, and its open ``episode``, whose separation is NaN.
+
+``pulls`` says whether the contact has pulled in this episode: it is counted once. ``mode`` and ``approach`` (w'_minus
+in m/s) are set in a checkpoint alone; a running simulation has them in its ``SITE``. A free site has no open episode.
+"""
 
 
 class Tracks(NamedTuple):
@@ -80,7 +83,8 @@ def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extrem
     episode.indentation = max(episode.indentation, reached.indentation)
     episode.force = max(episode.force, reached.force)
 
-    # No pull is that of the law continued to a landing short of D, or beyond g = 0.
+    # A landing ends within a tolerance of w = D or g = 0. There the law, continued beyond its limit, has a small force
+    # that pulls, and is the error of the landing: only a larger one counts.
     pull = -reached.smallest_force
     before_onset = (1.0 + site.damping) * elastic_force(site.elastic, LANDED_W * site.scale)
     beyond_clipping = LANDED_G * elastic_force(site.elastic, episode.indentation)
@@ -96,7 +100,8 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
         side = side_of(contacts[i].mode)
         turns = side * start[i, 1] > 0.0 > side * end[i, 1]
         if abs(contacts[i].mode) == PERMANENT and not turns:
-            # Monotonous in the step: its end is enough, which matters where thousands of beads touch all the time.
+            # The depth has no largest value inside the step: the step's end is enough. A search for extremes would cost
+            # as much as the step where thousands of beads touch all the time.
             episode = tracks.sites[i].episode
             episode.indentation = max(episode.indentation, side * end[i, 0] - gap_of(contacts[i], side))
             episode.force = max(episode.force, side * contact_force(contacts, i, end[i, 0], end[i, 1])[0])
@@ -211,7 +216,10 @@ def _set_mode(
 
 @njit(error_model="numpy")
 def shortest_beginning(contacts: np.ndarray, motion: np.ndarray) -> float:
-    """As ``shortest_impact``, of the permanent contacts that close at this ``motion`` (sites, 3)."""
+    """The smallest ``impact_time`` in s of the permanent contacts that close at this ``motion`` (sites, 3).
+
+    A contact closes if |side w - D| is at most ``MOVED_W`` of its scale and w approaches; inf if none does.
+    """
     shortest = np.inf
     for i in range(contacts.size):
         site = contacts[i]

@@ -62,7 +62,7 @@ class OwnRows(NamedTuple):
 
     @classmethod
     def of(cls, series: StepSeries) -> Self:
-        """What the cells that differ in the lattice of ``series`` need."""
+        """The needs of the cells that differ in the lattice of ``series``."""
         cells, tables = series.own_rows()
         return cls(cells, tables, (2 * series.chain.cell.dofs) ** 2 * (2 * series.reach + 1))
 

@@ -207,7 +207,7 @@ class EnergyMeter:
         self.largest = self.unit * LARGEST
 
     def sums(self, y: np.ndarray) -> np.ndarray:
-        """What ``measure`` gives of the rank's part ``y`` of a state, ghosts up to date: (5, 2)."""
+        """The sums (5, 2) of ``measure`` over the rank's part ``y`` of a state, whose ghosts are up to date."""
         sums = np.zeros((ENERGY_SUMS, 2), np.int64)
         measure(y, self.lattice, self.unit, sums)
         return sums

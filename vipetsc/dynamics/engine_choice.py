@@ -1,4 +1,4 @@
-"""Which engine simulates a case, decided before any kernel is loaded."""
+"""Choice of the engine that simulates a case, made before any kernel is loaded."""
 
 from typing import NamedTuple
 

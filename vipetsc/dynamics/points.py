@@ -44,7 +44,7 @@ class _ForceAtPoint(NamedTuple):
 
 
 class _PointTerms(NamedTuple):
-    """What acts on a point: its column and mass (0-based) among the sampled cells, kg, N s/m to ground, all else."""
+    """Terms of a point's equation of motion: its column and mass (0-based) among sampled cells, kg, N s/m, forces."""
 
     column: int
     mass: int
@@ -83,7 +83,7 @@ class PointMotion:
         self._terms = [self._terms_of(cell, mass, model, preloads) for cell, mass in places]
 
     def _terms_of(self, cell: int, mass: int, model: Model, preloads: np.ndarray) -> _PointTerms:
-        """What acts on a ``mass`` of a ``cell``, both 0-based."""
+        """The terms of the equation of motion of a ``mass`` of a ``cell``, both 0-based."""
         chain = model.chain
         coefficients = chain.coefficients(cell - 1, cell + 1)
         springs = []

@@ -1,4 +1,4 @@
-"""What of a run is recorded, by which ranks, and in chunks of how many samples: computed without any kernel."""
+"""Recorded cells of a run, the ranks that write them, and samples in a chunk: computed without any kernel."""
 
 import h5py
 

@@ -1,4 +1,4 @@
-"""Which spring no longer pulls back, where a run fails."""
+"""The spring that no longer pulls back, where a run fails."""
 
 from typing import NamedTuple
 
@@ -74,7 +74,7 @@ def _elongations(setup: Setup, places: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _worst(chain: Chain, places: np.ndarray, elongations: np.ndarray) -> _Torn | None:
-    """Of the springs at ``places`` (spring, 2) the one farthest beyond the zero of its force; None if none is.
+    """The spring at one of ``places`` (spring, 2) that is farthest beyond the zero of its force; None if none is.
 
     ``elongations`` (spring,) are in m.
     """

@@ -1,4 +1,4 @@
-"""What a step of ``ts`` costs, as fitted to the paper's lattices on one core."""
+"""Cost of a step of ``ts``, as fitted to the paper's lattices on one core."""
 
 # Seconds of an accepted step of 8vr, and of a mass in it; radians of the top band in a step.
 STEP = 3.7e-5

@@ -1,4 +1,4 @@
-"""What the process of ``SecondProcess`` does: it draws what is asked for, one request after the other."""
+"""Program of the process that ``SecondProcess`` starts: it draws the requests one after the other."""
 
 import gc
 import json

@@ -56,7 +56,7 @@ class Curve(NamedTuple):
 
 
 class CommonAxes(NamedTuple):
-    """What pages of one measure of several sweeps have in common: all ``values``, and positions along x (and y)."""
+    """Axes that pages of one measure of several sweeps share: all ``values``, and positions along x (and y)."""
 
     values: np.ndarray
     x: np.ndarray

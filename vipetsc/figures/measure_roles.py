@@ -1,4 +1,4 @@
-"""What the axes of a measure are in its pictures: positions, curves of a panel, panels of a page, pages."""
+"""Roles of the axes of a measure in its pictures: positions, curves of a panel, panels of a page, pages."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ PART = "part"  # the dimension of parts of the frequency axis
 
 
 class Roles(NamedTuple):
-    """What the axes of a measure are in its pictures: positions ``x`` (and ``y`` of a map), curves, panels, pages."""
+    """Roles of the axes of a measure in its pictures: positions ``x`` (and ``y`` of a map), curves, panels, pages."""
 
     x: SweptAxis
     y: SweptAxis | None

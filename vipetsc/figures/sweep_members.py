@@ -76,7 +76,7 @@ class MemberRun(NamedTuple):
 
     @property
     def results(self) -> tuple[xr.Dataset, xr.Dataset]:
-        """What a picture of the member shows, with its warnings."""
+        """The run and its analysis, from which pictures of the member are drawn."""
         return self.run, self.analysis
 
     @classmethod

@@ -217,7 +217,7 @@ def _datasets(group: h5py.Group) -> Iterator[h5py.Dataset]:
 
 
 def _members(group: h5py.Group) -> Iterator[Any]:
-    """What a ``group`` itself holds: soft links lead to coordinates of other groups."""
+    """The members that a ``group`` itself holds; soft links lead to coordinates of other groups, and are left out."""
     for name in group:
         if isinstance(group.get(name, getlink=True), h5py.HardLink):
             yield group[name]

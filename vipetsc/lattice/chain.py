@@ -176,7 +176,7 @@ class Chain:
         return Coefficients(*self._arrays(Coefficients._fields, start, stop))
 
     def spring_terms(self, start: int, stop: int) -> SpringTerms:
-        """What the springs of the cells ``start`` to ``stop``, as in ``coefficients``, have beyond linear parts."""
+        """Quadratic and cubic parts of springs of the cells ``start`` to ``stop``, as ``coefficients`` counts them."""
         return SpringTerms(*self._arrays(SpringTerms._fields, start, stop))
 
     def _arrays(self, names: tuple[str, ...], start: int, stop: int) -> list[np.ndarray]:

@@ -1,4 +1,4 @@
-r"""What the cells at an end of a lattice send back, of a wave that comes to them, and ends that absorb.
+r"""Waves that the cells at an end of a lattice send back when a wave comes to them, and ends that absorb.
 
 The section of the last cells is condensed onto its innermost cell: from the outermost one inwards, with B the coupling
 outwards, Z_n = K_nn + i omega C_nn - omega^2 M_n - B Z_{n+1}^-1 B^T. There Z u = -B^T u_before, where the waves that

@@ -232,7 +232,7 @@ def _standing_shape(chain: Chain, number: int) -> np.ndarray:
 
 
 class _SpectrumCounter(NamedTuple):
-    """``below`` counts squared frequencies below a number; ``top`` in (rad/s)^2 is a bound of all of them."""
+    """Counter of squared frequencies ``below`` a number; ``top`` in (rad/s)^2 is a bound of all of them."""
 
     below: Callable[[float], int]
     top: float

@@ -22,7 +22,7 @@ class Coefficients(NamedTuple):
 
 
 class SpringTerms(NamedTuple):
-    """What the springs of consecutive cells have beyond their linear parts, as ``Coefficients`` has these.
+    """Quadratic and cubic parts of the springs of consecutive cells; ``Coefficients`` has their linear parts.
 
     ``quadratic`` (cell, spring) in N/m^2, ``cubic`` (cell, spring) in N/m^3.
     """

@@ -189,7 +189,7 @@ class System:
 
     @cached_property
     def is_pressed(self) -> np.ndarray:
-        """Which contacts (contacts,) are pressed at rest."""
+        """Mask (contacts,) of the contacts that are pressed at rest."""
         return np.array([pair.stops.is_pressed for pair in self.contacts], bool)
 
     @property

@@ -161,7 +161,7 @@ class Numbers(NamedTuple):
 
 
 def _numbers(run: xr.Dataset, case: Case, options: AnalysisTable, measures: Collection[str]) -> Numbers:
-    """Those of ``measures`` that are in the registry."""
+    """The numbers of a ``run`` by those ``measures`` that are in the registry."""
     record = record_of(run, case, options)
     taken = take(record, measures)
     layout: dict[str, tuple[str, str, str]] = {}

@@ -200,7 +200,7 @@ class Network:
         return WaveCompliance(chain, points=driven)
 
     def _losses(self, driving: np.ndarray) -> WaveLosses | None:
-        """What dashpots take from waves; ``driving`` (drive, offset) are the spectra of the drives."""
+        """Losses of waves in dashpots; ``driving`` (drive, offset) are the spectra of the drives."""
         compliance = self._compliance()
         driven = fastest_wave(self.cell, self.om, self.model.chain.contact_pairs[0])
         if isinstance(compliance, WaveCompliance) or driven is None:

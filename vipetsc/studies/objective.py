@@ -81,7 +81,7 @@ class ObjectiveRuns:
         self.recorded.make(cases, lambda name: self._record(cases[name]), failures=True)
 
     def _record(self, case: Case) -> Record:
-        """What is measured of a run, or of frequency responses, by its whole team."""
+        """The record of measured values of a run, or of frequency responses, which its whole team computes."""
         if isinstance(case, NfrcCase):
             return measured_responses(case, self._tables(case), self.recorded.team, self.recorded.stop)
         data, result = self.recorded.run_in_memory(case)

@@ -197,7 +197,7 @@ class ScatteringRuns:
         } | contact
 
     def _contact(self, run: xr.Dataset, amplitude: float) -> Record:
-        """What a ``run`` under ``amplitude`` in N says of the contact; energies over the amplitude's square."""
+        """Times, forces and losses of the contact in a ``run`` under ``amplitude`` in N; energies over its square."""
         square = amplitude**2
         first_contact = np.nan
         last_contact = np.nan

@@ -1,4 +1,4 @@
-r"""What dashpots and absorbing ends leave of the energy that a site sends out, along the rays of its waves.
+r"""Energy that a site sends out and that dashpots and absorbing ends leave, along the rays of its waves.
 
 A wave of a band at the wavenumber kappa travels with its group velocity v, is reflected by ends that do not absorb, and
 goes round a ring. Dashpots of the cell take its energy at the rate 2 gamma = -2 Re s, exactly (``damped_bloch``); those
@@ -53,7 +53,7 @@ class Rays:
         self.bins = np.pi * (np.arange(BINS) + 0.5) / BINS
 
     def of_bands(self, site: int, spectrum: np.ndarray) -> Left:
-        """What is left (band, time) of energy that a ``site`` (cell) sends into the bands.
+        """Fractions (band, time) that are left of the energy that a ``site`` (cell) sends into the bands.
 
         Of that in a band the fraction ``spectrum`` (band, bin) is in each bin of the wavenumber.
         """
@@ -61,7 +61,7 @@ class Rays:
         return Left(np.einsum("bk,bkt->bt", spectrum, remaining), np.einsum("bk,bkt->bt", spectrum, absorbed))
 
     def of_wave(self, site: int, band: int, kappa: float) -> Left:
-        """What is left (time,) of the energy that a ``site`` (cell) sends into one wave."""
+        """Fractions (time,) that are left of the energy that a ``site`` (cell) sends into one wave."""
         remaining, absorbed = self._fractions(site, np.array([kappa]))
         return Left(remaining[band, 0], absorbed[band, 0])
 
@@ -70,7 +70,7 @@ class Rays:
         return float(-2 * damped_bloch(self.model.chain.cell, kappa).rate.real[band])
 
     def _fractions(self, site: int, kappas: np.ndarray) -> Left:
-        """What is left (band, kappa, time) of the energy that a ``site`` (cell) sends into each wave of each band."""
+        """Fractions (band, kappa, time) that are left of the energy that a ``site`` (cell) sends into each wave."""
         chain = self.model.chain
         point = bloch(chain.cell, kappas)
         speed = np.abs(point.group_velocity).T

@@ -79,13 +79,13 @@ def _why_incomplete(case: NfrcCase, branch: Branch[Any]) -> str:
 
 
 def _values(branch: Branch[Any], of: ResponseMeasure) -> np.ndarray:
-    """What is measured of every state (point,) of a curve."""
+    """The measured values (point,) of the states of a curve."""
     values = measure(branch, of.quantity).reshape(len(branch.points), -1)
     return np.asarray(values.max(axis=1) if of.member is None else values[:, of.member])
 
 
 def _part(branch: Branch[Any], of: ResponseMeasure) -> CurvePart:
-    """What is measured along a curve, over the parameter."""
+    """The measured values along a curve, over the parameter."""
     # Over the length along the curve, which the parameter need not follow: it turns back at folds.
     steps = np.linalg.norm(np.diff(branch.column("xi"), axis=0), axis=1)
     return CurvePart(

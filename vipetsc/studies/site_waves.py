@@ -99,7 +99,7 @@ class SiteWaves:
             self.arriving[node, band] = leaving * forward.factor**setting.distance
 
     def _sent(self, omega: float, up: complex, drive_mass: int) -> tuple[SentWave, SentWave]:
-        """What is sent forward and backward at ``omega`` by waves near to the factor ``up`` of one to higher cells."""
+        """Waves sent forward and backward at ``omega``, near to the wave to higher cells whose factor is ``up``."""
         waves = damped_waves(self.cell, omega)
         half = len(waves.factor) // 2
         site = self._amplitudes_of_pair(waves)

@@ -1,4 +1,4 @@
-"""What dashpots and absorbing ends take from the waves between sites, until the end of the run.
+"""Losses of the waves between sites in dashpots and absorbing ends, until the end of the run.
 
 Waves in other bands than the drive's fade along rays (``studies.rays``). The driven wave is one of interference: its
 energy at the end is that of the run without contacts less all that it gives to contacts, to other bands and to the
@@ -22,7 +22,7 @@ from vipetsc.studies.spectral_line import SpectralLine
 
 
 class SentPowers(NamedTuple):
-    """What contacts send out and take in a lattice with dashpots, powers in W (site, time).
+    """Powers in W (site, time) that contacts send out and take in a lattice with dashpots.
 
     ``bands`` (band, site, time) is what goes to bands other than the drive's, and ``spectrum`` (site, band, bin) the
     fractions of it in bins of the wavenumber; ``third`` is the gain of third harmonics together, ``given`` all that the

@@ -123,7 +123,7 @@ def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) 
 
 @inlined
 def _stride(cluster: Cluster) -> int:
-    """From one power of time in a response to the next: 2, since they are odd, or with dashpots 1.
+    """The distance between powers of time in a response: 2, since they are odd, or with dashpots 1.
 
     A series has 2 n coefficients, a response its n odd ones, or with dashpots the 2 n - 1 after the zeroth: the sizes
     of the two arrays tell them apart.

@@ -144,7 +144,7 @@ def _free_rows(responses: _Responses, from_start: np.ndarray, dashpots: DashpotR
 
 
 def _pairs(groups: Groups) -> Iterator[tuple[np.ndarray, np.ndarray, int]]:
-    """For each place j in a cluster: the DoFs of clusters with more than j DoFs, their j-th one, and j."""
+    """Yield, of each place j in a cluster, the DoFs of clusters with more than j DoFs, their j-th one, and j."""
     sizes = np.diff(groups.first)
     for j in range(max(sizes, default=0)):
         targets = np.flatnonzero(np.repeat(sizes, sizes) > j)

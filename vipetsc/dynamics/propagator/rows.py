@@ -142,7 +142,7 @@ def _multiply(
 
 
 class Bounds(NamedTuple):
-    """What no cell of a lattice exceeds.
+    """Bounds that no cell of a lattice exceeds.
 
     ``frequency`` of a mode in rad/s and its ``damping``, a rate in 1/s, are by Gershgorin's circles of M^-1/2 K M^-1/2
     and of M^-1/2 C M^-1/2. ``by_stiffness`` and ``by_damping`` (3, dof, dof) are the largest magnitudes in any cell of

@@ -226,7 +226,7 @@ class StepSeries:
         return is_far & (self._differing_before[cells + window] == self._differing_before[cells])
 
     def representatives(self, cells: ArrayLike) -> np.ndarray:
-        """For each of ``cells`` (cell,), counted from 0, the first one of them that has the same rows, (cell,)."""
+        """The first of ``cells`` (cell,), counted from 0, that has the same rows as each of them, (cell,)."""
         cells = np.array(cells, np.int64)
         interior = self.is_interior(cells)
         cells[interior] = cells[interior][:1]

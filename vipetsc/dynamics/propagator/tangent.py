@@ -268,7 +268,7 @@ class TangentPropagator(Propagator):
         return substeps
 
     def _is_open(self, c: int) -> np.ndarray:
-        """Which rows (row,) of the tape of cluster ``c`` are of an open site.
+        """Mask (row,) of the rows of the tape of cluster ``c`` that belong to an open site.
 
         The tape has the sites that are not free. Of these only a contact that is pressed at rest may be open.
         """

@@ -72,7 +72,7 @@ class TimeStepper:
         return self._try(time, h, after_onset)
 
     def repeat_step(self, time: float, h: float, after_onset: bool) -> StepOutcome:
-        """As ``try_step``, from the state that the last step began with."""
+        """Repeat ``try_step`` from the state with which the last step began."""
         self.undo_step()
         return self._try(time, h, after_onset)
 

@@ -107,7 +107,7 @@ def _transform(theta: np.ndarray, weighted: np.ndarray, out: np.ndarray) -> None
 
 @lru_cache(maxsize=256)
 def _factors(order: int) -> np.ndarray:
-    """What turns harmonics (K + 1,) up to an ``order`` into the transforms (4, K + 1) of z and three derivatives.
+    """Factors (4, K + 1) by which harmonics up to an ``order`` become the transforms of z and three derivatives.
 
     They are those of uniform samples, up to a factor of half their number.
     """

@@ -50,7 +50,7 @@ AT_END = 1e-9
 
 
 class Dissipation(NamedTuple):
-    """What dissipates: ``damping`` (n, n) in N s/m, the ``laws`` of all contacts; and the ``forced`` mass or None."""
+    """Sources of loss, ``damping`` (n, n) in N s/m and the ``laws`` of all contacts; the ``forced`` mass or None."""
 
     damping: csr_matrix
     laws: Sequence[Contact]
@@ -63,7 +63,7 @@ class Dissipation(NamedTuple):
 
 
 def dissipation_of(case: NnmCase) -> Dissipation:
-    """What dissipates in a case."""
+    """The dashpots and contacts of a case that dissipate, and its forced mass."""
     damping = csr_matrix((0, 0))
     if case.nnm.system in ("chain", "condensed"):
         chain = case.damped_chain

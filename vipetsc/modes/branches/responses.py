@@ -150,7 +150,7 @@ class ResponseMethod(Method[Response]):
 
 
 def _axes(case: NfrcCase) -> Variables:
-    """What variables of states have for dimensions: sites, harmonics, channels, and what [output] names."""
+    """Coordinates of the variables of states: sites, harmonics, channels, points and pairs that [output] names."""
     chain = case.model().chain
     orders = np.arange(case.nfrc.harmonics + 1)
     axes = {

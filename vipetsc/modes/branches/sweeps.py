@@ -17,7 +17,7 @@ class ParameterSweep(NamedTuple):
 
 
 def with_stable_folds(stable: np.ndarray, fold: np.ndarray) -> np.ndarray:
-    """Which states (state,) a sweep reaches: the ``stable`` ones and the folds that have a stable neighbour.
+    """Mask (state,) of the states that a sweep reaches: the ``stable`` ones and folds with a stable neighbour.
 
     ``stable`` and ``fold`` (state,) mark the states of a curve, in its order.
     """

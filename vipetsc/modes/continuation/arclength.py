@@ -83,10 +83,10 @@ class StepRule(Protocol[S]):
     chart: str
 
     def not_converged(self, step: float, attempt: Attempt) -> Verdict:
-        """What follows after an ``attempt`` at a ``step`` that has not converged."""
+        """The verdict on an ``attempt`` at a ``step`` that has not converged."""
 
     def judge(self, before: S, after: S, geometry: Geometry) -> Verdict:
-        """What follows after a step from the point ``before`` to ``after`` that has converged."""
+        """The verdict on a step from the point ``before`` to ``after`` that has converged."""
 
     def end(self, point: S) -> tuple[S, str] | None:
         """The last point of the branch and how it ended, if it ends at ``point``; else None.

@@ -1,4 +1,4 @@
-"""What ``[output]`` asks for of a steady state: motion of named masses, forces of contacts and on walls.
+"""Outputs of a steady state that ``[output]`` asks for: motion of named masses, forces of contacts and on walls.
 
 The harmonics F_k of the contact forces and of the drive give those of every displacement, U_k = G(k Om) F_k; velocity
 and acceleration follow by factors i k Om. Peaks are those of the sum of all harmonics; those of contact forces are
@@ -41,7 +41,7 @@ class HarmonicMotion(NamedTuple):
 
 
 class ResponseOutputs:
-    """What ``[output]`` of a ``case`` asks for: ``points``, pairs of them (``transmission``), ``forces``.
+    """The outputs that a ``case`` asks for: ``points``, pairs of them (``transmission``), ``forces``.
 
     ``cells`` are those, from 0, of the named masses and, for the forces on walls, of the two ends.
     """

@@ -25,7 +25,7 @@ NEIMARK_SACKER = "neimark-sacker"
 
 
 class StatesWithStability(Protocol):
-    """What is asked of the states of a curve (``SteadyStates``), each given by its unknowns ``xi``."""
+    """The questions that states of a curve (``SteadyStates``) must answer, each state given by its unknowns ``xi``."""
 
     @property
     def options(self) -> Any:

@@ -89,7 +89,7 @@ class Shooting(ShootingEquations[Arc]):
         return traces, float(np.abs(multipliers(traces, self.map.quarter)).max(initial=1.0))
 
     def residual(self, arc: Arc) -> np.ndarray:
-        """What vanishes at the arc's end (n,), and the displacement of the centre of mass times a frequency."""
+        """Values (n,) that vanish at the arc's end, plus the displacement of the centre of mass times a frequency."""
         end = super().residual(arc)
         if self._kept is None:
             return end
