@@ -2,6 +2,7 @@
 
 import errno
 from pathlib import Path
+from types import SimpleNamespace
 
 from mpi4py import MPI
 
@@ -12,7 +13,7 @@ import xarray as xr
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.cli.drawing import draw_pictures
-from vipetsc.cli.verbs.branch_verbs import PICTURES
+from vipetsc.cli.verbs.branch_verbs import PICTURES, parameter_unit
 from vipetsc.figures import branch_curves, nfrc, registry, style
 from vipetsc.figures.sources import BRANCHES
 from vipetsc.figures.sweep_members import Files
@@ -176,3 +177,25 @@ def test_a_full_disk_is_no_error_of_the_branch_that_is_drawn(tmp_path, monkeypat
     with pytest.raises(OSError, match="No space left") as raised:
         draw_pictures(PICTURES, [tmp_path], MPI.COMM_WORLD)
     assert not isinstance(raised.value, ValueError)
+
+
+@pytest.mark.parametrize(
+    ("nfrc_section", "drive", "unit"),
+    [
+        ({"source": "wave"}, {}, "clearances"),
+        ({"source": "force"}, {}, "N"),
+        ({"source": "force"}, {"end": "left"}, "m"),
+        ({"source": "force", "over": "frequency", "range": [400.0, 600.0], "fixed": [1e-4]}, {"end": "left"}, "rad/s"),
+        ({"source": "force", "over": "contacts.clearance", "range": [1e-4, 2e-4], "fixed": [1e-4]}, {}, "mm"),
+    ],
+)
+def test_printed_special_points_have_the_unit_of_the_parameter(nfrc_section, drive, unit):
+    """Amplitudes of a wave, a force and a wall that moves; frequencies; a key, whose unit the curve has."""
+    table = {
+        "lattice": {"preset": "four-band", "cells": 6},
+        "contacts": {"sites": [3], "clearance": 1e-3},
+        "drive": {"waveform": "harmonic", "frequency": 1000.0} | drive,
+        "nfrc": nfrc_section,
+    }
+    curve = SimpleNamespace(about={"unit": "mm"})
+    assert parameter_unit(NfrcCase.from_table(table), curve) == unit

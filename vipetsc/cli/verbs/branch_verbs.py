@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vipetsc.case import NnmCase
+from vipetsc.case.amplitude import drive_unit
 from vipetsc.case.keys import unit_of
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.cli.arguments import CASE, OF_STUDIES, case_with
@@ -218,6 +219,19 @@ def branch_table(branch: "Branch") -> str:
     return "\n".join(lines)
 
 
+def parameter_unit(case: NfrcCase, curve: "Branch") -> str:
+    """Unit of the parameter over which a ``curve`` of the case runs."""
+    options = case.nfrc
+    if options.varies_key:
+        return str(curve.about["unit"])
+    if options.over == "frequency":
+        return "rad/s"
+    # The amplitude of a wave counts in clearances of the first site, that of a drive in N or, of a wall, in m.
+    if options.source == "wave":
+        return "clearances"
+    return drive_unit(case.drive)
+
+
 def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
     """Summary of a curve: length, folds, jumps of a slow sweep up and down, stable points, energy balance."""
     from vipetsc.modes.branches.response_layout import measure, parameter_values, sweep_down, sweep_up
@@ -227,11 +241,7 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
     if not curve.points:
         return rows
 
-    unit = "rad/s"
-    if options.over == "amplitude":
-        unit = "clearances" if options.source == "wave" else "N"
-    elif options.varies_key:
-        unit = str(curve.about["unit"])
+    unit = parameter_unit(case, curve)
     parameter = parameter_values(curve)
     for kind, heading in SPECIAL_POINTS.items():
         at = parameter[curve.is_kind(kind)]
