@@ -126,10 +126,10 @@ class CompilerListener(event.Listener):
 
 @cache
 def _announce() -> None:
-    """Report once, on one rank, why the first run of a version takes half a minute longer than the next."""
+    """Report once, on one rank, why the first run of a version takes some 20 s longer than the next."""
     # Where kernels cannot be kept, a warning has said that they are compiled at every start.
     if not launched_rank() and all(_can_keep(parent) for parent in PARENTS):
-        say("vipetsc: compiling kernels (once, about half a minute)")
+        say("vipetsc: compiling kernels (once, about 20 s)")
 
 
 event.register("numba:compile", CompilerListener())
@@ -161,7 +161,7 @@ def _can_keep(parent: Path) -> bool:
         parent.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=parent).close()
     except OSError as error:
-        # Once, on one rank: every command compiles for up to half a minute then.
+        # Once, on one rank: every command compiles for up to 20 s then.
         if not launched_rank():
             reason = error.strerror or error
             logger.warning(

@@ -219,7 +219,7 @@ def test_that_kernels_are_compiled_is_said_once(package, tmp_path):
         return done.stderr.splitlines()
 
     assert say(OMPI_COMM_WORLD_RANK="1", NUMBA_CACHE_DIR=str(tmp_path / "other")) == []
-    assert say(OMPI_COMM_WORLD_RANK="0") == ["vipetsc: compiling kernels (once, about half a minute)"]
+    assert say(OMPI_COMM_WORLD_RANK="0") == ["vipetsc: compiling kernels (once, about 20 s)"]
     assert say() == []
 
 
