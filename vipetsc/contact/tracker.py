@@ -1,4 +1,9 @@
-"""Modes of sites over time, compiled: switching at located changes, and the log of impacts."""
+"""Modes of sites over time, compiled: switching at located changes, and the log of impacts.
+
+Engines locate the instants at which a contact opens or closes (``contact.changes``) and end a step there. The tracker
+then gives the site its new mode, and keeps the log: an episode begins where a site closes, has the largest indentation
+and force of its steps, and is written to the log where the site opens.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -113,10 +118,11 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
 def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energies: np.ndarray, t: float) -> int:
     """Switch every site that has landed at time ``t`` in s; returns how many. The log must have room.
 
-    ``motion`` (sites, 3) holds w, w', w''. ``energies`` (sites,) are the ledger's in J, which change at both ends of a
-    clipped phase: what the sites dissipated so far, and of a clipped one its ``clipped_energy``, too. Their sum is
-    constant while a site is clipped. As an integral the loss would need short steps: its power ends at the separation
-    as Hertz's force does, as the power 3/2 of time, where nothing in the motion asks for them.
+    ``motion`` (sites, 3) holds w, w', w''. ``energies`` (sites,) in J are what the ledger has of each site: the energy
+    that it has dissipated so far, to which the ``clipped_energy`` of a clipped site is added. That sum is constant in a
+    clipped phase, and this function changes it at both ends of the phase. The loss in that phase is not integrated:
+    its power vanishes at the separation as the power 3/2 of time, and would need short steps where the motion, which
+    feels no force, needs none.
     """
     switched = 0
     for i in range(contacts.size):

@@ -1,4 +1,9 @@
-"""The observer ``recorder``, which collects fields, energies and episodes and passes them to the output in chunks."""
+"""The observer ``recorder``, which collects fields, energies and episodes and passes them to the output in chunks.
+
+An engine fills the arrays of ``room`` in place with a block of samples; ``observe`` takes note of them. Chunks have a
+bounded size, since a run may be longer than memory, and each is written once. Rank 0 gathers the parts of all ranks
+unless they write one file together.
+"""
 
 import sys
 from dataclasses import fields
@@ -70,6 +75,7 @@ class Recorder(Observer):
         self._length = min(chunk_samples(8 * most), setup.output.longest)
         self._stride = output.stride
         self._shape = len(output.fields), self._length, layout.dofs, local.size
+        # Of the fields, 1 for velocities, which engines take from the second half of the state.
         self._moving = np.array([name == "velocity" for name in output.fields], np.int64)
         self._first = 0
         if local.size:
@@ -79,7 +85,11 @@ class Recorder(Observer):
     def _begin_chunk(self) -> None:
         """Allocate the arrays of a chunk of samples."""
         n = self._length
-        self._held = self._rows = self._number = 0
+        # Samples and recorded rows (every ``stride``-th sample) in the chunk so far, and the number of its first
+        # sample.
+        self._held = 0
+        self._rows = 0
+        self._number = 0
         self._sums = np.zeros((n, ENERGY_SUMS, 2), np.int64)
         self._work = np.zeros((n, len(self.setup.model.drives)))
         sites = len(self.setup.layout.sites)
@@ -186,6 +196,7 @@ class Recorder(Observer):
             chunk |= self._points.gather(self._kept["time"][held], self._motion[held], self._forces[held])
         if comm.rank == 0:
             chunk |= {name: values[: self._held] for name, values in self._kept.items()}
+            # Rows of fields are the samples whose number in the run is a multiple of the stride.
             chunk["field_time"] = chunk["time"][-self._number % self._stride :: self._stride]
         output.append(chunk or None)
 

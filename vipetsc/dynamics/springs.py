@@ -1,4 +1,9 @@
-"""Compiled accelerations by springs and dashpots, and sums of their squares.
+"""Compiled accelerations by springs and dashpots, and the energies and powers of these.
+
+A mass m feels from each spring of the stiffness k, with a dashpot c parallel to it, the force k (u_other - u) + c
+(v_other - v), and from its dashpot to the ground -c_g v; ``spring_accelerations`` divides the sum by m. ``add_squares``
+sums k z^2 and c z'^2 over the elongations z, twice the energy and the power, and springs beyond their linear part have
+functions of their own (``dynamics.spring_law``).
 
 A cell's sums run over its springs in the cell's order, whichever rank owns it and wherever in the loop it falls: the
 result does not depend on the partition, to the last bit. Where all cells are alike and undamped, a mass and a spring
@@ -23,7 +28,8 @@ CHUNK = 512
 def displacement(y: np.ndarray, lattice: LatticeRecord, cell: int, mass: int) -> float:
     """Displacement in m of ``mass`` in an owned ``cell`` or in one next to them (-1, cells); zero in a wall.
 
-    Of a ``mass`` counted on behind the cell's, where ghosts have velocities: its velocity in m/s.
+    A ``mass`` of dofs + j stands for the velocity in m/s of mass j, which lies there in ``y`` (component,). Ghosts have
+    velocities in lattices with dashpots only.
     """
     shape = lattice.shape
     if 0 <= cell < shape.cells:
@@ -62,7 +68,8 @@ def _is_beyond_free_end(lattice: LatticeRecord, cell: int) -> bool:
 @kernel
 def _table_entry(lattice: LatticeRecord, coupling: Any, cell: int) -> int:
     """Where ``stiffness`` and ``damping`` have the spring of a ``coupling`` of the owned ``cell``."""
-    # A row of the tables begins with the cell before the first one; a spring is its left cell's.
+    # A spring between two cells is listed with the left one. Each spring's row of the tables therefore begins with the
+    # cell before the first owned one, whose springs reach it.
     left = cell + min(coupling.offset, 0)
     return coupling.spring * (lattice.shape.cells + 1) + 1 + left
 
@@ -223,7 +230,8 @@ def add_nonlinear_energies(y: np.ndarray, lattice: LatticeRecord, first: int, en
     for s in range(lattice.nonlinear.size):
         coupling = lattice.nonlinear[s]
         for i in range(energies.size):
-            # A spring counts where it starts; one that starts in the wall on the left, where it ends.
+            # ``nonlinear`` has a spring twice, once for each of its masses. It counts at its start (sign +), and if it
+            # starts in the wall on the left, where no cell is, at its end.
             at_wall = first + i + coupling.offset < 0 and lattice.shape.left_ghost < 0
             if coupling.sign > 0.0 or at_wall:
                 law = lattice.spring_laws[coupling.law + coupling.stride * (first + i)]

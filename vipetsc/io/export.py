@@ -117,6 +117,7 @@ def write_curves(path: Path) -> list[Path]:
             if np.prod([data.sizes[dim] for dim in dims]) > MOST_ROWS:
                 continue
             table = data[names].assign(_columns_of_designs(data, dims) | _columns_of_responses(data, dims))
+            # CSV has no room for coordinates over other dimensions, such as the cells of sites.
             foreign = [name for name, item in table.coords.items() if not set(item.dims) <= set(dims)]
             # The dimensions name the file: variables over other ones are another table.
             over = "-".join(dims)

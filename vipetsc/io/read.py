@@ -45,6 +45,7 @@ def with_point_names(run: xr.Dataset) -> xr.Dataset:
         return run
     names = [point["name"] for point in tomllib.loads(run.attrs["case"])["output"]["points"]]
     named = run.assign_coords(point=("point", np.array(names, dtype=object), run["point"].attrs))
+    # A dataset that is made from another one does not close its file.
     named.set_close(run.close)
     return named
 
@@ -198,6 +199,7 @@ def curves(ensemble: xr.Dataset, along: str = "amplitude") -> Iterator[tuple[xr.
         return
     for index in np.ndindex(*(ensemble.sizes[name] for name in others)):
         curve = ensemble.isel(dict(zip(others, index, strict=True)))
+        # A member that failed has NaN for every measure, and every other member has this one.
         succeeded = curve["number"].values[np.isfinite(curve["contact_episodes"].values)]
         if succeeded.size:
             yield curve, int(succeeded[0])

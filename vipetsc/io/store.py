@@ -215,6 +215,7 @@ class RunFolder:
                 small, log = read
                 in_order = sort_over_ranks(chunks.writers(self), log, ("onset", "site"))
                 contents = _Contents(small=small, log=in_order)
+            # Ranks that do not write wait here as well, so that an error of a writer is raised on all.
             on_every_rank(self.comm, write if writes else lambda: None)
             on_root(self.comm, conclude)
         finally:

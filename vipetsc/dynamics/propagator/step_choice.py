@@ -18,11 +18,15 @@ from vipetsc.lattice import Chain, ToneBurst, nonlinear_numbers
 
 # The terms (omega H)^k / k! grow before they fall, to 5.5 at this omega H, and their rounding with them.
 LARGEST_OMEGA_H = 3.2
-# Steps a sample interval may be cut into.
+# Steps that a sample interval may be cut into. The shortest that were chosen in the lattices below are a sixth of the
+# interval, and an eleventh where samples are so far apart that the series does not allow longer ones.
 MOST_PARTS = 16
 # Sites of one cluster beyond which plain time stepping costs less.
 MOST_SITES = 32
-# Rough costs in us that decide the step's length.
+# Rough costs in us that decide the step's length. Each of the first three halved or doubled leaves the length as it is
+# in every example case (the longest that the series allows) and in 76 of 80 lattices of 300 or 3000 cells with 6 or 20
+# sites, 1 to 8 cells apart. In the other four the chosen steps cost at most 1.44 times as much as the best ones if one
+# of the numbers is wrong by a factor of two.
 STEP_COST = 20.0  # of a step
 CELL_COST = 0.03  # of a cell in a step
 SITE_COST = 10.0  # of a sample's contacts, for each site of a cluster
