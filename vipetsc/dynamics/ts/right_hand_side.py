@@ -6,6 +6,7 @@ ledger integrates fill the components behind the velocities (the equations are i
 """
 
 import ctypes
+from functools import cache
 from typing import Any, get_type_hints
 
 from petsc4py import PETSc
@@ -208,10 +209,12 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     return native.restore_read(u, address)
 
 
+@cache
 def compile_callback() -> CFunc:
     """``PetscErrorCode f(TS, PetscReal t, Vec u, Vec f, void *context)``, compiled or taken from numba's cache.
 
-    ``context`` is the address of a ``CONTEXT`` record. Raises AttributeError where PETSc hides its symbols.
+    ``context`` is the address of a ``CONTEXT`` record. All runs of a process have the same one, which lives on: to load
+    it takes longer than a short run does. Raises AttributeError where PETSc hides its symbols.
     """
     native.bind_symbols()
     return cfunc("i4(i8, f8, i8, i8, i8)")(_callback)
@@ -230,7 +233,7 @@ def register(ts: PETSc.TS, lattice: LatticeRecord) -> np.ndarray:
     context["address"] = tuple(tables[name].ctypes.data for name in _TABLES)
     context["length"] = tuple(tables[name].size for name in _TABLES)
     # PETSc holds bare pointers: all that they point to must live as long as ts.
-    ts.setAttr("callback", (callback, context, lattice))
+    ts.setAttr("callback", (context, lattice))
     error = petsc_library().TSSetRHSFunction(
         ctypes.c_void_p(ts.handle),
         ctypes.c_void_p(None),
