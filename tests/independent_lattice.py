@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -62,11 +62,13 @@ class ScipyLattice:
         """u, u', u'' as (quantity, time, mass) at ``times``, from the state at ``start`` on; the number of impacts."""
         n = len(self.masses)
         rows = [stop.row(n) for stop in self.stops]
+        # Springs and dashpots in one product: rates are asked for some ten thousand times.
+        linear = -np.hstack([self.stiffness, self.damping])
         closed: dict[int, float] = {}
         impacts = 0
 
         def rates(t: float, y: np.ndarray) -> np.ndarray:
-            total = self.force(t) - self.stiffness @ y[:n] - self.damping @ y[n:]
+            total = self.force(t) + linear @ y
             for spring in self.curved:
                 total = total + spring.force(y[:n])
             for k, speed in closed.items():
@@ -102,18 +104,18 @@ class ScipyLattice:
                 rtol=1e-11,
                 atol=1e-15,
                 events=events,
-                dense_output=True,
+                # At samples alone: interpolants of all steps would cost as much again as a fifth of the steps.
+                t_eval=times[times >= t],
                 # Events are looked for once a step: a longer one could miss a short contact.
                 max_step=2e-4,
             )
-            inside = (times >= t) & (times <= solution.t[-1])
-            if inside.any():
-                values = solution.sol(times[inside]).T
-                samples[inside] = values
-                accelerations[inside] = [rates(at, y)[n:] for at, y in zip(times[inside], values, strict=True)]
-            t = float(solution.t[-1])
+            first = np.searchsorted(times, t)
+            for number, at in enumerate(solution.t, first):
+                samples[number] = solution.y[:, number - first]
+                accelerations[number] = rates(at, samples[number])[n:]
+
             # Started anew at each change: the force's derivative jumps there.
-            y = solution.y[:, -1].copy()
+            t, y = self._end_of(solution, times[-1])
             for k, found in enumerate(solution.t_events):
                 if found.size and k in closed:
                     del closed[k]
@@ -122,6 +124,14 @@ class ScipyLattice:
                     closed[k] = float(self.stops[k].side * (rows[k] @ y[n:]))
                     impacts += 1
         return np.stack([samples[:, :n], samples[:, n:], accelerations]), impacts
+
+    @staticmethod
+    def _end_of(solution: Any, last: float) -> tuple[float, np.ndarray]:
+        """Time and state at which SciPy's ``solution`` ended: a change of contact, or else the ``last`` time."""
+        for times, states in zip(solution.t_events, solution.y_events, strict=True):
+            if len(times):
+                return float(times[-1]), states[-1]
+        return last, solution.y[:, -1]
 
 
 def chain_matrices(count: int, stiffness: float, damping: float, ground: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -41,8 +41,8 @@ def refined(few: SteadyStates, many: SteadyStates, xi: np.ndarray) -> np.ndarray
     return many.at(guess, xi[-1])
 
 
-def motion_at(states: SteadyStates, xi: np.ndarray, cells: np.ndarray, phase: float = 0.0):
-    """Displacement and velocity (cell, dof) of a steady state at a ``phase`` of its drive."""
+def motion_at(states: SteadyStates, xi: np.ndarray, cells: np.ndarray, phase: float | np.ndarray = 0.0):
+    """Displacement and velocity (cell, dof, ...) of a steady state at a ``phase`` (...) of its drive."""
     omega, amplitude = states.drive(xi[-1])
     unknowns = xi[:-1] * states.clearance
     # Motions that are the same on both sides have no mean.
@@ -61,7 +61,7 @@ def motion_at(states: SteadyStates, xi: np.ndarray, cells: np.ndarray, phase: fl
         if order == 1 and states.wave:
             field = field + states.linear_motion(omega).wave.field(cells) * amplitude * states.clearance
 
-        field = field * np.exp(1j * order * phase)
+        field = np.multiply.outer(field, np.exp(1j * order * phase))
         displacement = displacement + field.real
         velocity = velocity + (1j * order * omega * field).real
     return displacement, velocity

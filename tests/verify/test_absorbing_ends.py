@@ -93,7 +93,7 @@ def waves_of(cell, omega):
 
 def returning(source, section, slowest):
     """Fractions of what is sent that come back as waves faster than each of ``slowest`` (cells/s), on a fixed grid."""
-    angles = (np.arange(100) + 0.5) / 100 * np.pi / 2
+    angles = (np.arange(60) + 0.5) / 60 * np.pi / 2
     sent = 0.0
     back = np.zeros(len(slowest))
     for low, high in itertools.pairwise(source.edges().tolist()):

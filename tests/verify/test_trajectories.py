@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -39,8 +40,16 @@ class Reference:
         force = self.pull @ u
         if self.side.any():
             force += self.contact_forces(u, v)
-        force[self.driven] += self.model.drive.force(t)
+        force[self.driven] += self.burst(t)
         return np.concatenate([v, force / self.masses])
+
+    def burst(self, t: float) -> float:
+        """Force of the drive in N, eq. (3) of the paper."""
+        drive = self.model.drive
+        if not 0 < t < drive.duration:
+            return 0.0
+        phase = drive.frequency * t
+        return drive.window_amplitude * (1 - math.cos(phase / drive.cycles)) * math.sin(phase)
 
     def contact_forces(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Forces of the closed contacts on all masses (SPEC section 2)."""
