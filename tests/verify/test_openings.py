@@ -16,7 +16,8 @@ from vipetsc.dynamics import simulate
 from vipetsc.dynamics.opening import Opening
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest
-from vipetsc.studies.linear_history import LinearHistory, begins_linearly, opening_of
+from vipetsc.studies import linear_history
+from vipetsc.studies.linear_history import LinearHistory, begins_linearly, history_bytes, opening_of
 from vipetsc.studies.sweep import run_sweep
 
 TABLE = {
@@ -146,6 +147,25 @@ def test_a_run_that_may_touch_at_once_begins_at_rest():
 def test_members_begin_from_a_linear_run_that_several_have_in_common(sweep, sections, begins):
     plan = Sweep.from_table(with_sections(TABLE, sections) | {"sweep": sweep})
     assert begins_linearly(plan, plan.case(0)) == begins
+
+
+@pytest.mark.parametrize(("room", "simulated"), [(3, 3), (2, 6)])
+def test_histories_of_velocities_fit_twice_into_the_memory_of_whole_ones(monkeypatch, room, simulated):
+    """A third history needs the place of the first one, whose members simulate it again, and so on."""
+    sweep = {"drive": {"cycles": [3, 4, 5], "amplitude": [30.0, 31.0, 32.0]}, "measures": ["transfer"]}
+    plan = Sweep.from_table(TABLE | {"sweep": sweep})
+    size = history_bytes(plan.case(0), fields=1)
+    monkeypatch.setattr(linear_history, "MOST_BYTES", room * size)
+    cases = []
+    of = LinearHistory.of
+
+    def counted(case: Case, *others) -> LinearHistory:
+        cases.append(case)
+        return of(case, *others)
+
+    monkeypatch.setattr(LinearHistory, "of", counted)
+    assert run_sweep(plan).complete
+    assert len(cases) == simulated
 
 
 @pytest.mark.slow

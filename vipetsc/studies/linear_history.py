@@ -34,7 +34,7 @@ FEWEST_MEMBERS = 3  # of a linear run whose history is worth its computation: it
 # Samples between those that members may begin after: a member computes half of them twice on average, under 1 % of
 # the built-in run, and a state takes as much memory as one sample.
 STATES_EVERY = 64
-MOST_BYTES = 2**28  # of the histories that are kept, a quarter of a GB: three of the built-in lattice's, 85 MB each
+MOST_BYTES = 2**28  # of the histories that are kept, a quarter of a GB: six of the built-in lattice's, 42 MB each
 # Keys of contacts and of the amplitude, in which members of one linear run differ; those drawn for contacts.
 CONTACTS = "contacts."
 AMPLITUDE = "drive.amplitude"
@@ -114,10 +114,10 @@ def _keeps_linear_run(key: str, plan: Sweep, case: Case) -> bool:
     return key.startswith(CONTACTS)
 
 
-def history_bytes(case: Case) -> int:
-    """Bytes of the motion in the history of the linear run of ``case``."""
+def history_bytes(case: Case, fields: int = 2) -> int:
+    """Bytes of the motion in the history of the linear run of ``case``, of which so many ``fields`` are kept."""
     model = case.model()
-    return 16 * model.samples * model.chain.cells * model.chain.cell.dofs
+    return 8 * fields * model.samples * model.chain.cells * model.chain.cell.dofs
 
 
 class LinearHistories:
@@ -131,10 +131,13 @@ class LinearHistories:
         """The history of that ``name``, if it is kept."""
         return self._histories.get(name)
 
-    def keep(self, name: str, history: LinearHistory, case: Case) -> None:
-        """Keep the ``history`` of the linear run of ``case``, which is the same on all ranks, as what goes for it."""
+    def keep(self, name: str, history: LinearHistory, size: int) -> None:
+        """Keep the ``history`` of ``size`` bytes on the first rank; the oldest ones go for it.
+
+        The size is the same on all ranks: they drop the same histories, which they simulate together.
+        """
         self._histories[name] = history
-        self._bytes[name] = history_bytes(case)
+        self._bytes[name] = size
         while sum(self._bytes.values()) > MOST_BYTES:
             # A dictionary keeps the order of insertion.
             oldest = next(iter(self._histories))

@@ -25,7 +25,7 @@ from vipetsc.parallel import StopRequest, on_root
 from vipetsc.spectra.measures import can_be_scaled
 from vipetsc.studies.analysis import WHOLE, analyse
 from vipetsc.studies.ensemble import COMPLETE, FAILED, SCALED, STATUS
-from vipetsc.studies.linear_history import LinearHistories, LinearHistory, begins_linearly
+from vipetsc.studies.linear_history import LinearHistories, LinearHistory, begins_linearly, history_bytes
 from vipetsc.studies.linear_run import MARGIN, MEMBERS, LinearRun, factor, leading_cell, linear_name, measured
 from vipetsc.studies.pool import reason_of
 from vipetsc.studies.recorded_runs import RecordedRuns
@@ -88,9 +88,11 @@ class SweepRuns:
         """Keep the ``history`` of the linear run ``name`` of ``case`` for the members that begin from it."""
         if not begins_linearly(self.plan, case):
             return
+        size = history_bytes(case)
         if not self.plan.options.fields:
             history = history.with_velocity_alone()
-        self._histories.keep(name, history, case)
+            size = history_bytes(case, fields=1)
+        self._histories.keep(name, history, size)
 
     def _opening(self, case: Case, name: str) -> Opening | None:
         """The samples with which ``case`` begins, from the linear run ``name``, which is simulated if it is not kept.
