@@ -196,7 +196,7 @@ def _state_values(windows: GrowingWindows, z: np.ndarray, jacobian: np.ndarray) 
         errors = np.sqrt(np.einsum("ij,jk,ik->i", state.matrix, inside, state.matrix))
         masses = np.arange(len(displacement))
 
-        # All other coordinates come first: what is left is what the data tell of this state while these are free.
+        # All other coordinates come first: the rest is what the data determine of this state while these are free.
         others = [p for p in range(misfit.size) if p not in state.indices]
         ordered = jacobian[:data_rows][:, [*state.indices, *others]]
         singular = np.linalg.svd(marginal_jacobian(ordered, len(state.matrix)), compute_uv=False)
@@ -258,7 +258,7 @@ def _channel_values(windows: GrowingWindows, z: np.ndarray) -> dict[str, Any]:
 
 
 def warnings_of(data: xr.Dataset) -> list[str]:
-    """Sentences on what the fit does not explain, and what the data do not tell."""
+    """Sentences on residuals that the fit does not explain, and on values that the data do not determine."""
     return [
         *_warnings_of_channels(data),
         *_warnings_of_parameters(data),
@@ -294,12 +294,12 @@ def _warnings_of_parameters(data: xr.Dataset) -> Iterator[str]:
             yield f"{name}: at least {least:.4g} m; nothing touches there"
 
     for row in np.flatnonzero((data["determined"].values == 0) & np.isnan(at_least)):
-        helped = "no further sensor would"
+        helped = "no further sensor would do so"
         error = float(data["sensor/relative_error"].values[row])
         if error < DETERMINED:
             place = f"mass {data['sensor/mass'].values[row]} of cell {data['sensor/cell'].values[row]}"
-            helped = f"a sensor at {place} would, to {100 * error:.2g} %"
-        yield f"{data['parameter'].values[row]}: the data do not tell it; {helped}"
+            helped = f"with a sensor at {place} its error would be {100 * error:.2g} %"
+        yield f"{data['parameter'].values[row]}: the data do not determine it; {helped}"
 
 
 def _warnings_of_states(data: xr.Dataset) -> Iterator[str]:

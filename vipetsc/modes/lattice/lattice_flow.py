@@ -27,7 +27,8 @@ from vipetsc.lattice import Chain, Drive, ToneBurst
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.problem import FlowError
 
-# Errors allowed in a contact's substep, relative to its speed.
+# Errors allowed in a contact's substep, relative to its speed: below the 1e-12 to which orbits of lattices are
+# corrected.
 RTOL = 1e-13
 # Errors are relative to a speed: of an orbit that starts at rest, at least this fraction of its fastest mode's.
 SLOWEST = 0.1
