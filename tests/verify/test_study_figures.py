@@ -13,9 +13,10 @@ from matplotlib.image import imread
 from vipetsc.case import Case, Sweep
 from vipetsc.figures.entropy import AVERAGES, COLOURS
 from vipetsc.figures.registry import FIGURES, draw
-from vipetsc.figures.scattering import KC, LEAST_WEIGHT, bin_colours, shown_bins
+from vipetsc.figures.scattering import KC, LEAST_WEIGHT
 from vipetsc.figures.style import GREY, rc_style
 from vipetsc.figures.sweep_members import DrivenWave, Files, Sweeps, series_of
+from vipetsc.figures.wavenumber_bins import FIELD, bin_colours, partition, shown_bins
 from vipetsc.io.read import field_time, open_ensemble, open_run, select, whole_members
 from vipetsc.lattice import bloch
 from vipetsc.spectra import filter_bank, normalised, transform
@@ -233,6 +234,28 @@ def test_partition_shows_seven_bins_and_all_colours(whole):
     panels = [axes for axes in figure.axes if axes.get_title(loc="left").startswith("(b.")]
     assert len(panels) == 3
     assert all(axes.collections for axes in panels)
+
+
+@pytest.mark.slow
+def test_a_partition_into_one_bin_is_drawn(whole):
+    """One map with all of the energy, and nothing in the panels of the bins that there are not."""
+    with Files() as files:
+        (series,) = series_of(Sweeps([whole], files), FIELD)
+        runs = []
+        for member in series.runs:
+            field = member.analysis[FIELD]
+            bins = field.dims[0]
+            bounds = member.analysis["partition/bounds"][[0, -1]]
+            others = member.analysis.drop_dims([bins, *bounds.dims])
+            one_bin = {FIELD: field.sum(bins).expand_dims(bins), "partition/bounds": bounds}
+            runs.append(member._replace(analysis=others.assign(one_bin)))
+        with rc_style():
+            figure = partition.__wrapped__(series._replace(runs=tuple(runs)))
+
+        (image, *_) = maps(figure)
+        np.testing.assert_array_equal(image.get_array(), runs[1].analysis[FIELD].values[0].T)
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert [title for title in titles if title.startswith("(a.")] == ["(a.i) $K_{1}$"]
 
 
 @pytest.mark.slow

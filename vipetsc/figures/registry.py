@@ -33,6 +33,7 @@ from vipetsc.figures import (
     schematics,
     transfer,
     transfer_curves,
+    wavenumber_bins,
 )
 from vipetsc.figures.registered import registered_figures
 from vipetsc.figures.sources import BRANCHES, DESIGN, FILES, IDENTIFIED, LAW, OPTIMUM, PAPER, PREDICTION, RUN, SWEEP
@@ -104,9 +105,9 @@ _SPECS = (
     FigureSpec("ledger", RUN, runs.ledger, without=runs.without_ledger),
     FigureSpec("amplitudes", SWEEP, scattering.amplitudes, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("wavelets", SWEEP, scattering.wavelets, measure="entropy", needs=THREE_AMPLITUDES),
-    FigureSpec("partition", SWEEP, scattering.partition, measure="entropy", needs=THREE_AMPLITUDES),
-    FigureSpec("partition_explained", SWEEP, scattering.partition_explained, "entropy", needs=THREE_AMPLITUDES),
-    FigureSpec("reconstruction", SWEEP, scattering.reconstruction, measure="entropy", needs=THREE_AMPLITUDES),
+    FigureSpec("partition", SWEEP, wavenumber_bins.partition, measure="entropy", needs=THREE_AMPLITUDES),
+    FigureSpec("partition_explained", SWEEP, wavenumber_bins.partition_explained, "entropy", needs=THREE_AMPLITUDES),
+    FigureSpec("reconstruction", SWEEP, wavenumber_bins.reconstruction, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("entropy_maps", SWEEP, scattering.entropy_maps, measure="entropy", needs=THREE_AMPLITUDES),
     FigureSpec("entropy", PAPER, entropy.entropy, measure="entropy"),
     FigureSpec("entropy_all", PAPER, entropy.entropy_all, measure="entropy"),

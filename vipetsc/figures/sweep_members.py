@@ -184,11 +184,12 @@ class AmplitudeSeries(NamedTuple):
         return np.minimum(times, end)
 
 
-def from_series(*needs: str, wave: bool = False, sites: bool = False) -> Callable[..., Any]:
+def from_series(*needs: str, needs_wave: bool = False, needs_sites: bool = False) -> Callable[..., Any]:
     """Decorate a figure of an `AmplitudeSeries`: it offers one picture a series whose analyses hold ``needs``.
 
-    With ``wave`` only of series that drive a pass band, with ``sites`` only of those that recorded contact sites and
-    other cells.
+    ``needs`` are names of variables of ``analysis.h5``. A figure that ``needs_wave`` is offered of series that drive a
+    pass band, one that ``needs_sites`` of those that recorded contact sites and other cells. Of other series there is
+    no such picture, and no error.
     """
 
     def decorate(page: Callable[[AmplitudeSeries], Figure]) -> Callable[[Sweeps], Iterator[Drawing]]:
@@ -198,7 +199,7 @@ def from_series(*needs: str, wave: bool = False, sites: bool = False) -> Callabl
                 run = series.runs[0].run
                 has_wave = series.wave.band > 0
                 has_sites = len(recorded_sites(run)) > 0 and run.sizes["cell"] > 1
-                if (has_wave or not wave) and (has_sites or not sites):
+                if (has_wave or not needs_wave) and (has_sites or not needs_sites):
                     shown = [result for run in series.runs for result in run.results]
                     yield Drawing(series.suffix, partial(page, series), shown)
 
