@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 from mpi4py import MPI
@@ -158,7 +158,7 @@ def test_orbits_have_the_energies_that_are_asked_for(tmp_path):
 def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(tmp_path, monkeypatch):
     """A branch that was stopped in either half, and resumed each time, leaves the files of one that was not."""
     # The growing branch is written after every point, which takes no test of the clock.
-    monkeypatch.setattr("vipetsc.modes.branches.follow.SAVE_EVERY", 0.0)
+    monkeypatch.setattr("vipetsc.modes.branches.follower.SAVE_EVERY", 0.0)
     nnm = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.05]}
     nnm |= {"switch": ["period-doubling"], "switch_points": 3}
     parts = tmp_path / "parts"
@@ -195,23 +195,189 @@ def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(
     assert (parts / crossing).exists()
 
 
+class FailBelow:
+    """A listener that fails at one point below the start, with an exception of that kind."""
+
+    def __init__(self, index: int, error: BaseException) -> None:
+        self.index = index
+        self.error = error
+
+    def __call__(self, branch, point):
+        if branch.name.endswith("-down") and point.index == self.index:
+            raise self.error
+
+
+BOTH = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.0295], "locate": False}
+
+
+def files_of(folder: Path) -> dict[str, str]:
+    """The branches in a folder as text: ending, findings and table."""
+    found = {}
+    for path in sorted(folder.glob("branch-*")):
+        if path.suffix == ".h5":
+            branch = read_branch(path)
+            found[path.name] = f"{branch.ending}{branch.complete}{branch.findings}{table_of(branch)}"
+        else:
+            found[path.name] = path.read_text()
+    return found
+
+
 def test_a_branch_whose_lower_part_fails_keeps_it_and_its_upper_part(tmp_path):
-    """Both parts are in the file, whose ending says what failed; resumed, it says so again."""
-    nnm = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.0295], "locate": False}
-
-    def fail_below(branch, point):
-        if branch.name.endswith("-down") and point.index == 3:
-            raise FlowError("the flow ends here")
-
-    failed = follow(tmp_path, fail_below, **nnm)
-    resumed = follow(tmp_path, resume=True, **nnm)
+    """Both parts are in the file, which says what failed and is not complete."""
+    failed = follow(tmp_path, FailBelow(3, FlowError("the flow ends here")), **BOTH)
 
     # From the last point below the start over the start itself to the end above it.
     assert [point.index for point in failed.points[:5]] == [3, 2, 1, 0, 1]
     assert failed.points[0].energy < 0.029
     assert failed.points[-1].energy > 0.0295
+    # Tangents point along the branch in both parts; the energy grows along it here. The start has no energy tangent.
+    beside_start = failed.points[:3] + failed.points[4:5]
+    assert all(point.energy_tangent > 0 for point in beside_start)
+    assert all(point.tangent @ failed.points[4].tangent > 0 for point in failed.points[:4])
     assert failed.ending == "failed: below the start: the flow ends here"
-    assert read_branch(tmp_path / f"{NAME}.h5").ending == failed.ending
-    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{NAME}.csv", f"{NAME}.h5"]
-    assert resumed.ending == failed.ending
-    assert table_of(resumed) == table_of(failed)
+    assert not failed.complete
+    assert failed.findings == ["below the start: the flow ends here"]
+    stored = read_branch(tmp_path / f"{NAME}.h5")
+    assert stored.ending == failed.ending
+    assert stored.failure_below == failed.failure_below
+    assert not stored.complete
+    assert list(files_of(tmp_path)) == [f"{NAME}.csv", f"{NAME}.h5"]
+
+
+def test_a_lower_part_that_failed_is_tried_again_from_its_last_point(tmp_path):
+    """A failure that comes back is told again, with the points up to it; without it the branch is as if never failed.
+
+    An upper part that was complete is not followed again.
+    """
+    whole = follow(tmp_path / "whole", **BOTH)
+    parts = tmp_path / "parts"
+    first = follow(parts, FailBelow(3, FlowError("the flow ends here")), **BOTH)
+
+    second = follow(parts, FailBelow(5, FlowError("the flow ends there")), resume=True, **BOTH)
+    assert [point.index for point in second.points[:7]] == [5, 4, 3, 2, 1, 0, 1]
+    assert len(second.points) == len(first.points) + 2
+    assert second.ending == "failed: below the start: the flow ends there"
+    assert second.findings == ["below the start: the flow ends there"]
+
+    followed = set()
+    third = follow(parts, lambda branch, point: followed.add(branch.name), resume=True, **BOTH)
+    assert third.complete
+    assert third.failure_below is None
+    assert followed == {"out-of-phase-down"}
+    assert files_of(parts) == files_of(tmp_path / "whole")
+    assert third.ending == whole.ending
+
+
+def test_both_parts_that_failed_are_tried_again(tmp_path):
+    """The part below the start first, then the part above it, to the same bits as of a branch that never failed."""
+    follow(tmp_path / "whole", **BOTH)
+    parts = tmp_path / "parts"
+
+    def fail(branch, point):
+        if point.index == 3:
+            raise FlowError(f"{branch.name} ends here")
+
+    failed = follow(parts, fail, **BOTH)
+    assert failed.ending == "failed: out-of-phase ends here"
+    assert failed.findings == ["below the start: out-of-phase-down ends here"]
+
+    assert follow(parts, resume=True, **BOTH).complete
+    assert files_of(parts) == files_of(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_lower_part_that_is_tried_again_is_stopped_and_resumed(tmp_path, monkeypatch, killed):
+    """On request or by a kill: what has been tried again is kept, and the end is that of a branch that never failed."""
+    monkeypatch.setattr("vipetsc.modes.branches.follower.SAVE_EVERY", 0.0)
+    follow(tmp_path / "whole", **BOTH)
+    parts = tmp_path / "parts"
+    follow(parts, FailBelow(3, FlowError("the flow ends here")), **BOTH)
+
+    if killed:
+        # Any other exception than a method's ends the command wherever it is, as a kill does.
+        with pytest.raises(KeyboardInterrupt):
+            follow(parts, FailBelow(6, KeyboardInterrupt()), resume=True, **BOTH)
+    else:
+        stop = StopRequest()
+
+        def stop_below(branch, point):
+            stop.requested = point.index == 5
+
+        stopped = follow(parts, stop_below, stop, resume=True, **BOTH)
+        assert stopped.ending == "stopped on request after point 5; continue with --resume"
+        assert not stopped.complete
+        assert list(files_of(parts)) == [f"{NAME}.csv", f"{NAME}.h5"]
+
+    followed = []
+    resumed = follow(parts, lambda branch, point: followed.append(point.index), resume=True, **BOTH)
+    # The last point before the kill is in no file: the branch is written after the listener.
+    assert followed[0] == 6
+    assert resumed.complete
+    assert files_of(parts) == files_of(tmp_path / "whole")
+
+
+def test_a_kill_after_the_lower_part_has_ended_leaves_it_as_it_is(tmp_path, monkeypatch):
+    """It is not followed again, least of all beyond its end."""
+    monkeypatch.setattr("vipetsc.modes.branches.follower.SAVE_EVERY", 0.0)
+    follow(tmp_path / "whole", **BOTH)
+    parts = tmp_path / "parts"
+
+    def kill_above(branch, point):
+        if branch.name == "out-of-phase":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        follow(parts, kill_above, **BOTH)
+    followed = set()
+    follow(parts, lambda branch, point: followed.add(branch.name), resume=True, **BOTH)
+
+    assert followed == {"out-of-phase"}
+    assert files_of(parts) == files_of(tmp_path / "whole")
+
+
+def test_a_kill_at_the_end_of_a_branch_does_not_lengthen_it(tmp_path, monkeypatch):
+    """Its last point is written only with the word that it is complete."""
+    monkeypatch.setattr("vipetsc.modes.branches.follower.SAVE_EVERY", 0.0)
+    follow(tmp_path / "whole", energy=[0.0, 0.0295], locate=False)
+    parts = tmp_path / "parts"
+
+    def kill(*_):
+        raise KeyboardInterrupt
+
+    # Jumps are looked for after the last point, before the branch is written as a whole.
+    monkeypatch.setattr("vipetsc.modes.branches.orbits.jumps", kill)
+    with pytest.raises(KeyboardInterrupt):
+        follow(parts, energy=[0.0, 0.0295], locate=False)
+    monkeypatch.undo()
+    follow(parts, resume=True, energy=[0.0, 0.0295], locate=False)
+
+    assert files_of(parts) == files_of(tmp_path / "whole")
+
+
+def test_crossing_branches_follow_the_numbers_of_special_points_that_a_second_try_adds(tmp_path, monkeypatch):
+    """Special points are numbered from the far end below the start on: a longer part below shifts the numbers.
+
+    Linear motions have no special points: the second and the fifth one of each part stand for them, and what crosses
+    there is the branch itself.
+    """
+
+    def locate(problem, left, right, **options):
+        return [replace(right, kind="period-doubling")] if right.index in (2, 5) else []
+
+    def switch(shooting, point, amplitude):
+        return shooting, replace(point, kind="regular", index=0)
+
+    monkeypatch.setattr("vipetsc.modes.branches.follower.locate", locate)
+    monkeypatch.setattr("vipetsc.modes.branches.orbits.switch", switch)
+    nnm = BOTH | {"locate": True, "switch": ["period-doubling"], "switch_points": 1}
+    parts = tmp_path / "parts"
+    follow(tmp_path / "whole", **nnm)
+    follow(parts, FailBelow(3, FlowError("the flow ends here")), **nnm)
+    before = files_of(parts)
+    assert len(before) < len(files_of(tmp_path / "whole"))
+
+    follow(parts, resume=True, **nnm)
+
+    after = files_of(parts)
+    assert after == files_of(tmp_path / "whole")
+    assert all(text != after[name] for name, text in before.items())

@@ -2,9 +2,10 @@
 
 ``branch`` is a branch in memory, ``files`` its file; ``regions`` are those of a backbone, with their power laws.
 ``branch_checks`` looks for jumps, for a branch that retraces itself, stands still or passes on to another one, and
-compares flows; ``follow`` distributes the branches of a case over ranks.
+compares flows; ``follower`` follows one branch, ``follow`` distributes those of a case over ranks.
 """
 
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.files import read_branch, write_branch
-from vipetsc.modes.branches.follow import Follower, claim_branches, follow_all
+from vipetsc.modes.branches.follow import claim_branches, follow_all
+from vipetsc.modes.branches.follower import Follower

@@ -1,7 +1,7 @@
 """A branch in memory: its points in order, special ones in their places, and how it ended."""
 
 from dataclasses import dataclass, field
-from typing import Any, Generic
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 
@@ -10,13 +10,33 @@ from vipetsc.io.netcdf import Variables
 from vipetsc.modes.problem import S
 
 
+class FailureBelow(NamedTuple):
+    """A failure of the part of a branch below its start, which is tried again when the branch is resumed.
+
+    ``why`` says what failed, ``next_step`` is the step with which the part goes on from its far end. The branch's own
+    ending names the failure; how the part above the start has ended is kept here, in ``ending_above`` and
+    ``complete_above``.
+    """
+
+    why: str
+    next_step: float
+    ending_above: str = "not finished"
+    complete_above: bool = False
+
+    @property
+    def finding(self) -> str:
+        """The failure as a sentence among the branch's findings."""
+        return f"below the start: {self.why}"
+
+
 @dataclass(eq=False)
 class Branch(Generic[S]):
     """Points of a branch of one ``kind`` (``io.branch_kinds``); with ``next_step`` and ``case`` it can go on later.
 
     ``dofs`` counts the displacements (or places) for which a point has unknowns. ``findings`` are sentences about the
     branch: jumps, retracing, return to the linear mode; ``about`` are further attributes of its file, ``extra`` further
-    variables: orbits, comparisons with other flows.
+    variables: orbits, comparisons with other flows. ``complete`` says that there is nothing left to follow: the branch
+    has ended by itself, and on both sides of its start if both are asked for.
     """
 
     name: str
@@ -28,6 +48,7 @@ class Branch(Generic[S]):
     complete: bool = False
     ending: str = "not finished"
     findings: list[str] = field(default_factory=list)
+    failure_below: FailureBelow | None = None
     about: dict[str, Any] = field(default_factory=dict)
     extra: Variables = field(default_factory=dict)
 

@@ -92,7 +92,7 @@ class CondensedMethod(NnmMethod):
 
     kind = CONDENSED
     # Runs may begin with the states in the file: a branch that stopped or failed has them, too.
-    finishes_failed = True
+    finishes_interrupted = True
 
     def __init__(self, case: NnmCase, comm: MPI.Comm) -> None:
         super().__init__(case, comm)

@@ -29,17 +29,17 @@ class Method(ABC, Generic[S]):
     """A method that finds the branches of one case, which ``jobs`` numbers from 0 on.
 
     ``kind`` is the kind of their files. ``shared``: all ranks follow a branch together. ``failures`` end a branch and
-    not the program. ``keeps_empty``: a branch without points leaves a file that says why. ``finishes_failed``: a
-    branch that failed has the additions to the file of a whole branch, too. ``locates``: special points are looked for
-    between the regular ones, those where a contact grazes only with ``grazing``.
+    not the program. ``keeps_empty``: a branch without points leaves a file that says why. ``finishes_interrupted``: a
+    branch that failed or was stopped has the additions to the file of a whole branch, too (``finish``). ``locates``:
+    special points are looked for between the regular ones, those where a contact grazes only with ``locates_grazing``.
     """
 
     kind: ClassVar[str]
     shared: ClassVar[bool] = False
     failures: ClassVar[tuple[type[Exception], ...]] = (ContinuationError, FlowError, ValueError)
     keeps_empty: ClassVar[bool] = True
-    finishes_failed: ClassVar[bool] = False
-    grazing: bool = False
+    finishes_interrupted: ClassVar[bool] = False
+    locates_grazing: bool = False
     locates: bool = True
 
     def __init__(self, case: Any, comm: MPI.Comm) -> None:
@@ -80,7 +80,7 @@ class Method(ABC, Generic[S]):
 
     @property
     def has_lower_part(self) -> bool:
-        """Whether a branch is followed from its start towards falling energy, too, before ``direction``."""
+        """Whether a branch is followed from its start towards falling energy first, and then along ``direction``."""
         return False
 
     def assess(self, problem: PeriodicProblem[S], point: S) -> S:
@@ -92,7 +92,7 @@ class Method(ABC, Generic[S]):
         return lambda point: None
 
     def jumps(self, problem: PeriodicProblem[S], points: list[S]) -> Iterator[str]:
-        """Sentences about jumps between points."""
+        """Sentences about jumps: neighbouring points of which one may lie on another arc or another branch."""
         return iter(())
 
     def finish(self, problem: PeriodicProblem[S], branch: Branch[S]) -> None:

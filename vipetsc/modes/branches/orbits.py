@@ -117,7 +117,7 @@ class ShootingMethod(NnmMethod):
         options = case.nnm
         self.system = System.from_case(case)
         self.dissipation = dissipation_of(case)
-        self.grazing = options.locate_grazing
+        self.locates_grazing = options.locate_grazing
         self.crossing_options = options.model_copy(update={"points": options.switch_points, "chart": "relative"})
 
         flow = FLOWS[options.flow](self.system)
