@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from vipetsc.case.nnm_table import NnmTable
-from vipetsc.lattice import Contact, Spring
+from vipetsc.lattice import Contact, DenseCompliance, Spring
 from vipetsc.modes.balance import conservative
 from vipetsc.modes.balance.arcs import arcs
 from vipetsc.modes.balance.conservative import ConservativeMotions
@@ -308,3 +308,30 @@ def test_a_weight_at_which_the_motion_changes_too_much_is_tried_again_shorter(mo
     with pytest.raises(ContinuationError, match=r"no breather at 2\.1 rad/s: with 0 of the harmonics above the first"):
         gap_motions().from_gap(2.1, np.array([1.0]))
     assert tried == pytest.approx(0.1 * 0.4 ** np.arange(8))
+
+
+def one_mass(**options: object) -> ConservativeMotions:
+    """The motions of a mass of 1 kg on a spring of 1 N/m with a stop of 20 N/m, 1 m away on one side."""
+    compliance = DenseCompliance(np.ones(1), np.array([[1.0]]), np.array([[1.0]]))
+    stops = Stops(Contact("bilinear", 20.0), 1.0, np.inf)
+    return ConservativeMotions(compliance, SiteForces([stops]), NnmTable(tolerance=1e-12, **options))
+
+
+def test_a_start_whose_guess_needs_fewer_harmonics_than_the_motion_has_enough():
+    """The guess is within the bounds of the truncation, the motion found with its harmonics is not."""
+    motions = one_mass(truncation=4e-4)
+    z = np.array([1.01])
+    guess = motions._guess(motions.one_harmonic(z), 1.0)
+    assert motions.order_near(guess) == guess.order
+
+    point = motions.from_mode(z, 1.0)
+
+    assert point.order > guess.order
+    assert point.truncation <= conservative.MORE * 4e-4
+
+
+@pytest.mark.parametrize("harmonics", [20, 21])
+def test_the_highest_order_is_odd_and_a_start_that_needs_more_has_it(harmonics):
+    point = one_mass(truncation=1e-9, harmonics=harmonics).from_mode(np.array([1.01]), 1.0)
+    assert point.truncation > 1e-9
+    assert point.order == {20: 19, 21: 21}[harmonics]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from vipetsc.lattice.cell import Spring
-from vipetsc.modes.balance.describing_function import PlaceCompliance, describing_motion
+from vipetsc.modes.balance.describing_function import PairCompliance, describing_motion
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.problem import ContinuationError
 
@@ -13,7 +13,7 @@ from vipetsc.modes.problem import ContinuationError
 def test_a_spring_without_a_cubic_part_begins_no_breather():
     forces = SiteForces([], [Spring(0, 1, 1e4, quadratic=1e6)])
     with pytest.raises(ContinuationError, match="without a cubic part"):
-        describing_motion(forces, 0, PlaceCompliance(1e-4, -1e-4), 1e3)
+        describing_motion(forces, 0, PairCompliance(1e-4, -1e-4), 1e3)
 
 
 def test_the_amplitude_on_a_cubic_spring_is_that_of_its_first_harmonic():
@@ -21,4 +21,4 @@ def test_the_amplitude_on_a_cubic_spring_is_that_of_its_first_harmonic():
     g, cubic = -1e-4, 1e9
     forces = SiteForces([], [Spring(0, 1, 1e4, cubic=cubic)])
     expected = (-4 / (3 * g * cubic)) ** 0.5
-    assert describing_motion(forces, 0, PlaceCompliance(1e-4, g), 1e3).amplitude == pytest.approx(expected, rel=1e-9)
+    assert describing_motion(forces, 0, PairCompliance(1e-4, g), 1e3).amplitude == pytest.approx(expected, rel=1e-9)

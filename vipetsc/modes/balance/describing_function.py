@@ -1,7 +1,7 @@
-"""Describing function: a motion of one place with a mean and one harmonic, from which a branch in a gap begins.
+"""Describing function: a motion of one pair with a mean and one harmonic, from which a branch in a gap begins.
 
-The force at the place is replaced by its mean and its first harmonic, the others are neglected (N. M. Krylov and N. N.
-Bogoliubov, Introduction to Non-Linear Mechanics, Princeton 1947).
+The force of the pair, a contact or a smooth spring, is replaced by its mean and its first harmonic, the others are
+neglected (N. M. Krylov and N. N. Bogoliubov, Introduction to Non-Linear Mechanics, Princeton 1947).
 """
 
 import itertools
@@ -25,38 +25,38 @@ LEAST_OF_PRESSED = 1e-2
 TRIED_OF_PRESSED = 41
 
 
-class PlaceCompliance(NamedTuple):
-    """Compliance in m/N of one place: ``static``, which the mean of a force meets, and ``dynamic``, at a frequency."""
+class PairCompliance(NamedTuple):
+    """Compliance in m/N of one pair: ``static``, which the mean of a force meets, and ``dynamic``, at a frequency."""
 
     static: float
     dynamic: float
 
 
 class DescribedMotion(NamedTuple):
-    """A motion ``mean`` + ``amplitude`` cos(theta) of one place, in m."""
+    """A motion ``mean`` + ``amplitude`` cos(theta) of one pair, in m."""
 
     mean: float
     amplitude: float
 
 
-def describing_motion(forces: SiteForces, place: int, g: PlaceCompliance, omega: float) -> DescribedMotion:
-    """The motion z = b + a cos(Om t) at a ``place`` with one of the ``forces``, of which two harmonics balance.
+def describing_motion(forces: SiteForces, pair: int, g: PairCompliance, omega: float) -> DescribedMotion:
+    """The motion z = b + a cos(Om t) of a ``pair`` with one of the ``forces``, of which two harmonics balance.
 
     b + G(0) F_0(a, b) = 0 gives the mean b for every amplitude a; with it a + G(Om) F_1(a, b) = 0 gives a. Here ``g``
-    are the compliances of the place at 0 and at ``omega`` (rad/s). Raises ContinuationError where there is none.
+    are the compliances of the pair at 0 and at ``omega`` (rad/s). Raises ContinuationError where there is none.
     """
-    spring = place - len(forces.contacts)
+    spring = pair - len(forces.contacts)
     if spring >= 0 and forces.springs[spring].cubic == 0:
         raise ContinuationError(
             f"no breather starts at {omega:g} rad/s on a spring without a cubic part: of a harmonic motion its "
             "quadratic force has a mean and a second harmonic alone; give it a cubic part, or begin at another place"
         )
-    is_pressed = place < len(forces.contacts) and forces.contacts[place].is_pressed
+    is_pressed = pair < len(forces.contacts) and forces.contacts[pair].is_pressed
     z = np.zeros((forces.pairs, 2), complex)
 
     def force(mean: float, amplitude: float) -> np.ndarray:
-        z[place] = mean, amplitude
-        return forces.series(z, omega).forces[place].real
+        z[pair] = mean, amplitude
+        return forces.series(z, omega).forces[pair].real
 
     def mean_of(amplitude: float) -> float:
         def static_balance(mean: float) -> float:
@@ -78,7 +78,7 @@ def describing_motion(forces: SiteForces, place: int, g: PlaceCompliance, omega:
     def balance(amplitude: float) -> float:
         return amplitude + g.dynamic * float(force(mean_of(amplitude), amplitude)[1])
 
-    size = forces.amplitude_scale(place, g.dynamic)
+    size = forces.amplitude_scale(pair, g.dynamic)
     sizes = [size, LARGEST * size]
     if is_pressed:
         sizes = (size * np.geomspace(LEAST_OF_PRESSED, LARGEST, TRIED_OF_PRESSED)).tolist()

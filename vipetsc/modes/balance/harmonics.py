@@ -298,15 +298,15 @@ class SiteForces:
         """Whether motions about rest are linear up to where contacts open or close."""
         return not self.springs and all(stops.is_linear_at_rest for stops in self.contacts)
 
-    def amplitude_scale(self, place: int, g: float) -> float:
-        """Amplitude in m at which the pair ``place`` with the compliance ``g`` in m/N begins to feel its force.
+    def amplitude_scale(self, pair: int, g: float) -> float:
+        """Amplitude in m at which the ``pair`` with the compliance ``g`` in m/N begins to feel its force.
 
         That of a contact is the clearance, or the depth by which it is pressed. For a spring |g c| a^2 = 1, with its
         cubic coefficient c, which is not 0: of its force at z = a cos theta only the cubic part has a first harmonic.
         """
-        if place < len(self.contacts):
-            return abs(self.contacts[place].clearance)
-        cubic = self.springs[place - len(self.contacts)].cubic
+        if pair < len(self.contacts):
+            return abs(self.contacts[pair].clearance)
+        cubic = self.springs[pair - len(self.contacts)].cubic
         return float(1 / np.sqrt(np.abs(g * cubic)))
 
     def series(self, z: np.ndarray, omega: float) -> ForceSeries:

@@ -28,7 +28,7 @@ class Compliance(Protocol):
     """Interface of ``lattice.compliance``: G (frequencies, pairs, pairs) in m/N, real or complex."""
 
     def at(self, omegas: np.ndarray) -> np.ndarray:
-        """G (frequency, place, place) in m/N at ``omegas`` (frequency,) in rad/s, which may be complex."""
+        """G (frequency, pair, pair) in m/N at ``omegas`` (frequency,) in rad/s, which may be complex."""
 
 
 class Shifted(NamedTuple):

@@ -19,7 +19,7 @@ from scipy.sparse import diags
 from scipy.sparse.linalg import splu
 
 from vipetsc.lattice import Chain
-from vipetsc.modes.balance.describing_function import PlaceCompliance, describing_motion
+from vipetsc.modes.balance.describing_function import PairCompliance, describing_motion
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.lattice.lattice_flow import LatticeArc, LatticeFlow
 from vipetsc.modes.newton import BorderedNewton, Equations
@@ -221,7 +221,7 @@ class LatticeShooting(ShootingEquations[LatticeArc]):
             stops = system.contacts[abs(number) - 1].stops
             moved = dynamic.solve(row)
             pressed = static.solve(row)
-            g = PlaceCompliance(static=float(row @ pressed), dynamic=float(row @ moved))
+            g = PairCompliance(static=float(row @ pressed), dynamic=float(row @ moved))
             mean, amplitude = describing_motion(SiteForces([stops]), 0, g, omega)
             x += moved * (np.sign(number) * amplitude / g.dynamic) + pressed * (mean / g.static)
 
