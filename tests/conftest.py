@@ -37,7 +37,7 @@ from vipetsc.dynamics.observers import Observer
 from vipetsc.dynamics.result import Result
 from vipetsc.io.records import RecordFile
 from vipetsc.io.store import RunMemory
-from vipetsc.parallel import StopRequest
+from vipetsc.parallel import StopRequest, wait_for_all
 
 ROOT = Path(__file__).parents[1]
 NUMBER_OF_RANKS = re.compile(r"parallel\[(\d+)\]")
@@ -69,6 +69,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         item.add_marker(pytest.mark.skip(reason=f"another number of ranks: {command}"))
 
 
+@pytest.fixture(autouse=True)
+def ranks_end_together():
+    """End a test on all ranks: one that waits for the next test's first message would do so at full speed."""
+    yield
+
+    if MPI.COMM_WORLD.size > 1:
+        wait_for_all(MPI.COMM_WORLD)
+
+
 @pytest.fixture
 def folder():
     """A temporary folder that all ranks share."""
@@ -81,7 +90,7 @@ def folder():
     yield Path(path)
 
     # A rank that is slower may still read what rank 0 would remove.
-    comm.Barrier()
+    wait_for_all(comm)
     if comm.rank == 0:
         shutil.rmtree(path, ignore_errors=True)
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from mpi4py import MPI
 
 import pytest
+import xarray as xr
 
 from tests.conftest import small_case
 from vipetsc.dynamics import simulate
+from vipetsc.parallel import on_root
 from vipetsc.studies import analysis
 from vipetsc.studies.analysis import analyse
 
@@ -17,8 +19,12 @@ COMM = MPI.COMM_WORLD
 @pytest.mark.parallel([1, 2, 3])
 def test_ranks_take_different_measures_of_one_run(monkeypatch):
     """Every rank gets all of them, in the order and with the attributes of one rank; an error is raised on all."""
-    run = simulate(small_case(time={"end": 0.02}), comm=MPI.COMM_SELF).dataset
-    alone = analyse(run)
+
+    def measured() -> tuple[xr.Dataset, xr.Dataset]:
+        run = simulate(small_case(time={"end": 0.02}), comm=MPI.COMM_SELF).dataset
+        return run, analyse(run)
+
+    run, alone = on_root(COMM, measured)
 
     taken = []
     bands = analysis.band_energies

@@ -7,6 +7,7 @@ from typing import Any
 
 from mpi4py import MPI
 
+import numpy as np
 import pytest
 
 from tests.conftest import assert_same_bits, datasets
@@ -45,6 +46,16 @@ def plan_of(folder: Path, changes: dict[str, Any], end: float = 0.009, **options
     return IdentifyCase.from_toml(on_root(MPI.COMM_WORLD, written))
 
 
+def result_of_one_rank(plan: IdentifyCase, folder: Path) -> dict[str, np.ndarray]:
+    """Every dataset of the identification that rank 0 makes alone, on all ranks."""
+
+    def identified() -> dict[str, np.ndarray]:
+        run_identification(plan, folder, MPI.COMM_SELF)
+        return datasets(folder / "identified.h5")
+
+    return on_root(MPI.COMM_WORLD, identified)
+
+
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory):
     """A fit from two starts."""
@@ -57,17 +68,13 @@ def single(tmp_path_factory):
     # A state has many coordinates, whose derivatives are the jobs that ranks divide.
     changes = {"begin": 0.004, "initial": "estimate"}
     plan = plan_of(tmp_path_factory.mktemp("single"), changes, end=0.007, profile=0, steps=3)
-    folder = tmp_path_factory.mktemp("single-whole")
-    run_identification(plan, folder, MPI.COMM_SELF)
-    return plan, datasets(folder / "identified.h5")
+    return plan, result_of_one_rank(plan, tmp_path_factory.mktemp("single-whole"))
 
 
 @pytest.fixture(scope="module")
 def whole(plan, tmp_path_factory):
     """The result of one rank."""
-    folder = tmp_path_factory.mktemp("whole")
-    run_identification(plan, folder, MPI.COMM_SELF)
-    return datasets(folder / "identified.h5")
+    return result_of_one_rank(plan, tmp_path_factory.mktemp("whole"))
 
 
 @pytest.mark.parallel([1, 2])

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from mpi4py import MPI
 
+import numpy as np
 import pytest
 
 from tests.conftest import TWO, StopAt, assert_same_bits, datasets, on_two, search_table, with_sections
 from tests.verify.test_optimise_responses import TABLE
 from vipetsc.case.optimise import OptimiseCase
-from vipetsc.parallel import StoppedError, StopRequest
+from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.studies.optimum_search import run_search
 
 
@@ -20,12 +23,20 @@ def plan(*changes: str) -> OptimiseCase:
     return OptimiseCase.from_table(table | {"optimise": table["optimise"] | bounds}, changes)
 
 
+def found_by_one_rank(case: OptimiseCase, folder: Path) -> dict[str, np.ndarray]:
+    """Every dataset of the search that rank 0 makes alone in ``folder``, on all ranks."""
+
+    def found() -> dict[str, np.ndarray]:
+        run_search(case, folder, MPI.COMM_SELF)
+        return datasets(folder / "optimum.h5")
+
+    return on_root(MPI.COMM_WORLD, found)
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The optimum that one rank finds."""
-    folder = tmp_path_factory.mktemp("whole")
-    run_search(plan(), folder, MPI.COMM_SELF)
-    return datasets(folder / "optimum.h5")
+    return found_by_one_rank(plan(), tmp_path_factory.mktemp("whole"))
 
 
 @pytest.mark.parallel([1, 2, 3])
@@ -40,12 +51,11 @@ def test_the_optimum_does_not_depend_on_the_ranks(folder, whole, team):
 
 @pytest.mark.parallel([2])
 def test_a_front_does_not_depend_on_the_ranks(folder, tmp_path_factory):
-    alone = tmp_path_factory.mktemp("alone")
     case = plan(TWO, "optimise.population=6")
-    run_search(case, alone, MPI.COMM_SELF)
+    alone = found_by_one_rank(case, tmp_path_factory.mktemp("alone"))
     run_search(case, folder, MPI.COMM_WORLD)
 
-    assert_same_bits(datasets(folder / "optimum.h5"), datasets(alone / "optimum.h5"))
+    assert_same_bits(datasets(folder / "optimum.h5"), alone)
     MPI.COMM_WORLD.Barrier()
 
 
@@ -71,14 +81,13 @@ def test_one_rank_that_is_asked_to_stop_stops_all_and_the_search_goes_on(folder,
 @pytest.mark.parallel([2])
 def test_responses_do_not_depend_on_the_ranks(folder, tmp_path_factory):
     """Designs fall to different ranks, or the curves of each to the ranks of a team; a search that goes on too."""
-    alone = tmp_path_factory.mktemp("alone")
     # Near the lower resonance, where the stops hold the mass back at 2 N and are not reached at 1 N.
     curves = {"fixed": [1.0, 2.0], "range": [0.84, 0.9], "largest_step": 1.0}
     sections = {"contacts": {"clearance": 14.0}, "nfrc": curves, "optimise": {"budget": 3}}
     table = with_sections(TABLE, sections)
-    run_search(OptimiseCase.from_table(table), alone, MPI.COMM_SELF)
+    alone = found_by_one_rank(OptimiseCase.from_table(table), tmp_path_factory.mktemp("alone"))
     for ranks in (1, 2):
         case = OptimiseCase.from_table(table, [f"optimise.ranks={ranks}"])
         run_search(case, folder / str(ranks), MPI.COMM_WORLD)
-        assert_same_bits(datasets(folder / str(ranks) / "optimum.h5"), datasets(alone / "optimum.h5"))
+        assert_same_bits(datasets(folder / str(ranks) / "optimum.h5"), alone)
     MPI.COMM_WORLD.Barrier()

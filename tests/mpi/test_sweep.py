@@ -8,12 +8,13 @@ import tomllib
 
 from mpi4py import MPI
 
+import numpy as np
 import pytest
 
 from tests.conftest import StopAt, assert_same_bits, datasets, on_two
 from tests.faults.inject import Injector
 from vipetsc.case import Sweep
-from vipetsc.parallel import SharedCounter, StopRequest
+from vipetsc.parallel import SharedCounter, StopRequest, on_root
 from vipetsc.studies.pool import TaskPool
 from vipetsc.studies.sweep import run_sweep
 
@@ -52,10 +53,14 @@ def sweep(*changes: str) -> Sweep:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The ensemble of the sweep that one rank makes."""
+    """The ensemble of the sweep that rank 0 makes alone, on all ranks."""
     folder = tmp_path_factory.mktemp("whole")
-    run_sweep(sweep(), folder, MPI.COMM_SELF)
-    return datasets(folder / "ensemble.h5")
+
+    def swept() -> dict[str, np.ndarray]:
+        run_sweep(sweep(), folder, MPI.COMM_SELF)
+        return datasets(folder / "ensemble.h5")
+
+    return on_root(MPI.COMM_WORLD, swept)
 
 
 @pytest.mark.parallel([1, 2, 3])
