@@ -18,6 +18,7 @@ from vipetsc.lattice import (
     modes,
     pass_bands,
 )
+from vipetsc.lattice.drive import impulse
 from vipetsc.spectra import ModalParts, upper_fraction
 from vipetsc.spectra.modal_energies import cluster_samples
 
@@ -136,6 +137,22 @@ def test_the_burst_drives_the_modes_as_its_force_does(ends, start, stop):
     integrand = np.exp(1j * modes_.frequency[:, None] * (stop - t)) * burst.force(t)
     expected = integrand @ weights * (last - start) / 2
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+# Within the force, from its beginning to its end, and with a time after it.
+@pytest.mark.parametrize(("start", "stop"), [(0.013, 0.052), (0.0, 0.1), (0.0, 0.3)])
+def test_a_long_force_drives_the_modes_as_its_integral_says(start, stop):
+    """Half a sine of 0.1 s, in which the fastest mode turns by 360 rad, has its integral in closed form."""
+    duration = 0.1
+    frequency = np.array([0.0, 90.0, DRIVEN, 3600.0])
+    found = impulse(2.0, duration).response(frequency, start, stop)
+
+    rate = np.pi / duration
+    ends = np.array([[start], [min(stop, duration)]])
+    terms = 1j * frequency * np.sin(rate * ends) + rate * np.cos(rate * ends)
+    lower, upper = -terms * np.exp(1j * frequency * (stop - ends)) / (rate**2 - frequency**2)
+    # The force is 2 pi / (2 duration) = pi / duration times the sine.
+    assert found == pytest.approx(rate * (upper - lower), rel=1e-11, abs=1e-14)
 
 
 @ENDS

@@ -31,6 +31,8 @@ SMOOTH = np.array([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
 # nodes or panels twice as long change a ramped sine's response by 2e-14, and take .6 of the time.
 NODES = 16
 PANEL = 4.0
+# As many as nodes: the factors of both take the same memory.
+PANELS_AT_ONCE = 16
 # Periods beyond which a waveform's peak is not sought period by period: twenty instants in each are 16 MB.
 MOST_PERIODS = 1e5
 
@@ -246,12 +248,19 @@ class Pieces:
 
         total = np.zeros(len(frequency), complex)
         for a, b in pairwise(cuts):
-            edges = np.linspace(a, b, int(fastest * (b - a) / PANEL) + 2)
-            half = np.diff(edges)[:, None] / 2
-            s = edges[:-1, None] + half * (1 + nodes)
-            weighted = self.force(s) * weights * half
-            for times, values in zip(s, weighted, strict=True):  # a panel at a time: memory for many frequencies
-                total += np.exp(1j * np.multiply.outer(frequency, stop - times)) @ values
+            panels = int(fastest * (b - a) / PANEL) + 1
+            half = (b - a) / (2 * panels)
+            begins = a + 2 * half * np.arange(panels)
+            later = half * (1 + nodes)
+            weighted = self.force(begins[:, None] + later) * weights * half
+
+            # Of exp(i w (stop - s)) all panels have the factor of the nodes in common, which is computed once; that of
+            # a panel's beginning follows for a few panels at a time, since frequencies may be many.
+            at_nodes = np.exp(-1j * np.multiply.outer(frequency, later))
+            for first in range(0, panels, PANELS_AT_ONCE):
+                some = slice(first, first + PANELS_AT_ONCE)
+                at_begins = np.exp(1j * np.multiply.outer(frequency, stop - begins[some]))
+                total += (at_begins * (at_nodes @ weighted[some].T)).sum(axis=1)
         return total
 
 
