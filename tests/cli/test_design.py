@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray
 
-from tests.conftest import alone_and_on_two_ranks, assert_same_bits, datasets, modified, set_words
+from tests.conftest import assert_same_bits, datasets, modified, set_words
 from vipetsc.case import Case, CaseError
 from vipetsc.case.design import DesignCase
 from vipetsc.case.nnm import NnmCase
@@ -153,12 +153,11 @@ def test_what_is_wrong_with_a_search_is_named(change, message):
     assert message in str(error.value)
 
 
-@alone_and_on_two_ranks
-def test_bad_cases_write_nothing(on_ranks, case, tmp_path, ranks):
-    """Everything wrong is said at once, once, whatever the number of ranks."""
+def test_bad_cases_write_nothing(in_process, case, tmp_path):
+    """Everything wrong is said at once, once; tests/mpi/test_refusals.py says it of two ranks."""
     wrong = set_words("design.eta.last=1.5", "design.lambda.coutn=3", "design.wavenumbers=2")
 
-    done = on_ranks(ranks, "design", case, "--out", tmp_path / "out", *wrong)
+    done = in_process("design", case, "--out", tmp_path / "out", *wrong)
     assert done.returncode == 2, done.stdout
     for message in (
         "3 problems",

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.cli.browser import NEEDED, browsing
-from vipetsc.figures import panels
+from vipetsc.figures import panels, style
 from vipetsc.figures.style import new_figure, rc_style, save
 from vipetsc.paper.paper_figures import PaperFigure
 from vipetsc.paper.report import ReportContents, write_report
@@ -166,9 +166,11 @@ def test_a_tap_on_a_phone_shows_the_picture_on_the_whole_screen(page):
 
 @pytest.mark.browser
 @NEEDED
-def test_a_full_report_is_printed_on_less_than_forty_pages(page, tmp_path):
+def test_a_full_report_is_printed_on_less_than_forty_pages(page, tmp_path, monkeypatch):
     """Seventy-four pictures of half a page's height."""
     _, browser = page
+    # 770 pixels, wider than a printed page: the style alone makes them smaller. More would take long to encode.
+    monkeypatch.setattr(style, "SCREEN", 110)
     with rc_style():
         figure = new_figure(7, 5)
         figure.subplots().plot(*POINTS)

@@ -7,7 +7,7 @@ import os
 import h5py
 import pytest
 
-from tests.conftest import alone_and_on_two_ranks, assert_same_bits, clean_environment, datasets, modified
+from tests.conftest import assert_same_bits, clean_environment, datasets, modified
 
 CASE = """
 [lattice]
@@ -146,13 +146,12 @@ def test_an_error_of_one_rank_ends_all_that_follow_a_branch_together(vipetsc, tm
     assert "of rank 1 alone" in done.stderr
 
 
-@alone_and_on_two_ranks
-def test_a_file_that_is_no_branch_is_refused_on_all_ranks(on_ranks, tmp_path, ranks):
+def test_a_file_that_is_no_branch_is_refused(in_process, tmp_path):
     """An HDF5 file of another kind under a branch's name ends with exit code 2 and no traceback."""
     with h5py.File(tmp_path / "branch-x.h5", "w") as file:
         file["energy"] = [1.0]
 
-    done = on_ranks(ranks, "plot", tmp_path)
+    done = in_process("plot", tmp_path)
     assert done.returncode == 2
     assert "is not a branch" in done.stderr
     assert "Traceback" not in done.stderr

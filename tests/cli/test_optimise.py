@@ -11,16 +11,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from tests.conftest import (
-    TWO,
-    alone_and_on_two_ranks,
-    assert_same_bits,
-    clean_environment,
-    datasets,
-    modified,
-    search_table,
-    set_words,
-)
+from tests.conftest import TWO, assert_same_bits, clean_environment, datasets, modified, search_table, set_words
 from vipetsc.io.records import read_records
 
 FIGURES = {"convergence", "compared_designs", "compared_curves"}
@@ -135,12 +126,11 @@ def test_a_request_to_stop_ends_with_75_and_the_same_command_goes_on(in_process,
     assert_same_bits(datasets(out / "optimum.h5"), datasets(whole / "optimum.h5"))
 
 
-@alone_and_on_two_ranks
-def test_bad_cases_write_nothing(on_ranks, case, tmp_path, ranks):
-    """Everything wrong is said at once, once, whatever the number of ranks."""
+def test_bad_cases_write_nothing(in_process, case, tmp_path):
+    """Everything wrong is said at once, once; tests/mpi/test_refusals.py says it of two ranks."""
     wrong = set_words("optimise.variables.clearance=[-1.0, 1.0]", "optimise.objective=[{measure='band_share'}]")
 
-    done = on_ranks(ranks, "optimise", case, "--out", tmp_path / "out", *wrong)
+    done = in_process("optimise", case, "--out", tmp_path / "out", *wrong)
     assert done.returncode == 2, done.stdout
     for message in ("2 problems", "optimise.variables.clearance[1] = -1.0", "optimise.objective[1].band: missing"):
         assert done.stderr.count(message) == 1
