@@ -19,7 +19,7 @@ from tests.unit.test_inhomogeneity import ENDS, scattered_chain
 from vipetsc.case import Case
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.propagator.tangent import unrecorded_samples
+from vipetsc.dynamics.propagator.unrecorded import unrecorded_samples
 from vipetsc.lattice import Chain, Variation
 
 DAMPING = {"mass": 10.0, "stiffness": 1e-5}

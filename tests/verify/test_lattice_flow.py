@@ -170,9 +170,17 @@ def test_substeps_of_a_pressed_contact_are_those_in_which_it_is_closed():
 def test_an_orbit_without_a_tape_has_no_variations():
     """Without a tape the contacts would be missing from the linearisation, and nothing would show it."""
     flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
-    engine = TangentPropagator(flow._model(PERIOD, 1), flow.layout, rows=0)
-    with pytest.raises(ValueError, match="rows is 0"):
+    engine = TangentPropagator(flow._model(PERIOD, 1), flow.layout, tape_rows=0)
+    with pytest.raises(ValueError, match="tape_rows is 0"):
         engine.move(np.zeros((1, 2 * DOFS, CELLS)))
+
+
+@pytest.mark.parametrize("look", [None, list])
+def test_an_orbit_has_at_least_one_sample(look):
+    flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
+    engine = TangentPropagator(flow._model(PERIOD, 1), flow.layout, tape_rows=0)
+    with pytest.raises(ValueError, match="samples is 0"):
+        engine.run(0, look)
 
 
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
@@ -206,6 +214,26 @@ def test_a_dissipative_contact_cannot_be_closed_at_the_start():
     flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"], 0.7))
     with pytest.raises(FlowError, match="dissipates is closed"):
         flow.arc(irregular_motion((5,), w=2.2e-3, speed=0.0), PERIOD)
+
+
+@pytest.mark.parametrize("w", [0.0, -0.5e-5, -2e-5])
+def test_a_dissipative_contact_that_is_pressed_at_rest_is_refused_wherever_it_begins(w):
+    """At rest, a little apart and open: it has no approach velocity in any of these states."""
+    stops = Stops(Contact("hertz", STIFFNESS["hertz"], 0.7), -1e-5, np.inf)
+    flow = LatticeFlow(breather_chain("fixed", (5,)), [stops], MPI.COMM_SELF)
+    with pytest.raises(FlowError, match="pressed at rest dissipate"):
+        flow.arc(irregular_motion((5,), w=w, speed=0.0), PERIOD)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_dissipative_contact_is_closed_on_the_side_of_its_displacement(side):
+    """A little beyond its stop on that side it is closed, a little before it open; the other stop is elsewhere."""
+    clearance = {1: CLEARANCE, -1: 1.5 * CLEARANCE}
+    stops = Stops(Contact("hertz", STIFFNESS["hertz"], 0.7), plus=clearance[1], minus=clearance[-1])
+    flow = LatticeFlow(breather_chain("fixed", (5,)), [stops], MPI.COMM_SELF)
+    with pytest.raises(FlowError, match="dissipates is closed"):
+        flow.arc(irregular_motion((5,), w=side * 1.001 * clearance[side], speed=0.0), PERIOD)
+    flow.arc(irregular_motion((5,), w=side * 0.999 * clearance[side], speed=0.0), PERIOD / 1000)
 
 
 def test_contacts_that_touch_at_rest_are_refused():

@@ -13,7 +13,7 @@ from vipetsc.dynamics.engine import FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.step_choice import refusal
-from vipetsc.dynamics.propagator.tangent import unrecorded_samples
+from vipetsc.dynamics.propagator.unrecorded import unrecorded_samples
 
 
 def test_a_lattice_without_contacts_is_stepped():

@@ -4,23 +4,30 @@
 were closed on a tape. From the tape it computes how variations of the orbit's beginning move to its end. Shooting for
 periodic orbits of a whole lattice asks for that: for products of the monodromy matrix with vectors, never the matrix.
 
-**Method.** A step takes the lattice's state y to P y, the free motion, plus what the forces of contacts leave (sec. 5
-of the derivation in the package's docstring). The forces depend on y through few numbers: for each cluster, the Taylor
-coefficients a of the free motion of its DoFs, and the approach velocities q of its sites. q is w'_minus, the relative
-velocity at which the present contact began, by which the law scales its damping. A variation dy therefore moves by
+**Method.** A step of the length H takes the lattice's state y to P y, its free motion, plus L mu, the motion that the
+forces of contacts leave (sec. 5 of the derivation in the package's docstring). The numbers mu are the moments of each
+force F over the step, mu_k = integral of F (1 - s)^k dt, s from 0 to 1. The forces depend on y through few numbers: for
+each cluster, the Taylor coefficients a of the free motion of its DoFs, and the approach velocities q of its sites. With
+the relative displacement w of a site, q is w'_minus, the value of w' at which the present contact began; it is negative
+on the side -. The law scales its damping by q. A variation dy therefore moves by
 
     dy+ = P dy + L dmu,    (dmu, dq+) = J (da, dq),    da = T dy,
 
-where T is ``expand_free_motion``, L is ``apply_impulses``, and mu are the moments of the forces. J is one small matrix
-for each step and cluster in contact, computed once for the orbit by linearising the collocation of each substep on the
-tape (``tangent_kernels``). After that a variation costs as much as a linear step, and the small products.
+where T is ``expand_free_motion`` and L is ``apply_impulses``. J is one small matrix for each step and cluster in
+contact: the product of the linearised collocations of the step's substeps, which the tape has, one after the other
+(``tangent_kernels``). It is computed once for the orbit. After that a variation costs as much as a linear step, and the
+small products.
 
 **Times of onset and separation** vary with y, too. The variation of the state has no term for them: the force is
 continuous at each change of mode, zero at an onset, at a separation, and where clipping begins and ends. To act earlier
 by dt changes the state by the order of dt^2, and the saltation matrix is the identity (Leine and Nijmeijer 2004,
 ch. 7). Only q feels the instant: an onset at the velocity w' and acceleration w'' comes earlier by dw/w', so that
-dq = dw' - w'' dw/w'. J leaves the ends of substeps where the orbit has them. It is the derivative of the flow up to the
-error of the collocation, and not that of a program that chooses its substeps by the state.
+dq = dw' - w'' dw/w'. Where the orbit grazes, w' = 0, there is no such derivative; near grazing dq is large, and so are
+the products with variations, if the contact dissipates. Nothing is done about that here.
+
+In J the ends of substeps are the orbit's, fixed in time. They only divide integrals over time, on whose value they have
+no influence but the error of the collocation: up to that J is the derivative of the flow. The derivative of a program
+that chooses its substeps by the state would have terms for that choice.
 
 References
 ----------
@@ -35,9 +42,7 @@ import numpy as np
 
 from vipetsc.case import Model
 from vipetsc.contact.law import CLOSED, FREE, PERMANENT
-from vipetsc.dynamics.energies import ENERGY_SUMS
 from vipetsc.dynamics.engine import StalledError
-from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.clusters import expand_free_motion
 from vipetsc.dynamics.propagator.engine import Propagator
@@ -46,22 +51,25 @@ from vipetsc.dynamics.propagator.stencil import Halo, exchange
 from vipetsc.dynamics.propagator.step_choice import refusal as refusal_of_steps
 from vipetsc.dynamics.propagator.substeps import create_tape
 from vipetsc.dynamics.propagator.tangent_kernels import Variations, linearise, move_variations
-from vipetsc.dynamics.samples import Samples
+from vipetsc.dynamics.propagator.unrecorded import unrecorded_samples
 from vipetsc.dynamics.site_dofs import site_records
 from vipetsc.parallel import on_every_rank
 
-# Rows of the tape of a cluster, 208 B each with the motion at the nodes: 1.7 MB. A contact takes fewer than 30 of them
-# in the built-in case, so that there is room for hundreds of contacts in one orbit; one that needs more is refused with
-# the number of rows. The system gives memory to rows as they are written: those that are never used cost none.
-MOST_ROWS = 8192
+# Rows of the tape of a cluster, one for each closed site in each substep, 208 B each with the motion at the nodes: 1.7
+# MB. A contact of the built-in case takes fewer than 30 substeps, so that there is room for hundreds of contacts in one
+# orbit; one that needs more is refused with the number of rows. The system gives memory to rows as they are written:
+# those that are never used cost none.
+MOST_TAPE_ROWS = 8192
 
 
 class _Linearisation(NamedTuple):
-    """The matrices J of an orbit, ``matrices`` (number, row, column).
+    """The matrices J of an orbit, ``matrices`` (number, row, column), one for each step and cluster in contact.
 
-    ``places`` (step, cluster) is the number of the matrix of that step and cluster, -1 without contact in it. Rows and
-    columns are those of the largest cluster; a smaller one uses the first of them. A DoF with its 2 term coefficients
-    and its w'_minus takes some 30 rows: 8 kB a step in contact for a site alone, 800 kB for ten sites in one cluster.
+    ``places`` (step, cluster) is the number of the matrix, -1 without contact in that step. Columns are what J takes:
+    the Taylor coefficients a of the cluster's first DoF, of the second and so on, then q of each site. Rows are what it
+    gives: as many moments mu of the force on each DoF, then q of each site. All matrices have the size of the largest
+    cluster's; a smaller cluster uses the first rows and columns. A DoF has some 30 of them, most of them coefficients:
+    8 kB a step in contact for a site alone, 800 kB for ten sites in one cluster.
     """
 
     places: np.ndarray
@@ -96,47 +104,23 @@ class ClosedSubsteps(NamedTuple):
     weights: np.ndarray
 
 
-def unrecorded_samples(model: Model, layout: Layout, goal: int) -> Samples:
-    """Samples with which ``Propagator.fill`` advances to the sample ``goal``, counted from 0, and stores none.
-
-    The engine goes to the last sample for which there is room. Without room that is the one before the first, so that
-    the first one must be ``goal`` + 1. All arrays are empty, and what describes samples is never read.
-    """
-    return Samples(
-        number=goal + 1,
-        sums=np.zeros((0, ENERGY_SUMS, 2), np.int64),
-        work=np.zeros((0, 0)),
-        losses=np.zeros((0, 0)),
-        fields=np.zeros((0, 0, 0, 0)),
-        moving=np.zeros(0, np.int64),
-        first_cell=0,
-        every=1,
-        stride=1,
-        lattice=create_record(model, layout),
-        unit=1.0,
-        interval=1.0,
-        forces=np.zeros((0, 0)),
-        motion=np.zeros((0, 0, 0)),
-        watched=np.zeros(0, np.int64),
-    )
-
-
 class TangentPropagator(Propagator):
     """The engine of a lattice that nothing drives: one orbit from a given state, and the motion of its variations.
 
-    Call ``place`` once, then ``run`` once, then ``move`` any number of times. States are arrays (2 dof, owned cell),
-    displacements in m before velocities in m/s. The drives of ``model`` are switched off. ``rows`` is the room for
-    substeps in contact on the tape of each cluster; with 0 there is no tape, and ``move`` raises ValueError.
+    Call ``place`` once, then ``run`` once, then ``move`` any number of times. States are arrays (2 mass, owned cell)
+    over the masses of a cell, displacements in m before velocities in m/s. The drives of ``model`` are switched off.
+    ``tape_rows`` is the length of each cluster's tape, which takes a row for each closed site in each substep; with 0
+    there is no tape, and ``move`` raises ValueError.
     """
 
-    def __init__(self, model: Model, layout: Layout, rows: int = MOST_ROWS) -> None:
+    def __init__(self, model: Model, layout: Layout, tape_rows: int = MOST_TAPE_ROWS) -> None:
         super().__init__(model, layout)
         self._model = model
         clusters = self._forces.clusters
-        # A drive of no duration never acts. Its cluster is then solved only in steps in which a site may touch, as all
-        # others are.
+        # A drive of no duration never acts. Its DoF stays in its cluster, which is then solved only in steps in which a
+        # site may touch, as all others are.
         clusters.drives.rows["duration"] = 0.0
-        self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), rows))
+        self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), tape_rows))
         self._linear: _Linearisation | None = None
         self._moving: _Moving | None = None
 
@@ -145,18 +129,23 @@ class TangentPropagator(Propagator):
         """Why this engine does not suit ``model``, in words, or None.
 
         It refuses what ``Propagator`` refuses; nonlinear springs, whose force is collocated but not linearised here;
-        and contacts that touch at rest, about which no motion is linear, however small: their stiffness jumps from 0 to
-        that of the contact. A contact that is pressed at rest has a slope there, and is not refused.
+        contacts that touch at rest, about which no motion is linear, however small: their stiffness jumps from 0 to
+        that of the contact; and contacts that are pressed at rest and dissipate, as they have no approach velocity. The
+        stiffness of other pressed contacts does not jump at rest: they are not refused.
         """
         if not model.chain.is_linear:
             return "springs have a quadratic or cubic part; variations are not supported for them"
         sites = site_records(model, np.arange(len(model.chain.sites)))
-        if (np.minimum(sites["clearance"], sites["clearance_minus"]) == 0).any():
+        # The clearance is 0 of a site that touches at rest, negative of one that is pressed, which has this one stop.
+        clearance = np.minimum(sites["clearance"], sites["clearance_minus"])
+        if (clearance == 0).any():
             return "contacts touch at rest; variations are not supported for them"
+        if ((clearance < 0) & (sites["damping"] != 0)).any():
+            return "contacts that are pressed at rest dissipate, which needs an approach velocity that they do not have"
         return refusal_of_steps(model)
 
     def place(self, cells: np.ndarray, speed: float) -> None:
-        """Begin at the state ``cells`` (2 dof, owned cell); ``speed`` in m/s is a typical one of relative motion.
+        """Begin at the state ``cells`` (2 mass, owned cell); ``speed`` in m/s is a typical one of relative motion.
 
         The errors of substeps in contact are relative to the approach velocity. That of a contact that is closed at the
         beginning is not part of the state: ``speed`` takes its place. All ranks must call it.
@@ -165,54 +154,63 @@ class TangentPropagator(Propagator):
         """
         clusters = self._forces.clusters
         sites = clusters.contacts
-        state = self._components[0]
-        state[: cells.size] = cells.ravel()
+        state = self._present_cells()
+        state[:] = cells
 
         # The zeroth coefficients of free motion are the relative displacements themselves.
-        exchange(self._halo, 0, state[: cells.size].reshape(cells.shape))
+        exchange(self._halo, 0, state)
         for c in range(len(clusters.state)):
             expand_free_motion(self._forces.dofs, c, self._halo.columns, clusters.taylor)
         w = clusters.taylor[:, 0]
-        closed = np.where(w < 0, -w - sites["clearance_minus"], w - sites["clearance"]) > 0
+
+        # Every DoF has a row among ``sites``: those of drives have no stops, their clearances are inf. A mode has the
+        # sign of the side that touches. A contact that is pressed at rest has one side, the others that of w.
+        is_pressed = np.abs(sites["mode"]) == PERMANENT
+        side = np.where(is_pressed, np.sign(sites["mode"]), np.sign(w))
+        closed = side * w > _clearance_on(side, sites)
         if self._layout.comm.allreduce(bool((closed & (sites["damping"] != 0)).any())):
             raise StalledError("a contact that dissipates is closed at the beginning")
 
         # Contacts that are pressed at rest keep the mode PERMANENT, closed or open: their force has a kink where they
         # open and close, and substeps end there (``kinks``).
-        is_pressed = np.abs(sites["mode"]) == PERMANENT
-        side = np.where(is_pressed, np.sign(sites["mode"]), np.sign(w))
         sites["mode"] = np.where(is_pressed, sites["mode"], np.where(closed, side * CLOSED, FREE))
         # An open contact gets its velocity at its onset. Until then it is not read; 1 is what ``create_contacts`` sets.
         sites["approach"] = np.where(closed | is_pressed, side * speed, 1.0)
-        # Contacts that are closed already count as old, at any duration: substeps are short only after an onset.
+        # The engine takes a contact for new, with short substeps, while the time since its onset is a small fraction of
+        # its expected duration (``advance``). Contacts that are closed already began long ago, whatever the duration.
         clusters.history["onset"] = -np.inf
         clusters.history["duration"] = 1.0
 
     def run(self, samples: int, look: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
-        """Advance to the sample number ``samples``, counted from 0 at the start; returns the cells there.
+        """Advance to the sample number ``samples``, at least 1, counted from 0 at the start; returns the cells there.
 
-        Cells are states (2 dof, owned cell). ``look`` is called with those of every sample on the way. All ranks must
-        call it. Raises StalledError, on all ranks, where the engine stalls, and where the orbit needs more substeps in
-        contact than the tape has rows.
+        Cells are states (2 mass, owned cell). ``look`` is called with those of the samples 1 to ``samples``. All ranks
+        must call it. Raises StalledError, on all ranks, where the engine stalls, and where the orbit needs more
+        substeps in contact than the tape has rows; ValueError for fewer samples than 1.
         """
-        layout = self._layout
+        if samples < 1:
+            raise ValueError(f"samples is {samples}: an orbit needs at least 1")
         tape = self._forces.clusters.tape
         # Without anything to show the engine goes to the last sample at once.
         numbers = range(samples, samples + 1)
         if look:
             numbers = range(1, samples + 1)
         for number in numbers:
-            result = self.fill(unrecorded_samples(self._model, layout, goal=number))
+            result = self.fill(unrecorded_samples(self._model, self._layout, goal=number))
             # A full tape goes on to count the rows that it lacks; one without rows counts none.
-            needed = layout.comm.allreduce(int(tape.used.max(initial=0)), max)
+            needed = self._layout.comm.allreduce(int(tape.used.max(initial=0)), max)
             room = tape.rows.shape[1]
             if result.stalled or needed > room:
                 raise StalledError(result.stalled or f"an orbit needs {needed} substeps in contact, of {room}")
-            cells = self._components[self.steps % 2][: 2 * layout.dofs * layout.owned]
-            cells = cells.reshape(2 * layout.dofs, layout.owned).copy()
             if look:
-                look(cells)
-        return cells
+                look(self._present_cells().copy())
+        return self._present_cells().copy()
+
+    def _present_cells(self) -> np.ndarray:
+        """The engine's present state (2 mass, owned cell), a view: steps read and write two states in turn."""
+        rows = 2 * self._layout.dofs
+        owned = self._layout.owned
+        return self._components[self.steps % 2][: rows * owned].reshape(rows, owned)
 
     def contacts(self) -> tuple[np.ndarray, int]:
         """Begin and end (substep, 2) in s of the substeps in which a site was closed, and the number of contacts.
@@ -220,17 +218,16 @@ class TangentPropagator(Propagator):
         They are those of the sites that this rank logs; one contact takes several substeps, which follow each other.
         Of contacts that are pressed at rest the number is that of their openings.
         """
-        tape = self._forces.clusters.tape
         spans = [np.zeros((0, 2))]
         episodes = 0
-        for c in np.flatnonzero(self._forces.logs):
-            rows = tape.rows[c, : tape.used[c]]
+        for c in np.flatnonzero(self._forces.logs).tolist():
+            rows = self._tape_rows(c)
             is_open = self._is_open(c)
-            begin = rows["begin"] + rows["position"] * self.series.interval
-            end = begin + rows["length"] * self.series.interval
+            begin, end = self._times(rows)
             spans.append(np.column_stack([begin, end])[~is_open])
 
-            # The first substep after an onset is marked; a contact that is closed from the start has none on the tape.
+            # The first substep after an onset is marked. One that begins with the orbit is not, though it begins a
+            # contact as well: that of a site which is closed at the start.
             is_pressed = np.abs(rows["mode"]) == PERMANENT
             begins = (rows["onset"] > 0) | (begin == 0.0)
             episodes += int(np.sum(begins & ~is_pressed))
@@ -243,21 +240,20 @@ class TangentPropagator(Propagator):
     def closed_substeps(self) -> list[ClosedSubsteps]:
         """The substeps in which contacts were closed, one record for each cluster that this rank logs."""
         clusters = self._forces.clusters
-        interval = self.series.interval
         substeps = []
         for c in np.flatnonzero(self._forces.logs).tolist():
             is_closed = ~self._is_open(c)
-            rows = clusters.tape.rows[c, : clusters.tape.used[c]][is_closed]
+            rows = self._tape_rows(c)[is_closed]
             motion = clusters.tape.motion[c, : clusters.tape.used[c]][is_closed]
             rate = motion[:, 1]
-            length = rows["length"] * interval
-            # ``sites`` counts from 1, as messages do. "begin" is the beginning of the step, "position" that of the
-            # substep within it.
+            _, end = self._times(rows)
+            length = rows["length"] * self.series.interval
+            # Rows have a site's number in its cluster; ``Forces.sites`` gives those in the lattice, from 1.
             of_cluster = ClosedSubsteps(
                 site=np.array(self._forces.sites(c), int)[rows["site"]] - 1,
                 side=np.sign(rows["mode"]),
                 onset=rows["onset"] > 0,
-                end=rows["begin"] + rows["position"] * interval + length,
+                end=end,
                 first_rate=rows["rate"],
                 last_rate=rate @ at_end(),
                 w=motion[:, 0],
@@ -267,19 +263,31 @@ class TangentPropagator(Propagator):
             substeps.append(of_cluster)
         return substeps
 
+    def _tape_rows(self, c: int) -> np.ndarray:
+        """The rows (row,) of the tape of cluster ``c`` that are written, of dtype ``TAPE_ROW``."""
+        tape = self._forces.clusters.tape
+        return np.asarray(tape.rows[c, : tape.used[c]])
+
+    def _times(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Begin and end (row,) in s of the substeps in ``rows`` of a tape."""
+        # "begin" is that of the linear step in s; position and length of the substep in it are in units of the step.
+        step = self.series.interval
+        begin = rows["begin"] + rows["position"] * step
+        return begin, begin + rows["length"] * step
+
     def _is_open(self, c: int) -> np.ndarray:
         """Mask (row,) of the rows of the tape of cluster ``c`` that belong to an open site.
 
         The tape has the sites that are not free. Of these only a contact that is pressed at rest may be open.
         """
         tape = self._forces.clusters.tape
-        rows = tape.rows[c, : tape.used[c]]
-        # A substep ends where such a contact opens or closes: in its middle it is what it is all through.
+        rows = self._tape_rows(c)
+        # A substep ends where such a contact opens or closes: at all nodes it is what it is at one. A node in the
+        # middle is farthest from the ends, where rounding decides.
         w = tape.motion[c, : tape.used[c], 0, NODES // 2]
         sites = self._forces.clusters.contacts[self._forces.dofs.first[c] + rows["site"]]
         side = np.sign(rows["mode"])
-        clearance = np.where(side > 0, sites["clearance"], sites["clearance_minus"])
-        return np.asarray((np.abs(rows["mode"]) == PERMANENT) & (side * w < clearance))
+        return np.asarray((np.abs(rows["mode"]) == PERMANENT) & (side * w < _clearance_on(side, sites)))
 
     def _linearise(self) -> _Linearisation:
         """Compute the matrices J of the orbit from the tape."""
@@ -288,14 +296,16 @@ class TangentPropagator(Propagator):
         tape = clusters.tape
         places = np.full((self.steps, len(clusters.state)), -1)
         matrices: list[np.ndarray] = []
-        # Rows and columns of J: 2 term coefficients of the first DoF, then of the second, and so on; then w'_minus of
-        # each site. Every site is a DoF, drives and springs are DoFs without w'_minus: one more for each DoF is enough.
+        # Rows and columns as in ``_Linearisation``. Every site is a DoF, and drives are DoFs without q: one number more
+        # than the coefficients of each DoF is enough.
         coefficients = clusters.taylor.shape[1]
         largest = int(np.diff(dofs.first).max(initial=0)) * (coefficients + 1)
 
+        # The kernels that carry variations through a substep are those of the motion itself: they add to the energies
+        # what the variations' forces would dissipate, which is taken off again.
         energy = clusters.energy.copy()
         for c in range(len(clusters.state)):
-            rows = tape.rows[c, : tape.used[c]]
+            rows = self._tape_rows(c)
             motion = tape.motion[c, : tape.used[c]]
             # Rows are in the order of time: those of one step follow each other.
             steps, first = np.unique(np.rint(rows["begin"] / self.series.interval), return_index=True)
@@ -304,19 +314,17 @@ class TangentPropagator(Propagator):
                 places[step, c] = len(matrices)
                 matrices.append(np.zeros((largest, largest)))
                 linearise(clusters, dofs, c, rows[a:b], motion[a:b], matrices[-1])
-        # The kernels that carry variations through a substep are those of the motion itself, and add to its energies
-        # what the variations' forces would dissipate.
         clusters.energy[:] = energy
         return _Linearisation(places, np.array(matrices).reshape(len(matrices), largest, largest))
 
     def move(self, cells: np.ndarray) -> np.ndarray:
-        """Move variations (variation, 2 dof, owned cell) of the beginning to the orbit's end; all ranks must call it.
+        """Move variations (variation, 2 mass, owned cell) of the beginning to the orbit's end; all ranks must call it.
 
         The map is linear: variations may have any size, with velocities per s in the unit of the displacements. Raises
         ValueError for an engine without a tape, and RuntimeError where PETSc fails to exchange cells.
         """
         if self._forces.clusters.tape.rows.shape[1] == 0:
-            raise ValueError("rows is 0: an orbit without a tape has no variations; rows must be at least 1")
+            raise ValueError("tape_rows is 0: an orbit without a tape has no variations; tape_rows must be at least 1")
         layout = self._layout
         count = len(cells)
         rows = 2 * layout.dofs
@@ -328,6 +336,7 @@ class TangentPropagator(Propagator):
 
         variations = self._moving.variations
         variations.components[:, 0, : rows * layout.owned] = cells.reshape(count, -1)
+        # dq = 0: of contacts that are closed at the beginning q is the fixed ``speed``, and the others have none yet.
         variations.approach[:] = 0.0
         error = move_variations(variations, self._stencil, self._moving.halo, self._forces.dofs, layout.owned)
         if error:
@@ -363,3 +372,8 @@ class TangentPropagator(Propagator):
         """Free the PETSc objects of the variations and of the engine; all ranks must call it."""
         self._release()
         super().destroy()
+
+
+def _clearance_on(side: np.ndarray, sites: np.ndarray) -> np.ndarray:
+    """The clearances (site,) in m of ``sites`` of dtype ``SITE``, each on its ``side``: + above 0, else -."""
+    return np.where(side > 0, sites["clearance"], sites["clearance_minus"])

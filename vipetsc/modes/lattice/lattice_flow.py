@@ -6,7 +6,7 @@ cluster of sites feels the lattice (``dynamics.propagator.tangent``). The orbit 
 located on all ranks from the same numbers; any number of variations is then propagated along it without another
 search, in compiled code. Displacements, contacts and variations have the same bits on any number of ranks.
 
-States are blocks (2 dof, owned cell), displacements in m before velocities in m/s, mass by mass as in
+States are blocks (2 mass, owned cell), displacements in m before velocities in m/s, mass by mass as in
 ``dynamics.layout``; ``scatter`` and ``gather`` go from and to the order of ``modes.system``, cell by cell.
 """
 
@@ -22,7 +22,7 @@ from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.step_choice import LARGEST_OMEGA_H
-from vipetsc.dynamics.propagator.tangent import MOST_ROWS, TangentPropagator
+from vipetsc.dynamics.propagator.tangent import MOST_TAPE_ROWS, TangentPropagator
 from vipetsc.lattice import Chain, Drive, ToneBurst
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.problem import FlowError
@@ -49,7 +49,7 @@ class LatticeArc:
     engine: TangentPropagator
 
     def move(self, variations: np.ndarray) -> np.ndarray:
-        """Variations (variation, 2 dof, owned cell) of the end, given those of the start; all ranks must call it."""
+        """Variations (variation, 2 mass, owned cell) of the end, given those of the start; all ranks must call it."""
         return self.engine.move(variations)
 
 
@@ -87,7 +87,7 @@ class LatticeFlow:
         )
 
     def arc(self, start: np.ndarray, duration: float) -> LatticeArc:
-        """The orbit from the block ``start`` (2 dof, owned cell) over ``duration`` seconds; all ranks must call it.
+        """The orbit from the block ``start`` (2 mass, owned cell) over ``duration`` seconds; all ranks must call it.
 
         Raises FlowError on all ranks.
         """
@@ -101,7 +101,7 @@ class LatticeFlow:
         return max(int(np.ceil(self._omega * duration / largest)), 1)
 
     def watch(self, start: np.ndarray, duration: float, steps: int, look: Callable[[np.ndarray], None]) -> None:
-        """Let ``look`` see the block (2 dof, owned cell) ``start`` of an arc and that after each of so many ``steps``.
+        """Let ``look`` see the block (2 mass, owned cell) ``start`` of an arc and that after each of so many ``steps``.
 
         All ranks must call it. Raises FlowError on all ranks.
         """
@@ -118,10 +118,10 @@ class LatticeFlow:
         if why:
             raise FlowError(f'{why}; nnm.shooting = "dense" does without such steps')
 
-        rows = MOST_ROWS
+        tape_rows = MOST_TAPE_ROWS
         if look:
-            rows = 0
-        engine = TangentPropagator(model, self.layout, rows)
+            tape_rows = 0
+        engine = TangentPropagator(model, self.layout, tape_rows)
         largest = np.zeros(len(start))
         if start.size:
             largest = np.abs(start).max(axis=1, initial=0.0)
