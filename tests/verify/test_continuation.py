@@ -140,7 +140,7 @@ def test_contacts_change_at_grazing_points(in_phase, monkeypatch):
 
     # Points of other kinds, which are bisected, are left out where bisection fails.
     with monkeypatch.context() as patch:
-        patch.setattr(segments, "brentq", fail)
+        patch.setattr(segments, "bracketed_root", fail)
         touching = grazing_points(steps)
 
     assert len(touching) == len(steps)

@@ -145,3 +145,21 @@ def test_short_contacts_inside_a_step_are_found(excess, changes):
     arc = Dop853Flow(system).arc(centre, period / 2, period)
 
     assert len(arc.events) == changes
+
+
+@pytest.mark.parametrize("law", ["bilinear", "hertz"])
+def test_states_at_uniform_times_are_those_of_arcs(law, request):
+    """The orbit without its variations passes the ends of arcs, contact changes between them included."""
+    branch = request.getfixturevalue(law)
+    flow = branch.problem.flow
+    point = branch.at_energy(10.0)
+    start = branch.problem.start(point.x)
+    count = 12
+    states = flow.states(start, point.period / count, count, point.period)
+
+    size = np.abs(states).max(axis=0)
+    assert states.shape == (count + 1, len(start))
+    assert np.array_equal(states[0], start)
+    for number in range(1, count + 1):
+        end = flow.arc(start, number * point.period / count, point.period).end
+        assert np.all(np.abs(states[number] - end) <= 1e-11 * size)

@@ -179,17 +179,26 @@ class BranchMonitor:
         if len(track) < FEWEST or not self._touched:
             return None
 
-        starts = track[:-LATEST]
-        ends = track[1 : 1 - LATEST]
-        _, distance, length = _nearest(here, starts, ends)
-        i = int(distance.argmin())
         step = here - track[-1]
         size = np.linalg.norm(step)
+        starts = track[:-LATEST]
+        ends = track[1 : 1 - LATEST]
+        # A step of other periods is too far away, and a branch has thousands of steps.
+        low = np.minimum(starts[:, -1], ends[:, -1]) - SAME_PLACE * size
+        high = np.maximum(starts[:, -1], ends[:, -1]) + SAME_PLACE * size
+        (near,) = np.nonzero((low <= here[-1]) & (here[-1] <= high))
+        if not near.size:
+            return None
+
+        starts = starts[near]
+        ends = ends[near]
+        _, distance, length = _nearest(here, starts, ends)
+        i = int(distance.argmin())
         along = (ends[i] - starts[i]) @ step / max(length[i] * size, 1e-300)
 
         if distance[i] >= SAME_PLACE * size or abs(along) <= SAME_DIRECTION:
             return None
-        where = f"point {point.index} lies on the step after point {i + 1}"
+        where = f"point {point.index} lies on the step after point {near[i] + 1}"
         if along < 0:
             return f"retraces itself: {where}, backwards"
         return f"closed on itself: {where}"

@@ -8,8 +8,8 @@ from functools import cache, partial
 from typing import Generic, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
+from vipetsc.modes.continuation.bracketed_root import bracketed_root
 from vipetsc.modes.problem import PeriodicProblem, S, SpecialKind
 
 # A point of a segment is nearer to where it was sought than this fraction of its length. The cubic between two knots
@@ -24,6 +24,8 @@ MIDDLES = np.array([0.5, 0.25, 0.75, 0.125, 0.875])
 # Where a test turns back between two points, its extreme is estimated by a parabola. It is looked for if the estimate
 # has crossed zero or is below this fraction of the values at both ends: the parabola may be wrong by about as much.
 NEAR = 0.5
+# A special point is sought to this fraction of the segment's length: values of its test have errors of 1e-11.
+EXACT = 1e-10
 
 
 class Knot(NamedTuple):
@@ -100,7 +102,7 @@ class Segment(Generic[S]):
         if min(abs(a), abs(b)) <= kind.floor:
             return []
         if a * b < 0:
-            return [self.root(kind)]
+            return [self.root(kind, before)]
         if before is None or not self.left.step:
             return []
 
@@ -112,14 +114,15 @@ class Segment(Generic[S]):
             parts = self.split(turn)
         return [part.root(kind) for part in parts if kind.test(part.left) * kind.test(part.right) < 0]
 
-    def root(self, kind: SpecialKind[S], halvings: int = HALVINGS) -> S:
+    def root(self, kind: SpecialKind[S], before: S | None = None, halvings: int = HALVINGS) -> S:
         """The point where the kind's test vanishes; in the half with it if Newton's method fails before it is found.
 
-        Raises ArithmeticError if that does not help ``halvings`` times.
+        The point ``before`` the left one gives a better first estimate. Raises ArithmeticError if halving does not help
+        ``halvings`` times.
         """
         sys.audit("vipetsc.landing", kind.name)
         try:
-            point = self._find(kind, seek=halvings > 0)
+            point = self._find(kind, before, seek=halvings > 0)
             if kind.finish is not None:
                 point = kind.finish(point, self.left, self.right)
             return replace(point, kind=kind.name, step=self.begin + point.step)
@@ -130,10 +133,10 @@ class Segment(Generic[S]):
         # Nearer ends give better guesses, and a Newton step that left the segment may stay in its half.
         first, second = self.split()
         if kind.test(first.left) * kind.test(first.right) < 0:
-            return first.root(kind, halvings - 1)
-        return second.root(kind, halvings - 1)
+            return first.root(kind, halvings=halvings - 1)
+        return second.root(kind, halvings=halvings - 1)
 
-    def _find(self, kind: SpecialKind[S], seek: bool) -> S:
+    def _find(self, kind: SpecialKind[S], before: S | None, seek: bool) -> S:
         """The point where a test vanishes, by the kind's own equations if it has some and ``seek``, or bracketed."""
         at = cache(self.at)  # the root is one of the arclengths at which a value was asked for
         if seek and kind.seek is not None:
@@ -143,8 +146,18 @@ class Segment(Generic[S]):
                 raise ArithmeticError("the touch lies outside the step")
         else:
             value = partial(self._value, kind.test, at)
-            arclength = brentq(value, 0.0, self.length, xtol=1e-12 * self.length, rtol=1e-14)
+            arclength = bracketed_root(value, 0.0, self.length, EXACT * self.length, self._value_before(kind, before))
         return at(arclength)
+
+    def _value_before(self, kind: SpecialKind[S], before: S | None) -> dict[float, float]:
+        """The kind's test at the arclength of the point ``before`` the left one, if there is one."""
+        if before is None:
+            return {}
+        arclength = float(self.frame.tangent @ (self.frame.encode(before) - self.frame.xi))
+        # Where the branch turns sharply it does not lie before the left one in this direction.
+        if arclength >= 0:
+            return {}
+        return {arclength: kind.test(before)}
 
     def _value(self, test: Callable[[S], float], at: Callable[[float], S], arclength: float) -> float:
         """A test at an arclength; the ends need no correction."""

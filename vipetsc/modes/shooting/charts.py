@@ -8,7 +8,6 @@ A chart belongs to a point of the branch. It encodes (x, period) as xi, decodes 
 from abc import ABC, abstractmethod
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from vipetsc.modes.system import System
 
@@ -73,7 +72,10 @@ class Relative(DenseChart):
                 scale = min(max(abs(row @ x), abs(pair.stops.clearance)), self.size)
                 self.weights[pair.resonator] = row / scale
         self.inverse = np.linalg.inv(self.weights)
-        self._derivative = block_diag(self.inverse, period)
+        n = len(x)
+        self._derivative = np.zeros((n + 1, n + 1))
+        self._derivative[:n, :n] = self.inverse
+        self._derivative[n, n] = period
 
     def encode(self, x: np.ndarray, period: float) -> np.ndarray:
         """The unknowns (n + 1,) of initial values ``x`` (n,) and period."""

@@ -5,6 +5,7 @@ authors' code DOP853. Stage s is y + h sum_r A[s, r] k_r, the new state y + h su
 estimates of orders 5 and 3, which II.10 combines into err5^2 / sqrt(err5^2 + err3^2 / 100).
 """
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,9 +41,9 @@ SMALLEST_ERROR = 1e-12
 class Stepper(NamedTuple):
     """Arrays of a step: rates at its ``stages`` (STAGES, rows, 1 + m), states at its ``start`` and ``end``.
 
-    Velocities count as displacements over a radian of ``omega_ref`` (rad/s), and a step is at most one radian. The 2n
-    rows are padded to a multiple of 8, so that sums over stages have no remainder. Those are done on ``flat``: stages,
-    errors, start and end with one dimension in place of two. ``errors`` (2, rows, 1 + m): of orders 3 and 5, over h.
+    Velocities count as displacements over a radian of ``omega_ref`` (rad/s), and a step is at most one radian. Rows or
+    columns are padded with zeros (``_padded``). Sums over stages are done on ``flat``: stages, errors, start and end
+    with one dimension in place of two. ``errors`` (2, rows, 1 + m): of orders 3 and 5, over h.
     """
 
     step: flow.FlowStep
@@ -113,25 +114,45 @@ def _scaled_error(stepper: Stepper, h: float) -> float:
 
 
 @kernel
-def _advance(stepper: Stepper, h: float) -> float:
-    """One step of length ``h`` from the start, whose rates are the first stage; returns the scaled error."""
+def _advance(stepper: Stepper, h: float) -> None:
+    """One step of length ``h`` from the start, whose rates are the first stage."""
     step = stepper.step
     for s in range(1, STAGES):
         _combine(stepper, A[s], h)
         flow.rates(step.system, step.side, stepper.end, stepper.stages[s])
     _combine(stepper, B, h)
+
+
+@kernel
+def _tried(stepper: Stepper, h: float) -> float:
+    """The scaled error of a step of length ``h``, which is made."""
+    _advance(stepper, h)
     return _scaled_error(stepper, h)
 
 
 @kernel
-def _land(stepper: Stepper, t: float, h: float, change: Change) -> tuple[float, bool]:
-    """Repeat the step of length ``h`` at time ``t`` so that it ends on a change: its length, whether it is one."""
-    step = stepper.step
+def _take_orbit(orbit: Stepper, stepper: Stepper) -> None:
+    """Let the ``orbit`` begin where the ``stepper`` begins, without the variations."""
+    # Of an attempt that overflowed: a weight of 0 would not remove it from sums.
+    orbit.stages[1:] = 0.0
+    for i in range(2 * stepper.step.system.inverse_mass.size):
+        orbit.start[i, 0] = stepper.start[i, 0]
+        orbit.stages[0, i, 0] = stepper.stages[0, i, 0]
+
+
+@kernel
+def _land(stepper: Stepper, orbit: Stepper, t: float, h: float, change: Change) -> tuple[float, bool]:
+    """Repeat the step of length ``h`` at time ``t`` so that it ends on a change: its length, whether it is one.
+
+    The attempts are made by the ``orbit`` alone, a stepper without variations, which do not act on it.
+    """
+    step = orbit.step
+    _take_orbit(orbit, stepper)
     for _ in range(MOST_ATTEMPTS):
         # Each attempt is a whole step from the start: its end has the order of the pair, an interpolant has not.
         length = change.length
-        _advance(stepper, length)
-        flow.observe(step, stepper.end, stepper.end_rates, step.end)
+        _advance(orbit, length)
+        flow.observe(step, orbit.end, orbit.end_rates, step.end)
         # A root is sought to the rounding of the arc's time; an extremum, near which the gap is flat, to that of h.
         floor = 1e-16 * (t + h)
         if change.extremum:
@@ -139,15 +160,28 @@ def _land(stepper: Stepper, t: float, h: float, change: Change) -> tuple[float, 
         change, outcome = correct(change, step.end[change.contact], floor)
         if outcome != NONE:
             break
+    _advance(stepper, length)
     return length, outcome != EXTREMUM
 
 
 @kernel
-def _begin_at_end(stepper: Stepper) -> None:
-    """Begin the next step at the end of the last one."""
+def _begin_at_end(stepper: Stepper, smooth: bool) -> None:
+    """Begin the next step at the end of the last one, which was observed if the step was ``smooth``."""
     _, _, start, end = stepper.flat
     for e in range(end.size):
         start[e] = end[e]
+    if not smooth:
+        return
+
+    # The same contacts are closed: rates and motions are those of the end.
+    rows, columns = stepper.end_rates.shape
+    for i in range(rows):
+        for j in range(columns):
+            stepper.stages[0, i, j] = stepper.end_rates[i, j]
+    step = stepper.step
+    for c in range(step.side.size):
+        for k in range(3):
+            step.start[c, k] = step.end[c, k]
 
 
 @kernel
@@ -169,8 +203,8 @@ def _list(event: np.ndarray, t: float, change: Change, kind: int) -> None:
 
 
 @kernel
-def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, int, float]:
-    """Advance the ``start`` in place over ``duration`` seconds.
+def _flow(stepper: Stepper, orbit: Stepper, duration: float, events: np.ndarray) -> tuple[int, int, float]:
+    """Advance the ``start`` in place over ``duration`` seconds; the ``orbit`` is a stepper for its first column alone.
 
     Returns the outcome (DONE, STUCK or FULL), the number of ``events`` (capacity, 4) filled with time, contact, side
     and kind (1 onset, -1 separation), and the seconds with a contact closed.
@@ -192,7 +226,7 @@ def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, i
         elif h < flow.SMALLEST_STEP * duration:
             return STUCK, count, closed
 
-        error = _advance(stepper, h)
+        error = _tried(stepper, h)
         if not error < 1.0:
             # A stage that overflowed is infinite or NaN, which a weight of 0 in the next sums would not remove.
             if not error < 1e300:
@@ -207,7 +241,7 @@ def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, i
         changed = False
         whole = h
         if not smooth:
-            h, changed = _land(stepper, t, h, change)
+            h, changed = _land(stepper, orbit, t, h, change)
         # What rounding took for an extremum lies before the step, which is then taken as it was tried.
         if not smooth and not changed and t + h == t:
             if whole > SHORT * duration:
@@ -217,7 +251,7 @@ def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, i
             _advance(stepper, h)
             flow.observe(step, stepper.end, stepper.end_rates, step.end)
 
-        _begin_at_end(stepper)
+        _begin_at_end(stepper, smooth)
         if np.any(step.side):
             closed += h
         t += h
@@ -230,8 +264,37 @@ def _flow(stepper: Stepper, duration: float, events: np.ndarray) -> tuple[int, i
                 return FULL, count, closed
             _list(events[count], t, change, flow.switch(step, change))
             count += 1
-        flow.observe(step, stepper.start, stepper.stages[0], step.start)
+        if not smooth:
+            flow.observe(step, stepper.start, stepper.stages[0], step.start)
     return DONE, count, closed
+
+
+def _padded(rows: int, columns: int) -> tuple[int, int]:
+    """The least numbers of rows and columns with a multiple of 8 entries: sums over them then have no remainder."""
+    more_rows = -(-rows // 8) * 8, columns
+    least = 8 // math.gcd(rows, 8)
+    more_columns = rows, -(-columns // least) * least
+    return min(more_rows, more_columns, key=math.prod)
+
+
+@kernel
+def _flow_through(
+    stepper: Stepper, orbit: Stepper, interval: float, states: np.ndarray, events: np.ndarray
+) -> tuple[int, int, float]:
+    """Advance by the ``interval`` in s as often as there are ``states`` (count, 2n), which are those of the orbit.
+
+    Returns what ``_flow`` gives for the last interval, or for the first that is not covered.
+    """
+    outcome = DONE
+    count = 0
+    closed = 0.0
+    for number in range(states.shape[0]):
+        outcome, count, closed = _flow(stepper, orbit, interval, events)
+        if outcome != DONE:
+            break
+        for i in range(states.shape[1]):
+            states[number, i] = stepper.start[i, 0]
+    return outcome, count, closed
 
 
 class Dop853Flow(Flow):
@@ -241,21 +304,48 @@ class Dop853Flow(Flow):
 
     def __init__(self, system: System) -> None:
         super().__init__(system)
-        rows = -(-2 * system.dofs // 8) * 8
-        block = np.zeros((STAGES + 5, rows, 1 + 2 * system.dofs))
+        self._columns = 1 + 2 * system.dofs
+        self._stepper = self._room(self._columns)
+        self._orbit = self._room(1)
+        # The orbit where no variations are asked for, and its end.
+        self._alone = self._room(1)
+        self._end = np.empty((1, 2 * system.dofs))
+        self._events = np.empty((MOST_CHANGES, 4))
+
+    def _room(self, columns: int) -> Stepper:
+        """The arrays of a step of the orbit and its variations in so many ``columns``."""
+        shape = _padded(2 * self.system.dofs, columns)
+        block = np.zeros((STAGES + 5, *shape))
         flat = block.reshape(len(block), -1)
         stages, errors, (start, end, end_rates) = np.split(block, [STAGES, STAGES + 2])
         sums = flat[:STAGES], flat[STAGES : STAGES + 2], flat[STAGES + 2], flat[STAGES + 3]
         step = flow.begin(self.compiled, start)
-        self._stepper = Stepper(step, 1.0, stages, errors, start, end, end_rates, sums)
-        self._events = np.empty((MOST_CHANGES, 4))
+        return Stepper(step, 1.0, stages, errors, start, end, end_rates, sums)
 
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:
-        state = self._stepper.start[: len(y)]
+        state = self._stepper.start[: len(y), : self._columns]
         state[:] = y
-        stepper = self._stepper._replace(omega_ref=self.omega_ref(period))
-        outcome, count, closed = _flow(stepper, duration, self._events)
+        count, closed = self._flow_through(self._stepper, duration, self._end, period)
+        return state, self._events[:count].copy(), closed
+
+    def states(self, start: np.ndarray, interval: float, count: int, period: float) -> np.ndarray:
+        """The states as of ``Flow.states``, without variations."""
+        states = np.empty((1 + count, 2 * self.system.dofs))
+        states[0] = start
+        self._alone.start[: states.shape[1], 0] = start
+        self._flow_through(self._alone, interval, states[1:], period)
+        return states
+
+    def _flow_through(self, stepper: Stepper, interval: float, states: np.ndarray, period: float) -> tuple[int, float]:
+        """Advance a ``stepper`` by an ``interval`` in s for each of the ``states``, which are filled.
+
+        Returns the number of changes in the last interval, and its seconds with a contact closed.
+        """
+        stepper = stepper._replace(omega_ref=self.omega_ref(period))
+        # Contacts that are closed in a step are so for both.
+        orbit = self._orbit._replace(step=stepper.step)
+        outcome, count, closed = _flow_through(stepper, orbit, interval, states, self._events)
         if outcome != DONE:
             why = {STUCK: "the step became too small", FULL: f"more than {MOST_CHANGES} contact changes"}
-            raise FlowError(f"the flow stopped after {count} contact changes in {duration:.6g} s: {why[outcome]}")
-        return state, self._events[:count].copy(), closed
+            raise FlowError(f"the flow stopped after {count} contact changes in {interval:.6g} s: {why[outcome]}")
+        return count, closed

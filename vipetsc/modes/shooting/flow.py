@@ -123,8 +123,8 @@ def rates(system: CompiledSystem, side: np.ndarray, y: np.ndarray, dy: np.ndarra
     """Time derivative ``dy`` of the orbit, column 0, and variations of ``y`` (2n, 1 + m): displacements, velocities."""
     n = system.inverse_mass.size
     columns = y.shape[1]
-    if n == 2 and columns == 5:  # the reduced model: numbers that the compiler knows
-        restore(system, side, y, dy, (2, 2, 5))
+    if n == 2 and columns == 6:  # the reduced model in padded arrays: numbers that the compiler knows
+        restore(system, side, y, dy, (2, 2, 6))
     else:
         restore(system, side, y, dy, (n, n, columns))
     for i in range(n):
@@ -242,6 +242,9 @@ class Flow(ABC):
             load=np.array([pair.stops.load for pair in system.contacts]) @ system.contact_rows,
         )
         self.omega = float(system.linear_modes()[0][-1])
+        n = system.dofs
+        self._variations = np.eye(2 * n, 1 + 2 * n, k=1)  # at the start of an arc, behind the column of the orbit
+        self._away = np.where(system.is_pressed, SEPARATION, ONSET)
 
     def omega_ref(self, period: float) -> float:
         """Frequency in rad/s by which velocities count as displacements: the fastest linear mode's, or the orbit's."""
@@ -252,14 +255,16 @@ class Flow(ABC):
 
         Raises FlowError if the time cannot be covered.
         """
-        y = np.hstack([np.asarray(start, float)[:, None], np.eye(len(start))])
+        y = self._variations.copy()
+        y[:, 0] = start
         y, events, closed = self._advance(y, duration, period)
 
         # Contacts that are not at the start as they are at rest, and changes away from what they are at rest.
-        is_pressed = self.system.is_pressed
-        is_closed = self.system.gaps(start[: self.system.dofs]) > 0
-        away = np.where(is_pressed, SEPARATION, ONSET)[events[:, 1].astype(int)]
-        episodes = np.count_nonzero(is_closed != is_pressed) + np.count_nonzero(events[:, 3] == away)
+        plus, minus = self.system.clearances.T
+        w = self.system.contact_rows @ start[: self.system.dofs]
+        is_closed = (w > plus) | (-w > minus)
+        away = self._away[events[:, 1].astype(int)]
+        episodes = np.count_nonzero(is_closed != self.system.is_pressed) + np.count_nonzero(events[:, 3] == away)
         return Arc(
             duration=duration,
             start=start,
@@ -269,6 +274,16 @@ class Flow(ABC):
             episodes=episodes,
             closed=closed,
         )
+
+    def states(self, start: np.ndarray, interval: float, count: int, period: float) -> np.ndarray:
+        """The states (1 + count, 2n) of the orbit from ``start`` (2n,) on, every ``interval`` seconds.
+
+        ``period`` helps to choose steps. Raises FlowError if the time cannot be covered.
+        """
+        states = [np.asarray(start, float)]
+        for _ in range(count):
+            states.append(self.arc(states[-1], interval, period).end)
+        return np.array(states)
 
     @abstractmethod
     def _advance(self, y: np.ndarray, duration: float, period: float) -> tuple[np.ndarray, np.ndarray, float]:

@@ -37,10 +37,9 @@ def sample_orbit(problem: ShotOrbits, point: Point, samples: int = 400) -> tuple
 
     Only the arc that was shot is integrated; its mirror images make up the period. ``samples`` is a multiple of 4.
     """
-    states = [problem.arc(point.x, point.period).start]
-    for _ in range(round(problem.map.fraction * samples)):
-        states.append(problem.flow.arc(states[-1], point.period / samples, point.period).end)
-    u, v = np.hsplit(np.array(states), 2)
+    start = problem.arc(point.x, point.period).start
+    count = round(problem.map.fraction * samples)
+    u, v = np.hsplit(problem.flow.states(start, point.period / samples, count, point.period), 2)
     return whole_period(u, problem.map, samples, 1), whole_period(v, problem.map, samples, -1)
 
 

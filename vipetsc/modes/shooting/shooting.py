@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError, Frame, SpecialKind
@@ -74,6 +75,7 @@ class Shooting(ShootingEquations[Arc]):
         if shooting_map.starts_at_rest and shooting_map.ends_at_rest:
             self._kept = flow.system.mean_motion
         self.newton = DenseNewton(flow.system.dofs + 1, max_newton)
+        self._frames: LatestValues[tuple[Point, str], ShootingFrame[Arc]] = LatestValues(1)
 
     def _integrate(self, start: np.ndarray, period: float) -> Arc:
         return self.flow.arc(start, self.map.fraction * period, period)
@@ -101,6 +103,11 @@ class Shooting(ShootingEquations[Arc]):
         if self._kept is not None:
             sensitivity = sensitivity + self.flow.omega * self._kept
         return np.column_stack([sensitivity, self.map.fraction * self.end_rate(arc)])
+
+    def frame(self, point: Point, chart: str = "auto") -> ShootingFrame[Arc]:
+        """The frame at an orbit, as of ``ShootingEquations``; the latest one is kept."""
+        # A step of a branch and the search for its special points begin at the same orbit.
+        return self._frames.get((point, chart), lambda: super(Shooting, self).frame(point, chart))
 
     def frame_at(self, chart: str, x: np.ndarray, period: float, tangent: np.ndarray | None = None) -> DenseFrame:
         """The frame at any initial values ``x`` (n,) and period, in the ``chart`` of that name."""

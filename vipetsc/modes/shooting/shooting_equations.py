@@ -67,9 +67,11 @@ class ShootingFrame(Generic[A]):
 
     def arc(self, xi: np.ndarray) -> A:
         """The arc from the unknowns ``xi`` (n + 1,); raises FlowError where there is none."""
-        if not np.all(np.isfinite(xi)) or self.chart.decode(xi)[1] <= 0:
-            raise FlowError("Newton's method left the domain: the period is not positive")
-        return self.problem.arc(*self.chart.decode(xi))
+        if np.all(np.isfinite(xi)):
+            x, period = self.chart.decode(xi)
+            if period > 0:
+                return self.problem.arc(x, period)
+        raise FlowError("Newton's method left the domain: the period is not positive")
 
     def residual(self, xi: np.ndarray) -> np.ndarray:
         """The residual (n,) at the arc's end, which vanishes for an orbit, over its unit."""
@@ -153,7 +155,7 @@ class ShootingEquations(ABC, Generic[A]):
         self.zero = displacements
         if shooting_map.ends_at_rest:
             self.zero = velocities
-        self._latest: tuple[np.ndarray, float, A] | None = None
+        self._latest: tuple[bytes, float, A] | None = None
 
     def start(self, x: np.ndarray) -> np.ndarray:
         """The state (2n,) at the start of the arc from initial values ``x``."""
@@ -163,8 +165,10 @@ class ShootingEquations(ABC, Generic[A]):
 
     def arc(self, x: np.ndarray, period: float) -> A:
         """The arc from initial values ``x`` (n,); raises FlowError where the flow fails. The latest one is kept."""
-        if self._latest is None or self._latest[1] != period or not np.array_equal(self._latest[0], x):
-            self._latest = x.copy(), period, self._integrate(self.start(x), period)
+        # As bytes: to compare arrays of few numbers takes longer.
+        values = x.tobytes()
+        if self._latest is None or self._latest[:2] != (values, period):
+            self._latest = values, period, self._integrate(self.start(x), period)
         return self._latest[2]
 
     @abstractmethod
