@@ -218,3 +218,22 @@ def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, mo
     first, second = datasets(tmp_path / "optimum.h5")["parameter"]
     assert first == pytest.approx(2e-4)
     assert second[[1, 0, 2]] == pytest.approx(matched, rel=1e-3)
+
+
+def test_a_search_of_grains_has_no_bands():
+    """Contacts alone join the masses: what needs bands has no value, the force of the contacts has."""
+    contacts = {"sites": [1, 2, 3], "next_cell": True, "side": "minus", "clearance": 0.0, "stiffness": 1e3}
+    case = Case.from_table(
+        {
+            "name": "grains",
+            "lattice": {"cells": 4, "ends": "free", "cell": {"masses": [1.0]}},
+            "contacts": contacts,
+            "drive": {"amplitude": 1.5, "cycles": 1, "frequency": 3.0},
+            "time": {"end": 3.0, "sample_interval": 0.05},
+        }
+    )
+    force = objective("largest_force")
+    values, run = judged(case, force, objective("band_share", band=1))
+    assert values[force.name] == pytest.approx(float(run["impacts/force"].max()))
+    assert np.isnan([values["upper_share_at_end"], values["band_share 1"], *values["bands"]]).all()
+    assert 0 < values["transmitted"] < 1

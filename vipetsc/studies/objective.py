@@ -177,6 +177,31 @@ def measured(run: xr.Dataset, statistics: dict[str, Any], tables: Sequence[Measu
     # The ledger counts the energy of the motion at t = 0 as work.
     work = float(run["energy/work"][-1])
     u, v = (run[name].values[-1:] for name in ("displacement", "velocity"))
+    # All of these are measured whatever is asked for: the pictures compare designs by them.
+    values: dict[str, Any] = {
+        "episodes": statistics["episodes"],
+        "dissipated": statistics["dissipated"] / work,
+        **_of_bands(model, u, v, work, tables),
+        "transmitted": _energy_beyond(model, u, v) / work,
+    }
+    return values | _analysed(
+        run, [table for table in tables if table.measure not in values and table.measure != OF_A_BAND]
+    )
+
+
+def _of_bands(
+    model: Model, u: np.ndarray, v: np.ndarray, work: float, tables: Sequence[MeasuredTable]
+) -> dict[str, Any]:
+    """Energies of the bands over the ``work`` in J in the state ``u``, ``v`` (1, cell, dof) in m and m/s.
+
+    ``bands`` (pass band), ``upper_share_at_end``, and those parts of a band that ``tables`` ask for, by their names;
+    NaN where contacts alone join the masses, so that there are no bands.
+    """
+    of_a_band = [table for table in tables if table.measure == OF_A_BAND]
+    if not model.chain.cell.springs:
+        values: dict[str, Any] = {"bands": [np.nan] * model.chain.cell.dofs, "upper_share_at_end": np.nan}
+        return values | {table.name: np.nan for table in of_a_band}
+
     # By modes rather than filters: the energies of an undamped lattice's modes are constant after the last contact,
     # so that one sample suffices.
     modal = ModalParts.of(model.chain)
@@ -189,18 +214,12 @@ def measured(run: xr.Dataset, statistics: dict[str, Any], tables: Sequence[Measu
     for band in pass_bands(model.chain.cell):
         holds_band = [band.number in bands for bands in modal.parts.bands]
         inside[band.number] = modal.part == holds_band.index(True)
-    # All of these are measured whatever is asked for: the pictures compare designs by them.
-    values: dict[str, Any] = {
-        "episodes": statistics["episodes"],
-        "dissipated": statistics["dissipated"] / work,
+    values = {
         "bands": [float(energy[modes].sum()) for modes in inside.values()],
         "upper_share_at_end": float(energy[above[modal.part]].sum()),
-        "transmitted": _energy_beyond(model, u, v) / work,
     }
-
-    values |= _analysed(run, [table for table in tables if table.measure not in values and table.measure != OF_A_BAND])
-    for table in tables:
-        if table.measure == OF_A_BAND and table.band:
+    for table in of_a_band:
+        if table.band:
             low, high = table.part or (0.0, np.inf)
             within = inside[table.band] & (frequency >= low) & (frequency < high)
             values[table.name] = float(energy[within].sum())
