@@ -15,6 +15,7 @@ from vipetsc.case.contacts import NO_APPROACH, gaps_of_sites
 from vipetsc.case.drive import DriveTable
 from vipetsc.case.family import FamilyMember, family_of
 from vipetsc.case.names import distinct
+from vipetsc.case.nfrc_ends import are_contacts_springs, check_ground, check_open_ends, no_waves
 from vipetsc.case.nfrc_table import NfrcTable
 from vipetsc.case.resolve import build_chain, check_cell, check_stiffness
 from vipetsc.case.sites import ContactsTable
@@ -93,7 +94,7 @@ class NfrcCase(Case):
             nfrc = nfrc.model_copy(update={"band": fastest and fastest[0]})
         problems = [
             *_check_waves(nfrc, cell),
-            *_check_ground(sections | {"nfrc": nfrc}, chain),
+            *check_ground(nfrc, sections["lattice"], chain, gaps_of_sites(contacts, list(chain.clearances))),
             *_check_searches(nfrc, chain),
         ]
         return sections | {"nfrc": nfrc}, problems
@@ -168,7 +169,7 @@ class NfrcCase(Case):
             remedy = 'a wave that comes from far away is moved by no wall; omit it, or nfrc.source = "force"'
             yield Problem("drive.end", sections["drive"].end, remedy)
         if nfrc.open_ends and valid("lattice", "drive"):
-            yield from _check_open_ends(sections)
+            yield from check_open_ends(sections)
         if nfrc.over == "frequency" and not nfrc.fixed:
             yield Problem("nfrc.fixed", [], "give the amplitudes of the curves over frequency")
         if nfrc.over == "amplitude" and nfrc.isolas:
@@ -245,6 +246,12 @@ class NfrcCase(Case):
             return laws
         return [replace(law, restitution=restitution) for law in laws]
 
+    @property
+    def are_contacts_springs(self) -> bool:
+        """Whether contacts that are pressed at rest are springs of the linear lattice, as nothing else holds it."""
+        model = self.model()
+        return are_contacts_springs(self.nfrc, self.lattice, model.chain, model.gaps)
+
     @cached_property
     def _members(self) -> list[tuple[FamilyMember, "NfrcCase"]]:
         if self.table is None or not self.nfrc.family:
@@ -311,7 +318,7 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
         remedy = "a wave's amplitude counts in clearances, and a contact has none; a force can be given"
         yield Problem("nfrc.source", "wave", remedy)
     if not has_waves(chain):
-        yield from _no_waves(nfrc, chain)
+        yield from no_waves(nfrc, chain)
 
     # Of motions that do not consist of Bloch waves all modes are computed, by dense matrices.
     if not needs_modes(chain) or nfrc.infinite or nfrc.source == "wave":
@@ -326,46 +333,6 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
         if unknowns > MOST_UNKNOWNS:
             remedy = f"{places} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
             yield Problem("nfrc.harmonics", nfrc.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
-
-
-def _no_waves(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
-    """Problems with an infinite lattice whose motions do not consist of Bloch waves."""
-    reason = "a wave in springs that are not linear changes its shape as it travels"
-    if chain.is_damped:
-        reason = "in a lattice with dashpots a wave from far away has decayed before it arrives"
-    elif not chain.linearised().is_uniform():
-        reason = "a wave of equal cells does not pass cells that differ as it came"
-    if nfrc.source == "wave":
-        yield Problem("nfrc.source", "wave", f'{reason}; source = "force" drives a mass')
-    elif nfrc.infinite:
-        yield Problem("nfrc.infinite", True, f"{reason}; omit it, and give the lattice absorbing ends")
-
-
-def _check_ground(sections: dict[str, Any], chain: Chain) -> Iterator[Problem]:
-    """Problems with a mean force of the ground on a lattice that no wall holds."""
-    nfrc = sections["nfrc"]
-    absorbing = sections["lattice"].absorbing
-    is_open = nfrc.infinite or (nfrc.open_ends and absorbing.end == "both")
-    has_walls = chain.ends == "fixed" and not is_open
-    if not has_walls and not nfrc.symmetric and any(pair.host < 0 for pair in chain.contact_pairs):
-        reason = "in unsymmetric motions contacts to ground have a mean force, which pushes away a lattice that no wall"
-        yield Problem("contacts.pair", None, f'{reason} holds; use ends = "fixed", or equal stops on both sides')
-
-
-def _check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:
-    """Problems with ends that go on for ever."""
-    absorbing = sections["lattice"].absorbing
-    cell, _ = check_cell(sections["lattice"])
-    moved = sections["drive"].end
-    if sections["nfrc"].source == "wave":
-        yield Problem("nfrc.open_ends", True, "the lattice of an incident wave has no ends; omit it")
-    elif not absorbing:
-        yield Problem("nfrc.open_ends", True, "says that absorbing ends reflect nothing; give [lattice.absorbing]")
-    elif cell is not None and sections["lattice"].nonlinear_keys:
-        remedy = "beyond its ends a lattice goes on with linear springs; omit it, or quadratic and cubic"
-        yield Problem("nfrc.open_ends", True, remedy)
-    elif moved and absorbing.end in (moved, "both"):
-        yield Problem("drive.end", moved, "no wall moves where the lattice goes on; set lattice.absorbing.end")
 
 
 def _check_searches(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:

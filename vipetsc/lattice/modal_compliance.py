@@ -10,8 +10,8 @@ Without dashpots each mode answers for itself. With dashpots the state (S q, q')
     G(omega) = sum_r a_r b_r / (i omega - p_r).
 
 A motion as a rigid body, which neither a spring nor a dashpot opposes, is kept apart: its pole is double, and such a
-matrix has too few eigenvectors. Cf. F. Tisseur, K. Meerbergen, The quadratic eigenvalue problem, SIAM Rev. 43 (2001)
-235.
+matrix has too few eigenvectors. Where dashpots to the ground oppose it, one of its poles is 0. Cf. F. Tisseur, K.
+Meerbergen, The quadratic eigenvalue problem, SIAM Rev. 43 (2001) 235.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eig, eigh
-from scipy.sparse import diags
+from scipy.sparse import csc_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from vipetsc.lattice.chain import Chain
@@ -54,12 +54,15 @@ class ModalCompliance:
 
     Relative displacements of the contact pairs, and behind them elongations of the springs that are not linear, follow
     from pairs of opposite forces, and from forces on single masses at the ``points``, which are (cell, mass) from 0.
-    Raises ValueError for more than ``MOST_DOFS`` masses, and where
-    the damping is so close to critical that the modes do not represent the motion.
+    ``contact_springs`` are stiffnesses in N/m of springs in the place of the contacts, one each, () if there are none.
+
+    Raises ValueError for more than ``MOST_DOFS`` masses, and where the damping is so close to critical that the modes
+    do not represent the motion.
     """
 
     chain: Chain
     points: tuple[tuple[int, int], ...] = ()
+    contact_springs: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         dofs = self.chain.cells * self.chain.cell.dofs
@@ -93,6 +96,15 @@ class ModalCompliance:
                 column[place.start] = -1
         return np.insert(loads, [len(self.chain.sites)], elongations, axis=1)
 
+    @cached_property
+    def stiffness(self) -> csc_matrix:
+        """Stiffness (dofs, dofs) in N/m of the lattice, with the springs in the place of contacts."""
+        stiffness = self.chain.stiffness_matrix()
+        if not self.contact_springs:
+            return stiffness
+        contacts = csc_matrix(self.loads[:, : len(self.contact_springs)])
+        return (stiffness + contacts @ diags(self.contact_springs) @ contacts.T).tocsc()
+
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Compliance (omega, pair, pair) in m/N at frequencies ``omegas`` in rad/s, on or below the real axis."""
         return self.response(omegas)[:, :, : self.pairs]
@@ -104,8 +116,7 @@ class ModalCompliance:
         """
         rows, columns, rigid_rows, rigid_columns = self._parts
         omega = np.atleast_1d(np.asarray(omegas, complex))
-        gain = 1 / (1j * omega[:, None] - self._poles.poles)
-        out = (rows * gain[:, None, :]) @ columns
+        out = (rows * self._gain(omega, np.any(rows, axis=0))[:, None, :]) @ columns
         if rigid_columns.size:
             with np.errstate(divide="ignore", invalid="ignore"):
                 out += rigid_rows @ rigid_columns / (-(omega[:, None, None] ** 2))
@@ -129,12 +140,23 @@ class ModalCompliance:
         dofs = self.chain.cell.dofs
         rows = (np.atleast_1d(cells)[:, None] * dofs + np.arange(dofs)).ravel()
         _, columns, _, _ = self._parts
-        u = poles.output[rows] @ ((columns[:, : len(signed)] @ signed) / (1j * omega - poles.poles))
-        moved = poles.rigid.T @ force
         # The mean position of a lattice that is free to move is arbitrary.
+        gain = self._gain(np.array([omega]), np.zeros(len(poles.poles), bool))[0]
+        u = poles.output[rows] @ ((columns[:, : len(signed)] @ signed) * gain)
+        moved = poles.rigid.T @ force
         if np.any(moved) and omega != 0:
             u = u - poles.rigid[rows] @ moved / omega**2
         return np.asarray(u.reshape(-1, dofs))
+
+    def _gain(self, omega: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        """The factor 1/(i omega - p) (omega, pole) at ``omega`` in rad/s.
+
+        At rest a body that nothing holds may be anywhere: at p = 0 it is 0 unless the pole is ``moved`` (pole,).
+        """
+        poles = self._poles.poles
+        gap = 1j * omega[:, None] - poles
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.divide(1, gap, out=np.zeros_like(gap), where=moved | (poles != 0) | (gap != 0))
 
     @cached_property
     def _parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -152,7 +174,14 @@ class ModalCompliance:
         rigid_columns[np.abs(rigid_columns) < UNMOVED * scale] = 0
         if not rigid_rows.any():
             rigid_rows, rigid_columns = rigid_rows[:, :0], rigid_columns[:0]
-        return pairs.T @ poles.output, poles.input @ loads, rigid_rows, rigid_columns
+
+        # The same of rigid motions that dashpots oppose, whose pole is 0.
+        rows = pairs.T @ poles.output
+        columns = poles.input @ loads
+        still = poles.poles == 0
+        rows[:, still] = _without_rounding(rows[:, still], np.abs(poles.output[:, still]))
+        columns[still] = _without_rounding(columns[still], np.abs(poles.input[still]))
+        return rows, columns, rigid_rows, rigid_columns
 
     @cached_property
     def _poles(self) -> Poles:
@@ -160,13 +189,14 @@ class ModalCompliance:
         chain = self.chain
         masses = chain.masses()
         root = 1 / np.sqrt(masses)
-        stiffness = chain.stiffness_matrix().toarray()
+        stiffness = self.stiffness.toarray()
         squared, vectors = eigh(stiffness * np.outer(root, root))
         vectors = vectors * root[:, None]
 
         damping = chain.damping_rows(0, chain.cells)
         modal_damping = vectors.T @ (damping @ vectors)
-        still = np.abs(squared) < RIGID * np.abs(squared).max()
+        # Masses that no springs join have squared frequencies of 0 alone.
+        still = np.abs(squared) <= RIGID * np.abs(squared).max()
         lossless = np.abs(modal_damping).max(axis=1) <= RIGID * np.abs(modal_damping).max(initial=0.0)
         rigid = still & lossless
 
@@ -184,7 +214,7 @@ class ModalCompliance:
         """Compare the sum over ``poles`` with a direct solution; raises ValueError where they differ."""
         chain = self.chain
         omega = float(np.median(np.abs(poles.poles)))
-        dynamic = chain.stiffness_matrix() + 1j * omega * chain.damping_rows(0, chain.cells)
+        dynamic = self.stiffness + 1j * omega * chain.damping_rows(0, chain.cells)
         dynamic = dynamic - omega**2 * diags(chain.masses())
         force = self.loads.sum(axis=1)
 
@@ -209,11 +239,19 @@ def _sum_over_poles(squared: np.ndarray, damping: np.ndarray, vectors: np.ndarra
 
     # A scale of the displacements by the frequencies makes the matrix one of a single size; a mode that dashpots
     # alone hold has none, and takes a thousandth of the highest.
-    scale = np.maximum(np.sqrt(squared), 1e-3 * np.sqrt(squared.max()))
+    highest = np.sqrt(squared.max()) or np.abs(damping).max()
+    scale = np.maximum(np.sqrt(squared), 1e-3 * highest)
     matrix = np.zeros((2 * count, 2 * count))
     matrix[:count, count:] = np.diag(scale)
     matrix[count:, :count] = np.diag(-squared / scale)
     matrix[count:, count:] = -damping
+    # What no spring holds stays where dashpots have stopped it: one pole of each such mode is 0, and without rounding,
+    # as its column is zero.
     poles, right = eig(matrix)
     left = np.linalg.inv(right)
     return Poles(poles, vectors @ (right[:count] / scale[:, None]), left[:, count:] @ vectors.T, rigid)
+
+
+def _without_rounding(motions: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """The ``motions`` with 0 in the place of what is rounding beside the largest of ``sizes``."""
+    return np.where(np.abs(motions) < UNMOVED * sizes.max(initial=0.0), 0, motions)

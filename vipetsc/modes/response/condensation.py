@@ -51,9 +51,9 @@ def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
         if absorbing.end == "both":
             ends = ("left", "right")
         without = build_chain(case.lattice.model_copy(update={"absorbing": None}), case.contacts)
-        return OpenCompliance(without, places, ends)
+        return OpenCompliance(without, places, contact_springs(case), open_ends=ends)
     if needs_modes(chain) and not case.nfrc.infinite:
-        return ModalCompliance(chain, places)
+        return ModalCompliance(chain, places, contact_springs(case))
     return WaveCompliance(chain, bool(case.nfrc.infinite), places)
 
 
@@ -68,4 +68,15 @@ def stops_of(case: NfrcCase, restitution: float) -> list[Stops]:
     """The law and the stops of each site of a ``case``, with a ``restitution``."""
     model = case.model()
     gaps = model.gaps or [(clearance, clearance) for clearance in model.chain.clearances]
-    return [Stops(law, plus, minus) for law, (plus, minus) in zip(case.laws(restitution), gaps, strict=True)]
+    stops = [Stops(law, plus, minus) for law, (plus, minus) in zip(case.laws(restitution), gaps, strict=True)]
+    if not case.are_contacts_springs:
+        return stops
+    return [one._replace(spring=one.slope_at_rest) for one in stops]
+
+
+def contact_springs(case: NfrcCase) -> tuple[float, ...]:
+    """Stiffness in N/m of the spring that the linear lattice of a ``case`` has at each contact; () without any."""
+    if not case.are_contacts_springs:
+        return ()
+    # Contacts that are pressed at rest have no loss, and a spring that does not depend on the restitution.
+    return tuple(one.spring for one in stops_of(case, 1.0))

@@ -99,8 +99,8 @@ def _conservative(states: SteadyStates) -> ConservativeMotions:
         elastic.append(stops._replace(law=replace(stops.law, restitution=1.0)))
     forces = SiteForces(elastic, states.forces.springs)
 
-    rows = ModalCompliance(chain).loads.T
-    compliance = DenseCompliance(chain.masses(), chain.stiffness_matrix().toarray(), rows)
+    modal = ModalCompliance(chain, contact_springs=tuple(stops.spring for stops in elastic))
+    compliance = DenseCompliance(chain.masses(), modal.stiffness.toarray(), modal.loads.T)
     options = NnmTable.model_validate(
         {
             "harmonics": max(states.options.harmonics, FEWEST),

@@ -27,8 +27,9 @@ class HarmonicMotion(NamedTuple):
     """A steady state in harmonics: ``omega`` in rad/s, the drive's ``amplitude`` in its unit.
 
     ``relative`` (pairs, K + 1) are the displacements of the pairs in m, ``forces`` (pairs, K + 1) those on them in N,
-    without the static load of contacts that are pressed at rest; ``driving`` (driven masses,) are forces in N at Om;
-    ``episodes`` are the contact episodes. ``incident`` (cells, dofs) in m is an incident wave at the named cells.
+    without the static load of contacts that are pressed at rest, and without that of a spring which the linear lattice
+    has in the place of such a contact; ``driving`` (driven masses,) are forces in N at Om; ``episodes`` are the contact
+    episodes. ``incident`` (cells, dofs) in m is an incident wave at the named cells.
     """
 
     omega: float
@@ -88,7 +89,8 @@ class ResponseOutputs:
                 largest_force(stops, relative, [e for e in motion.episodes if e.pair == pair], motion.omega)
                 for pair, (stops, relative) in enumerate(zip(self.contacts, motion.relative, strict=False))
             ]
-            first = motion.forces[: len(self.contacts), 1]
+            springs = np.array([stops.spring for stops in self.contacts])
+            first = motion.forces[: len(springs), 1] + springs * motion.relative[: len(springs), 1]
             values |= {"largest_force": np.array(peaks), "first_force": magnitude(first), "force_lag": lag(first)}
         if self.walls:
             values |= self._on_walls(motion, field)

@@ -97,7 +97,8 @@ class SteadyStates(SteadyEquations):
                 if 0 < gap < np.inf:
                     return gap
         over_amplitude = self.options.over == "amplitude"
-        if self.forces.springs and not over_amplitude:
+        has_springs = bool(self.forces.springs) or any(stops.spring for stops in self.forces.contacts)
+        if has_springs and not over_amplitude:
             # The range of frequencies may have a resonance, at which motions are much larger than at its beginning.
             low, high = self.options.range
             largest = max(

@@ -131,10 +131,10 @@ def _touches(states: SteadyStates, linear: np.ndarray) -> bool:
 def _by_weights(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
     """Scaled harmonics of the state at ``omega`` to which growing weights of the contacts' forces lead.
 
-    The forces of all contacts are multiplied by a weight s^4, each has a parallel dashpot of 1 - s times the impedance
-    of the lattice, and the state is followed from s = 0, where it is the linear one, to s = 1. The curve cannot come
-    back to s = 0, where there is no other state, and the dashpots keep it from resonances. The power gives stiff
-    contacts, which act at small weights already, a long part of the path.
+    The forces of all contacts, less those of springs in their place, are multiplied by a weight s^4, each has a
+    parallel dashpot of 1 - s times the impedance of the lattice, and the state is followed from s = 0, where it is the
+    linear one, to s = 1. The curve cannot come back to s = 0, where there is no other state, and the dashpots keep it
+    from resonances. The power gives stiff contacts, which act at small weights already, a long part of the path.
     """
     impedance = 1 / (omega * np.abs(np.diag(states.compliance.at(np.array([omega]))[0])))
     update = {"over": "amplitude", "range": [amplitude, 2 * amplitude], "fixed": [omega]}
@@ -142,7 +142,7 @@ def _by_weights(states: SteadyStates, omega: float, amplitude: float) -> np.ndar
 
     def weighted(s: float) -> SteadyStates:
         stops = [
-            one._replace(weight=s**4, drag=(1 - s) * drag)
+            one._replace(weight=s**4, drag=(1 - s) * drag, spring=s**4 * one.spring)
             for one, drag in zip(states.forces.contacts, impedance.tolist(), strict=False)
         ]
         springs = [

@@ -1,0 +1,149 @@
+"""Frequency responses of lattices with free ends that only contacts pressed to the ground hold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.rigs import after_a_period
+from tests.steady_states import motion_at
+from vipetsc.case import CaseError
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.lattice import Chain, ModalCompliance, UnitCell
+from vipetsc.modes.response.steady import SteadyStates
+from vipetsc.modes.response.steps import first_state
+
+pytestmark = pytest.mark.parallel(1)
+
+SPRING = 3.0
+DASHPOT = 0.1
+STOP = 20.0
+DEPTH = 0.1
+
+
+def held(contacts: dict[str, Any] | None = None, lattice: dict[str, Any] | None = None, **nfrc: Any) -> NfrcCase:
+    """Two masses of 1 kg in a row without walls, of which the first is pressed against a stop of the ground."""
+    spring = {"start": 1, "end": 1, "stiffness": SPRING, "next_cell": True}
+    table: dict[str, Any] = {
+        "lattice": {"cells": 2, "ends": "free", "damping": {"mass": DASHPOT}},
+        "contacts": {"law": "hertz", "stiffness": STOP, "restitution": 1.0, "sites": [1], "pair": [0, 1]},
+        "drive": {"waveform": "harmonic", "amplitude": 1.0, "frequency": 1.0, "cell": 2},
+        "time": {"end": 10.0, "sample_interval": 0.1},
+        "output": {"points": [{"name": "near", "cell": 1}, {"name": "far", "cell": 2}], "forces": True},
+        "nfrc": {"source": "force", "over": "frequency", "range": [0.8, 3.0], "fixed": [0.2], "harmonics": 41},
+    }
+    table["lattice"] |= {"cell": {"masses": [1.0], "springs": [spring], "contact": [1, 1]}} | (lattice or {})
+    table["contacts"] |= {"side": "minus", "clearance": 0.0, "precompression": DEPTH} | (contacts or {})
+    table["nfrc"] |= nfrc
+    return NfrcCase.from_table(table)
+
+
+def test_a_weak_force_moves_it_as_a_lattice_with_a_spring_to_the_ground():
+    """The spring has the slope of the contact's force at rest; its force is the first harmonic of the contact's."""
+    omega = 1.7
+    states = SteadyStates(held(range=[omega, 2.0], fixed=[1e-4]), 1.0, 1e-4)
+    slope = 1.5 * STOP * DEPTH**0.5
+    stiffness = np.array([[SPRING + slope, -SPRING], [-SPRING, SPRING]])
+    u = np.linalg.solve(stiffness + (1j * omega * DASHPOT - omega**2) * np.eye(2), [0.0, 1e-4])
+
+    outputs = states.measured(first_state(states).xi).outputs
+    np.testing.assert_allclose(outputs["first_displacement"], np.abs(u), rtol=1e-5)
+    np.testing.assert_allclose(outputs["first_force"], slope * np.abs(u[:1]), rtol=1e-5)
+    np.testing.assert_allclose(outputs["largest_force"], STOP * DEPTH**1.5 + slope * np.abs(u[:1]), rtol=1e-5)
+
+
+@pytest.mark.parametrize("side", ["plus", "minus"])
+def test_a_motion_that_opens_the_contact_returns_after_a_period(side):
+    """The static load, which the contact no longer balances while it is open, pushes the lattice back."""
+    states = SteadyStates(held({"side": side}, range=[1.4, 2.0], fixed=[0.5]), 1.0, 0.5)
+    point = first_state(states)
+    measured = states.measured(point.xi)
+    assert 0 < measured.closed[0] < 0.9
+    state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(2))])
+    assert after_a_period(states, point, state) == pytest.approx(state, abs=2e-4 * np.abs(state).max())
+
+
+def test_growing_weights_lead_to_the_same_state_beside_a_stop_that_touches():
+    """A second stop of the ground touches at rest, so that the forces of contacts grow from zero."""
+    each = {"precompression": [DEPTH, 0.0], "pair": [[0, 1], [0, 1]], "side": ["minus", "plus"]}
+    contacts = {"sites": [1, 2], "each": each, "side": None, "pair": None, "precompression": None}
+    given = {key: value for key, value in contacts.items() if value is not None}
+    case = held(given, range=[1.4, 2.0], fixed=[0.1])
+    states = SteadyStates(case, 1.0, 0.1)
+    point = first_state(states)
+    state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(2))])
+    assert after_a_period(states, point, state) == pytest.approx(state, abs=1e-3 * np.abs(state).max())
+
+
+def test_the_unit_of_a_curve_is_its_largest_linear_motion():
+    """Not that at the beginning of the range: a resonance would be hundreds of units away, and as many steps."""
+    states = SteadyStates(held(), 1.0, 0.2)
+    motions = [np.abs(states.linear_motion(omega).harmonics).max() for omega in np.linspace(0.8, 3.0, 200)]
+    assert states.clearance == pytest.approx(0.2 * max(motions), rel=0.2)
+
+
+def test_a_lattice_that_walls_hold_has_its_own_springs_alone():
+    """Its contacts' forces are all of their forces, as they are where no contact is pressed to the ground."""
+    assert held().are_contacts_springs
+    assert not held(lattice={"ends": "fixed"}).are_contacts_springs
+    assert not held(IN_A_CELL | PRESSED, {"cell": SPRUNG}).are_contacts_springs
+
+
+def test_what_nothing_holds_is_refused():
+    """A stop at a distance pushes it away, and beyond ends that go on for ever a pressed contact is too far."""
+    with pytest.raises(CaseError, match="a lattice that no wall holds"):
+        held({"precompression": None, "clearance": 0.1} | {"side": "plus"})
+    with pytest.raises(CaseError, match="infinite lattice without bound"):
+        held(lattice={"damping": {}}, infinite=True)
+
+
+SPRINGS = [{"start": 1, "end": 1, "stiffness": SPRING, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 1.0}]
+SPRUNG = {"masses": [1.0, 0.5], "springs": SPRINGS, "contact": [1, 2]}
+IN_A_CELL = {"sites": [2], "pair": [1, 2], "side": "plus", "clearance": 0.1, "precompression": None}
+GRAINS = {"masses": [1.0], "contact": [1, 1]}
+PRESSED = {"clearance": 0.0, "precompression": DEPTH}
+BETWEEN_CELLS = {"sites": [1, 2], "pair": [1, 1], "next_cell": True}
+RING = {"sites": [1, 2, 3], "pair": [1, 1], "next_cell": True}
+BOTH_SIDES = BETWEEN_CELLS | {"side": "both", "clearance": 0.01, "precompression": None}
+
+
+@pytest.mark.parametrize(
+    ("cell", "ends", "damping", "contacts", "force"),
+    [
+        pytest.param(SPRUNG, "free", {"mass": DASHPOT}, IN_A_CELL, 0.3, id="dashpots"),
+        pytest.param(SPRUNG | {"grounding": [DASHPOT, 0.0]}, "free", {}, IN_A_CELL, 0.3, id="a dashpot"),
+        pytest.param(SPRUNG, "periodic", {"mass": DASHPOT}, IN_A_CELL, 0.3, id="a ring"),
+        pytest.param(GRAINS, "free", {"mass": DASHPOT}, BETWEEN_CELLS, 0.2, id="grains"),
+        pytest.param(GRAINS, "free", {}, BETWEEN_CELLS, 0.2, id="grains without loss"),
+        pytest.param(GRAINS, "periodic", {"mass": DASHPOT}, RING, 0.2, id="a ring of grains"),
+        pytest.param(GRAINS, "free", {"mass": DASHPOT}, BOTH_SIDES, 0.02, id="grains apart"),
+    ],
+)
+def test_what_only_dashpots_or_nothing_holds_returns_after_a_period(cell, ends, damping, contacts, force):
+    """The contacts' forces add up to nothing on the whole, so that its mean place does not matter."""
+    lattice = {"cells": 3, "ends": ends, "cell": cell, "damping": damping}
+    case = held(contacts, lattice, range=[1.3, 2.0], fixed=[force], infinite=False)
+    states = SteadyStates(case, 1.0, force)
+    point = first_state(states)
+    assert min(states.measured(point.xi).closed) > 0
+    state = np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(3))])
+    assert after_a_period(states, point, state) == pytest.approx(state, abs=2e-4 * np.abs(state).max())
+
+
+def test_bodies_that_dashpots_oppose_differently_move_each_for_itself():
+    """Two masses of which dashpots brake one: no mode without stiffness is that of one body unless it is chosen so."""
+    cell = UnitCell((1.0, 2.0), (), 0, 1, grounding=(0.3, 0.0))
+    chain = Chain(cell, 1, "free", sites=(0,), clearances=(0.1,))
+    omega = 0.7
+    found = ModalCompliance(chain).at(omega)[0, 0, 0]
+    assert found == pytest.approx(1 / (0.3j * omega - omega**2) - 1 / (2 * omega**2), rel=1e-12)
+
+
+@pytest.mark.parametrize("clearance", [0.0, 0.1])
+def test_grains_that_do_not_stay_together_are_refused(clearance):
+    """On one side alone their contacts have a mean force, and nothing brings them back."""
+    lattice = {"cells": 3, "cell": GRAINS}
+    with pytest.raises(CaseError, match="its mean force pushes them apart"):
+        held(BETWEEN_CELLS | {"clearance": clearance, "precompression": None}, lattice)

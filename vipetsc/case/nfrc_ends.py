@@ -1,0 +1,114 @@
+"""What holds the lattice of steady states: walls, contacts that are pressed at rest, and ends that go on for ever."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from vipetsc.case.case_file import Problem
+from vipetsc.case.nfrc_table import NfrcTable
+from vipetsc.case.resolve import check_cell
+from vipetsc.case.schema import LatticeTable
+from vipetsc.lattice import Chain
+from vipetsc.lattice.cell import connected_groups
+
+
+def has_walls(nfrc: NfrcTable, lattice: LatticeTable) -> bool:
+    """Whether springs tie the ``lattice`` to a wall."""
+    is_open = nfrc.infinite
+    if nfrc.open_ends and lattice.absorbing:
+        is_open = is_open or lattice.absorbing.end == "both"
+    return lattice.ends == "fixed" and bool(lattice.unit_cell().springs) and not is_open
+
+
+def are_contacts_springs(
+    nfrc: NfrcTable, lattice: LatticeTable, chain: Chain, gaps: Sequence[tuple[float, float]]
+) -> bool:
+    """Whether the contacts that are pressed at rest are springs of the linear lattice.
+
+    They are where nothing else holds the masses: at the ground of a lattice without walls, and where no springs join
+    them. Without these springs a mean force would push such masses away without bound. ``gaps`` are the clearances in m
+    of the sites of ``chain`` on both sides.
+    """
+    pressed = [pair for pair, gap in zip(chain.contact_pairs, gaps, strict=False) if min(gap) < 0]
+    if not lattice.unit_cell().springs:
+        return bool(pressed)
+    return any(pair.host < 0 for pair in pressed) and not has_walls(nfrc, lattice)
+
+
+def no_waves(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
+    """Problems with an infinite lattice whose motions do not consist of Bloch waves."""
+    reason = "a wave in springs that are not linear changes its shape as it travels"
+    if chain.is_damped:
+        reason = "in a lattice with dashpots a wave from far away has decayed before it arrives"
+    elif not chain.linearised().is_uniform():
+        reason = "a wave of equal cells does not pass cells that differ as it came"
+    if nfrc.source == "wave":
+        yield Problem("nfrc.source", "wave", f'{reason}; source = "force" drives a mass')
+    elif nfrc.infinite:
+        yield Problem("nfrc.infinite", True, f"{reason}; omit it, and give the lattice absorbing ends")
+
+
+def check_ground(
+    nfrc: NfrcTable, lattice: LatticeTable, chain: Chain, gaps: Sequence[tuple[float, float]]
+) -> Iterator[Problem]:
+    """Problems with a mean force of the ground on a lattice that neither a wall nor a pressed contact holds.
+
+    ``gaps`` are the clearances in m of the sites of ``chain`` on both sides; () if they are equal.
+    """
+    if nfrc.symmetric:
+        return
+    if not (chain.cell.springs or nfrc.infinite):
+        yield from _check_loose(chain, gaps)
+        return
+    to_ground = any(pair.host < 0 for pair in chain.contact_pairs)
+    if not to_ground or has_walls(nfrc, lattice):
+        return
+    if nfrc.infinite:
+        reason = "a mean force of the ground moves an infinite lattice without bound, since no wall holds it"
+        yield Problem("contacts.pair", None, f"{reason}; give equal stops on both sides, or nfrc.infinite = false")
+    elif not are_contacts_springs(nfrc, lattice, chain, gaps):
+        reason = "in unsymmetric motions contacts to ground have a mean force, which pushes away a lattice that no wall"
+        remedy = 'use ends = "fixed", a precompression, or equal stops on both sides'
+        yield Problem("contacts.pair", None, f"{reason} holds; {remedy}")
+
+
+def _check_loose(chain: Chain, gaps: Sequence[tuple[float, float]]) -> Iterator[Problem]:
+    """The problem of the first contact of masses without springs that neither is pressed nor joins what others press.
+
+    ``gaps`` are the clearances in m of the sites of ``chain`` on both sides; () if they are equal.
+    """
+    d = chain.cell.dofs
+    ends = []
+    for site, cell, pair in zip(chain.sites, chain.resonator_cells, chain.contact_pairs, strict=True):
+        # Node 0 is the ground.
+        host = 0
+        if pair.host >= 0:
+            host = 1 + site * d + pair.host
+        ends.append((host, 1 + cell * d + pair.resonator))
+
+    pressed = [pair for pair, gap in zip(ends, gaps, strict=False) if min(gap) < 0]
+    # A node is joined to itself, so that there is a pair without contacts that are pressed, too.
+    group = connected_groups(1 + chain.cells * d, ((0, 0), *pressed))
+    for number, (host, resonator) in enumerate(ends, 1):
+        if group[host] != group[resonator]:
+            reason = (
+                f"site {number} joins masses that neither springs nor pressed contacts join: in unsymmetric motions"
+            )
+            remedy = "its mean force pushes them apart; give a precompression, or equal stops on both sides"
+            yield Problem("contacts.clearance", None, f"{reason} {remedy}")
+            return
+
+
+def check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:
+    """Problems with ends that go on for ever."""
+    absorbing = sections["lattice"].absorbing
+    cell, _ = check_cell(sections["lattice"])
+    moved = sections["drive"].end
+    if sections["nfrc"].source == "wave":
+        yield Problem("nfrc.open_ends", True, "the lattice of an incident wave has no ends; omit it")
+    elif not absorbing:
+        yield Problem("nfrc.open_ends", True, "says that absorbing ends reflect nothing; give [lattice.absorbing]")
+    elif cell is not None and sections["lattice"].nonlinear_keys:
+        remedy = "beyond its ends a lattice goes on with linear springs; omit it, or quadratic and cubic"
+        yield Problem("nfrc.open_ends", True, remedy)
+    elif moved and absorbing.end in (moved, "both"):
+        yield Problem("drive.end", moved, "no wall moves where the lattice goes on; set lattice.absorbing.end")
