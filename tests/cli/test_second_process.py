@@ -76,7 +76,7 @@ def test_two_processes_draw_what_one_draws(run, tmp_path):
 
     with SecondProcess() as second:
         draw_unmeasured(PICTURES, run, second)
-        drawn = draw_pictures(PICTURES, [run], MPI.COMM_SELF, afresh=False, second=second)
+        drawn = draw_pictures(PICTURES, [run], MPI.COMM_SELF, afresh=False, helper=second)
         # Both were asked for the two that show measures, and each took one turn too many.
         assert next(second.turns) == 2 + 2
 
@@ -92,7 +92,7 @@ def test_two_processes_draw_what_one_draws(run, tmp_path):
 
 def test_pictures_that_the_second_process_did_not_draw_are_drawn_here(thinned):
     second = Recorded()
-    drawn = draw_pictures(PICTURES, [thinned], MPI.COMM_SELF, second=second)
+    drawn = draw_pictures(PICTURES, [thinned], MPI.COMM_SELF, helper=second)
     assert {path.name for path in drawn} == {"spacetime.png", "unit_cell.png", "ledger.png"}
     assert all(path.stat().st_size for path in drawn)
 
@@ -105,7 +105,7 @@ def test_pictures_without_the_warnings_of_the_measures_are_drawn_again(name, req
     monkeypatch.setattr("vipetsc.figures.registry.draw", lambda *arguments, **options: [])
     second = Recorded()
     draw_unmeasured(PICTURES, folder, second)
-    draw_pictures(PICTURES, [folder], MPI.COMM_SELF, second=second)
+    draw_pictures(PICTURES, [folder], MPI.COMM_SELF, helper=second)
     ahead, rest = second.requests
     assert {f"{figure}.png" for figure in ahead["names"]} == WITHOUT_MEASURES
     assert rest["omit"] == (ahead["names"] if name == "run" else ())

@@ -32,7 +32,7 @@ def drawn(monkeypatch):
     """Keep the sources of pictures that are asked for, and draw nothing."""
     sources = []
 
-    def draw(pictures, folders, comm, afresh, second):
+    def draw(pictures, folders, comm, afresh, helper):
         sources.append(pictures.source)
         return [folders[0] / "figures" / "picture.png"]
 

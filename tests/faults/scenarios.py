@@ -251,11 +251,14 @@ SCENARIOS = {
 def shrink_pictures() -> None:
     """Make the program's own pieces as small as the cases: pictures and chunks."""
     # Workers alone call this: what is replaced stays so in the process.
+    from vipetsc.cli.verbs import run_verb
     from vipetsc.dynamics import recorded_sizes
     from vipetsc.figures import measure_pages, registry
 
     for name in registry.FIGURES.keys() - {*DRAWN}:
         del registry.FIGURES[name]
+    # Frozen: the verb holds it already.
+    object.__setattr__(run_verb.PICTURES, "unmeasured", tuple({*run_verb.PICTURES.unmeasured} & {*DRAWN}))
     measures_of = measure_pages.measures_of
     measure_pages.measures_of = lambda ensemble: measures_of(ensemble)[:1]
     recorded_sizes.CHUNK_SAMPLES = SAMPLES_A_CHUNK

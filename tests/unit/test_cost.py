@@ -14,6 +14,9 @@ def test_ranks_are_advised_against_where_messages_cost_what_they_save(engine):
     short = Case.load(overrides=[f"time.engine={engine}"])
     long = short.varied(overrides=["lattice.cells=3000"])
 
+    assert estimate(short, 2).one_rank_suffices
+    assert not estimate(short, 1).one_rank_suffices
+    assert not estimate(long, 2).one_rank_suffices
     assert "one rank would be as fast" in estimate(short, 2).faster
     assert estimate(short, 2).seconds == pytest.approx(estimate(short, 1).seconds, rel=0.1)
     assert "one rank" not in estimate(short, 1).faster

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 from mpi4py import MPI
 
@@ -25,6 +25,30 @@ if TYPE_CHECKING:
 
 MEASURES = "analysis.h5"  # the file of what `Pictures.prepare` measures
 SWEEP_FIGURES = "sweep"  # the source of pictures whose measures are those of the file
+
+
+class Helper(Protocol):
+    """A process or ranks that draw pictures while this one computes, or draws others.
+
+    These are `vipetsc.figures.second_process.SecondProcess` and `vipetsc.cli.helping_ranks.HelpingRanks`.
+    """
+
+    @property
+    def turns(self) -> Iterator[int]:
+        """Numbers of pictures that both draw, each for one of them."""
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether anything was asked for that `drawn` has not waited for."""
+
+    def ask(self, source: str, folders: Sequence[Path], divided: bool = False, **options: Any) -> None:
+        """Ask for what ``vipetsc.figures.registry.draw`` draws with these arguments; returns at once.
+
+        Of pictures that are ``divided`` it draws those whose turns this process does not take.
+        """
+
+    def drawn(self) -> list[Path] | None:
+        """Wait for all that was asked for; returns the files, or None where this process has to draw all of them."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +89,11 @@ def second_process(
     return nullcontext()
 
 
-def draw_unmeasured(pictures: Pictures, folder: Path, second: SecondProcess) -> None:
-    """Let the ``second`` process draw what shows the new results in ``folder`` alone; they are measured meanwhile."""
+def draw_unmeasured(pictures: Pictures, folder: Path, helper: Helper) -> None:
+    """Let the ``helper`` draw what shows the new results in ``folder`` alone; they are measured meanwhile."""
     # Earlier measures would put their warnings below the pictures.
     if not (folder / MEASURES).exists():
-        second.ask(pictures.source, [folder], names=pictures.unmeasured)
+        helper.ask(pictures.source, [folder], names=pictures.unmeasured)
 
 
 def draw_pictures(
@@ -79,12 +103,12 @@ def draw_pictures(
     names: list[str] | None = None,
     formats: tuple[str, ...] = ("png",),
     afresh: bool = True,
-    second: SecondProcess | None = None,
+    helper: Helper | None = None,
 ) -> list[Path]:
     """Draw what ``folders`` hold as `vipetsc.figures.registry.draw`, measured first where that is missing or older.
 
     ``names`` are figures among ``pictures``, all by default; unless ``afresh``, those that are newer than the files
-    they show stay. A ``second`` process, which may have been asked to `draw_unmeasured`, draws half of all figures.
+    they show stay. A ``helper``, which may have been asked to `draw_unmeasured`, draws a part of all figures.
     Returns the files written, on rank 0, an empty list on the others. Raises FolderError for folders that hold nothing
     to draw, and for a figure that does not exist.
     """
@@ -95,19 +119,20 @@ def draw_pictures(
         newest = on_root(comm, lambda: newest_result(folders))
     # Asked before this process loads what it needs to draw itself.
     drawn_ahead: tuple[str, ...] = ()
-    if second:
-        if second.is_asked and not measures_warn(folders[0]):
+    if helper:
+        if helper.is_asked and not measures_warn(folders[0]):
             drawn_ahead = pictures.unmeasured
-        second.ask(pictures.source, folders, divided=True, formats=formats, newest=newest, omit=drawn_ahead)
+        helper.ask(pictures.source, folders, divided=True, formats=formats, newest=newest, omit=drawn_ahead)
 
+    load_matplotlib()
     from vipetsc.figures.registry import draw
     from vipetsc.figures.sweep_members import Files
 
     def draw_part() -> list[Path]:
         with reading(pictures, folders):
-            if second:
-                from_here = draw_here(turns=second.turns, omit=drawn_ahead)
-                others = second.drawn()
+            if helper:
+                from_here = draw_here(turns=helper.turns, omit=drawn_ahead)
+                others = helper.drawn()
                 if others is not None:
                     return [*{*from_here, *others}]
             return draw_here(turns=count(comm.rank, comm.size))
@@ -155,16 +180,16 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
 
     Raises FolderError for an unknown picture, before any file is written.
     """
-    # Before any module that loads it as it is.
-    load_matplotlib()
-    from vipetsc.figures.registry import figure_names
+    # Names first: measuring writes files, and a wrong --fig must leave none.
+    if names is not None:
+        # Before any module that loads it as it is.
+        load_matplotlib()
+        from vipetsc.figures.registry import figure_names
 
-    try:
-        # Names first: measuring writes files, and a wrong --fig must leave none.
-        if names is not None:
+        try:
             figure_names(pictures.source, names, folders)
-    except KeyError as error:
-        raise FolderError(f"--fig: {error.args[0]}") from None
+        except KeyError as error:
+            raise FolderError(f"--fig: {error.args[0]}") from None
     if pictures.prepare:
         pictures.prepare(folders)
 

@@ -11,7 +11,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,9 @@ from mpi4py import MPI
 
 from vipetsc.case import CaseFile
 from vipetsc.cli.arguments import Argument
-from vipetsc.cli.drawing import Pictures, draw_pictures, second_process
+from vipetsc.cli.drawing import Helper, Pictures, draw_pictures, second_process
+from vipetsc.cli.helping_ranks import HelpingRanks, with_helping_ranks
 from vipetsc.cli.messages import echo, echo_paths, echo_warnings
-from vipetsc.figures.second_process import SecondProcess
 from vipetsc.io.folder import FolderKind
 from vipetsc.io.lock import locked
 from vipetsc.io.names import path_named
@@ -74,14 +74,14 @@ class PlainVerb(Verb):
 class Work:
     """Arguments of a study besides its case: the folder of its results, the ranks, the options and the stop request.
 
-    ``second`` is a process that draws pictures, while the study still measures what they do not show.
+    ``helper`` draws pictures, while the study still measures what they do not show.
     """
 
     options: argparse.Namespace
     folder: Path
     comm: MPI.Comm
     stop: StopRequest
-    second: SecondProcess | None = None
+    helper: Helper | None = None
     warned: list[str] = field(default_factory=list)
 
     @property
@@ -121,7 +121,8 @@ class StudyVerb(Verb):
     ``study`` computes, prints what came out, and says how it ended; all ranks call it. ``table`` are the rows that
     ``validate`` prints of a case on so many ranks, ``pictures`` what is drawn of the results, if anything is. The
     folder is named after the case, with the ``suffix``. ``load`` reads the case from the parsed options, where ``CASE``
-    and ``--set`` do not say all.
+    and ``--set`` do not say all. ``is_for_one_rank`` says of a case whether one rank computes it as fast as so many
+    ranks do.
     """
 
     case: type[CaseFile]
@@ -131,6 +132,7 @@ class StudyVerb(Verb):
     pictures: Pictures | None = None
     suffix: str = ""
     load: Callable[[argparse.Namespace], CaseFile] | None = None
+    is_for_one_rank: Callable[[Any, int], bool] | None = None
     is_stoppable: bool = True
 
     def call(self, options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
@@ -143,29 +145,53 @@ class StudyVerb(Verb):
         work = Work(options, folder, comm, stop)
         # On rank 0, since warnings compute the bands of the cell.
         work.warn(on_root(comm, case.warnings))
-        pictures = None
-        if case.wants_pictures:
-            pictures = self.pictures
+        # Without pictures there would be nothing to do for the other ranks.
+        if comm.size > 1 and self.pictures_of(case) and on_root(comm, lambda: self.suits_one_rank(case, comm.size)):
+            work.report(f"one of {comm.size} ranks computes, which is as fast; the others draw pictures")
 
-        # Studies lock their folder themselves, which the same process may do again; this lock spans the pictures too.
-        with ExitStack() as stack:
-            stack.enter_context(locked(comm, folder))
-            # Results of an earlier command have their pictures.
-            if pictures and (options.force or not pictures.are_of([folder])):
-                work.second = stack.enter_context(second_process(pictures, comm))
+            def compute_alone(helpers: HelpingRanks) -> Outcome:
+                return self.compute_and_draw(case, replace(work, comm=MPI.COMM_SELF, helper=helpers))
 
-            outcome = self.study(case, work)
-            # What was computed is saved; pictures are drawn by the command that goes on.
-            stop.check(comm)
-            if pictures and outcome.drawable:
-                with stop.at_once():
-                    drawn = draw_pictures(pictures, [folder], comm, afresh=False, second=work.second)
-                echo_paths(comm, drawn)
+            outcome = with_helping_ranks(comm, stop, compute_alone)
+        else:
+            outcome = self.compute_and_draw(case, work)
 
         # Last, where a user sees them; with --quiet they are all that is printed.
         for failure in outcome.failures:
             echo(comm, f"vipetsc: {failure}", sys.stderr)
         return DONE if outcome.complete and not outcome.failures else FAILED
+
+    def compute_and_draw(self, case: CaseFile, work: Work) -> Outcome:
+        """Compute the results of the case and draw their pictures; all ranks of ``work`` must call it."""
+        options = work.options
+        folder = work.folder
+        comm = work.comm
+        pictures = self.pictures_of(case)
+        # Studies lock their folder themselves, which the same process may do again; this lock spans the pictures too.
+        with ExitStack() as stack:
+            stack.enter_context(locked(comm, folder))
+            # Results of an earlier command have their pictures.
+            if pictures and not work.helper and (options.force or not pictures.are_of([folder])):
+                work.helper = stack.enter_context(second_process(pictures, comm))
+
+            outcome = self.study(case, work)
+            # What was computed is saved; pictures are drawn by the command that goes on.
+            work.stop.check(comm)
+            if pictures and outcome.drawable:
+                with work.stop.at_once():
+                    drawn = draw_pictures(pictures, [folder], comm, afresh=False, helper=work.helper)
+                echo_paths(comm, drawn)
+        return outcome
+
+    def pictures_of(self, case: CaseFile) -> Pictures | None:
+        """The pictures of the results of a case, if it wants any."""
+        if case.wants_pictures:
+            return self.pictures
+        return None
+
+    def suits_one_rank(self, case: CaseFile, ranks: int) -> bool:
+        """Whether one rank computes the case as fast as so many ranks."""
+        return self.is_for_one_rank is not None and self.is_for_one_rank(case, ranks)
 
     def checked_case(self, options: argparse.Namespace) -> CaseFile:
         """The case, with PETSc options that time stepping knows; raises CaseError. Called on one rank."""

@@ -103,9 +103,14 @@ class Cost:
         ratio = self.seconds / self.propagator
         return f'time.engine = "propagator" would be about {ratio:.0f} times faster'
 
+    @property
+    def one_rank_suffices(self) -> bool:
+        """Whether one rank is as fast as the several ``ranks``, whose messages cost what they save."""
+        return self.ranks > 1 and self.seconds >= WORTHWHILE * self.alone
+
     def _fewer_ranks(self) -> str:
-        """Sentence that one rank is as fast as several, where their messages cost what they save; else empty."""
-        if self.ranks == 1 or self.seconds < WORTHWHILE * self.alone:
+        """Sentence that one rank is as fast as several, where it is; else empty."""
+        if not self.one_rank_suffices:
             return ""
         return f"one rank would be as fast: in so short a lattice messages cost what {self.ranks} ranks save"
 

@@ -75,8 +75,8 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     # Measures need a second sample: a run that fails in its first has none.
     has_two_samples = result.statistics["samples"] > 1
     has_fields = bool(case.output.fields) and has_two_samples
-    if has_fields and work.second:
-        draw_unmeasured(PICTURES, work.folder, work.second)
+    if has_fields and work.helper:
+        draw_unmeasured(PICTURES, work.folder, work.helper)
     if has_fields or (case.output.points and has_two_samples):
         sweep = None
         if work.options.member:
@@ -90,6 +90,13 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
         if measured:
             work.report(measured)
     return Outcome(complete=result.complete, drawable=has_fields)
+
+
+def one_rank_suffices(case: Case, ranks: int) -> bool:
+    """Whether messages between so many ranks cost what these save of the simulation of a case."""
+    from vipetsc.dynamics.cost import estimate
+
+    return estimate(case, ranks).one_rank_suffices
 
 
 def run_rows(case: Case, ranks: int) -> Rows:
@@ -292,5 +299,6 @@ VERB = StudyVerb(
     table=run_rows,
     results=RUN,
     pictures=PICTURES,
+    is_for_one_rank=one_rank_suffices,
     takes_petsc_options=True,
 )

@@ -1,0 +1,137 @@
+"""Ranks that draw pictures for rank 0: the same files, errors of either side on all ranks, requests to stop."""
+
+from __future__ import annotations
+
+import shutil
+import time
+
+from mpi4py import MPI
+
+import pytest
+
+from tests.conftest import small_case
+from vipetsc.cli.drawing import draw_pictures, draw_unmeasured
+from vipetsc.cli.helping_ranks import with_helping_ranks
+from vipetsc.cli.verbs.run_verb import PICTURES
+from vipetsc.dynamics import simulate
+from vipetsc.figures import registry
+from vipetsc.parallel import StopRequest, on_root
+from vipetsc.studies.reanalysis import measure_run
+
+COMM = MPI.COMM_WORLD
+PATIENCE = 60.0  # s for what takes a tenth of one where the machine is idle
+
+
+@pytest.fixture
+def run(folder):
+    """The folder of a run that is not measured, which rank 0 has simulated."""
+    case = small_case(time={"engine": "propagator", "end": 0.03}, output={"fields": ["velocity"]})
+    on_root(COMM, lambda: simulate(case, folder / "run", MPI.COMM_SELF))
+    return folder / "run"
+
+
+def pictures_in(folder):
+    return {path.name: path.read_bytes() for path in (folder / "figures").iterdir()}
+
+
+@pytest.mark.usefixtures("plain_pictures")
+@pytest.mark.parallel([2, 3])
+def test_all_ranks_together_draw_what_one_draws(run, monkeypatch):
+    """Every rank draws some of the pictures, each picture is drawn once, and the files are those of one rank."""
+    drawn_here = []
+    draw = registry.draw
+
+    def watch(*arguments, **options):
+        files = draw(*arguments, **options)
+        drawn_here.extend(path.name for path in files)
+        return files
+
+    monkeypatch.setattr(registry, "draw", watch)
+
+    def work(helpers):
+        draw_unmeasured(PICTURES, run, helpers)
+        assert helpers.is_asked
+        measure_run(run)
+        files = draw_pictures(PICTURES, [run], MPI.COMM_SELF, afresh=False, helper=helpers)
+        assert not helpers.is_asked
+        return files
+
+    files = with_helping_ranks(COMM, StopRequest(), work)
+    by_rank = COMM.allgather(drawn_here)
+    # What shows no measures is left to the helpers, two or four pictures for each; rank 0 may be late for the others.
+    assert all(by_rank[1:])
+    drawn = sorted(name for names in by_rank for name in names)
+    assert drawn == [path.name for path in files]
+    assert len({*drawn}) == len(drawn) > len(PICTURES.unmeasured)
+
+    monkeypatch.undo()
+    if COMM.rank == 0:
+        alone = shutil.copytree(run, run.parent / "alone", ignore=shutil.ignore_patterns("figures"))
+        with monkeypatch.context() as context:
+            from tests.coarse import coarse_pictures
+
+            coarse_pictures(context.setattr)
+            draw_pictures(PICTURES, [alone], MPI.COMM_SELF)
+        assert pictures_in(run) == pictures_in(alone)
+
+
+def fail(*arguments, **options):
+    """Raise an error as of a picture that cannot be drawn."""
+    raise ValueError(f"rank {COMM.rank} cannot draw")
+
+
+@pytest.mark.parallel([2, 3])
+def test_what_a_helping_rank_raises_is_raised_on_all(run, monkeypatch):
+    if COMM.rank == COMM.size - 1:
+        monkeypatch.setattr(registry, "draw", fail)
+
+    def work(helpers):
+        helpers.ask("run", [run], names=["unit_cell", "ledger"])
+        return helpers.drawn()
+
+    with pytest.raises(ValueError, match=f"rank {COMM.size - 1} cannot draw"):
+        with_helping_ranks(COMM, StopRequest(), work)
+
+    # It has drawn nothing, but is there for the next request.
+    monkeypatch.undo()
+    files = with_helping_ranks(COMM, StopRequest(), work)
+    assert {path.stem for path in files} == {"unit_cell", "ledger"}
+
+
+@pytest.mark.parallel([2, 3])
+def test_what_rank_0_raises_is_raised_on_all(run):
+    """An answer that rank 0 does not wait for is not taken for that of a later request."""
+
+    def work(helpers):
+        helpers.ask("run", [run], names=["no figure"])
+        raise RuntimeError(f"on rank {COMM.rank}")
+
+    with pytest.raises(RuntimeError, match="on rank 0"):
+        with_helping_ranks(COMM, StopRequest(), work)
+
+    def work_again(helpers):
+        helpers.ask("run", [run], divided=True, names=["unit_cell"])
+        return helpers.drawn()
+
+    # Rank 0 takes no turn here.
+    (path,) = with_helping_ranks(COMM, StopRequest(), work_again)
+    assert path.name == "unit_cell.png"
+
+
+@pytest.mark.parallel([2, 3])
+def test_a_request_to_stop_that_any_rank_gets_reaches_rank_0():
+    """Rank 0 sees the request of another rank while it works, and not when that work is over."""
+    stop = StopRequest()
+    stop.requested = COMM.rank == COMM.size - 1
+
+    def work(helpers):
+        deadline = time.monotonic() + PATIENCE
+        while not stop.requested and time.monotonic() < deadline:
+            time.sleep(0.01)
+        return stop.requested
+
+    assert with_helping_ranks(COMM, stop, work)
+
+    stop = StopRequest()
+    assert not with_helping_ranks(COMM, stop, lambda helpers: stop.requested)
+    assert not stop.requested
