@@ -62,8 +62,9 @@ class DofTables(NamedTuple):
     its nonlinear force is rounding; inf for a driven mass.
 
     DoFs that have equal rows share a table: ``table`` (dof,) numbers it in ``rows`` (table, mass, cell, term) and in
-    ``inverse_masses`` (table, mass, cell) in 1/kg. ``factors`` (2 term,) are H^(k mod 2)/k!. With dashpots ``rows`` are
-    (table, 2 mass, cell, 2 term), those of P_k before those of Q_k, and ``factors`` 1/k! and then H/k!.
+    ``inverse_masses`` (table, mass, cell) in 1/kg. ``factors`` (coefficient,) are H^(k mod 2)/k! of
+    each power s^k, two for each term. With dashpots ``rows`` are (table, 2 mass, cell, coefficient), those of P_k and
+    then those of Q_k, and ``factors`` 1/k! and then H/k!.
 
     ``ledger`` lists the DoFs whose energies the rank's part of the state contains, in the order in which it does: the
     works of the rank's drives, then what its sites have dissipated.
@@ -183,8 +184,8 @@ def _form_rows(cells: np.ndarray, forms: np.ndarray, series: StepSeries) -> np.n
 def create_responses(groups: Groups, tables: DofTables, model: Model, series: StepSeries) -> np.ndarray:
     """Create the motion (dof, source, term) of each DoF after a unit impulse on each DoF of its cluster.
 
-    It is the coefficients g_p in m/N of H times the displacement, by powers s^p: those of p = 2 term + 1, or with
-    dashpots of p = term + 1. An impulse on DoF l leaves the velocities M^-1 c_l^T, on which the rows of DoF i act.
+    It is the coefficients g_p in m/N of H times the displacement, by powers s^p: term m is that of p = 2 m + 1, or with
+    dashpots of p = m + 1. An impulse on DoF l leaves the velocities M^-1 c_l^T, on which the rows of DoF i act.
     Sources are counted within the cluster; columns beyond a smaller cluster's size are zero.
     """
     all_dofs = contact_dofs(model)
@@ -240,7 +241,8 @@ def create_responses(groups: Groups, tables: DofTables, model: Model, series: St
 def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
     """Expand the free motion of the DoFs of cluster ``c`` in powers of t/H; whether a force may act on one of them.
 
-    A force may act on a site or spring that reaches its clearance. Coefficients in m go into ``taylor`` (dof, 2 term);
+    A force may act on a site or spring that reaches its clearance. Coefficients in m go into ``taylor`` (dof,
+    coefficient), by powers of t/H;
     ``columns`` (2 mass, column) hold the lattice's state at the beginning of the step.
     """
     _, masses, width, terms = dofs.rows.shape
@@ -316,8 +318,8 @@ def is_zero(row: np.ndarray) -> bool:
 def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.ndarray) -> None:
     """Add to the owned cells ``out`` (2 mass, cell) the motion that forces within the step have caused at its end.
 
-    Row i of ``moments`` (dof, 2 term) in N s belongs to the DoF ``first`` + i: integrals of its force times (1 - t/H)^k
-    dt over the step. Displacements in m come before velocities in m/s.
+    Row i of ``moments`` (dof, k) in N s belongs to the DoF ``first`` + i: integrals of its force times (1 - t/H)^k dt
+    over the step. Displacements in m come before velocities in m/s.
     """
     masses, width, terms = dofs.rows.shape[1:]
     # With dashpots: see ``expand_free_motion``.

@@ -95,7 +95,7 @@ def _force_of_spring(cluster: Cluster, i: int, z: float) -> float:
 def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) -> None:
     """Put w, w', w'' of every site at the present position into ``out`` (site, 3), in m, m/s and m/s^2.
 
-    ``taylor`` (dof, 2 term) is the series of the free motion from that position on, in m.
+    ``taylor`` (dof, coefficient) is the series of the free motion from that position on, in m.
     """
     # A record in an array of one: compiled code can change it in place.
     state = cluster.state[0]

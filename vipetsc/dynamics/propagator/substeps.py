@@ -59,8 +59,8 @@ class Sums(NamedTuple):
 
     At the nodes: ``free_w`` and ``free_v`` (dof, node) of the free motion; ``to_w`` and ``to_v`` (dof, source, node of
     the source, node) of a unit force, for pairs that ``reaches`` (dof, source) marks; ``w`` and ``v`` (node,) of one
-    DoF. Besides, ``forces`` (dof,) at one time; ``moments`` (2 term,) of one DoF's force about the substep's end;
-    ``series`` (2 term, 2 term), whose row k is the polynomial in s that term k of a response makes of these moments;
+    DoF. Besides, ``forces`` (dof,) at one time; ``moments`` (power,) of one DoF's force about the substep's
+    end; ``series`` (power, coefficient), whose row k is the polynomial in s that term k of a response makes of them;
     and ``bernstein`` (2, 6), the coefficients of two quintics for w.
     """
 
@@ -116,12 +116,13 @@ class Cluster(NamedTuple):
     ``SPRING_DOF``, and then the driven masses in reach. ``drives`` has a row for every DoF; those of sites and springs
     drive nothing. ``response`` (dof, dof of the same cluster, term):
     term m is the coefficient of s^(2 m + 1), s the time over H, in the displacement of the first DoF after a unit
-    impulse on the second one, times H; with dashpots that of s^(m + 1), m < 2 term - 1. ``interval`` is H in s;
-    ``rtol`` and ``atol`` (m/s) bound the error of a substep; a contact begins with the fraction ``first_substep`` of
-    its duration.
+    impulse on the second one, times H; with dashpots that of s^(m + 1), one for each power but s^0. ``interval`` is H
+    in s; ``rtol`` and ``atol`` (m/s) bound the error of a substep; a contact begins with the fraction ``first_substep``
+    of its duration.
 
-    ``taylor`` (dof, 2 term) is the series of the free motion about the present position, ``site_motion`` (dof, 3) has
-    w, w', w'' of the sites there. ``moments`` (dof, 2 term) in N s are those of the step's forces about its end,
+    ``taylor`` (dof, coefficient) is the series in m of the free motion about the present position, by powers of s,
+    twice ``StepSeries.terms`` of them; ``site_motion`` (dof, 3) has w, w', w'' of the sites there. ``moments`` (dof,
+    power) in N s, as many, are the integrals of the step's forces times (remaining time/H)^power up to its end,
     ``energy`` (dof,) in J is what sites dissipated and the work of drives. ``history`` (dof,) is of dtype ``HISTORY``,
     ``state`` (cluster,) of dtype ``SUBSTEP_STATE``; ``trial`` is workspace for the largest cluster, ``tape`` a log.
     """

@@ -37,7 +37,7 @@ class Variations(NamedTuple):
 
     ``components`` (variation, 2, component) are states as ``Layout`` orders them: step k reads slot k % 2 and writes
     the other one. ``approach`` (variation, dof) are those of w'_minus. ``places`` (step, cluster) numbers the
-    ``matrices`` (number, row, column), -1 without contact; ``taylor`` (dof, 2 term) is workspace.
+    ``matrices`` (number, row, column), -1 without contact; ``taylor`` (dof, coefficient) is workspace.
     """
 
     components: np.ndarray
@@ -197,9 +197,9 @@ def linearise(
 ) -> None:
     """Put the matrix J of cluster ``c`` in a step whose part of the tape is ``rows`` and ``motion`` into ``out``.
 
-    J maps the series of the free motion (dof, 2 term) and the variations of w'_minus (site,) at the step's beginning to
-    the moments of the forces and the variations of w'_minus at its end. The cluster's Taylor coefficients, moments,
-    energies and position, and the workspace of a trial, are overwritten.
+    J maps the series of the free motion (dof, coefficient) and the variations of w'_minus (site,) at the step's
+    beginning to the moments of the forces and the variations of w'_minus at its end. The cluster's Taylor coefficients,
+    moments, energies and position, and the workspace of a trial, are overwritten.
     """
     cluster = select_cluster(clusters, dofs, c)
     count, terms = cluster.taylor.shape
