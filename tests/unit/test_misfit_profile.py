@@ -18,7 +18,7 @@ class BentValley:
     """A fit of two coordinates (a, b) with cost a^2 + (b - a - BEND a^2)^2, and JUMP more without one contact."""
 
     def __init__(self) -> None:
-        self.misfit = SimpleNamespace(records=[None])
+        self.misfit = SimpleNamespace(records=[None], cost=self.cost)
         self.last = [1.0]
         self.low = np.full(2, -9.0)
         self.high = np.full(2, 9.0)
