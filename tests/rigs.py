@@ -8,12 +8,10 @@ from typing import Any, NamedTuple
 from mpi4py import MPI
 
 import numpy as np
-import pytest
 from scipy.integrate import solve_ivp
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.modes.branches.follow import follow_all
-from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 
@@ -128,11 +126,6 @@ def period_map(states: SteadyStates, point: Response, state: np.ndarray) -> Peri
     # Integrated together, all have the same steps, whose errors the differences do not contain.
     ends = after_a_period(states, point, state + step * np.vstack([np.zeros(len(state)), np.eye(len(state))]))
     return PeriodMap(end=ends[0], multipliers=np.linalg.eigvals((ends[1:] - ends[0]).T / step))
-
-
-def without_special_points(patch: pytest.MonkeyPatch) -> None:
-    """Follow curves of ``nfrc`` without the points at which stability changes, for tests of states: they cost most."""
-    patch.setattr(StabilityChanges, "kinds", lambda self: iter(()))
 
 
 def followed(case: NfrcCase, folder):

@@ -170,7 +170,6 @@ energy = [0.0, {highest}]
 start_energy = {0.9 * touching}
 points = 60
 truncation = 1e-4
-locate = false
 
 [output]
 figures = false

@@ -9,7 +9,6 @@ from __future__ import annotations
 import pytest
 
 from tests.manual_modules import write_modules
-from tests.rigs import without_special_points
 from tests.verify.another_law import compare
 
 pytestmark = pytest.mark.slow
@@ -22,7 +21,6 @@ def found(tmp_path_factory) -> dict:
     write_modules(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        without_special_points(patch)
         return compare()
 
 
