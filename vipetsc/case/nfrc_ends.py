@@ -90,11 +90,10 @@ def _check_loose(chain: Chain, gaps: Sequence[tuple[float, float]]) -> Iterator[
     group = connected_groups(1 + chain.cells * d, ((0, 0), *pressed))
     for number, (host, resonator) in enumerate(ends, 1):
         if group[host] != group[resonator]:
-            reason = (
-                f"site {number} joins masses that neither springs nor pressed contacts join: in unsymmetric motions"
-            )
-            remedy = "its mean force pushes them apart; give a precompression, or equal stops on both sides"
-            yield Problem("contacts.clearance", None, f"{reason} {remedy}")
+            cause = f"site {number} joins masses that neither springs nor pressed contacts join"
+            effect = "in unsymmetric motions its mean force pushes them apart"
+            remedy = "give a precompression, or equal stops on both sides"
+            yield Problem("contacts.clearance", None, f"{cause}: {effect}; {remedy}")
             return
 
 
