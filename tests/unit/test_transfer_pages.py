@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,11 @@ from matplotlib.figure import Figure
 
 from tests.hertz_branch import write_branch
 from vipetsc.case import Case, Sweep
-from vipetsc.figures import registry, sources, transfer
+from vipetsc.figures import registry, sources, sweep_members, transfer
 from vipetsc.figures.registry import FIGURES, specified_drawings
-from vipetsc.figures.style import Drawing, rc_style
-from vipetsc.figures.sweep_members import Files, MemberRun, Sweeps
+from vipetsc.figures.style import Drawing, Shown, rc_style
+from vipetsc.figures.sweep_members import AmplitudeSeries, DrivenWave, Files, MemberRun, Sweeps, from_series
+from vipetsc.figures.warning_lines import warning_lines
 from vipetsc.io.netcdf import write_netcdf
 from vipetsc.io.read import open_ensemble
 from vipetsc.studies import backbone
@@ -146,15 +148,17 @@ def test_members_alone_share_a_page_of_dispersions_and_warn_of_themselves(monkey
     ]
     # Sentences that differ in numbers alone would be one: these differ in letters.
     assert [figure.get_label().splitlines() for figure in figures] == [
-        ["the run a", "the run b"],
-        ["the run c", "the run d"],
+        ["Hertz, 10 N: the run a", "Hertz, 20 N: the run b"],
+        [f"{member.labels.member}: the run {member.folder}" for member in members[2:]],
     ]
 
 
 def test_one_member_alone_has_a_page_of_its_name(monkeypatch):
     (page,) = dispersions(monkeypatch, member_of("a", 10, 0.5))
     assert page.stem.endswith("contacts.restitution-0.5")
-    assert len(titles(page.draw())) == 1
+    figure = page.draw()
+    assert len(titles(figure)) == 1
+    assert figure.get_label() == "the run a"
 
 
 def test_a_page_of_more_lone_members_goes_on_on_the_next(monkeypatch):
@@ -173,3 +177,48 @@ def test_a_page_without_members_has_the_warnings_of_its_sweeps():
     with Files() as files:
         (drawing,) = specified_drawings(spec, [sweep], files)
     assert drawing.draw().get_label() == "of the sweep"
+
+
+def series_of_three(*warnings: str) -> AmplitudeSeries:
+    """A series of three amplitudes whose runs have these warnings, an empty text for none."""
+    runs = []
+    for amplitude, warning in zip((0.1, 2, 20), warnings, strict=True):
+        member = member_of(f"{amplitude:g}", amplitude, 0.5)
+        about = {"warnings": json.dumps([warning] if warning else [])}
+        recorded = {"cell": [8, 9, 10], "sites/cell": ("site", [9])}
+        runs.append(member._replace(run=xr.Dataset(recorded, attrs=about)))
+    return AmplitudeSeries(suffix="", title="", runs=tuple(runs), wave=DrivenWave(0, np.nan, np.nan))
+
+
+def lines_below(figure_of_series: Callable, series: AmplitudeSeries, monkeypatch) -> list[str]:
+    """The warnings below a picture of that ``series``."""
+    monkeypatch.setattr(sweep_members, "series_of", lambda sweeps, *needs: iter([series]))
+    spec = registry.FigureSpec("a_figure", sources.SWEEP, figure_of_series)
+    with Files() as files:
+        (drawing,) = specified_drawings(spec, [], files)
+    return drawing.draw().get_label().splitlines()
+
+
+def test_a_warning_below_a_series_names_its_amplitude(monkeypatch):
+    """A sentence about the lowest amplitude is not true of the others."""
+    series = series_of_three("no contact", "", "coarse samples")
+    whole = from_series()(lambda series: Figure())
+    assert lines_below(whole, series, monkeypatch) == ["0.1 N: no contact", "20 N: coarse samples"]
+
+    series = series_of_three("no contact", "energy off by 1 %", "energy off by 3 %")
+    assert lines_below(whole, series, monkeypatch) == [
+        "0.1 N: no contact",
+        "2 N, 20 N (numbers of 2 N): energy off by 1 %",
+    ]
+
+
+def test_a_picture_of_the_medium_amplitude_has_its_warnings_alone(monkeypatch):
+    medium = from_series(medium_alone=True)(lambda series: Figure())
+    assert lines_below(medium, series_of_three("no contact", "", ""), monkeypatch) == []
+    assert lines_below(medium, series_of_three("", "no contact", "of 20 N"), monkeypatch) == ["no contact"]
+
+
+def test_many_members_of_one_warning_are_counted():
+    shown = [Shown(f"{number} N", [xr.Dataset(attrs={"warnings": '["beware"]'})]) for number in range(1, 8)]
+    assert warning_lines(shown) == ["1 N, 2 N, 3 N, 4 N and 3 others: beware"]
+    assert warning_lines(shown[:1]) == ["beware"]

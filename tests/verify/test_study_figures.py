@@ -260,7 +260,10 @@ def test_a_partition_into_one_bin_is_drawn(whole):
 
 @pytest.mark.slow
 def test_explained_inverse_is_the_filter_banks(whole):
-    figure = only("partition_explained", [whole])
+    (drawing,) = FIGURES["partition_explained"].function(Sweeps([whole], Files()))
+    # What is said of the other amplitudes of the sweep does not belong below it.
+    assert [member.name for member in drawing.shown] == ["2 N"]
+    figure = drawing.draw()
     titled = [(axes.get_title(loc="left"), axes) for axes in figure.axes]
     snapshot = next(axes for title, axes in titled if title.startswith("(a)")).lines[0].get_ydata()
     parts = filter_bank(CELLS).split(np.array(snapshot))

@@ -2,8 +2,6 @@
 
 import difflib
 import itertools
-import json
-import re
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -37,16 +35,14 @@ from vipetsc.figures import (
 )
 from vipetsc.figures.registered import registered_figures
 from vipetsc.figures.sources import BRANCHES, DESIGN, FILES, IDENTIFIED, LAW, OPTIMUM, PAPER, PREDICTION, RUN, SWEEP
-from vipetsc.figures.style import Drawing, draw_each, rc_style, save
+from vipetsc.figures.style import Drawing, Shown, draw_each, rc_style, save
 from vipetsc.figures.sweep_members import Files, Sweeps, table
+from vipetsc.figures.warning_lines import warned
 from vipetsc.io import branch_kinds
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import open_ensemble, open_run
 from vipetsc.lattice import UnitCell
 from vipetsc.register import FIGURE, reserve
-
-NUMBER = re.compile(r"\d[\d.e+-]*")
-MOST_WARNINGS = 4  # below a picture, whose strip must not be higher than its panels
 
 
 class FigureSpec(NamedTuple):
@@ -288,7 +284,7 @@ def _measure_drawings(name: str, ensembles: Sequence[xr.Dataset], by_name: bool)
             if is_asked and not measure_pages.reason_without_page(ensemble, measure, by_name):
                 others = [other for other in ensembles if other is not ensemble and measure in other]
                 for drawing in measure_pages.measure_pages(ensemble, measure, sweep, others):
-                    yield drawing._replace(draw=warned(drawing.draw, ensemble))
+                    yield drawing._replace(draw=warned(drawing.draw, [Shown(sweep, [ensemble])]))
 
 
 def specified_drawings(spec: FigureSpec, ensembles: Sequence[xr.Dataset], files: Files) -> Iterator[Drawing]:
@@ -297,9 +293,10 @@ def specified_drawings(spec: FigureSpec, ensembles: Sequence[xr.Dataset], files:
         ensemble for ensemble in ensembles if not spec.measure or spec.measure in table(ensemble)["sweep"]["measures"]
     ]
     sweeps = Sweeps(measured, files)
+    whole_sweeps = [Shown(str(table(sweep).get("name", "")), [sweep]) for sweep in sweeps]
     for offered in spec.function(sweeps):
         stem = f"{spec.name}-{offered.stem}" if offered.stem else spec.name
-        yield Drawing(stem, warned(offered.draw, *(offered.shown or sweeps)))
+        yield Drawing(stem, warned(offered.draw, offered.shown or whole_sweeps))
 
 
 def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files) -> Iterator[Drawing]:
@@ -328,7 +325,15 @@ def _branch_drawing(spec: FigureSpec, paths: Sequence[Path], folders: int, files
         stem = stem.replace(BRANCH, spec.name, 1)
     elif folders > 1:
         stem = stem.replace(BRANCH, "branches", 1)
-    yield Drawing(stem, warned(partial(spec.function, paths), *branches))
+    yield Drawing(stem, warned(partial(spec.function, paths), _shown_branches(paths, branches)))
+
+
+def _shown_branches(paths: Sequence[Path], branches: Sequence[xr.Dataset]) -> list[Shown]:
+    """Return the ``branches`` by their names, those of one name by their folders' names too."""
+    names = [str(branch.attrs["name"]) for branch in branches]
+    if len(set(names)) < len(names):
+        names = [f"{path.parent.name}, {name}" for path, name in zip(paths, names, strict=True)]
+    return [Shown(name, [branch]) for name, branch in zip(names, branches, strict=True)]
 
 
 def point_count(path: Path) -> int:
@@ -348,7 +353,7 @@ def _run_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> It
     results = [run] if analysis is None else [run, analysis]
     for spec in specs:
         if not (spec.without and spec.without(run, analysis)):
-            yield Drawing(spec.name, warned(partial(spec.function, run, analysis), *results))
+            yield Drawing(spec.name, warned(partial(spec.function, run, analysis), [Shown("", results)]))
 
 
 def run_and_analysis(folder: Path, files: Files) -> tuple[xr.Dataset, xr.Dataset | None]:
@@ -365,24 +370,3 @@ def _file_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> I
         file = FILES[spec.source]
         data = files.get(folder / file.name, partial(open_netcdf, kind="search", needs=file.needs))
         yield Drawing(spec.name, partial(spec.function, data))
-
-
-def warned(make: Callable[[], Figure], *results: xr.Dataset) -> Callable[[], Figure]:
-    """Return ``make`` so that its figure is labelled with the warnings that the ``results`` carry, each once.
-
-    They stand as JSON in the attribute ``warnings``; `vipetsc.figures.style.save` prints the label below the picture.
-    """
-    # Of sentences that differ in numbers alone one stands for all.
-    by_kind: dict[str, str] = {}
-    for line in (line for data in results for line in json.loads(data.attrs.get("warnings", "[]"))):
-        by_kind.setdefault(NUMBER.sub("0", line), line)
-    sentences = list(by_kind.values())
-    if len(sentences) > MOST_WARNINGS:
-        sentences[MOST_WARNINGS - 1 :] = [f"{len(sentences) - MOST_WARNINGS + 1} more warnings are in the file"]
-
-    def labelled() -> Figure:
-        figure = make()
-        figure.set_label("\n".join(sentences))
-        return figure
-
-    return labelled

@@ -56,15 +56,22 @@ BAND_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 BAND_DASHES = ("-", (0, (6, 1)), (0, (4, 1, 1, 1)), (0, (1.5, 0.8)), (0, (6, 1, 1, 1, 1, 1)), (0, (3, 2)))
 
 
+class Shown(NamedTuple):
+    """A member that a picture shows: the files of its ``results``, and the ``name`` that tells it from the others."""
+
+    name: str
+    results: Sequence[xr.Dataset]
+
+
 class Drawing(NamedTuple):
     """A picture to come: the ``stem`` of its file's name; ``draw`` is called before the next drawing is asked for.
 
-    ``shown`` are the results that the picture shows, where these are not all of what the figure was offered from.
+    ``shown`` are the members that the picture shows, where these are not all of what the figure was offered from.
     """
 
     stem: str
     draw: Callable[[], Figure]
-    shown: Sequence[xr.Dataset] = ()
+    shown: Sequence[Shown] = ()
 
 
 def band_colour(number: int) -> str:

@@ -16,7 +16,7 @@ from vipetsc.case import Case, Model, Sweep
 from vipetsc.case.amplitude import drive_unit
 from vipetsc.figures import style
 from vipetsc.figures.panels import ROMAN, recorded_sites
-from vipetsc.figures.style import Drawing
+from vipetsc.figures.style import Drawing, Shown
 from vipetsc.figures.swept_axes import SweptAxis, in_pi
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.io.read import axes, curves, field_time, open_run, over_samples, whole_members
@@ -74,10 +74,9 @@ class MemberRun(NamedTuple):
         """The names of the member on pages and in their files' names."""
         return Labels.of(self.case, self.varied)
 
-    @property
-    def results(self) -> tuple[xr.Dataset, xr.Dataset]:
-        """The run and its analysis, from which pictures of the member are drawn."""
-        return self.run, self.analysis
+    def shown(self, name: str = "") -> Shown:
+        """The run and its analysis, from which pictures of the member are drawn, under a ``name`` on the page."""
+        return Shown(name or self.labels.member, [self.run, self.analysis])
 
     @classmethod
     @contextmanager
@@ -148,6 +147,11 @@ class AmplitudeSeries(NamedTuple):
     wave: DrivenWave
 
     @property
+    def medium(self) -> MemberRun:
+        """The run at the medium amplitude."""
+        return self.runs[1]
+
+    @property
     def headings(self) -> list[str]:
         """The texts above each amplitude's panels."""
         levels = zip(LEVELS, self.runs, strict=True)
@@ -184,12 +188,14 @@ class AmplitudeSeries(NamedTuple):
         return np.minimum(times, end)
 
 
-def from_series(*needs: str, needs_wave: bool = False, needs_sites: bool = False) -> Callable[..., Any]:
+def from_series(
+    *needs: str, needs_wave: bool = False, needs_sites: bool = False, medium_alone: bool = False
+) -> Callable[..., Any]:
     """Decorate a figure of an `AmplitudeSeries`: it offers one picture a series whose analyses hold ``needs``.
 
     ``needs`` are names of variables of ``analysis.h5``. A figure that ``needs_wave`` is offered of series that drive a
     pass band, one that ``needs_sites`` of those that recorded contact sites and other cells. Of other series there is
-    no such picture, and no error.
+    no such picture, and no error. A figure may show the run at the ``medium_alone``, and none of the others' warnings.
     """
 
     def decorate(page: Callable[[AmplitudeSeries], Figure]) -> Callable[[Sweeps], Iterator[Drawing]]:
@@ -200,7 +206,8 @@ def from_series(*needs: str, needs_wave: bool = False, needs_sites: bool = False
                 has_wave = series.wave.band > 0
                 has_sites = len(recorded_sites(run)) > 0 and run.sizes["cell"] > 1
                 if (has_wave or not needs_wave) and (has_sites or not needs_sites):
-                    shown = [result for run in series.runs for result in run.results]
+                    runs = [series.medium] if medium_alone else series.runs
+                    shown = [run.shown(run.labels.amplitude) for run in runs]
                     yield Drawing(series.suffix, partial(page, series), shown)
 
         return offer

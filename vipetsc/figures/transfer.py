@@ -9,7 +9,6 @@ from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patheffects import withStroke
@@ -18,8 +17,8 @@ from numpy.typing import ArrayLike
 
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
-from vipetsc.figures.style import Drawing
-from vipetsc.figures.sweep_members import Files, Labels, MemberRun, Sweeps, grouped, transfer_members
+from vipetsc.figures.style import Drawing, Shown
+from vipetsc.figures.sweep_members import Files, Labels, MemberRun, Sweeps, grouped, phrase, transfer_members
 from vipetsc.figures.transfer_curves import TransferCurve, columns_of_laws, transfer_curves
 from vipetsc.io.read import field_interval, field_time, leading_site, nearest_cell
 from vipetsc.lattice import pass_bands
@@ -57,7 +56,7 @@ def transfer(sweeps: Sweeps) -> Iterator[Drawing]:
     """Offer for every whole member: energy in space-time, dispersion and spectra before and behind the first site."""
     for member in transfer_members(sweeps):
         if "velocity" in member.run and all(name in member.analysis for name in (FIELD, *SEGMENTS)):
-            yield Drawing(member.labels.member_stem, partial(nine_panels, member), member.results)
+            yield Drawing(member.labels.member_stem, partial(nine_panels, member), [member.shown()])
 
 
 def nine_panels(member: MemberRun) -> Figure:
@@ -191,7 +190,7 @@ def transfer_dispersions(sweeps: Sweeps) -> Iterator[Drawing]:
     pages = grouped(members, lambda member: member.labels.page_stem)
     for name, group in pages.items():
         if len(group) > 1:
-            yield Drawing(name, partial(_dispersion_table, group, sweeps.files), _results(group, sweeps.files))
+            yield Drawing(name, partial(_dispersion_table, group, sweeps.files), _shown(group, sweeps.files))
 
     alone = [group[0] for group in pages.values() if len(group) == 1]
     for first in range(0, len(alone), MOST_PANELS):
@@ -199,12 +198,19 @@ def transfer_dispersions(sweeps: Sweeps) -> Iterator[Drawing]:
         name = group[0].labels.page_stem
         if len(group) > 1:
             name = f"members-{first + 1}-to-{first + len(group)}"
-        yield Drawing(name, partial(_dispersion_page, group, sweeps.files), _results(group, sweeps.files))
+        yield Drawing(name, partial(_dispersion_page, group, sweeps.files), _shown(group, sweeps.files))
 
 
-def _results(members: Sequence[CaseFolder], files: Files) -> list[xr.Dataset]:
-    """Return runs and analyses of ``members``."""
-    return [result for member in members for result in files.get(member.folder, MemberRun.open).results]
+def _shown(members: Sequence[CaseFolder], files: Files) -> list[Shown]:
+    """Return ``members`` under what of their names is not the page's."""
+    is_of_one_page = len({member.labels.page_stem for member in members}) == 1
+    shown = []
+    for member in members:
+        name = member.labels.member
+        if is_of_one_page:
+            name = phrase(member.labels.law, member.labels.amplitude)
+        shown.append(files.get(member.folder, MemberRun.open).shown(name))
+    return shown
 
 
 def _dispersion_table(members: Sequence[CaseFolder], files: Files) -> Figure:
@@ -265,7 +271,7 @@ def band_energies(sweeps: Sweeps) -> Iterator[Drawing]:
     """Offer energies of all parts and their sum over time for every whole member."""
     for member in transfer_members(sweeps):
         if member.analysis.sizes["bands/part"] and "bands/total" in member.analysis:
-            yield Drawing(member.labels.member_stem, partial(energies_over_time, member), member.results)
+            yield Drawing(member.labels.member_stem, partial(energies_over_time, member), [member.shown()])
 
 
 def band_shares(sweeps: Sweeps) -> Iterator[Drawing]:

@@ -316,7 +316,7 @@ def phase_regimes(sweeps: Sweeps) -> Iterator[Drawing]:
         members = [sweeps.files.get(folder, MemberRun.open) for folder in page_folders]
         (site,) = sites_of(members[0].case)
         curve = curves_by_site.get((name, site))
-        shown = [result for member in members for result in member.results]
+        shown = [member.shown(member.labels.amplitude) for member in members]
         yield Drawing(name, partial(_regimes, page_folders, sweeps.files, labels, curve), shown)
 
 

@@ -94,7 +94,7 @@ def partition(series: AmplitudeSeries) -> Figure:
     (a) Maps of some bins over space and time at the medium amplitude; (b) contours of all bins at each of the three
     amplitudes; (c) the dispersion of the driven band with each bin in the colour of its contours.
     """
-    medium = series.runs[1]
+    medium = series.medium
     field = medium.analysis[FIELD].load()
     bins = shown_bins(series.wave.wavenumber, len(field))
     colours = bin_colours(len(field))
@@ -129,7 +129,7 @@ def partition(series: AmplitudeSeries) -> Figure:
 
 def _draw_driven_band(axes: Axes, series: AmplitudeSeries, colours: np.ndarray) -> None:
     """Draw the dispersion of the driven band, each bin in its colour, and the driven wavenumber."""
-    medium = series.runs[1]
+    medium = series.medium
     wave = series.wave
     for ends, colour in zip(pairwise(medium.analysis["partition/bounds"].values), colours, strict=True):
         kappa = np.linspace(*ends, 31)
@@ -229,10 +229,10 @@ class Snapshot(NamedTuple):
         )
 
 
-@from_series(FIELD, needs_wave=True, needs_sites=True)
+@from_series(FIELD, needs_wave=True, needs_sites=True, medium_alone=True)
 def partition_explained(series: AmplitudeSeries) -> Figure:
     """Draw a snapshot, its wavelet transform cut into bins, the inverse of some, their energy (paper, Fig. S1)."""
-    member = series.runs[1]
+    member = series.medium
     field = member.analysis[FIELD].load()
     cells = member.run["cell"].values
     bounds = member.analysis["partition/bounds"].values

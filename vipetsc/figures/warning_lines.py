@@ -1,0 +1,67 @@
+"""The lines below a picture: warnings that the results it shows carry, each with the members that it is about."""
+
+import json
+import re
+from collections.abc import Callable, Sequence
+
+from matplotlib.figure import Figure
+
+from vipetsc.figures.style import Shown
+from vipetsc.wording import counted
+
+NUMBER = re.compile(r"\d[\d.e+-]*")
+MOST_WARNINGS = 4  # below a picture, whose strip must not be higher than its panels
+MOST_NAMES = 4  # of members before a warning, and the number of the others
+
+
+def warned(make: Callable[[], Figure], shown: Sequence[Shown]) -> Callable[[], Figure]:
+    """Return ``make`` so that its figure is labelled with the warnings of the results that it has ``shown``.
+
+    They stand as JSON in the attribute ``warnings``; `vipetsc.figures.style.save` prints the label below the picture.
+    """
+    lines = warning_lines(shown)
+
+    def labelled() -> Figure:
+        figure = make()
+        figure.set_label("\n".join(lines))
+        return figure
+
+    return labelled
+
+
+def warning_lines(shown: Sequence[Shown]) -> list[str]:
+    """Return the warnings of the results ``shown``, each once; of several members with the names of those that have it.
+
+    Of sentences that differ in numbers alone one stands for all.
+    """
+    by_kind: dict[str, list[str]] = {}
+    names: dict[str, list[str]] = {}
+    for member in shown:
+        for sentence in _warnings(member):
+            kind = NUMBER.sub("0", sentence)
+            by_kind.setdefault(kind, []).append(sentence)
+            names.setdefault(kind, []).append(member.name)
+
+    lines = [sentences[0] for sentences in by_kind.values()]
+    if len(shown) > 1:
+        lines = [f"{_listed(names[kind], by_kind[kind])}: {by_kind[kind][0]}" for kind in by_kind]
+    if len(lines) > MOST_WARNINGS:
+        lines[MOST_WARNINGS - 1 :] = [f"{len(lines) - MOST_WARNINGS + 1} more warnings are in the file"]
+    return lines
+
+
+def _warnings(member: Shown) -> list[str]:
+    """Return the sentences of the results of a member, each once."""
+    attributes = [result.attrs.get("warnings", "[]") for result in member.results]
+    return list(dict.fromkeys(sentence for text in attributes for sentence in json.loads(text)))
+
+
+def _listed(names: Sequence[str], sentences: Sequence[str]) -> str:
+    """Return the ``names`` of the members of the ``sentences``, each once, before the first of these."""
+    distinct = list(dict.fromkeys(names))
+    text = ", ".join(distinct[:MOST_NAMES])
+    if len(distinct) > MOST_NAMES:
+        text += f" and {counted(len(distinct) - MOST_NAMES, 'other')}"
+    if len(set(sentences)) > 1:
+        text += f" (numbers of {distinct[0]})"
+    return text
