@@ -44,7 +44,7 @@ def condensed_breather(
     control = NnmTable(truncation=truncation, tolerance=1e-12, **options)
     forces = SiteForces([Stops.both(four_band_contact("hertz"), CLEARANCE)])
     problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), forces, control)
-    return problem, problem.from_gap(omega, np.array([1.0]))
+    return problem, problem.in_gap(omega, np.array([1.0]))
 
 
 def displacement(problem: ConservativeMotions, point: Point) -> np.ndarray:

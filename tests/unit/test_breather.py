@@ -66,7 +66,7 @@ def test_a_mass_between_two_stops_has_its_period_in_closed_form():
 
     problem, points = condensed_branch(system, 0, 0.5 * k * (0.99 * clearance) ** 2, truncation=1e-7, points=6)
     for factor in (1.3, 3.0):
-        points.append(problem.from_gap(factor * slow, np.array([1.0])))
+        points.append(problem.in_gap(factor * slow, np.array([1.0])))
 
     # The first point has no contact yet.
     assert points[0].frequency == pytest.approx(slow / (2 * np.pi), rel=1e-12)
@@ -138,7 +138,7 @@ def test_the_cost_of_a_breather_does_not_grow_with_the_cells():
         compliance = CountedCompliance(WaveCompliance(chain))
         control = NnmTable(truncation=1e-5, tolerance=1e-11)
         problem = ConservativeMotions(compliance, SiteForces([Stops.both(HERTZ, CLEARANCE)]), control)
-        problem.from_gap(4000.0, np.array([1.0]))
+        problem.in_gap(4000.0, np.array([1.0]))
         counts[cells] = compliance.frequencies
     assert counts[1_000_000] <= 2 * counts[300]
 
@@ -161,7 +161,7 @@ def breather_of_two_sites(signs: list[int]) -> Point:
     control = NnmTable(truncation=1e-6, tolerance=1e-11)
     forces = SiteForces([Stops.both(HERTZ, CLEARANCE)] * 2)
     problem = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), forces, control)
-    return problem.from_gap(4000.0, np.array(signs))
+    return problem.in_gap(4000.0, np.array(signs))
 
 
 @pytest.mark.slow

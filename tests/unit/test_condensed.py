@@ -13,9 +13,11 @@ from vipetsc.modes.balance import conservative
 from vipetsc.modes.balance.arcs import arcs
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
+from vipetsc.modes.balance.harmonic_frame import HarmonicFrame
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.stops import Stops
-from vipetsc.modes.problem import ContinuationError
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import Attempt, ContinuationError
 
 Symmetry = Literal["at rest", "odd", "any"]
 
@@ -294,7 +296,7 @@ def record_weights(monkeypatch) -> list[float]:
 
 def test_the_harmonics_above_the_first_are_brought_in_by_growing_weights(monkeypatch):
     tried = record_weights(monkeypatch)
-    point = gap_motions().from_gap(2.1, np.array([1.0]))
+    point = gap_motions().in_gap(2.1, np.array([1.0]))
     # Steps of 0.1, 0.16, 0.256, 0.4096, and what is left.
     assert tried == pytest.approx([0.1, 0.26, 0.516, 0.9256, 1.0])
     assert point.frequency == pytest.approx(2.1 / (2 * np.pi), rel=1e-14)
@@ -306,8 +308,93 @@ def test_a_weight_at_which_the_motion_changes_too_much_is_tried_again_shorter(mo
     # No change is small enough: steps of 0.1 times powers of 0.4, until the next one is below the smallest.
     monkeypatch.setattr(conservative, "FURTHEST", 0.0)
     with pytest.raises(ContinuationError, match=r"no breather at 2\.1 rad/s: with 0 of the harmonics above the first"):
-        gap_motions().from_gap(2.1, np.array([1.0]))
+        gap_motions().in_gap(2.1, np.array([1.0]))
     assert tried == pytest.approx(0.1 * 0.4 ** np.arange(8))
+
+
+def test_a_weight_cut_to_1_in_vain_is_followed_by_a_smaller_one(monkeypatch):
+    """The problem of the weight 1 is not solved twice from the same guess."""
+    tried = record_weights(monkeypatch)
+    solve = HarmonicFrame.solve
+
+    def fail_once_at_1(frame: HarmonicFrame, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
+        attempt = solve(frame, guess, row, value)
+        # ``refined`` solves with all harmonics without asking for a weight.
+        if tried.count(1.0) == 1 and tried[-1] == 1.0:
+            attempt.converged = False
+        return attempt
+
+    monkeypatch.setattr(HarmonicFrame, "solve", fail_once_at_1)
+    gap_motions().in_gap(2.1, np.array([1.0]))
+    # Of the step of 0.0744 to the weight 1 a fraction of 0.4, then 1.6 times as much, and what is left.
+    assert tried == pytest.approx([0.1, 0.26, 0.516, 0.9256, 1.0, 0.95536, 1.0])
+
+
+def coupled_masses(masses: int, coupling: float) -> ConservativeMotions:
+    """The motions of masses of 1 kg, each on a spring of 1 N/m and with a contact, and springs between neighbours."""
+    neighbours = coupling * (np.eye(masses, k=1) + np.eye(masses, k=-1))
+    stiffness = (1 + 2 * coupling) * np.eye(masses) - neighbours
+    compliance = DefinedCompliance(np.ones(masses), stiffness, np.eye(masses))
+    forces = SiteForces([Stops.both(CONSERVATIVE[1], 1.0)] * masses)
+    return ConservativeMotions(compliance, forces, NnmTable(tolerance=1e-12, truncation=1e-4))
+
+
+@pytest.mark.parametrize("coupling", [0.3, 1.0])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_contacts_that_feel_one_another_have_the_motion_of_one_mass_on_its_share_of_the_springs(sign, coupling):
+    """By symmetry: in phase the spring between two equal masses is at rest, out of phase its middle is."""
+    omega = 1.05 * np.sqrt(1 + 3 * coupling)
+    point = coupled_masses(2, coupling).in_gap(omega, np.array([1.0, sign]))
+
+    # To the wall and to the neighbour there are springs of the same stiffness.
+    share = 1 + 2 * coupling - sign * coupling
+    compliance = DefinedCompliance(np.ones(1), np.array([[share]]), np.eye(1))
+    forces = SiteForces([Stops.both(CONSERVATIVE[1], 1.0)])
+    alone = ConservativeMotions(compliance, forces, NnmTable(tolerance=1e-12, truncation=1e-4))
+    reference = alone.in_gap(omega, np.array([1.0]))
+    assert point.elongations == pytest.approx(reference.elongations[0] * np.array([1, sign]), rel=1e-9)
+    assert point.energy == pytest.approx(2 * reference.energy, rel=1e-9)
+
+
+def test_a_motion_with_other_signs_is_not_taken_for_the_one_that_is_asked_for():
+    """From each pair's own motion Newton's method finds three masses in phase here, though the middle one has -1."""
+    with pytest.raises(ContinuationError, match="no breather at"):
+        coupled_masses(3, coupling=1.0).in_gap(2.20605, np.array([1.0, -1.0, 1.0]))
+
+
+def test_a_motion_in_a_gap_needs_a_sign():
+    with pytest.raises(ValueError, match="signs are 0 for all pairs"):
+        gap_motions().in_gap(2.1, np.zeros(1))
+
+
+def test_the_state_of_rest_is_no_motion():
+    """Within the clearance no force acts, and at a frequency of the gap rest is the only solution."""
+    motions = gap_motions()
+    guess = motions._guess(motions.one_harmonic(np.array([0.5])), 2.1)
+    with pytest.raises(ContinuationError, match="the state of rest"):
+        motions.refined(guess, keep_frequency=True)
+
+
+def test_folds_are_sought_where_both_motions_have_contact():
+    """The frequency of linear motions changes by rounding alone, whose sign tells nothing."""
+    motions = one_mass(truncation=1e-3)
+    linear = motions.from_mode(np.array([0.99]), 1.0)
+    touching = motions.from_mode(np.array([1.05]), 1.0)
+    assert (linear.episodes, touching.episodes) == (0, 1)
+
+    def kinds(left: Point, right: Point) -> list[str]:
+        return [kind.name for kind in motions.special_kinds(left, right)]
+
+    assert kinds(touching, touching) == ["fold-energy", "fold-frequency"]
+    assert kinds(linear, touching) == kinds(touching, linear) == kinds(linear, linear) == []
+
+
+def test_folds_of_motions_that_are_never_linear_are_sought_everywhere():
+    compliance = DenseCompliance(np.ones(1), np.eye(1), np.eye(1))
+    motions = ConservativeMotions(compliance, SiteForces([], [Spring(0, 1, 0.0, cubic=0.2)]), NnmTable())
+    point = motions.from_mode(np.array([0.1]), 1.0)
+    assert point.episodes == 0
+    assert len(list(motions.special_kinds(point, point))) == 2
 
 
 def one_mass(**options: object) -> ConservativeMotions:

@@ -38,7 +38,7 @@ def test_branches_from_modes_are_those_of_shooting(system, mode, energy, truncat
 def test_a_branch_from_a_describing_function_is_that_of_shooting():
     system = reduced_model("bilinear")
     problem = condensed_problem(system, truncation=1e-7, points=2)
-    start = problem.from_gap(3200.0, np.array([1.0]))
+    start = problem.in_gap(3200.0, np.array([1.0]))
     points = list(Continuation(problem, start, problem.control))
     assert points[-1].episodes
     assert_orbits_of_shooting(system, problem, points)

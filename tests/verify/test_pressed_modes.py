@@ -279,7 +279,7 @@ def opening():
     nnm = {"system": "condensed", "start_frequency": [OPENING], "truncation": 1e-6, "tolerance": 1e-11}
     case = NnmCase.from_table(SITES | {"nnm": nnm})
     condensed = Condensed.from_case(case)
-    point = condensed.motions.from_gap(OPENING, np.array([1.0, 0.0]))
+    point = condensed.motions.in_gap(OPENING, np.array([1.0, 0.0]))
     return condensed, point, System.from_chain(case.chain(), [*condensed.motions.forces.contacts])
 
 
@@ -287,7 +287,7 @@ def test_a_breather_of_a_pressed_site_is_an_orbit(opening):
     """By waves, by all modes with a spring in the place of the contact, and by shooting: one motion."""
     condensed, point, system = opening
     assert point.episodes == 1
-    by_modes = condensed_system(system, condensed.motions.control).from_gap(OPENING, np.array([1.0, 0.0]))
+    by_modes = condensed_system(system, condensed.motions.control).in_gap(OPENING, np.array([1.0, 0.0]))
     assert by_modes.x == pytest.approx(point.x, abs=1e-9 * np.abs(point.x).max())
     assert by_modes.energy == pytest.approx(point.energy, rel=1e-9)
 

@@ -206,7 +206,7 @@ def test_bloch_waves_and_all_modes_give_the_same_breather_on_one_side(one_sided)
     by_waves = ConservativeMotions(SeriesCompliance(WaveCompliance(chain)), SiteForces(stops), control)
     by_modes = condensed_system(System.from_chain(chain, stops), control)
 
-    first, second = (problem.from_gap(OMEGA, np.array([1.0])) for problem in (by_waves, by_modes))
+    first, second = (problem.in_gap(OMEGA, np.array([1.0])) for problem in (by_waves, by_modes))
 
     assert first.x == pytest.approx(second.x, abs=1e-10 * np.abs(first.x).max())
     assert first.energy == pytest.approx(shot.energy, rel=1e-5)

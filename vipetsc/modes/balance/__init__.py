@@ -2,8 +2,9 @@
 
 ``stops`` says where a contact acts, ``arcs`` on which intervals of phase it does, ``harmonics`` the forces of contacts
 and springs in a periodic motion. ``shifted_compliance`` is the linear system between them, and ``harmonic_balance`` the
-equations of a motion's harmonics. ``conservative`` has branches of conservative motions, ``describing_function`` their
-start in a gap, ``hill`` the stability of a motion by Hill's determinant.
+equations of a motion's harmonics. ``conservative`` has branches of conservative motions, ``harmonic_frame`` the
+unknowns in which a step of such a branch is taken, ``describing_function`` a pair's first guess in a gap, ``hill`` the
+stability of a motion by Hill's determinant.
 """
 
 from vipetsc.modes.balance.conservative import ConservativeMotions

@@ -1,27 +1,48 @@
-"""Branches of conservative motions by harmonic balance: their start, and the unknowns of their continuation.
+"""Branches of conservative motions by harmonic balance: their equations, special points, and starts.
 
-A *pair* is a contact or a smooth spring, contacts first (``harmonics``; files of branches call it a place); z are the
-elongations of all pairs. In a motion of frequency Om that is at rest at phase 0 each is a sum of cosines,
+*Conservative* means that no force depends on a velocity and that nothing drives the system. A *pair* is a contact or a
+smooth spring, contacts first (files of branches call it a place); z (pairs,) are the elongations of all pairs. In a
+motion of frequency Om that is at rest at phase 0 each elongation is a sum of cosines,
 
     z(theta) = sum_k Z_k cos(k theta),    theta = Om t,    k = 0..K,
 
-with real Z_k, of which those of odd k are enough where all forces are odd: such motions are symmetric. With the
-harmonics F_k(Z) of the forces they solve the equations of ``harmonic_balance``,
+with real Z_k. Where all forces are odd, the Z_k of odd k are enough: such motions are symmetric, z(theta + pi) =
+-z(theta). K is the *order* of the motion.
 
-    Z_k + G_s(k Om) (F_k - s_k Z_k) = 0,    G_s = (G^-1 + s_k)^-1.
+**Equations.** The linear part of the system has the compliance G(omega) (pairs, pairs) in m/N: forces f cos(omega t)
+that the pairs exert against their elongation give them the elongations -G f cos(omega t). With the harmonics F_k(Z) of
+the forces in N a motion solves
 
-The *shift* s_k in N/m, one number for each harmonic, is the stiffness of a spring that is added at each pair to the
-linear system, whose compliance G becomes G_s, and taken off the pair's force. It keeps poles of G_s away from k Om. The
-solutions do not depend on it, the residuals do: a ``HarmonicFrame`` keeps one through a step of the continuation. The
-unknowns are Z_k, pair by pair, and the frequency.
+    Z_k + G_s(k Om) (F_k - s_k Z_k) = 0,    G_s = (1 + s_k G)^-1 G,
 
-The *truncation* of a motion is the estimated size of the harmonics left out over that of the motion
-(``HarmonicBalance.truncation``). By it the number of harmonics is chosen at every point for the next one.
+which ``vipetsc.modes.balance.harmonic_balance`` derives, with G from masses and stiffnesses. The *shift* s_k in N/m,
+one number for each k, is the stiffness of a spring that is added at each pair to the linear part and taken off the
+pair's force. G_s has other poles than G. The solutions do not depend on s_k, the residuals do: a ``HarmonicFrame``
+keeps one shift through a step of the continuation. It is
 
-A branch begins at a linear mode, or at a frequency in a gap between or beyond the lattice's pass bands. In a gap a
-describing function is the first guess: the motion of each pair is z = b + a cos(Om t), with a from a + G(Om) F_1 = 0
-and the mean b from b + G(0) F_0 = 0. Then the compliances G(k Om) of the other harmonics, k > 1, are multiplied by a
-weight that grows from 0 to 1.
+    s_k = +-(k Om)^2 m    (Om^2 m for k = 0),    1/m = (K Om)^2 |trace G(K Om)|/pairs,
+
+where m is the effective mass of a pair, since at high frequencies inertia alone counts, G = -1/(m omega^2). Of the two
+signs s_k has the one with the larger smallest singular value of 1 + s_k G(k Om): with it k Om is farther from the poles
+of G_s (``vipetsc.modes.balance.shifted_compliance``).
+
+**Number of harmonics.** The *truncation* of a motion estimates the harmonics that it leaves out, relative to those that
+it has:
+
+    max_i [4/3 sum_{k=K+1..2K} g_i (K/k)^2 |F_ik|] / max_i [sum_{k<=K} |Z_ik|],    g_i = sum_j |G_ij(K Om)|,
+
+for the pairs i. The harmonic -G F_k that is left out has G at k Om, which falls as k^-2 from its value at K Om. The
+factor 4/3 stands for the harmonics beyond 2K: where |G F_k| falls as k^-3, their sum is a third of that from K to 2K.
+From the truncation at each point the order of the next one is chosen.
+
+**Starts.** A branch begins at a linear mode, or at a frequency in a gap between or beyond the lattice's pass bands. The
+start in a gap is found in three stages.
+
+1. *Each pair alone.* A describing function gives the motion z_p = b_p + a_p cos(Om t) of each pair p that is to have
+   contact, with a_p from a_p + G_pp(Om) F_p1 = 0 and b_p from b_p + G_pp(0) F_p0 = 0.
+2. *All pairs together.* From there Newton's method solves the equations of the mean and the first harmonic, K = 1.
+3. *All harmonics.* The compliances G(k Om) of the harmonics k > 1 are multiplied by a weight that grows from 0, at
+   which the motion of the second stage is a solution, to 1.
 """
 
 from collections.abc import Iterator
@@ -31,13 +52,14 @@ import numpy as np
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.modes.balance.describing_function import PairCompliance, describing_motion
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import Episode, SiteForces
+from vipetsc.modes.balance.harmonic_frame import HarmonicFrame
+from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.shifted_compliance import Compliance
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind, unit
+from vipetsc.modes.problem import Attempt, ContinuationError, SpecialKind, unit
 
-# Order of the highest harmonic at the start; no motion has fewer harmonics.
+# Order of the motions with which a branch begins. No motion has fewer harmonics, unless ``nnm.harmonics`` is smaller.
 FEWEST = 15
 # The number of harmonics changes where the truncation is outside these fractions of the one allowed, and then so that
 # it becomes the fraction AIM: far enough from both ends that the number does not change at every point.
@@ -50,8 +72,11 @@ DECAY = 3
 # In one step the order grows by this factor at most (and to the next odd number), since the estimate of a motion with
 # few harmonics may be far off.
 MOST_GROWTH = 2.0
-# The energy's derivative along the branch is a difference over this distance along the tangent, to both sides.
-SLOPE_STEP = 1e-5
+# A motion smaller than this fraction of the guess is the state of rest, which solves the equations at every frequency.
+AT_REST = 1e-6
+# A guess whose residual is below this fraction of its size solves the equations of the mean and the first harmonic: the
+# describing functions' roots are found to some 1e-9 of it.
+BALANCED = 1e-6
 # As the harmonics above the first are brought in: first step of their weight; how far the motion may change in one
 # step, over the largest harmonic of the first guess; factors of the step after success and failure; the smallest step.
 FIRST_WEIGHT = 0.1
@@ -59,156 +84,18 @@ FURTHEST = 0.1
 LONGER = 1.6
 SHORTER = 0.4
 SMALLEST_WEIGHT = 1e-4
-# Of an episode about the end of an arc the middle is the end but for rounding, up to this phase (rad). The arc includes
-# both of its ends.
-PHASE_ROUNDING = 1e-9
-
-
-class HarmonicFrame:
-    """Unknowns ``xi`` (n + 1,) at and near a motion with the harmonics x (n,) in m and the frequency Om in rad/s.
-
-    They are x/``size``, with the largest |x| of the motion in m, and Om/``omega``, with its frequency. The equations
-    ``balance``, with their number of harmonics, and their ``shift`` stay the same within a step. The unit ``tangent``
-    (n + 1,) has been set if the branch has one at the motion; ``correct`` and ``tangent_at`` need it. Tangents of
-    ``Point`` are d(x, period) in m and s, of any length.
-    """
-
-    tangent: np.ndarray
-
-    def __init__(
-        self, problem: "ConservativeMotions", balance: HarmonicBalance, x: np.ndarray, omega: float, size: float
-    ) -> None:
-        self.problem = problem
-        self.balance = balance
-        self.shift = balance.shift(omega)
-        self.size = size
-        self.omega = omega
-        self.xi = np.append(x / size, 1.0)
-
-    def motion(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
-        """Harmonics (n,) in m and frequency in rad/s at the unknowns ``xi`` (n + 1,)."""
-        return xi[:-1] * self.size, float(xi[-1] * self.omega)
-
-    def encode(self, point: Point) -> np.ndarray:
-        """The unknowns (n + 1,) of another motion, which may have another number of harmonics."""
-        x = self.problem.resized(point.x, self.balance)
-        return np.append(x / self.size, 2 * np.pi / point.period / self.omega)
-
-    def direction(self, point: Point) -> np.ndarray:
-        """The branch's direction (n + 1,) at another motion, of any length."""
-        # dOm = -2 pi/period^2 dperiod.
-        harmonics = self.problem.resized(point.tangent[:-1], self.balance) / self.size
-        return np.append(harmonics, -2 * np.pi / point.period**2 * point.tangent[-1] / self.omega)
-
-    def residual(self, xi: np.ndarray) -> np.ndarray:
-        """The residual (n,) at the unknowns ``xi`` (n + 1,), which vanishes at a solution, over the size.
-
-        Raises FlowError where the frequency has changed by a factor of 2 or more.
-        """
-        if not np.all(np.isfinite(xi)) or not 0.5 < xi[-1] < 2:
-            raise FlowError("Newton's method left the domain: the frequency changed by a large factor")
-        return self.balance.residual(*self.motion(xi), self.shift) / self.size
-
-    def jacobian(self, xi: np.ndarray) -> np.ndarray:
-        """Derivative (n, n + 1) of the residual."""
-        x, omega = self.motion(xi)
-        jacobian = self.balance.jacobian(x, omega, self.shift)
-        rate = self.balance.rate(x, omega, self.shift)
-        return np.column_stack([jacobian, rate * (self.omega / self.size)])
-
-    def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the motion at an ``arclength`` along the tangent."""
-        return self.solve(guess, self.tangent, self.tangent @ self.xi + arclength)
-
-    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
-        """Newton's method from ``guess`` (n + 1,) for the motion with row . xi = value."""
-        newton = self.problem.newton(self.balance)
-        return newton.solve(self, guess, row, value, self.problem.tolerance)
-
-    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), along the branch on the side of the frame's own."""
-        border = np.vstack([self.jacobian(xi), self.tangent])
-        return unit(np.linalg.solve(border, np.append(np.zeros(len(xi) - 1), 1.0)))
-
-    def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
-        """The motion that an attempt has converged to.
-
-        ``direction`` (n + 1,) is the branch's unit tangent there; without one, None, the motion has no slope. The
-        point's ``energy_tangent`` is dE in J for a unit step along it in this frame's unknowns: from frame to frame
-        only its sign can be compared.
-        """
-        balance = self.balance
-        xi = attempt.xi
-        x, omega = self.motion(xi)
-        series = balance.series(x, omega)
-        tangent = np.empty(0)
-        energy_tangent = slope = np.nan
-        if direction is not None:
-            energies = [balance.energy(*self.motion(xi + s * SLOPE_STEP * direction), self.shift) for s in (1, -1)]
-            energy_tangent = (energies[0] - energies[1]) / (2 * SLOPE_STEP)
-            by_frequency = direction[-1] * self.omega / (2 * np.pi)
-            # The slope is df/dE in Hz/J: infinite at a fold of the energy.
-            slope = np.inf
-            if energy_tangent:
-                slope = by_frequency / energy_tangent
-            period = 2 * np.pi / omega
-            tangent = np.append(direction[:-1] * self.size, -direction[-1] * self.omega / (2 * np.pi) * period**2)
-
-        return Point(
-            x=x,
-            period=2 * np.pi / omega,
-            energy=balance.energy(x, omega, self.shift),
-            residual=float(np.abs(balance.residual(x, omega, self.shift)).max() / self.size),
-            episodes=self._episodes(series.episodes),
-            closed=float(series.closed.max(initial=0.0)),
-            newton=len(attempt.history) - 1,
-            order=balance.order,
-            truncation=balance.truncation(x, omega),
-            # At phase 0 all cosines are 1.
-            elongations=balance.unpack(x).real.sum(axis=1),
-            tangent=tangent,
-            energy_tangent=energy_tangent,
-            slope=slope,
-        )
-
-    def _episodes(self, episodes: list[Episode]) -> int:
-        """How often contacts close, or open if they are pressed at rest, from phase 0 to where the motion repeats.
-
-        That is half a period for a motion at rest at phase 0, and a quarter if it is symmetric as well: the arcs that
-        shooting integrates, with whose counts these are compared.
-        """
-        end = np.pi
-        if self.balance.forces.odd:
-            end = np.pi / 2
-        middles: list[float] = []
-        for pair, stops in enumerate(self.balance.forces.contacts):
-            spans = [(episode.onset, episode.onset + episode.length) for episode in episodes if episode.pair == pair]
-            if stops.is_pressed:
-                spans = _between(spans)
-            middles += [(begin + stop) / 2 for begin, stop in spans]
-
-        count = 0
-        for middle in middles:
-            count += (middle + PHASE_ROUNDING) % (2 * np.pi) < end + 2 * PHASE_ROUNDING
-        return count
-
-
-def _between(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The intervals of phase between ``spans``, sorted ones that do not overlap, and the first one's next turn."""
-    after = [*spans[1:], *((begin + 2 * np.pi, stop) for begin, stop in spans[:1])]
-    gaps = [(stop, begin) for (_, stop), (begin, _) in zip(spans, after, strict=True)]
-    return [(begin, stop) for begin, stop in gaps if stop > begin]
 
 
 class ConservativeMotions:
-    """Branches of conservative motions of ``forces`` at pairs whose ``compliance`` is given.
+    """Branches of conservative motions of ``forces`` at pairs whose ``compliance`` is given, as a ``PeriodicProblem``.
 
     ``control`` is the table [nnm] of a case: harmonics are taken up to the order ``nnm.harmonics`` at most, and as many
     as the relative ``nnm.truncation`` needs.
     """
 
-    # Floquet multipliers are not among these equations. What is guarded from point to point, besides the changes that
-    # all problems have in common, is the truncation: at the highest order the harmonics left out may become too large.
+    # ``PeriodicProblem`` asks for these two. Floquet multipliers, of which points of other problems have half-traces,
+    # are not computed here. What is guarded from point to point, besides the changes that all problems have in common,
+    # is the truncation: at the highest order the harmonics left out may become too large.
     has_half_traces = False
     guards = frozenset({"truncation"})
 
@@ -232,14 +119,6 @@ class ConservativeMotions:
         if balance.size not in self._newtons:
             self._newtons[balance.size] = DenseNewton(balance.size + 1, self.control.max_newton)
         return self._newtons[balance.size]
-
-    def resized(self, x: np.ndarray, balance: HarmonicBalance) -> np.ndarray:
-        """Unknowns (n,) of a ``balance`` from those of another one, ``x``; zero where they are new."""
-        parts = x.reshape(self.forces.pairs, -1)
-        out = np.zeros((len(parts), balance.size // len(parts)))
-        count = min(parts.shape[1], out.shape[1])
-        out[:, :count] = parts[:, :count]
-        return out.ravel()
 
     @property
     def highest_order(self) -> int:
@@ -273,34 +152,42 @@ class ConservativeMotions:
         There is one chart: the name of a ``chart``, which other problems need, is not looked at.
         """
         balance = self.balance(self.order_near(point))
-        x = self.resized(point.x, balance)
-        frame = HarmonicFrame(self, balance, x, 2 * np.pi / point.period, float(np.abs(x).max()))
+        x = balance.resized(point.x)
+        frame = self._frame_at(balance, x, 2 * np.pi / point.period, float(np.abs(x).max()))
         if point.tangent.size:
             frame.tangent = unit(frame.direction(point))
         return frame
+
+    def _frame_at(self, balance: HarmonicBalance, x: np.ndarray, omega: float, size: float) -> HarmonicFrame:
+        """The frame of the equations ``balance`` at harmonics ``x`` (n,) in m, which are scaled by ``size`` in m."""
+        return HarmonicFrame(balance, self.newton(balance), self.tolerance, x, omega, size)
 
     def first_tangent(self, start: Point, direction: int) -> np.ndarray:
         """Tangent d(x, period) at a corrected motion, towards growing (+1) or falling (-1) energy."""
         frame = self.frame(start)
         # The frame may have other harmonics than the start, which then solves its equations up to the truncation. That
         # is exact enough for a tangent, which predicts the first step and gets corrected.
-        null = np.linalg.svd(frame.jacobian(frame.xi))[2][-1]
-        point = frame.measures(_solution(frame.xi), null)
+        _, _, right_vectors = np.linalg.svd(frame.jacobian(frame.xi))
+        null_vector = right_vectors[-1]
+        point = frame.measures(_solution(frame.xi), null_vector)
+        # Where the energy does not change along the tangent, either sign is towards growing energy.
         sign = np.sign(point.energy_tangent) * direction or direction
-        harmonics = self.resized(point.tangent[:-1], self.balance(start.order))
+        harmonics = self.balance(start.order).resized(point.tangent[:-1])
         return np.append(harmonics, point.tangent[-1]) * sign
 
     def turn(self, before: Point, after: Point) -> float:
-        """0: with one chart there is nothing to guard beyond the angle between the tangents of a step.
+        """0: no angle is guarded beyond that between the tangents in the unknowns of a step's frame.
 
-        Problems with several charts give the angle in relative units here, whatever the chart of the step.
+        ``PeriodicProblem.turn`` is the angle in relative units. These equations have no other units, and the step's own
+        angle is guarded in any case.
         """
         return 0.0
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
-        """Folds of the energy and of the frequency, where the motion is not linear."""
-        # Linear motions have one frequency at all energies: their tests would be rounding.
-        if left.episodes or not self.forces.is_linear_at_rest:
+        """Folds of the energy and of the frequency, between two motions that are not linear."""
+        # Linear motions have one frequency at all energies: the test of a fold of the frequency would be rounding. A
+        # step into contact or out of it has a linear motion at one end; folds are then not sought, as in shooting.
+        if not self.forces.is_linear_at_rest or (left.episodes and right.episodes):
             yield SpecialKind("fold-energy", lambda p: p.energy_tangent)
             yield SpecialKind("fold-frequency", lambda p: float(p.tangent[-1] / p.period))
 
@@ -308,19 +195,24 @@ class ConservativeMotions:
         """The motion of the frequency, or else of the amplitude, of ``point``, with as many harmonics as are needed.
 
         If the order ``nnm.harmonics`` is not enough, it has all of these. Raises ContinuationError where Newton's
-        method fails.
+        method fails or ends at the state of rest.
         """
         while True:
             order = point.order
             frame = self.frame(point)
-            x = self.resized(point.x, frame.balance)
+            x = frame.balance.resized(point.x)
             row = unit(np.append(x, 0.0))
             if keep_frequency:
-                row = np.append(0 * x, 1.0)
+                row = _frequency_row(frame)
             attempt = frame.solve(frame.xi, row, row @ frame.xi)
             if not attempt.converged:
                 why = f"{attempt.reason}; residuals {attempt.residuals}"
                 raise ContinuationError(f"no motion at f = {point.frequency:.9g} Hz ({why}): choose another start")
+            if _is_at_rest(attempt):
+                raise ContinuationError(
+                    f"no motion at f = {point.frequency:.9g} Hz (Newton's method ends at the state of rest): choose "
+                    "another start"
+                )
             point = frame.measures(attempt)
             if point.truncation <= MORE * self.control.truncation:
                 return point
@@ -332,13 +224,21 @@ class ConservativeMotions:
         """The motion near a linear mode of frequency ``omega`` (rad/s) with the elongations ``z`` (pairs,) in m."""
         return self.refined(self._guess(self.one_harmonic(z), omega), keep_frequency=False)
 
-    def from_gap(self, omega: float, signs: np.ndarray) -> Point:
-        """The motion of ``omega`` (rad/s) with contact at the pairs whose ``signs`` (pairs,) are +1 or -1.
+    def in_gap(self, omega: float, signs: np.ndarray) -> Point:
+        """The motion of ``omega`` (rad/s) in a gap, with contact at the pairs whose ``signs`` (pairs,) are +1 or -1.
 
         A pair of the sign -1 moves half a period later than one of +1: its cosine has the other sign, its mean the
-        same. Raises ContinuationError where there is no motion with one harmonic, or none is reached by bringing in the
-        others.
+        same. Raises ContinuationError where a pair has no motion with one harmonic, or where no motion is reached by
+        bringing in the others; ValueError if all ``signs`` are 0.
         """
+        if not np.any(signs):
+            raise ValueError("signs are 0 for all pairs: a motion in a gap needs contact at one pair at least")
+        x = self._pairs_together(self._pairs_alone(omega, signs), omega, signs)
+        x = self._bring_in_harmonics(x, omega)
+        return self.refined(self._guess(x, omega), keep_frequency=True)
+
+    def _pairs_alone(self, omega: float, signs: np.ndarray) -> np.ndarray:
+        """The first stage: unknowns (n,) of a mean and one harmonic, by each pair's describing function."""
         # A harmonic motion of forces that are odd has no mean, and the static compliance need not be there.
         static_at = 0.0
         if self.forces.odd:
@@ -351,34 +251,59 @@ class ConservativeMotions:
             described = describing_motion(self.forces, pair, g, omega)
             mean[pair] = described.mean
             z[pair] = signs[pair] * described.amplitude
-            # A first guess: the force at this pair moves the pairs without a force of their own by the ratio of the
-            # compliances; how it moves the others is left to Newton's method.
+            # The force at this pair p moves a pair j without a force of its own by z_j = G_jp/G_pp z_p. What it adds to
+            # the motion of the other pairs with contact, and to all means, is left to the second stage.
             z += np.where(signs == 0, dynamic[:, pair] / g.dynamic * z[pair], 0.0)
+        return self.one_harmonic(z, mean)
 
-        x = self.one_harmonic(z, mean)
-        size = float(np.abs(z).max())
-        row = np.append(0 * x, 1.0)
+    def _pairs_together(self, x: np.ndarray, omega: float, signs: np.ndarray) -> np.ndarray:
+        """The second stage: the unknowns ``x`` (n,) corrected to the solution with a mean and one harmonic.
+
+        They are returned as they are where they solve the equations, or where Newton's method finds no motion with the
+        ``signs`` (pairs,): the third stage then tries from them.
+        """
+        balance = self.balance(1)
+        first = balance.resized(x)
+        frame = self._frame_at(balance, first, omega, float(np.abs(first).max()))
+        if np.abs(frame.residual(frame.xi)).max() < BALANCED:
+            return x
+        attempt = frame.solve(frame.xi, _frequency_row(frame), 1.0)
+        corrected, _ = frame.motion(attempt.xi)
+        keeps_signs = np.all(signs * balance.unpack(corrected)[:, 1].real >= 0)
+        if attempt.converged and keeps_signs and not _is_at_rest(attempt):
+            return self.balance(FEWEST).resized(corrected)
+        return x
+
+    def _bring_in_harmonics(self, x: np.ndarray, omega: float) -> np.ndarray:
+        """The third stage: the solution (n,) with ``FEWEST`` harmonics, from that with a mean and one harmonic, ``x``.
+
+        Raises ContinuationError where Newton's method fails or the motion changes too much however small the step.
+        """
+        size = float(np.abs(x).max())
         weight = 0.0
         step = FIRST_WEIGHT
-        # Harmonics above the first change the motion smoothly with their weight; at once Newton's method would be lost.
+        # The solution changes smoothly with the weight. With all harmonics at once Newton's method would diverge.
         while weight < 1:
             tried = min(weight + step, 1.0)
-            frame = HarmonicFrame(self, self.balance(FEWEST).weighted(tried), x, omega, size)
-            attempt = frame.solve(frame.xi, row, 1.0)
+            # The weight multiplies G itself, and the shift is chosen for the product.
+            frame = self._frame_at(self.balance(FEWEST).weighted(tried), x, omega, size)
+            attempt = frame.solve(frame.xi, _frequency_row(frame), 1.0)
             # Over ``size``, as the unknowns are.
             moved = np.linalg.norm(attempt.xi[:-1] - x / size)
             if attempt.converged and moved < FURTHEST:
-                x = attempt.xi[:-1] * size
+                x, _ = frame.motion(attempt.xi)
                 weight = tried
                 step = LONGER * step
                 continue
-            step = SHORTER * step
+
+            # Of the step that was tried: the weight 1 may have cut it.
+            step = SHORTER * min(step, 1.0 - weight)
             if step < SMALLEST_WEIGHT:
                 raise ContinuationError(
                     f"no breather at {omega:g} rad/s: with {weight:.3g} of the harmonics above the first, Newton's "
                     f"method ends ({attempt.reason}); change nnm.start_frequency or raise nnm.max_newton"
                 )
-        return self.refined(self._guess(x, omega), keep_frequency=True)
+        return x
 
     def one_harmonic(self, z: np.ndarray, mean: np.ndarray | float = 0.0) -> np.ndarray:
         """Unknowns with the fewest harmonics of a motion ``mean`` + z cos(theta), ``z`` (pairs,) and mean in m."""
@@ -389,10 +314,20 @@ class ConservativeMotions:
 
     def _guess(self, x: np.ndarray, omega: float) -> Point:
         """A point to be corrected, of unknowns with the fewest harmonics."""
-        frame = HarmonicFrame(self, self.balance(FEWEST), x, omega, 1.0)
+        frame = self._frame_at(self.balance(FEWEST), x, omega, size=1.0)
         return frame.measures(_solution(frame.xi))
 
 
 def _solution(xi: np.ndarray) -> Attempt:
     """Unknowns ``xi`` as if Newton's method had found them, for ``HarmonicFrame.measures``."""
     return Attempt(converged=True, reason="", history=[], xi=xi)
+
+
+def _is_at_rest(attempt: Attempt) -> bool:
+    """Whether Newton's method, from a motion whose largest harmonic is 1 in its unknowns, has ended at rest."""
+    return bool(np.abs(attempt.xi[:-1]).max() < AT_REST)
+
+
+def _frequency_row(frame: HarmonicFrame) -> np.ndarray:
+    """The row (n + 1,) whose product with the unknowns is the frequency, over that of the ``frame``."""
+    return np.append(np.zeros(len(frame.xi) - 1), 1.0)

@@ -97,6 +97,17 @@ class HarmonicBalance:
         z.imag[:, self._sine_places] = parts[:, len(self.orders) :]
         return z
 
+    def resized(self, x: np.ndarray) -> np.ndarray:
+        """Unknowns (size,) from those of equations with another ``order``, ``x`` (n,); 0 for orders that are new.
+
+        Both must have cosines alone, and both have odd orders alone or all.
+        """
+        parts = x.reshape(self.forces.pairs, -1)
+        out = np.zeros((len(parts), self.size // len(parts)))
+        count = min(parts.shape[1], out.shape[1])
+        out[:, :count] = parts[:, :count]
+        return out.ravel()
+
     def series(self, x: np.ndarray, omega: float) -> ForceSeries:
         """The forces' harmonics and derivatives at the unknowns ``x`` (n,)."""
         key = x.tobytes(), omega

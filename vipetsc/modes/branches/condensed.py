@@ -124,7 +124,7 @@ class CondensedMethod(NnmMethod):
         signs = np.zeros(self.motions.forces.pairs)
         numbers = self.options.start_sites or [1]
         signs[np.abs(numbers) - 1] = np.sign(numbers)
-        return self.motions.from_gap(self.options.start_frequency[job], signs)
+        return self.motions.in_gap(self.options.start_frequency[job], signs)
 
     def rule(self, problem: PeriodicProblem[Point], start: Point, done: int) -> StepRule[Point]:
         """Guarded steps; a branch that begins in a gap ends where it leaves it."""

@@ -1,0 +1,169 @@
+"""The unknowns of harmonic balance at and near one conservative motion, in which a step of its branch is taken.
+
+The unknowns ``xi`` (n + 1,) are numbers of order one,
+
+    xi = (x/size, Om/omega).
+
+Here x (n,) are the motion's harmonics in m, and Om is its frequency in rad/s; ``size`` is the largest |x| of the motion
+at which the frame is, ``omega`` that motion's frequency. A ``Point`` of a branch has its tangent as d(x, period) in m
+and s instead, of any length, with period = 2 pi/Om and so dperiod = -(period^2/2 pi) dOm.
+"""
+
+import numpy as np
+
+from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
+from vipetsc.modes.balance.harmonics import Episode
+from vipetsc.modes.newton import DenseNewton
+from vipetsc.modes.point import Point
+from vipetsc.modes.problem import Attempt, FlowError, unit
+
+# The energy's derivative along the branch is a central difference over this distance along the tangent to each side.
+SLOPE_STEP = 1e-5
+# A frequency that changes by this factor, or its inverse, within one correction has left the branch.
+LARGE_FACTOR = 2.0
+# An episode centred on an end of the arc counts. Rounding may put its middle outside by up to this phase (rad), at
+# either end.
+PHASE_ROUNDING = 1e-9
+
+
+class HarmonicFrame:
+    """Unknowns ``xi`` (n + 1,) at and near the motion with the harmonics ``x`` (n,) in m and ``omega`` in rad/s.
+
+    ``size`` in m is the unit of the harmonics. The equations ``balance``, with their number of harmonics, and their
+    ``shift`` stay the same within a step; ``newton`` solves them to the residual ``tolerance``. ``tangent`` (n + 1,) is
+    the branch's unit tangent. It is set after construction where the motion has one; ``correct`` and ``tangent_at``
+    need it.
+    """
+
+    tangent: np.ndarray
+
+    def __init__(
+        self, balance: HarmonicBalance, newton: DenseNewton, tolerance: float, x: np.ndarray, omega: float, size: float
+    ) -> None:
+        self.balance = balance
+        self.newton = newton
+        self.tolerance = tolerance
+        self.shift = balance.shift(omega)
+        self.size = size
+        self.omega = omega
+        self.xi = np.append(x / size, 1.0)
+
+    def motion(self, xi: np.ndarray) -> tuple[np.ndarray, float]:
+        """Harmonics (n,) in m and frequency in rad/s at the unknowns ``xi`` (n + 1,)."""
+        return xi[:-1] * self.size, float(xi[-1] * self.omega)
+
+    def encode(self, point: Point) -> np.ndarray:
+        """The unknowns (n + 1,) of another motion, which may have another number of harmonics."""
+        x = self.balance.resized(point.x)
+        return np.append(x / self.size, 2 * np.pi / point.period / self.omega)
+
+    def direction(self, point: Point) -> np.ndarray:
+        """The branch's direction (n + 1,) at another motion, of any length."""
+        # dOm = -2 pi/period^2 dperiod.
+        harmonics = self.balance.resized(point.tangent[:-1]) / self.size
+        return np.append(harmonics, -2 * np.pi / point.period**2 * point.tangent[-1] / self.omega)
+
+    def residual(self, xi: np.ndarray) -> np.ndarray:
+        """The residual (n,) at the unknowns ``xi`` (n + 1,), which vanishes at a solution, over the size.
+
+        Raises FlowError where the frequency has changed by a factor of ``LARGE_FACTOR`` or more.
+        """
+        if not np.all(np.isfinite(xi)) or not 1 / LARGE_FACTOR < xi[-1] < LARGE_FACTOR:
+            raise FlowError("Newton's method left the domain: the frequency changed by a large factor")
+        return self.balance.residual(*self.motion(xi), self.shift) / self.size
+
+    def jacobian(self, xi: np.ndarray) -> np.ndarray:
+        """Derivative (n, n + 1) of the residual."""
+        x, omega = self.motion(xi)
+        jacobian = self.balance.jacobian(x, omega, self.shift)
+        by_omega = self.balance.rate(x, omega, self.shift)
+        return np.column_stack([jacobian, by_omega * (self.omega / self.size)])
+
+    def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
+        """Newton's method from ``guess`` (n + 1,) for the motion at an ``arclength`` along the tangent."""
+        return self.solve(guess, self.tangent, self.tangent @ self.xi + arclength)
+
+    def solve(self, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
+        """Newton's method from ``guess`` (n + 1,) for the motion with row . xi = value."""
+        return self.newton.solve(self, guess, row, value, self.tolerance)
+
+    def tangent_at(self, xi: np.ndarray) -> np.ndarray:
+        """The unit tangent (n + 1,) at a solution ``xi`` (n + 1,), along the branch on the side of the frame's own."""
+        border = np.vstack([self.jacobian(xi), self.tangent])
+        return unit(np.linalg.solve(border, np.append(np.zeros(len(xi) - 1), 1.0)))
+
+    def measures(self, attempt: Attempt, direction: np.ndarray | None = None) -> Point:
+        """The point of the branch that an attempt has converged to.
+
+        ``direction`` (n + 1,) is the branch's unit tangent there; without one, None, the point has no slope. Its
+        ``energy_tangent`` is dE in J for a unit step along the tangent in this frame's unknowns: from frame to frame
+        only the sign can be compared.
+        """
+        balance = self.balance
+        xi = attempt.xi
+        x, omega = self.motion(xi)
+        period = 2 * np.pi / omega
+        series = balance.series(x, omega)
+
+        tangent = np.empty(0)
+        energy_tangent = slope = np.nan
+        if direction is not None:
+            energies = [balance.energy(*self.motion(xi + s * SLOPE_STEP * direction), self.shift) for s in (1, -1)]
+            energy_tangent = (energies[0] - energies[1]) / (2 * SLOPE_STEP)
+            by_frequency = direction[-1] * self.omega / (2 * np.pi)
+            # The slope is df/dE in Hz/J: infinite at a fold of the energy.
+            slope = np.inf
+            if energy_tangent:
+                slope = by_frequency / energy_tangent
+            tangent = np.append(direction[:-1] * self.size, -direction[-1] * self.omega / (2 * np.pi) * period**2)
+
+        return Point(
+            x=x,
+            period=period,
+            energy=balance.energy(x, omega, self.shift),
+            residual=float(np.abs(balance.residual(x, omega, self.shift)).max() / self.size),
+            episodes=self._episodes(series.episodes),
+            closed=float(series.closed.max(initial=0.0)),
+            # The history has the residual of the guess, too; that of a guess which is not corrected is empty.
+            newton=max(len(attempt.history) - 1, 0),
+            order=balance.order,
+            truncation=balance.truncation(x, omega),
+            # At phase 0 all cosines are 1.
+            elongations=balance.unpack(x).real.sum(axis=1),
+            tangent=tangent,
+            energy_tangent=energy_tangent,
+            slope=slope,
+        )
+
+    def _episodes(self, episodes: list[Episode]) -> int:
+        """How often contacts close, or open if they are pressed at rest, from phase 0 to where the motion repeats.
+
+        That is half a period for a motion at rest at phase 0, and a quarter if it is symmetric as well: the arcs that
+        shooting integrates, with whose counts these are compared. A contact that is pressed at rest and stays closed
+        for the whole period, or open, counts 0.
+        """
+        end = np.pi
+        if self.balance.forces.odd:
+            end = np.pi / 2
+        middles: list[float] = []
+        for pair, stops in enumerate(self.balance.forces.contacts):
+            spans = [(episode.onset, episode.onset + episode.length) for episode in episodes if episode.pair == pair]
+            if stops.is_pressed:
+                spans = _between(spans)
+            middles += [(begin + stop) / 2 for begin, stop in spans]
+
+        count = 0
+        for middle in middles:
+            # The phase from the arc's beginning on, which is moved back by the rounding, to its end moved on by it.
+            count += (middle + PHASE_ROUNDING) % (2 * np.pi) < end + 2 * PHASE_ROUNDING
+        return count
+
+
+def _between(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The intervals of phase between ``spans``, which are sorted and do not overlap.
+
+    The last interval ends where the first span begins, one turn later.
+    """
+    after = [*spans[1:], *((begin + 2 * np.pi, stop) for begin, stop in spans[:1])]
+    gaps = [(stop, begin) for (_, stop), (begin, _) in zip(spans, after, strict=True)]
+    return [(begin, stop) for begin, stop in gaps if stop > begin]
