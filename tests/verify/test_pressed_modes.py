@@ -140,16 +140,7 @@ GRAINS: dict[str, Any] = {
             "side": ["minus", "minus", "minus", "plus"],
         },
     },
-    "nnm": {
-        "system": "chain",
-        "modes": [2],
-        "tolerance": 1e-12,
-        "first_step": 0.1,
-        "largest_step": 0.3,
-        "points": 20,
-        # In a chain that is its own mirror image two contacts open at once, at either end of the orbit.
-        "guards": {"contacts": 4},
-    },
+    "nnm": {"system": "chain", "modes": [2], "tolerance": 1e-12, "first_step": 0.1, "largest_step": 0.3, "points": 20},
 }
 
 

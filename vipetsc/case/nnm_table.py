@@ -69,12 +69,12 @@ class SystemTable(Section):
 class Guards(Section):
     """Bounds on one step that keep a branch from jumping to another arc; 0 switches one off.
 
-    Changes of asinh(c) of every Floquet half-trace c and of the number of contact episodes of the arc, length of the
-    correction over the step's length, angle in rad between consecutive tangents: in the chart of the step, and in that
-    named ``relative``, since near grazing another chart hides the angle between two branches that cross. Residuals
-    cannot show a jump: both arcs satisfy the equations to rounding. A branch whose last ``standstill`` points are all
-    within ``advance`` times the orbit's size is ended: orbits are corrected to 1e-13, and the paper's branches move by
-    2e-6 in 200 points at least.
+    Changes of asinh(c) of every Floquet half-trace c and of the number of contact episodes of the arc (those that a
+    symmetry of the orbit takes to one another count once), length of the correction over the step's length, angle in
+    rad between consecutive tangents: in the chart of the step, and in that named ``relative``, since near grazing
+    another chart hides the angle between two branches that cross. Residuals cannot show a jump: both arcs satisfy the
+    equations to rounding. A branch whose last ``standstill`` points are all within ``advance`` times the orbit's size
+    is ended: orbits are corrected to 1e-13, and the paper's branches move by 2e-6 in 200 points at least.
     """
 
     half_trace: Annotated[float, Field(ge=0)] = 0.5

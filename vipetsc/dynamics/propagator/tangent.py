@@ -84,6 +84,17 @@ class _Moving(NamedTuple):
     petsc_objects: list
 
 
+class OrbitContacts(NamedTuple):
+    """Begins and ends (number, 2) in s of times in contact in an orbit.
+
+    One contact takes several ``closed_substeps``, which follow each other. ``departures`` are the times in which a site
+    is closed, or open if it is pressed at rest.
+    """
+
+    closed_substeps: np.ndarray
+    departures: np.ndarray
+
+
 class ClosedSubsteps(NamedTuple):
     """Substeps (row,) of an orbit in which contacts were closed, in the order of time at each site.
 
@@ -212,14 +223,10 @@ class TangentPropagator(Propagator):
         owned = self._layout.owned
         return self._components[self.steps % 2][: rows * owned].reshape(rows, owned)
 
-    def contacts(self) -> tuple[np.ndarray, int]:
-        """Begin and end (substep, 2) in s of the substeps in which a site was closed, and the number of contacts.
-
-        They are those of the sites that this rank logs; one contact takes several substeps, which follow each other.
-        Of contacts that are pressed at rest the number is that of their openings.
-        """
+    def contacts(self) -> OrbitContacts:
+        """The times in contact of the sites that this rank logs."""
         spans = [np.zeros((0, 2))]
-        episodes = 0
+        departures = []
         for c in np.flatnonzero(self._forces.logs).tolist():
             rows = self._tape_rows(c)
             is_open = self._is_open(c)
@@ -230,12 +237,17 @@ class TangentPropagator(Propagator):
             # contact as well: that of a site which is closed at the start.
             is_pressed = np.abs(rows["mode"]) == PERMANENT
             begins = (rows["onset"] > 0) | (begin == 0.0)
-            episodes += int(np.sum(begins & ~is_pressed))
-            for site in np.unique(rows["site"][is_pressed]):
-                is_open_here = is_open[rows["site"] == site]
-                was_open_before = np.append(False, is_open_here[:-1])
-                episodes += int(np.sum(is_open_here & ~was_open_before))
-        return np.concatenate(spans), episodes
+            is_away = is_open | ~is_pressed
+            for site in np.unique(rows["site"]):
+                here = rows["site"] == site
+                # An opening begins behind a substep in which the contact is closed.
+                opens = is_open[here] & ~np.append(False, is_open[here][:-1])
+                is_first = np.where(is_pressed[here], opens, begins[here])
+                number = np.cumsum(is_first)
+                for departure in range(1, number.max(initial=0) + 1):
+                    of_it = is_away[here] & (number == departure)
+                    departures.append((begin[here][of_it].min(), end[here][of_it].max()))
+        return OrbitContacts(np.concatenate(spans), np.reshape(departures, (-1, 2)))
 
     def closed_substeps(self) -> list[ClosedSubsteps]:
         """The substeps in which contacts were closed, one record for each cluster that this rank logs."""

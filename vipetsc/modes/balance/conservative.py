@@ -50,11 +50,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from vipetsc.case.nnm_table import NnmTable
+from vipetsc.modes.balance.departures import departures_of
 from vipetsc.modes.balance.describing_function import PairCompliance, describing_motion
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
 from vipetsc.modes.balance.harmonic_frame import HarmonicFrame
 from vipetsc.modes.balance.harmonics import SiteForces
 from vipetsc.modes.balance.shifted_compliance import Compliance
+from vipetsc.modes.departures import Departure
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError, SpecialKind, unit
@@ -119,6 +121,11 @@ class ConservativeMotions:
         if balance.size not in self._newtons:
             self._newtons[balance.size] = DenseNewton(balance.size + 1, self.control.max_newton)
         return self._newtons[balance.size]
+
+    def departures(self, point: Point) -> list[Departure]:
+        """The times in which contacts are not what they are at rest, from phase 0 to where the motion repeats."""
+        balance = self.balance(point.order)
+        return departures_of(self.forces, balance.series(point.x, 2 * np.pi / point.period).episodes)
 
     @property
     def highest_order(self) -> int:

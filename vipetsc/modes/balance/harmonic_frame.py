@@ -11,8 +11,8 @@ and s instead, of any length, with period = 2 pi/Om and so dperiod = -(period^2/
 
 import numpy as np
 
+from vipetsc.modes.balance.departures import departures_of
 from vipetsc.modes.balance.harmonic_balance import HarmonicBalance
-from vipetsc.modes.balance.harmonics import Episode
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, FlowError, unit
@@ -21,9 +21,6 @@ from vipetsc.modes.problem import Attempt, FlowError, unit
 SLOPE_STEP = 1e-5
 # A frequency that changes by this factor, or its inverse, within one correction has left the branch.
 LARGE_FACTOR = 2.0
-# An episode centred on an end of the arc counts. Rounding may put its middle outside by up to this phase (rad), at
-# either end.
-PHASE_ROUNDING = 1e-9
 
 
 class HarmonicFrame:
@@ -122,7 +119,7 @@ class HarmonicFrame:
             period=period,
             energy=balance.energy(x, omega, self.shift),
             residual=float(np.abs(balance.residual(x, omega, self.shift)).max() / self.size),
-            episodes=self._episodes(series.episodes),
+            episodes=len(departures_of(balance.forces, series.episodes)),
             closed=float(series.closed.max(initial=0.0)),
             # The history has the residual of the guess, too; that of a guess which is not corrected is empty.
             newton=max(len(attempt.history) - 1, 0),
@@ -134,36 +131,3 @@ class HarmonicFrame:
             energy_tangent=energy_tangent,
             slope=slope,
         )
-
-    def _episodes(self, episodes: list[Episode]) -> int:
-        """How often contacts close, or open if they are pressed at rest, from phase 0 to where the motion repeats.
-
-        That is half a period for a motion at rest at phase 0, and a quarter if it is symmetric as well: the arcs that
-        shooting integrates, with whose counts these are compared. A contact that is pressed at rest and stays closed
-        for the whole period, or open, counts 0.
-        """
-        end = np.pi
-        if self.balance.forces.odd:
-            end = np.pi / 2
-        middles: list[float] = []
-        for pair, stops in enumerate(self.balance.forces.contacts):
-            spans = [(episode.onset, episode.onset + episode.length) for episode in episodes if episode.pair == pair]
-            if stops.is_pressed:
-                spans = _between(spans)
-            middles += [(begin + stop) / 2 for begin, stop in spans]
-
-        count = 0
-        for middle in middles:
-            # The phase from the arc's beginning on, which is moved back by the rounding, to its end moved on by it.
-            count += (middle + PHASE_ROUNDING) % (2 * np.pi) < end + 2 * PHASE_ROUNDING
-        return count
-
-
-def _between(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The intervals of phase between ``spans``, which are sorted and do not overlap.
-
-    The last interval ends where the first span begins, one turn later.
-    """
-    after = [*spans[1:], *((begin + 2 * np.pi, stop) for begin, stop in spans[:1])]
-    gaps = [(stop, begin) for (_, stop), (begin, _) in zip(spans, after, strict=True)]
-    return [(begin, stop) for begin, stop in gaps if stop > begin]

@@ -9,7 +9,7 @@ import numpy as np
 from vipetsc.case.nnm_table import Guards, NnmTable
 from vipetsc.io.netcdf import Variables, variable
 from vipetsc.modes.continuation.arclength import Continuation
-from vipetsc.modes.continuation.guards import half_trace_change
+from vipetsc.modes.continuation.guards import contact_changes, half_trace_change
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import ContinuationError, FlowError
 from vipetsc.modes.shooting.charts import Relative
@@ -43,7 +43,7 @@ def suspects(problem: Shooting, points: list[Point]) -> Iterator[tuple[int, str]
     for i, (a, b) in enumerate(itertools.pairwise(points)):
         change = half_trace_change(a, b)
         turn = problem.turn(a, b)
-        if abs(a.episodes - b.episodes) > guards.contacts:
+        if contact_changes(problem, a, b, guards.contacts) > guards.contacts:
             yield i, f"contacts {a.episodes} -> {b.episodes}"
         elif change > 2 * guards.half_trace:
             yield i, f"asinh of a half-trace changes by {change:.2g}"

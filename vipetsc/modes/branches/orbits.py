@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import cast
 
 from mpi4py import MPI
 
@@ -16,6 +17,7 @@ from vipetsc.modes.branches.losses import dissipation_of, with_loss
 from vipetsc.modes.branches.method import CrossingBranch, Method, Monitor
 from vipetsc.modes.branches.regions import regions
 from vipetsc.modes.continuation.arclength import GuardedSteps, StepRule
+from vipetsc.modes.continuation.guards import OrbitProblem
 from vipetsc.modes.continuation.special import at_energy
 from vipetsc.modes.continuation.switching import switch
 from vipetsc.modes.point import Point
@@ -83,7 +85,9 @@ class NnmMethod(Method[Point]):
 def guarded_steps(problem: PeriodicProblem[Point], control: NnmTable, done: int) -> GuardedSteps:
     """Steps by [nnm] of a branch that has ``done`` points after its start."""
     # ``points`` limits the whole branch, so that one that is resumed ends where an unbroken one would.
-    return GuardedSteps(problem, control.model_copy(update={"points": max(control.points - done, 0)}))
+    remaining = control.model_copy(update={"points": max(control.points - done, 0)})
+    # The problems of normal modes say when contacts act, which the method's type does not tell.
+    return GuardedSteps(cast(OrbitProblem, problem), remaining)
 
 
 def map_of(options: NnmTable, system: System) -> ShootingMap:

@@ -25,7 +25,7 @@ from typing import Any, Generic, NamedTuple, Protocol
 import numpy as np
 
 from vipetsc.case.nnm_table import NnmTable
-from vipetsc.modes.continuation.guards import GUARDED, strain
+from vipetsc.modes.continuation.guards import GUARDED, OrbitProblem, strain
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError, PeriodicProblem, S
 
@@ -110,7 +110,7 @@ class GuardedSteps:
     points_key = "nnm.points"
     no_step = Verdict(False, 0.0, "no step tried", "nnm.max_newton or nnm.tolerance")
 
-    def __init__(self, problem: PeriodicProblem[Point], control: NnmTable) -> None:
+    def __init__(self, problem: OrbitProblem, control: NnmTable) -> None:
         self.problem = problem
         self.control = control
         self.points = control.points

@@ -4,11 +4,13 @@ Both arcs satisfy the equations to rounding, so that no residual distinguishes t
 resonances differ in half-traces, contacts and direction.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from vipetsc.case.nnm_table import NnmTable
+from vipetsc.modes.departures import Departure, changed_families
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import PeriodicProblem
 
@@ -25,6 +27,16 @@ GUARDED = {
 ALL_OR_NOTHING = {"contacts", "turn_relative", "truncation"}
 
 
+class OrbitProblem(PeriodicProblem[Point], Protocol):
+    """Equations whose solutions are orbits with contacts."""
+
+    def departures(self, point: Point) -> Sequence[Departure]:
+        """The times in the arc of an orbit in which contacts are not what they are at rest; all ranks must call it.
+
+        Raises FlowError if the arc cannot be integrated.
+        """
+
+
 class Strain(NamedTuple):
     """Largest change in a step over the bound of its ``guard``; 1 is the bound."""
 
@@ -32,11 +44,9 @@ class Strain(NamedTuple):
     guard: str
 
 
-def strain(
-    problem: PeriodicProblem[Point], control: NnmTable, before: Point, after: Point, geometry: dict[str, float]
-) -> Strain:
+def strain(problem: OrbitProblem, control: NnmTable, before: Point, after: Point, geometry: dict[str, float]) -> Strain:
     """The largest strain of a step between two points, whose ``geometry`` has its ``corrector`` and ``turn``."""
-    changes = {"contacts": float(abs(after.episodes - before.episodes)), **geometry}
+    changes = {"contacts": contact_changes(problem, before, after, control.guards.contacts), **geometry}
     if "half_trace" in problem.guards:
         changes["half_trace"] = half_trace_change(before, after)
     if "turn_relative" in problem.guards:
@@ -55,6 +65,19 @@ def strain(
         if size > worst.size:
             worst = Strain(size, guard)
     return worst
+
+
+def contact_changes(problem: OrbitProblem, before: Point, after: Point, allowed: int) -> int:
+    """How many contacts appear or disappear between two points; images of one another count once, if more than allowed.
+
+    In a lattice that is its own mirror image, or with equal stops on both sides, contacts begin in pairs along the
+    whole branch (``modes.departures``): no shorter step separates them, and to appear together is no jump. To look for
+    images takes the arcs of both orbits again, so it is left out where there is nothing to excuse.
+    """
+    change = abs(after.episodes - before.episodes)
+    if change <= allowed or not allowed:
+        return change
+    return changed_families(problem.departures(before), problem.departures(after))
 
 
 def half_trace_change(a: Point, b: Point) -> float:

@@ -38,15 +38,25 @@ SLOWEST = 0.1
 class LatticeArc:
     """A piece of an orbit of ``duration`` seconds between the blocks ``start`` and ``end``.
 
-    ``episodes`` counts contacts that are closed at the start or begin; ``closed`` is the time in s with one closed.
+    ``departures`` (number, 2) are begin and end in s of each time that a contact is closed, or open if it is pressed at
+    rest; ``closed`` is the time in s with a contact closed.
     """
 
     duration: float
     start: np.ndarray
     end: np.ndarray
-    episodes: int
+    departures: np.ndarray
     closed: float
     engine: TangentPropagator
+
+    @property
+    def episodes(self) -> int:
+        """The number of contacts that are closed at the start or begin, and of openings of pressed ones."""
+        return len(self.departures)
+
+    def spans(self) -> list[tuple[float, float]]:
+        """Begin and end in s of every episode, on all ranks alike."""
+        return [(begin, end) for begin, end in self.departures.tolist()]
 
     def move(self, variations: np.ndarray) -> np.ndarray:
         """Variations (variation, 2 mass, owned cell) of the end, given those of the start; all ranks must call it."""
@@ -92,9 +102,10 @@ class LatticeFlow:
         Raises FlowError on all ranks.
         """
         engine, end = self._run(start, duration, self.steps(duration))
-        intervals, episodes = engine.contacts()
-        closed = _union(np.concatenate(self.comm.allgather(intervals)))
-        return LatticeArc(duration, start, end, self.comm.allreduce(episodes), closed, engine)
+        contacts = engine.contacts()
+        closed = _union(np.concatenate(self.comm.allgather(contacts.closed_substeps)))
+        departures = np.concatenate(self.comm.allgather(contacts.departures))
+        return LatticeArc(duration, start, end, departures, closed, engine)
 
     def steps(self, duration: float, largest: float = LARGEST_OMEGA_H) -> int:
         """The steps of an arc of ``duration`` seconds, each at most ``largest`` radians of the fastest motion."""

@@ -5,6 +5,7 @@ contact is searched, and the step is repeated so that it ends on the first chang
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -210,7 +211,7 @@ class Arc:
     ``start`` and ``end`` (2n,) hold displacements in m, then velocities in m/s; ``sensitivity`` (2n, 2n) is
     d end/d start; ``events`` (changes, 4) lists time in s, contact, side (1 or -1), kind (``ONSET``, ``SEPARATION``);
     ``episodes`` counts how often contacts close, or open if they are pressed at rest, and ``closed`` are the seconds
-    with a contact closed.
+    with a contact closed. ``away_at_start`` (contact) says of which an episode goes on at the start.
     """
 
     duration: float
@@ -220,6 +221,20 @@ class Arc:
     events: np.ndarray
     episodes: int
     closed: float
+    away_at_start: np.ndarray
+
+    def spans(self) -> Iterator[tuple[float, float]]:
+        """Begin and end in s of every episode; those that go on at the start begin at 0, the last may end with the arc.
+
+        Changes of a contact alternate between away from what it is at rest and back to that.
+        """
+        for contact, is_away in enumerate(self.away_at_start):
+            times = self.events[self.events[:, 1] == contact, 0].tolist()
+            if is_away:
+                times = [0.0, *times]
+            if len(times) % 2:
+                times.append(self.duration)
+            yield from zip(times[::2], times[1::2], strict=True)
 
 
 class Flow(ABC):
@@ -263,8 +278,9 @@ class Flow(ABC):
         plus, minus = self.system.clearances.T
         w = self.system.contact_rows @ start[: self.system.dofs]
         is_closed = (w > plus) | (-w > minus)
+        is_away = is_closed != self.system.is_pressed
         away = self._away[events[:, 1].astype(int)]
-        episodes = np.count_nonzero(is_closed != self.system.is_pressed) + np.count_nonzero(events[:, 3] == away)
+        episodes = np.count_nonzero(is_away) + np.count_nonzero(events[:, 3] == away)
         return Arc(
             duration=duration,
             start=start,
@@ -273,6 +289,7 @@ class Flow(ABC):
             events=events,
             episodes=episodes,
             closed=closed,
+            away_at_start=is_away,
         )
 
     def states(self, start: np.ndarray, interval: float, count: int, period: float) -> np.ndarray:

@@ -6,11 +6,12 @@ sensitivities, ``modes.lattice`` without a matrix.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
+from vipetsc.modes.departures import Departure, within_arc
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, FlowError, SpecialKind, unit
 from vipetsc.modes.shooting.charts import Chart, near_grazing
@@ -32,6 +33,9 @@ class AnyArc(Protocol):
     @property
     def closed(self) -> float:
         """Time in s with a contact closed."""
+
+    def spans(self) -> Iterable[tuple[float, float]]:
+        """Begin and end in s of every contact episode, cut off at the arc's start and end."""
 
 
 A = TypeVar("A", bound=AnyArc)
@@ -220,6 +224,15 @@ class ShootingEquations(ABC, Generic[A]):
             if self.map.starts_at_rest and near_grazing(self.system, point.x):
                 chart = "grazing"
         return self.frame_at(chart, point.x, point.period, point.tangent)
+
+    def departures(self, point: Point) -> list[Departure]:
+        """The times in the arc of an orbit in which contacts are not what they are at rest; all ranks must call it.
+
+        Raises FlowError if the arc cannot be integrated.
+        """
+        spans = self.arc(point.x, point.period).spans()
+        in_periods = [(begin / point.period, end / point.period) for begin, end in spans]
+        return within_arc(in_periods, self.map.fraction, self.map.ends_at_rest)
 
     @abstractmethod
     def null_vector(self, start: Point) -> np.ndarray:

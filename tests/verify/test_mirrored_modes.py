@@ -1,0 +1,170 @@
+"""Modes of a lattice that is its own mirror image: its contacts begin in pairs, at once or half a period apart."""
+
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+
+from vipetsc.case import NnmCase
+from vipetsc.lattice import Contact
+from vipetsc.modes import Branch
+from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.system import ContactPair, System
+
+WALL = 1000.0  # N/m, of each of two masses of 1 kg to the ground
+BETWEEN = 500.0  # N/m, of the two
+STOP = 5000.0  # N/m
+CLEARANCE = 1e-3  # m
+# The stiffness of a half: in phase nothing is strained between the masses, out of phase the middle stands still.
+HALF = {"in-phase": WALL, "out-of-phase": WALL + 2 * BETWEEN}
+TABLE: dict[str, Any] = {
+    "name": "mirror",
+    "contacts": {"law": "bilinear", "stiffness": STOP},
+    "nnm": {
+        "system": "own",
+        "modes": [1, 2],
+        "energy": [0.0, 6e-3],
+        "points": 90,
+        "locate": False,
+        "own": {
+            "masses": [1.0, 1.0],
+            "springs": [
+                {"start": 0, "end": 1, "stiffness": WALL},
+                {"start": 1, "end": 2, "stiffness": BETWEEN},
+                {"start": 0, "end": 2, "stiffness": WALL},
+            ],
+            "contacts": [
+                {"host": 0, "resonator": 1, "clearance": CLEARANCE},
+                {"host": 0, "resonator": 2, "clearance": CLEARANCE},
+            ],
+        },
+    },
+}
+CELLS = 24
+SITES = [8, CELLS + 1 - 8]
+# Cells of one mass between walls, with two stops of equal distance from the middle.
+CHAIN: dict[str, Any] = {
+    "name": "mirror",
+    "lattice": {
+        "cells": CELLS,
+        "cell": {"masses": [1.0], "springs": [{"start": 1, "end": 1, "next_cell": True, "stiffness": WALL}]},
+    },
+    "contacts": {
+        "law": "bilinear",
+        "stiffness": STOP,
+        "sites": SITES,
+        "clearance": CLEARANCE,
+        "each": {"pair": [[0, 1], [0, 1]]},
+        "side": "plus",
+    },
+    "nnm": {
+        "system": "chain",
+        "modes": [1],
+        "start_energy": 1e-4,
+        "energy": [0.0, 1.6e-4],
+        "points": 60,
+        "tolerance": 1e-12,
+    },
+}
+
+
+def own_case(sides: list[str], **nnm: Any) -> dict[str, Any]:
+    """The case of two masses whose stops are on these ``sides``, with further keys of [nnm]."""
+    contacts = TABLE["contacts"] | {"each": {"side": sides}}
+    return TABLE | {"contacts": contacts, "nnm": TABLE["nnm"] | nnm}
+
+
+def branches(table: dict[str, Any]) -> dict[str, Branch]:
+    """The branches of the case in ``table`` by their names."""
+    found = follow_all(NnmCase.from_table(table), None, MPI.COMM_SELF)
+    return {branch.name: branch for branch in found}
+
+
+def exact_period(energy: float, stiffness: float, sides: int) -> float:
+    """Period in s of a mass of 1 kg on a spring, with a stop on one of its sides or on both, at an ``energy`` in J."""
+    omega = np.sqrt(stiffness)
+    if 2 * energy < stiffness * CLEARANCE**2:
+        return float(2 * np.pi / omega)
+    speed = np.sqrt(2 * energy - stiffness * CLEARANCE**2)
+    to_stop = np.arctan2(omega * CLEARANCE, speed) / omega
+    stiffer = np.sqrt(stiffness + STOP)
+    rest = STOP * CLEARANCE / (stiffness + STOP)
+    in_stop = np.arctan2(speed, stiffer * (CLEARANCE - rest)) / stiffer
+    return float(2 * sides * (to_stop + in_stop) + (2 - sides) * np.pi / omega)
+
+
+def assert_halves(branch: Branch, sides: int, rtol: float) -> None:
+    """Every orbit has the period of a half with half of the energy."""
+    for point in branch.regular():
+        exact = exact_period(point.energy / 2, HALF[branch.name], sides)
+        assert point.period == pytest.approx(exact, rel=rtol)
+
+
+# Which modes move as a half of the lattice does, by the sides of the stops: those whose halves touch at one instant.
+SIDES = [
+    (["plus", "plus"], ["in-phase"], 1),
+    (["plus", "minus"], ["out-of-phase"], 1),
+    (["both", "both"], ["in-phase", "out-of-phase"], 2),
+]
+
+
+@pytest.mark.parametrize(("sides", "halved", "stops"), SIDES)
+@pytest.mark.parametrize("map_name", ["auto", "half", "whole"])
+def test_contacts_of_a_mirrored_lattice_begin_in_pairs(sides, halved, stops, map_name):
+    """At once, or in the other mode half a period apart: all branches go through grazing to the end of their range."""
+    found = branches(own_case(sides, map=map_name))
+    assert list(found) == list(HALF)
+    for name, branch in found.items():
+        assert "energy range" in branch.ending, branch.ending
+        episodes = [point.episodes for point in branch.regular()]
+        assert episodes[0] == 0
+        assert episodes[-1] >= 2
+        if name in halved:
+            assert_halves(branch, stops, rtol=1e-9)
+
+
+def test_so_do_those_of_condensed_motions():
+    found = branches(own_case(["plus", "plus"], method="condensed", truncation=1e-5, first_step=0.05, largest_step=0.2))
+    for branch in found.values():
+        assert "energy range" in branch.ending, branch.ending
+        assert branch.regular()[-1].episodes == 2
+    assert_halves(found["in-phase"], sides=1, rtol=1e-5)
+
+
+def test_so_do_those_of_orbits_shot_without_matrices():
+    """The left half of a symmetric orbit is one of the left half of the lattice alone, with a free end.
+
+    Another flow integrates it.
+    """
+    table = CHAIN | {"nnm": CHAIN["nnm"] | {"shooting": "krylov"}}
+    (branch,) = branches(table).values()
+    assert "points reached" in branch.ending, branch.ending
+    touching = [point for point in branch.regular() if point.episodes]
+    assert len(touching) > 2
+    assert all(point.episodes == 2 for point in touching)
+
+    half = CELLS // 2
+    springs = [(None, 0, WALL), *((i, i + 1, WALL) for i in range(half - 1))]
+    stop = ContactPair(None, SITES[0] - 1, CLEARANCE, Contact("bilinear", STOP), clearance_minus=np.inf)
+    flow = Dop853Flow(System.assemble(np.ones(half), springs, [stop]))
+    for point in touching:
+        start = np.append(point.x[:half], np.zeros(half))
+        end = flow.arc(start, point.period / 2, point.period).end
+        scale = np.abs(point.x).max() * 2 * np.pi / point.period
+        assert np.abs(end[half:]).max() < 1e-9 * scale
+
+
+def test_contacts_that_are_no_images_begin_one_after_the_other():
+    """Clearances that differ by a ten thousandth: no step takes both contacts, near as they are."""
+    table = own_case(["plus", "plus"])
+    own = table["nnm"]["own"]
+    first, second = own["contacts"]
+    further = second | {"clearance": CLEARANCE * (1 + 1e-4)}
+    table["nnm"]["own"] = own | {"contacts": [first, further]}
+    for branch in branches(table).values():
+        episodes = [point.episodes for point in branch.regular()]
+        assert np.abs(np.diff(episodes)).max() == 1, branch.ending
+        assert max(episodes) == 2

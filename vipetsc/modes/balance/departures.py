@@ -1,0 +1,49 @@
+"""When contacts of a motion of harmonics are not what they are at rest."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from vipetsc.modes.balance.harmonics import Episode, SiteForces
+from vipetsc.modes.departures import Departure
+
+# An episode centred on an end of the arc counts. Rounding may put its middle outside by up to this part of the period,
+# at either end.
+ROUNDING = 1e-9 / (2 * np.pi)
+
+
+def departures_of(forces: SiteForces, episodes: Iterable[Episode]) -> list[Departure]:
+    """When contacts close, or open if they are pressed at rest, from phase 0 to where the motion repeats.
+
+    That is half a period for a motion at rest at phase 0, and a quarter if it is symmetric as well: the arcs that
+    shooting integrates, with whose counts these are compared. A contact that is pressed at rest and stays closed for
+    the whole period, or open, has none.
+    """
+    end = 0.5
+    if forces.odd:
+        end = 0.25
+    by_pair: dict[int, list[tuple[float, float]]] = {pair: [] for pair in range(len(forces.contacts))}
+    for episode in episodes:
+        by_pair[episode.pair].append((episode.onset, episode.onset + episode.length))
+
+    departures = []
+    for pair, stops in enumerate(forces.contacts):
+        spans = by_pair[pair]
+        if stops.is_pressed:
+            spans = _between(spans)
+        for begin, stop in spans:
+            middle = (begin + stop) / (4 * np.pi)
+            # The phase from the arc's beginning on, which is moved back by the rounding, to its end moved on by it.
+            if (middle + ROUNDING) % 1 < end + 2 * ROUNDING:
+                departures.append(Departure(middle=middle, length=(stop - begin) / (2 * np.pi)))
+    return departures
+
+
+def _between(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The intervals of phase between ``spans``, which are sorted and do not overlap.
+
+    The last interval ends where the first span begins, one turn later.
+    """
+    after = [*spans[1:], *((begin + 2 * np.pi, stop) for begin, stop in spans[:1])]
+    gaps = [(stop, begin) for (_, stop), (begin, _) in zip(spans, after, strict=True)]
+    return [(begin, stop) for begin, stop in gaps if stop > begin]
