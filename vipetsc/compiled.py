@@ -1,15 +1,5 @@
-"""Compiled kernels, stored between runs until their sources change: ``njit`` and ``cfunc`` as in numba.
+"""Compiled kernels, stored between runs until their sources change: ``njit`` and ``cfunc`` as in numba."""
 
-Numba's own cache checks only the file of a kernel: a kernel that calls a changed kernel of another file, or uses a
-constant of it, would keep the old code. Here the name of the cache folder contains a hash of the kernel's file, of the
-modules from which it uses kernels or constants, and of the tables of numbers, because compiled code contains constants.
-"""
-
-import hashlib
-import logging
-import os
-import re
-import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -21,16 +11,12 @@ from numba.core.caching import FunctionCache
 from numba.core.runtime import rtsys
 
 from vipetsc.kernel import EntryCompiler, Kernel
-from vipetsc.process import cache_folder, compiling, launched_rank, say
+from vipetsc.kernel_cache import ByContent, can_keep, kernel_cache, remove_oldest
+from vipetsc.process import compiling, launched_rank, say
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-logger = logging.getLogger(__name__)
-
 PARENTS: set[Path] = set()  # folders in which kernels are stored
-HAS_KERNELS = re.compile(rb"^(from|import) (vipetsc\.compiled|numba)\b", re.MULTILINE)
-IMPORTS = re.compile(r"^[ \t]*from ([\w.]+) import (\([^)]*\)|.*)$", re.MULTILINE)
-NAME = re.compile(r"\w+")
 
 
 @overload
@@ -76,14 +62,16 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
     def decorate(function: Callable[..., Any]) -> Any:
         config: Any = numba.config
         chosen = config.CACHE_DIR
+        locators = config.CACHE_LOCATOR_CLASSES
         file = Path(function.__code__.co_filename)
         folder = kernel_cache(Path(__file__).parent, file, chosen)
         PARENTS.add(folder.parent)
         config.CACHE_DIR = str(folder)
+        config.CACHE_LOCATOR_CLASSES = f"{ByContent.__module__}.{ByContent.__name__}"
         # Callbacks and kernels with a signature are compiled here, others at their first call.
         if signature:
             compiling.start()
-        keeps = _can_keep(folder.parent)
+        keeps = can_keep(folder.parent)
         try:
             compiled = compiler(*signature, cache=keeps, **options)(function)
             if keeps and not signature:
@@ -93,6 +81,7 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
             if signature:
                 compiling.stop()
             config.CACHE_DIR = chosen
+            config.CACHE_LOCATOR_CLASSES = locators
 
     return decorate
 
@@ -106,6 +95,11 @@ class _KeptCode(FunctionCache):
         rtsys.initialize(target_context)
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Store the code for a signature."""
+        super().save_overload(sig, data)
+        remove_oldest(Path(self.cache_path).parent)
 
 
 class CompilerListener(event.Listener):
@@ -128,85 +122,11 @@ class CompilerListener(event.Listener):
 def _announce() -> None:
     """Report once, on one rank, why the first run of a version takes some 20 s longer than the next."""
     # Where kernels cannot be kept, a warning has said that they are compiled at every start.
-    if not launched_rank() and all(_can_keep(parent) for parent in PARENTS):
+    if not launched_rank() and all(can_keep(parent) for parent in PARENTS):
         say("vipetsc: compiling kernels (once, about 20 s)")
 
 
 event.register("numba:compile", CompilerListener())
-
-
-@cache
-def kernel_cache(package: Path, file: Path, chosen: str = "") -> Path:
-    """The folder for the compiled kernels of a ``file`` of ``package``, named by the hash of ``kernel_sources``.
-
-    It is in ``chosen``, else in the package, else (a package that may not be written to) in the user's cache.
-    """
-    digest = hashlib.sha256()
-    for path in sorted(kernel_sources(package, file)):
-        digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
-
-    if chosen:
-        parent = Path(chosen)
-    elif os.access(package, os.W_OK):
-        parent = package / "__pycache__"
-    else:
-        parent = cache_folder()
-    return parent / f"kernels-{digest.hexdigest()[:16]}"
-
-
-@cache
-def _can_keep(parent: Path) -> bool:
-    """Whether kernels can be written below ``parent``; prints a message if they cannot."""
-    try:
-        parent.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=parent).close()
-    except OSError as error:
-        # Once, on one rank: every command compiles for up to 20 s then.
-        if not launched_rank():
-            reason = error.strerror or error
-            logger.warning(
-                "vipetsc: compiling kernels at every start; the cache %s cannot be written: %s", parent, reason
-            )
-        return False
-    return True
-
-
-def kernel_sources(package: Path, file: Path) -> set[Path]:
-    """Files that the kernels of ``file`` depend on: itself, the files that it imports, and the tables of ``package``.
-
-    Where one of those has kernels too, the files that it imports are among them, and so on.
-    """
-    sources = set(_tables(package))
-    waiting = [file]
-    while waiting:
-        path = waiting.pop()
-        if path not in sources:
-            sources.add(path)
-            waiting += _imports(package, path)
-    return sources
-
-
-@cache
-def _tables(package: Path) -> frozenset[Path]:
-    """The tables of numbers in ``package``, which stand next to its modules; other folders hold what users read."""
-    return frozenset(table for table in package.rglob("*.csv") if (table.parent / "__init__.py").exists())
-
-
-@cache
-def _imports(package: Path, path: Path) -> list[Path]:
-    """The files of ``package`` that the file ``path`` imports; none if it has no kernels."""
-    text = path.read_bytes()
-    if not HAS_KERNELS.search(text):
-        return []
-
-    names = []
-    # Not by Python's parser, which takes longer for all files with kernels than a short run does.
-    for module, imported in IMPORTS.findall(text.decode("utf-8")):
-        if module.split(".")[0] == package.name:
-            # What is imported may be a module, or a name in one.
-            names += [module, *(f"{module}.{name}" for name in NAME.findall(imported))]
-    files = [package.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names]
-    return [file for file in files if file.exists()]
 
 
 # For functions that make no arrays but views: numba counts no references to theirs, which costs more than short sums do

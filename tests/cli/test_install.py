@@ -78,26 +78,7 @@ def site(built, tmp_path_factory) -> Path:
     """Install the wheel into a folder of its own, next to the libraries of this environment."""
     folder = tmp_path_factory.mktemp("site")
     call(*PIP, "install", "--no-deps", "--no-compile", "--target", folder, built[1], cwd=folder)
-    bring_kernels(folder)
     return folder
-
-
-def bring_kernels(site: Path) -> None:
-    """Put kernels compiled for the source, if there are any, where numba looks for those of the installed package.
-
-    The sources are the same; to compile them again takes minutes and tests nothing.
-    """
-    for ours in (ROOT / "vipetsc" / "__pycache__").glob("kernels-*"):
-        for folder in {Path(name).parent for name in tracked() if name.startswith("vipetsc/")}:
-            # Numba's name of a folder depends on where it is.
-            compiled = ours / cache_name(ROOT / folder)
-            if compiled.is_dir():
-                shutil.copytree(compiled, site / "vipetsc" / "__pycache__" / ours.name / cache_name(site / folder))
-
-
-def cache_name(folder: Path) -> str:
-    """Return the name that numba gives to the cache of the modules in a folder."""
-    return f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
 
 
 def test_the_sdist_is_the_source_and_the_wheel_is_the_package(built):

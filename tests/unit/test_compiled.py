@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import numba
 import pytest
 
 import vipetsc
-from vipetsc import compiled, kernel, lowering, process
+from vipetsc import compiled, kernel, kernel_cache, lowering, process
 from vipetsc.dynamics.ts.right_hand_side import compile_callback
 from vipetsc.process import cache_folder
 
@@ -71,19 +72,26 @@ def package(tmp_path):
     (folder / "plain.py").write_text("import numpy\n")
     shutil.copy(compiled.__file__, folder)
     shutil.copy(kernel.__file__, folder)
+    shutil.copy(kernel_cache.__file__, folder)
     shutil.copy(lowering.__file__, folder)
     shutil.copy(process.__file__, folder)
 
-    def ask() -> list:
-        done = subprocess.run([sys.executable, "-c", ASK], cwd=tmp_path, env={"PYTHONPATH": "."}, capture_output=True)
+    def ask(parent: Path = tmp_path) -> list:
+        environment = environment_of(tmp_path)
+        done = subprocess.run([sys.executable, "-c", ASK], cwd=parent, env=environment, capture_output=True)
         assert done.returncode == 0, done.stderr.decode()
         return json.loads(done.stdout)
 
     return folder, ask
 
 
+def environment_of(folder: Path) -> dict[str, str]:
+    """The environment of a process in which the package below is imported, with a user's cache of its own."""
+    return {"PYTHONPATH": ".", "XDG_CACHE_HOME": str(folder / "of-user")}
+
+
 @pytest.mark.slow
-def test_kernels_are_found_again_until_their_sources_change(package):
+def test_kernels_are_found_again_until_their_sources_change(package, tmp_path):
     """Hits are those of the kernel in ``inner``, of the one in ``outer`` that calls it, and of the callback."""
     folder, ask = package
     assert ask() == [[12.0, 7.0], [0, 0, 0], True]
@@ -105,7 +113,11 @@ def test_kernels_are_found_again_until_their_sources_change(package):
     assert ask() == [[31.0, 12.0], [0, 0, 0], True]
 
     # Four versions of inner.py, and five of outer.py.
-    assert len(list(folder.glob("__pycache__/kernels-*"))) == 4 + 5
+    assert len(list(tmp_path.glob("of-user/vipetsc/kernels-*"))) == 4 + 5
+
+    # Those of an equal package elsewhere, whose files are of another time, are the same.
+    shutil.copytree(folder, tmp_path / "elsewhere" / "vipetsc", copy_function=shutil.copyfile)
+    assert ask(tmp_path / "elsewhere") == [[31.0, 12.0], [1, 1, 1], True]
 
 
 def test_a_kernel_is_translated_only_where_python_calls_it():
@@ -125,21 +137,48 @@ def test_a_kernel_is_translated_only_where_python_calls_it():
 def test_kernels_may_be_kept_in_a_chosen_folder(package, tmp_path):
     folder, _ = package
     file = folder / "outer.py"
-    chosen = compiled.kernel_cache(folder, file, str(tmp_path / "chosen"))
-    assert chosen == tmp_path / "chosen" / compiled.kernel_cache(folder, file).name
+    chosen = kernel_cache.kernel_cache(folder, file, str(tmp_path / "chosen"))
+    assert chosen == tmp_path / "chosen" / kernel_cache.kernel_cache(folder, file).name
 
 
-def test_kernels_of_a_package_that_cannot_be_written_are_in_the_users_cache(package, tmp_path, monkeypatch):
-    """Where modes of lattices are kept, too."""
+@pytest.fixture
+def forgotten():
+    """What is known of folders for kernels is forgotten before and after a test, which has others."""
+    functions = (kernel_cache.kernel_cache, kernel_cache.can_keep, kernel_cache.obstacle, kernel_cache.remove_oldest)
+    for function in functions:
+        function.cache_clear()
+    yield
+    for function in functions:
+        function.cache_clear()
+
+
+@pytest.mark.usefixtures("forgotten")
+def test_kernels_are_in_the_users_cache_or_else_in_the_package(package, tmp_path, monkeypatch):
+    """Where modes of lattices are kept, too; on nodes without a home in a package that can be written."""
     folder, _ = package
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "of-user"))
-    monkeypatch.setattr(os, "access", lambda *asked: False)
-    compiled.kernel_cache.cache_clear()
-    try:
-        kernels = compiled.kernel_cache(folder, folder / "outer.py")
-    finally:
-        compiled.kernel_cache.cache_clear()
+    kernels = kernel_cache.kernel_cache(folder, folder / "outer.py")
     assert kernels.parent == cache_folder() == tmp_path / "of-user" / "vipetsc"
+
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc")
+    kernel_cache.kernel_cache.cache_clear()
+    assert kernel_cache.kernel_cache(folder, folder / "outer.py") == folder / "__pycache__" / kernels.name
+
+
+@pytest.mark.usefixtures("forgotten")
+def test_kernels_that_were_used_longest_ago_make_room(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernel_cache, "LARGEST", 250)
+    for age in range(4):
+        folder = tmp_path / f"kernels-{age}"
+        folder.mkdir()
+        (folder / "code").write_bytes(bytes(100))
+        when = time.time() - 2 * kernel_cache.DAY * (age + 1)
+        os.utime(folder, (when, when))
+
+    # One of them is used meanwhile.
+    kernel_cache.note_use(tmp_path / "kernels-2")
+    kernel_cache.remove_oldest(tmp_path)
+    assert {folder.name for folder in tmp_path.iterdir()} == {"kernels-0", "kernels-2"}
 
 
 def test_tables_of_numbers_come_with_the_package():
@@ -181,29 +220,29 @@ def test_the_callback_of_petsc_is_found_again():
 
 def test_a_cache_that_cannot_be_written_is_named_once(caplog, monkeypatch):
     folder = Path("/proc/no-folder")
-    compiled._can_keep.cache_clear()
+    kernel_cache.can_keep.cache_clear()
     for _ in range(2):
-        assert not compiled._can_keep(folder)
+        assert not kernel_cache.can_keep(folder)
     (record,) = caplog.records
     assert f"compiling kernels at every start; the cache {folder} cannot be written" in record.getMessage()
 
     # Of several ranks the first says it for all.
-    compiled._can_keep.cache_clear()
+    kernel_cache.can_keep.cache_clear()
     monkeypatch.setenv("OMPI_COMM_WORLD_RANK", "1")
-    assert not compiled._can_keep(folder)
+    assert not kernel_cache.can_keep(folder)
     assert len(caplog.records) == 1
-    compiled._can_keep.cache_clear()
+    kernel_cache.can_keep.cache_clear()
 
 
 @pytest.mark.slow
-def test_kernels_work_without_a_cache(package, tmp_path):
-    folder, _ = package
-    environment = {"PYTHONPATH": ".", "NUMBA_CACHE_DIR": "/proc/no-folder"}
+@pytest.mark.usefixtures("package")
+def test_kernels_work_without_a_cache(tmp_path):
+    environment = environment_of(tmp_path) | {"NUMBA_CACHE_DIR": "/proc/no-folder"}
     done = subprocess.run([sys.executable, "-c", ASK], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)[0] == [12.0, 7.0]
     assert done.stderr.count("cannot be written") == 1
-    assert not list(folder.glob("__pycache__/kernels-*"))
+    assert not list(tmp_path.rglob("kernels-*"))
 
 
 @pytest.mark.slow
@@ -211,7 +250,7 @@ def test_that_kernels_are_compiled_is_said_once(package, tmp_path):
     """The first process says it in one line, on the first rank alone; the next finds the kernels and says nothing."""
 
     def say(**environment: str) -> list[str]:
-        environment = {"PYTHONPATH": ".", **environment}
+        environment = environment_of(tmp_path) | environment
         done = subprocess.run(
             [sys.executable, "-c", ASK], cwd=tmp_path, env=environment, capture_output=True, text=True
         )
@@ -235,7 +274,9 @@ print(compiling.seconds > before)
 """
 
     def ran() -> str:
-        done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env={"PYTHONPATH": "."}, capture_output=True)
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path, env=environment_of(tmp_path), capture_output=True
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout.decode().strip()
 

@@ -29,6 +29,7 @@ FLOORS = (
     "lattice",
     "parallel",
     "compiled",
+    "kernel_cache",
     "kernel",
     "lowering",
     "plugins",
