@@ -114,6 +114,19 @@ def test_sensitivities(law):
     assert defect.max() <= 1e-7 * size.max()
 
 
+def test_newmarks_sensitivities_are_derivatives_of_its_steps():
+    """They agree with central differences of the same flow, through many contacts."""
+    flow = Newmark(reduced_model("hertz"))
+    start = np.array([3 * CLEARANCE, 1.2 * CLEARANCE, 0.1, -0.2])
+
+    arc = flow.arc(start, 3e-3, 3e-3)
+    differences = FiniteDifferences(flow, 1e-7).arc(start, 3e-3, 3e-3).sensitivity
+
+    assert len(arc.events) >= 8
+    largest = np.abs(arc.sensitivity).max()
+    assert arc.sensitivity == pytest.approx(differences, rel=1e-4, abs=1e-4 * largest)
+
+
 def test_flow_conserves_energy_and_reverses():
     """After more than 50 changes of contact the energy is the same, and the reversed motion leads back."""
     system = reduced_model()

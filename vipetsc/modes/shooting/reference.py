@@ -13,7 +13,8 @@ from petsc4py import PETSc
 
 import numpy as np
 
-from vipetsc.compiled import njit
+from vipetsc.compiled import allocating, kernel
+from vipetsc.dynamics.propagator.linear_system import solve_in_place
 from vipetsc.modes.problem import FlowError
 from vipetsc.modes.shooting import flow
 from vipetsc.modes.shooting.flow import CompiledSystem, Flow, close, restore
@@ -137,78 +138,131 @@ class Tsrk(Flow):
         raise FlowError(f"TSRK does not land on the change of contact {change.contact + 1}")
 
 
-@njit
-def _forces(system: CompiledSystem, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Restoring forces (n,) in N and tangent stiffness (n, n) in N/m at displacements ``u`` (n,) in m."""
+@allocating
+def _forces(system: CompiledSystem, u: np.ndarray, tangent: np.ndarray, a: np.ndarray) -> None:
+    """Put the ``tangent`` stiffness (n, n) in N/m and the accelerations ``a`` (n,) at displacements ``u`` (n,) there.
+
+    Here and below are loops, which are compiled in a quarter of the time that expressions of arrays take.
+    """
+    n = u.size
     side = np.empty(system.contacts.size, np.int64)
-    columns = np.hstack((u.reshape(-1, 1), np.eye(u.size)))
+    # The displacements and a variation by each of them: what pulls the variations back is the tangent stiffness.
+    columns = np.zeros((n, 1 + n))
+    pull = np.empty((n, 1 + n))
+    for i in range(n):
+        columns[i, 0] = u[i]
+        columns[i, 1 + i] = 1.0
     close(system, columns, side)
-    pull = np.empty_like(columns)
-    restore(system, side, columns, pull, (0, u.size, columns.shape[1]))
-    return -pull[:, 0], -pull[:, 1:]
+    restore(system, side, columns, pull, (0, n, 1 + n))
+    for i in range(n):
+        a[i] = pull[i, 0] * system.inverse_mass[i]
+        for j in range(n):
+            tangent[i, j] = -pull[i, 1 + j]
 
 
-@njit
-def _linear_accelerations(system: CompiledSystem, tangent: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """-M^-1 tangent u (n, columns)."""
-    a = np.zeros_like(u)
-    for k in range(u.shape[0]):
-        a -= (system.inverse_mass * tangent[:, k]).reshape(-1, 1) * u[k]
-    return a
+@kernel
+def _solve(system: CompiledSystem, tangent: np.ndarray, quarter: float, matrix: np.ndarray, right: np.ndarray) -> None:
+    """Solve (I + h^2/4 M^-1 tangent) x = ``right`` (n, columns), with ``quarter`` = h^2/4, for x, which replaces it.
+
+    ``matrix`` (n, n) is room for the one in brackets.
+    """
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            matrix[i, j] = quarter * tangent[i, j] * system.inverse_mass[i]
+        matrix[i, i] += 1.0
+    solve_in_place(matrix, right)
 
 
-@njit
-def _matrix(system: CompiledSystem, tangent: np.ndarray, quarter: float) -> np.ndarray:
-    """I + h^2/4 M^-1 tangent, with ``quarter`` = h^2/4."""
-    return quarter * tangent * system.inverse_mass.reshape(-1, 1) + np.eye(tangent.shape[0])
+@kernel
+def _accelerate(system: CompiledSystem, tangent: np.ndarray, u: np.ndarray, a: np.ndarray) -> None:
+    """Put -M^-1 tangent u (n, columns) into ``a``; rows of ``u`` after the first n are not read."""
+    n = tangent.shape[0]
+    for i in range(n):
+        for j in range(u.shape[1]):
+            a[i, j] = 0.0
+            for k in range(n):
+                a[i, j] -= system.inverse_mass[i] * tangent[i, k] * u[k, j]
 
 
-@njit
-def _solve_step(system: CompiledSystem, guess: np.ndarray, a: np.ndarray, quarter: float) -> tuple[np.ndarray, bool]:
+@allocating
+def _solve_step(system: CompiledSystem, guess: np.ndarray, a: np.ndarray, quarter: float, tangent: np.ndarray) -> bool:
     """Newton's method for the accelerations ``a`` (n,) at a step's end, where u = ``guess`` + h^2/4 a.
 
-    Displacements as unknowns would lose digits to 4/h^2. Returns the tangent stiffness there, and whether it converged.
+    Displacements as unknowns would lose digits to 4/h^2. Returns whether it converged, and puts the stiffness (n, n)
+    there into ``tangent``.
     """
+    n = guess.size
+    u = np.empty(n)
+    forced = np.empty(n)
+    matrix = np.empty((n, n))
+    shift = np.empty((n, 1))
     scale = 0.0
-    shift = a
+    largest = 0.0
     for _ in range(60):
-        force, tangent = _forces(system, guess + quarter * a)
-        shift = np.linalg.solve(_matrix(system, tangent, quarter), a + force * system.inverse_mass)
-        a -= shift
-        scale = max(scale, np.abs(a).max())
-        if np.abs(shift).max() <= 1e-14 * scale:
+        for i in range(n):
+            u[i] = guess[i] + quarter * a[i]
+        _forces(system, u, tangent, forced)
+        for i in range(n):
+            shift[i, 0] = a[i] - forced[i]
+        _solve(system, tangent, quarter, matrix, shift)
+
+        largest = 0.0
+        for i in range(n):
+            a[i] -= shift[i, 0]
+            # A singular matrix, or a motion that has overflowed.
+            if not abs(shift[i, 0]) < np.inf:
+                return False
+            scale = max(scale, abs(a[i]))
+            largest = max(largest, abs(shift[i, 0]))
+        if largest <= 1e-14 * scale:
             break
-    return _forces(system, guess + quarter * a)[1], np.abs(shift).max() <= 1e-11 * scale
+
+    for i in range(n):
+        u[i] = guess[i] + quarter * a[i]
+    _forces(system, u, tangent, forced)
+    return largest <= 1e-11 * scale
 
 
-@njit
+@allocating
 def _newmark(system: CompiledSystem, y: np.ndarray, h: float, path: np.ndarray) -> bool:
     """Advance ``y`` (2n, 1 + m) in place along the ``path`` (steps + 1, n) in steps of ``h``; whether it converged."""
-    steps = path.shape[0] - 1
     n = path.shape[1]
+    columns = y.shape[1]
     quarter = 0.25 * h * h
-    u = y[:n].copy()
-    v = y[n:].copy()
-    force, tangent = _forces(system, u[:, 0].copy())
-    a = _linear_accelerations(system, tangent, u)
-    a[:, 0] = -force * system.inverse_mass
-    path[0] = u[:, 0]
+    tangent = np.empty((n, n))
+    a = np.empty((n, columns))
+    orbit = np.empty(n)
+    start = np.empty(n)
+    guess = np.empty((n, columns))
+    new = np.empty((n, columns))
+    matrix = np.empty((n, n))
 
-    for step in range(1, steps + 1):
-        guess = u + h * v + quarter * a
-        orbit = a[:, 0].copy()
-        tangent, converged = _solve_step(system, guess[:, 0].copy(), orbit, quarter)
-        if not converged:
+    for i in range(n):
+        start[i] = y[i, 0]
+        path[0, i] = y[i, 0]
+    _forces(system, start, tangent, orbit)
+    _accelerate(system, tangent, y, a)
+    for i in range(n):
+        a[i, 0] = orbit[i]
+
+    for step in range(1, path.shape[0]):
+        for i in range(n):
+            for j in range(columns):
+                guess[i, j] = y[i, j] + h * y[n + i, j] + quarter * a[i, j]
+            start[i] = guess[i, 0]
+            orbit[i] = a[i, 0]
+        if not _solve_step(system, start, orbit, quarter, tangent):
             return False
 
-        new = np.linalg.solve(_matrix(system, tangent, quarter), _linear_accelerations(system, tangent, guess))
-        new[:, 0] = orbit
-        u = guess + quarter * new
-        v += 0.5 * h * (a + new)
-        a = new
-        path[step] = u[:, 0]
-    y[:n] = u
-    y[n:] = v
+        _accelerate(system, tangent, guess, new)
+        _solve(system, tangent, quarter, matrix, new)
+        for i in range(n):
+            new[i, 0] = orbit[i]
+            for j in range(columns):
+                y[i, j] = guess[i, j] + quarter * new[i, j]
+                y[n + i, j] += 0.5 * h * (a[i, j] + new[i, j])
+                a[i, j] = new[i, j]
+            path[step, i] = y[i, 0]
     return True
 
 
