@@ -47,8 +47,11 @@ def table_of(branch: Branch) -> str:
     return str(LAYOUTS[branch.kind].table(branch))
 
 
-def follow(folder: Path, listener=None, stop=None, resume=False, **nnm) -> Branch:
-    """Follow the out-of-phase branch of linear stops as a case asks for it; ``nnm`` updates its table [nnm]."""
+def follow(folder: Path, listener=None, stop=None, resume=False, saves_all=False, **nnm) -> Branch:
+    """Follow the out-of-phase branch of linear stops as a case asks for it; ``nnm`` updates its table [nnm].
+
+    One that ``saves_all`` is written after every point, which takes no test of the clock.
+    """
     folder.mkdir(exist_ok=True)
     table = {
         "name": "x",
@@ -57,7 +60,10 @@ def follow(folder: Path, listener=None, stop=None, resume=False, **nnm) -> Branc
         "nnm": {"modes": [2], "chart": "auto"} | nnm,
     }
     case = NnmCase.from_table(table)
-    return follow_all(case, folder, MPI.COMM_SELF, resume=resume, listener=listener, stop=stop)[0]
+    with pytest.MonkeyPatch.context() as patch:
+        if saves_all:
+            patch.setattr("vipetsc.modes.branches.follower.SAVE_EVERY", 0.0)
+        return follow_all(case, folder, MPI.COMM_SELF, resume=resume, listener=listener, stop=stop)[0]
 
 
 @pytest.mark.slow
@@ -155,10 +161,8 @@ def test_orbits_have_the_energies_that_are_asked_for(tmp_path):
 
 
 @pytest.mark.slow
-def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(tmp_path, monkeypatch):
+def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(tmp_path):
     """A branch that was stopped in either half, and resumed each time, leaves the files of one that was not."""
-    # The growing branch is written after every point, which takes no test of the clock.
-    monkeypatch.setattr("vipetsc.modes.branches.follower.SAVE_EVERY", 0.0)
     nnm = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.05]}
     nnm |= {"switch": ["period-doubling"], "switch_points": 3}
     parts = tmp_path / "parts"
@@ -170,10 +174,10 @@ def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(
         saved.update(path.name for path in parts.iterdir())
         stop.requested = (branch.name, point.index) in {("out-of-phase-down", 5), ("out-of-phase", 7)}
 
-    first = follow(parts, listener, stop, **nnm)
+    first = follow(parts, listener, stop, saves_all=True, **nnm)
     assert first.ending.startswith("stopped on request")
     assert not (parts / f"{NAME}.h5").exists()
-    second = follow(parts, listener, stop, resume=True, **nnm)
+    second = follow(parts, listener, stop, resume=True, saves_all=True, **nnm)
     assert second.ending == "stopped on request after point 7; continue with --resume"
     assert {f"{NAME}-down.h5", f"{NAME}.h5"} <= saved
 
@@ -208,6 +212,8 @@ class FailBelow:
 
 
 BOTH = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.0295], "locate": False}
+# Without contact above the start either, and with a few points there.
+SHORT = BOTH | {"energy": [0.015, 0.0291]}
 
 
 def files_of(folder: Path) -> dict[str, str]:
@@ -286,40 +292,38 @@ def test_both_parts_that_failed_are_tried_again(tmp_path):
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_a_lower_part_that_is_tried_again_is_stopped_and_resumed(tmp_path, monkeypatch, killed):
+def test_a_lower_part_that_is_tried_again_is_stopped_and_resumed(tmp_path, killed):
     """On request or by a kill: what has been tried again is kept, and the end is that of a branch that never failed."""
-    monkeypatch.setattr("vipetsc.modes.branches.follower.SAVE_EVERY", 0.0)
-    follow(tmp_path / "whole", **BOTH)
+    follow(tmp_path / "whole", **SHORT)
     parts = tmp_path / "parts"
-    follow(parts, FailBelow(3, FlowError("the flow ends here")), **BOTH)
+    follow(parts, FailBelow(3, FlowError("the flow ends here")), **SHORT)
 
     if killed:
         # Any other exception than a method's ends the command wherever it is, as a kill does.
         with pytest.raises(KeyboardInterrupt):
-            follow(parts, FailBelow(6, KeyboardInterrupt()), resume=True, **BOTH)
+            follow(parts, FailBelow(6, KeyboardInterrupt()), resume=True, saves_all=True, **SHORT)
     else:
         stop = StopRequest()
 
         def stop_below(branch, point):
             stop.requested = point.index == 5
 
-        stopped = follow(parts, stop_below, stop, resume=True, **BOTH)
+        stopped = follow(parts, stop_below, stop, resume=True, saves_all=True, **SHORT)
         assert stopped.ending == "stopped on request after point 5; continue with --resume"
         assert not stopped.complete
         assert list(files_of(parts)) == [f"{NAME}.csv", f"{NAME}.h5"]
 
     followed = []
-    resumed = follow(parts, lambda branch, point: followed.append(point.index), resume=True, **BOTH)
+    resumed = follow(parts, lambda branch, point: followed.append(point.index), resume=True, **SHORT)
     # The last point before the kill is in no file: the branch is written after the listener.
     assert followed[0] == 6
     assert resumed.complete
     assert files_of(parts) == files_of(tmp_path / "whole")
 
 
-def test_a_kill_after_the_lower_part_has_ended_leaves_it_as_it_is(tmp_path, monkeypatch):
+def test_a_kill_after_the_lower_part_has_ended_leaves_it_as_it_is(tmp_path):
     """It is not followed again, least of all beyond its end."""
-    monkeypatch.setattr("vipetsc.modes.branches.follower.SAVE_EVERY", 0.0)
-    follow(tmp_path / "whole", **BOTH)
+    follow(tmp_path / "whole", **SHORT)
     parts = tmp_path / "parts"
 
     def kill_above(branch, point):
@@ -327,9 +331,9 @@ def test_a_kill_after_the_lower_part_has_ended_leaves_it_as_it_is(tmp_path, monk
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        follow(parts, kill_above, **BOTH)
+        follow(parts, kill_above, saves_all=True, **SHORT)
     followed = set()
-    follow(parts, lambda branch, point: followed.add(branch.name), resume=True, **BOTH)
+    follow(parts, lambda branch, point: followed.add(branch.name), resume=True, **SHORT)
 
     assert followed == {"out-of-phase"}
     assert files_of(parts) == files_of(tmp_path / "whole")
@@ -337,8 +341,8 @@ def test_a_kill_after_the_lower_part_has_ended_leaves_it_as_it_is(tmp_path, monk
 
 def test_a_kill_at_the_end_of_a_branch_does_not_lengthen_it(tmp_path, monkeypatch):
     """Its last point is written only with the word that it is complete."""
-    monkeypatch.setattr("vipetsc.modes.branches.follower.SAVE_EVERY", 0.0)
-    follow(tmp_path / "whole", energy=[0.0, 0.0295], locate=False)
+    nnm = {"start_energy": 0.029, "energy": [0.0, 0.0291], "locate": False}
+    follow(tmp_path / "whole", **nnm)
     parts = tmp_path / "parts"
 
     def kill(*_):
@@ -347,9 +351,9 @@ def test_a_kill_at_the_end_of_a_branch_does_not_lengthen_it(tmp_path, monkeypatc
     # Jumps are looked for after the last point, before the branch is written as a whole.
     monkeypatch.setattr("vipetsc.modes.branches.orbits.jumps", kill)
     with pytest.raises(KeyboardInterrupt):
-        follow(parts, energy=[0.0, 0.0295], locate=False)
+        follow(parts, saves_all=True, **nnm)
     monkeypatch.undo()
-    follow(parts, resume=True, energy=[0.0, 0.0295], locate=False)
+    follow(parts, resume=True, **nnm)
 
     assert files_of(parts) == files_of(tmp_path / "whole")
 
