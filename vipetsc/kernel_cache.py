@@ -17,6 +17,7 @@ import time
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import llvmlite
 import numba
@@ -38,12 +39,14 @@ NAME = re.compile(r"\w+")
 class ByContent(UserProvidedCacheLocator):
     """Has numba look for code in ``NUMBA_CACHE_DIR`` itself, whose name says of which sources it is.
 
-    Numba would add the path and the time of the source file, in which equal files differ.
+    Numba would add the path of the source file, and older versions the time at which it was written, in which equal
+    files differ.
     """
 
     def __init__(self, function: object, file: str) -> None:
         super().__init__(function, file)
-        self._cache_path = numba.config.CACHE_DIR
+        config: Any = numba.config
+        self._cache_path = config.CACHE_DIR
 
     def get_source_stamp(self) -> str:
         """What must not have changed since code was stored: nothing but the name of the folder."""
