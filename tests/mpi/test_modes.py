@@ -95,3 +95,38 @@ def test_a_branch_that_is_stopped_goes_on_to_the_same_bits(folder):
 
     for name in ("branch-mode-1.h5", "branch-mode-2.h5"):
         assert_same_bits(datasets(folder / name), datasets(whole / name))
+
+
+@pytest.mark.parallel([2])
+def test_an_error_of_one_rank_is_raised_on_all_when_the_others_have_finished(folder):
+    """Such as a listener's, which is not one of the method's failures."""
+    comm = MPI.COMM_WORLD
+
+    def listener(branch, point):
+        if branch.name == "mode-2":
+            raise RuntimeError("of rank 1 alone")
+
+    # Rank 1 follows mode-2.
+    with pytest.raises(RuntimeError, match="of rank 1 alone"):
+        follow_all(three_cells(points=3), folder, comm, listener=listener)
+
+    comm.Barrier()
+    if comm.rank == 0:
+        assert len(read_branch(folder / "branch-mode-1.h5").points) == 4
+
+
+@pytest.mark.parallel([2])
+def test_an_error_of_the_listener_is_raised_on_all_ranks_that_follow_one_branch(folder):
+    """It is called on rank 0 alone, between the points of a lattice that all ranks shoot together."""
+
+    def listener(branch, point):
+        raise RuntimeError("of the listener")
+
+    # As many cells as the orbits' steps couple.
+    table = {
+        "lattice": {"preset": "four-band", "cells": 6},
+        "contacts": {"sites": [2], "clearance": 1.8e-3},
+        "nnm": {"system": "chain", "shooting": "krylov", "start_frequency": [1600.0], "tolerance": 1e-12, "points": 2},
+    }
+    with pytest.raises(RuntimeError, match="of the listener"):
+        follow_all(NnmCase.from_table(table), folder, MPI.COMM_WORLD, listener=listener)

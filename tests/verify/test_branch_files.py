@@ -62,7 +62,7 @@ def follow(folder: Path, listener=None, stop=None, resume=False, saves_all=False
     case = NnmCase.from_table(table)
     with pytest.MonkeyPatch.context() as patch:
         if saves_all:
-            patch.setattr("vipetsc.modes.branches.follower.SAVE_EVERY", 0.0)
+            patch.setattr("vipetsc.modes.branches.growth.SAVE_EVERY", 0.0)
         return follow_all(case, folder, MPI.COMM_SELF, resume=resume, listener=listener, stop=stop)[0]
 
 
@@ -358,11 +358,11 @@ def test_a_kill_at_the_end_of_a_branch_does_not_lengthen_it(tmp_path, monkeypatc
     assert files_of(parts) == files_of(tmp_path / "whole")
 
 
-def test_crossing_branches_follow_the_numbers_of_special_points_that_a_second_try_adds(tmp_path, monkeypatch):
-    """Special points are numbered from the far end below the start on: a longer part below shifts the numbers.
+@pytest.fixture
+def marked_points(monkeypatch):
+    """Special points where there are none: after the second and the fifth point of each part of a branch.
 
-    Linear motions have no special points: the second and the fifth one of each part stand for them, and what crosses
-    there is the branch itself.
+    Linear motions have no special points: regular ones stand for them, and what crosses there is the branch itself.
     """
 
     def locate(problem, left, right, **options):
@@ -371,17 +371,96 @@ def test_crossing_branches_follow_the_numbers_of_special_points_that_a_second_tr
     def switch(shooting, point, amplitude):
         return shooting, replace(point, kind="regular", index=0)
 
-    monkeypatch.setattr("vipetsc.modes.branches.follower.locate", locate)
+    monkeypatch.setattr("vipetsc.modes.branches.growth.locate", locate)
     monkeypatch.setattr("vipetsc.modes.branches.orbits.switch", switch)
-    nnm = BOTH | {"locate": True, "switch": ["period-doubling"], "switch_points": 1}
+
+
+CROSSING = BOTH | {"locate": True, "switch": ["period-doubling"], "switch_points": 1}
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_crossing_branches_follow_the_numbers_of_special_points_that_a_second_try_adds(
+    tmp_path, marked_points, stopped
+):
+    """Special points are numbered from the far end below the start on: a longer part below shifts the numbers.
+
+    That holds for a second try that is stopped after the special point, too.
+    """
     parts = tmp_path / "parts"
-    follow(tmp_path / "whole", **nnm)
-    follow(parts, FailBelow(3, FlowError("the flow ends here")), **nnm)
+    follow(tmp_path / "whole", **CROSSING)
+    follow(parts, FailBelow(3, FlowError("the flow ends here")), **CROSSING)
     before = files_of(parts)
     assert len(before) < len(files_of(tmp_path / "whole"))
 
-    follow(parts, resume=True, **nnm)
+    if stopped:
+        stop = StopRequest()
 
-    after = files_of(parts)
-    assert after == files_of(tmp_path / "whole")
-    assert all(text != after[name] for name, text in before.items())
+        def stop_below(branch, point):
+            stop.requested = branch.name.endswith("-down") and point.index == 5
+
+        half = follow(parts, stop_below, stop, resume=True, **CROSSING)
+        assert half.ending.startswith("stopped")
+        # Both special points below are there, so that the last try adds none: what is wrong now stays.
+        above = [point.index for point in half.points].index(0)
+        assert sum(point.kind != "regular" for point in half.points[:above]) == 2
+    follow(parts, resume=True, **CROSSING)
+
+    # Of crossing branches the tables: one that is resumed without points left tells another number of them.
+    after = {name: text for name, text in files_of(parts).items() if name.endswith("csv")}
+    assert after == {name: text for name, text in files_of(tmp_path / "whole").items() if name.endswith("csv")}
+    assert all(text != after[name] for name, text in before.items() if name.endswith("csv"))
+
+
+def regular_points(branch: Branch) -> int:
+    """The number of regular points of a branch beyond its start."""
+    return len(branch.regular()) - 1
+
+
+def test_a_lower_part_that_is_tried_again_leaves_the_branch_its_number_of_points(tmp_path):
+    """The points above count, too; with more of them the branch is the one that never failed."""
+    whole = follow(tmp_path / "whole", **BOTH)
+    # So that the part above takes what the failure has left.
+    points = 4
+    parts = tmp_path / "parts"
+    first = follow(parts, FailBelow(3, FlowError("the flow ends here")), points=points, **BOTH)
+    assert regular_points(first) == points < regular_points(whole)
+
+    second = follow(parts, resume=True, points=points, **BOTH)
+    assert regular_points(second) == points
+    assert not second.complete
+    assert second.ending == "below the start: 0 points reached: increase nnm.points and resume to continue"
+
+    third = follow(parts, resume=True, **BOTH)
+    assert third.complete
+    assert files_of(parts) == files_of(tmp_path / "whole")
+
+
+def test_a_branch_that_has_used_up_its_points_below_its_start_goes_on_there(tmp_path):
+    """Resumed with more points it is the branch that had them from the beginning."""
+    follow(tmp_path / "whole", **BOTH)
+    parts = tmp_path / "parts"
+    first = follow(parts, points=3, **BOTH)
+    assert [point.index for point in first.points] == [3, 2, 1, 0]
+    assert first.ending == "below the start: 3 points reached: increase nnm.points and resume to continue"
+    assert not first.complete
+    assert list(files_of(parts)) == [f"{NAME}.csv", f"{NAME}.h5"]
+
+    assert follow(parts, resume=True, **BOTH).complete
+    assert files_of(parts) == files_of(tmp_path / "whole")
+
+
+def test_a_table_that_cannot_be_written_costs_no_branch(tmp_path, monkeypatch, caplog):
+    """The branch itself is read, and not computed again."""
+    short = {"energy": [0.0, 0.0295], "locate": False}
+    whole = follow(tmp_path, **short)
+    (tmp_path / f"{NAME}.csv").unlink()
+
+    def refuse(*_):
+        raise OSError("the disk is full")
+
+    monkeypatch.setattr("vipetsc.modes.branches.follower.restore_table", refuse)
+    followed = []
+    branch = follow(tmp_path, lambda *_: followed.append(1), resume=True, **short)
+    assert not followed
+    assert table_of(branch) == table_of(whole)
+    assert "the table of branch out-of-phase is not written: the disk is full" in caplog.text

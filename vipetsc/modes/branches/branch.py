@@ -11,21 +11,22 @@ from vipetsc.modes.problem import S
 
 
 class FailureBelow(NamedTuple):
-    """A failure of the part of a branch below its start, which is tried again when the branch is resumed.
+    """Why the part of a branch below its start is not complete; it goes on when the branch is resumed.
 
-    ``why`` says what failed, ``next_step`` is the step with which the part goes on from its far end. The branch's own
-    ending names the failure; how the part above the start has ended is kept here, in ``ending_above`` and
-    ``complete_above``.
+    ``why`` says what failed, or, with ``failed`` false, that the part has used up its points. ``next_step`` is the step
+    with which the part goes on from its far end. The branch's own ending names the part below; how the part above the
+    start has ended is kept here, in ``ending_above`` and ``complete_above``.
     """
 
     why: str
     next_step: float
     ending_above: str = "not finished"
     complete_above: bool = False
+    failed: bool = True
 
     @property
     def finding(self) -> str:
-        """The failure as a sentence among the branch's findings."""
+        """It as a sentence among the branch's findings."""
         return f"below the start: {self.why}"
 
 
@@ -33,10 +34,15 @@ class FailureBelow(NamedTuple):
 class Branch(Generic[S]):
     """Points of a branch of one ``kind`` (``io.branch_kinds``); with ``next_step`` and ``case`` it can go on later.
 
-    ``dofs`` counts the displacements (or places) for which a point has unknowns. ``findings`` are sentences about the
-    branch: jumps, retracing, return to the linear mode; ``about`` are further attributes of its file, ``extra`` further
-    variables: orbits, comparisons with other flows. ``complete`` says that there is nothing left to follow: the branch
-    has ended by itself, and on both sides of its start if both are asked for.
+    ``dofs`` counts the displacements (or places) for which a point has unknowns. ``next_step`` is the arclength of the
+    step after the last point, 0 without points. ``about`` are further attributes of its file, ``extra`` further
+    variables: orbits, comparisons with other flows.
+
+    ``ending`` says in a sentence how the branch has ended, or that it has failed ("failed: ...") or was stopped
+    ("stopped ..."). ``complete`` says that there is nothing left to follow: the branch has left its range or met
+    itself, on both sides of its start if both are asked for. A branch that failed, was stopped or has used up its
+    points is not complete. ``findings`` are further sentences: jumps, retracing, return to the linear mode, special
+    points that are not located. They are the attribute ``warnings`` of the file.
     """
 
     name: str

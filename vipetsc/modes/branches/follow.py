@@ -9,8 +9,9 @@ from mpi4py import MPI
 
 from vipetsc.io.folder import BRANCHES, Claim, claimed, provenance
 from vipetsc.modes.branches.branch import Branch
-from vipetsc.modes.branches.follower import BranchCase, Follower, Listener, method_of
-from vipetsc.parallel import StopRequest
+from vipetsc.modes.branches.follower import BranchCase, Follower, method_of
+from vipetsc.modes.branches.growth import Listener
+from vipetsc.parallel import StopRequest, on_every_rank
 
 
 def claim_branches(
@@ -18,11 +19,12 @@ def claim_branches(
 ) -> AbstractContextManager[Claim]:
     """Claim ``folder`` for the branches of ``case``, as ``claimed``.
 
-    With ``resume`` the case may differ from the earlier one in where branches end, and in nothing of their physics.
+    With ``resume`` the case must have the physics of the earlier one (``physics`` of its class). It may differ in what
+    does not move a branch: steps, bounds, and numbers of points and of Newton steps.
     """
 
     def difference(earlier: str) -> str | None:
-        # The whole case need not be the same: a branch that has used up its points is resumed with more of them.
+        # A branch that has used up its points is resumed with a case that allows more of them.
         if type(case).from_toml(earlier).physics() == case.physics():
             return None
         return f"--resume needs {case.kept_by_resume}"
@@ -47,11 +49,16 @@ def follow_all(
     branches r, r + n, r + 2n and so on. Where a lattice is shot without dense matrices, all ranks follow one branch
     together, and then the next one.
 
-    A branch that fails is written as far as it came and says why in its ``ending``, and the others go on. Where the
-    part below its start fails, the part above is followed all the same. A ``stop`` ends each branch at its next point,
-    with an ending that begins with "stopped". With ``resume`` branches that were stopped go on to the same bits, and
-    branches that failed, above their start or below it, are tried again from their last point. Returns all branches on
-    rank 0, in the order of the case; an empty list on the others.
+    A branch that fails, by one of ``Method.failures``, is written as far as it came and says why in its ``ending``, and
+    the others go on. Where the part below its start fails, the part above is followed all the same. A ``stop`` ends
+    each branch at its next point, with an ending that begins with "stopped". With ``resume`` branches that were
+    stopped go on to the same bits, and branches that failed or have used up their points, above their start or below
+    it, go on from their last point. Returns all branches on rank 0, in the order of the case; an empty list on the
+    others.
+
+    Any other error of one rank, as where a file cannot be written, is raised on all ranks once the others have followed
+    their branches. Where all ranks follow one branch together, an error that one of them has alone leaves the others
+    waiting, unless it ends them too (``parallel.install_abort_hook``).
     """
     follower = partial(Follower, case, folder, provenance(comm), listener, stop, resume)
     jobs = method_of(case).jobs(case)
@@ -64,11 +71,15 @@ def follow_all(
         return branches
 
     # Neighbours in the list fall to different ranks; no rank waits for another until all are followed.
-    followed: dict[int, list[Branch[Any]]] = {}
     numbers = range(comm.rank, len(jobs), comm.size)
-    if numbers:
+
+    def follow_alone() -> dict[int, list[Branch[Any]]]:
+        if not numbers:
+            return {}
         alone = follower(comm=MPI.COMM_SELF)
-        followed = {number: alone.follow(jobs[number]) for number in numbers}
+        return {number: alone.follow(jobs[number]) for number in numbers}
+
+    followed = on_every_rank(comm, follow_alone)
     # ``gather`` returns None on the other ranks.
     by_number: dict[int, list[Branch[Any]]] = {}
     for of_rank in comm.gather(followed) or []:

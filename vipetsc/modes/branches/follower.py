@@ -5,17 +5,38 @@ and frequency change, or a nonlinear frequency response curve (NFRC), whose para
 another key of the case. Its *points* are single motions. Those of the continuation are regular, and their ``index``
 counts the steps from the start, which has 0; *special* points lie between them, where something changes: a fold of the
 energy or of the frequency, a change of stability, a contact that grazes. A ``Method`` gives the equations of a case's
-branches and their starts, ``Continuation`` makes the steps; this module is the loop around them, with its files. Steps,
-tangents and charts are explained in ``continuation.arclength``.
+branches and their starts, and ``Growth`` continues a branch from one motion to its end. This module says from which
+motions, and keeps the files. Steps, tangents and charts are explained in ``vipetsc.modes.continuation.arclength``.
 
 **Two parts.** An NNM may be followed from its start both to larger and to smaller energies. The part *below the start*,
 towards smaller energies, is computed first, as a branch of its own with the name ``<name>-down``. Then its points are
-put before the start in reverse order, from the far end on, and the part *above* is followed.
+put before the start in reverse order, from the far end on, and the part *above*, towards larger energies, is followed.
+In both parts the index counts the steps from the start: 3, 2, 1, 0, 1, 2. It is not negative, and only the start has 0.
+``nnm.points`` limits both parts together.
 
-**Failures.** What has failed is tried again when the branch is resumed, from the last point before the failure: the
-case may have got other steps, bounds or numbers of Newton steps. That holds for both parts. A part below that fails
-does not stop the part above, whose points do not depend on it; the branch is then not complete, its ending says that it
-failed below the start, and ``Branch.failure_below`` keeps what is needed to go on there.
+**Files.** A branch has the files ``branch-<name>.h5`` and ``.csv``. Every ``SAVE_EVERY`` seconds, where it is stopped
+and where it ends, a growing branch is written whole. What is in the folder, and what a resumed command does:
+
+    State                                   -down             <name>                      Resumed
+    the part below is followed, or stopped  points so far     none                        the part below goes on
+    the part above is followed              the whole part    none, then both parts       the part above goes on
+    stopped or out of points above          none              both parts, not complete    the part above goes on
+    failed or out of points below           none              both parts, not complete,   the part below goes on, then
+                                                              ``failure_below``           the part above
+    the part below is followed again        points so far     as before                   the part below goes on
+    failed at the start                     none              no points                   tried again
+    complete                                none              both parts, complete        read
+
+Of a branch with one part all is as above its start. A kill at any time leaves one of these states. ``Branch`` explains
+``ending``, ``complete`` and ``findings``.
+
+**Failures.** What has failed goes on from its last point when the branch is resumed: the case may have got other steps,
+bounds or numbers of points or of Newton steps, but no other physics. That holds for both parts. A part below that fails
+does not stop the part above, whose points do not depend on it. The same holds for a part that has used up its points.
+
+**Branches that cross** a branch at its special points, or are isolated near it, are followed after it, each with files
+of its own. They have one part, and the variables of their points alone (``Method.finish`` is not called for them).
+Their names have the number of the special point, counted from the far end below the start on.
 
 Phases of this loop are audit events ``vipetsc.<phase>`` of Python, which cost nothing unless a hook listens: the tests
 raise errors and signals there (chapter `trust` of the manual).
@@ -23,7 +44,6 @@ raise errors and signals there (chapter `trust` of the manual).
 
 import logging
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -37,21 +57,16 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.modes.branches.branch import Branch, FailureBelow
 from vipetsc.modes.branches.condensed import CondensedMethod
 from vipetsc.modes.branches.files import read_branch, restore_table, write_branch
+from vipetsc.modes.branches.growth import Growth, Listener
 from vipetsc.modes.branches.lattices import LatticeMethod
 from vipetsc.modes.branches.method import CrossingBranch, Method
 from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.branches.responses import ResponseMethod
-from vipetsc.modes.continuation.arclength import Continuation, StepRule
-from vipetsc.modes.continuation.special import locate
 from vipetsc.modes.problem import ContinuationError, PeriodicProblem
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 
-# Seconds between two writings of a growing branch.
-SAVE_EVERY = 10.0
-
 logger = logging.getLogger(__name__)
 BranchCase = NnmCase | NfrcCase
-Listener = Callable[[Branch[Any], Any], None]
 
 
 def method_of(case: BranchCase) -> type[Method[Any]]:
@@ -68,7 +83,8 @@ def method_of(case: BranchCase) -> type[Method[Any]]:
 class Follower:
     """Follows the branches of a case on the ranks ``comm``, into a folder or, without one, in memory alone.
 
-    ``about`` are attributes of the files. ``listener(branch, point)`` is called on rank 0 after each regular point.
+    ``about`` are attributes of the files. ``listener(branch, point)`` is called on rank 0 after each regular point. All
+    ranks call ``follow`` with the same jobs in the same order.
     """
 
     def __init__(
@@ -85,24 +101,24 @@ class Follower:
         self.case = case
         self.folder = folder
         self.about = about
-        self.listener = listener
         self.stop = stop or StopRequest()
         self.resume = resume
         self.comm = comm
         self.method: Method[Any] = method_of(case)(case, comm)
+        self.growth = Growth(self.method, comm, self.write, listener, self.stop)
 
     def follow(self, job: int) -> list[Branch[Any]]:
         """The branch of a ``job``, one of ``Method.jobs``, then those that cross it, if asked for."""
         # Members of a sweep have the same audit event: hooks count what a case consists of.
         sys.audit("vipetsc.member", job + 1)
-        branch = self._begun(self.method.name(job))
+        branch = self._stored_or_new(self.method.name(job))
         if not branch.complete:
-            self._save(branch, lambda: self._follow(branch, job))
-        # A branch that has points has been written with those below its start: that part's own files, with which a
-        # killed command would have gone on, can go. Before that they must stay: a kill leaves at least one of the two.
+            self._follow_and_write(branch, lambda: self._follow_parts(branch, job))
+        # The file of a branch that has points holds the part below the start, too: that part's own files can go. Not
+        # earlier: a kill must leave one of the two.
         if branch.points:
             self._remove(_name_below(branch))
-        return [branch, *self._further(branch)]
+        return [branch, *self._follow_crossing(branch)]
 
     def _remove(self, name: str) -> None:
         """Remove the files of the branch of that ``name``, if there are any."""
@@ -111,8 +127,8 @@ class Follower:
                 path = self.folder / f"branch-{name}.{suffix}"
                 on_root(self.comm, partial(path.unlink, missing_ok=True))
 
-    def _save(self, branch: Branch[Any], follow: Callable[[], None]) -> None:
-        """Follow a branch and write it, with the reason if it is stopped or fails."""
+    def _follow_and_write(self, branch: Branch[Any], follow: Callable[[], None]) -> None:
+        """Call ``follow`` for a branch, and write it; its ending says why if it is stopped or fails."""
         try:
             follow()
         except StoppedError as stopped:
@@ -129,7 +145,7 @@ class Follower:
         if folder:
             on_root(self.comm, lambda: write_branch(branch, folder, self.about))
 
-    def _follow(self, branch: Branch[Any], job: int) -> None:
+    def _follow_parts(self, branch: Branch[Any], job: int) -> None:
         """Compute the points of a branch, then what its file holds of the whole branch (``Method.finish``)."""
         method = self.method
         problem = method.problem(job)
@@ -139,11 +155,11 @@ class Follower:
                 start = branch.regular()[-1]
                 # A branch is saved with points of its own only once the part below its start is among them.
                 if branch.failure_below is not None:
-                    self._retry_below(branch, problem)
+                    self._resume_below(branch, problem)
             else:
                 start = method.start(problem, job)
                 if method.has_lower_part:
-                    below = self._begun(_name_below(branch))
+                    below = self._stored_or_new(_name_below(branch))
                     branch.failure_below = self._grow_below(below, problem, start)
                     _put_below(branch, below, above=[])
 
@@ -155,23 +171,30 @@ class Follower:
         method.finish(problem, branch)
 
     def _follow_above(self, branch: Branch[Any], problem: PeriodicProblem[Any], start: Any) -> None:
-        """Follow the part above the start from its point ``start`` on, unless only the part below had failed.
+        """Follow the part above the start from its point ``start`` on.
 
-        Raises ContinuationError if the part below has failed, after the part above has been followed.
+        Nothing is followed if that part was already complete. Raises ContinuationError if the part below has failed,
+        after the part above has been followed.
         """
-        failure = branch.failure_below
-        if not branch.complete and not (failure and failure.complete_above):
-            self.grow(branch, problem, start, self.method.rule, self.method.direction)
-            if failure:
-                failure = failure._replace(ending_above=branch.ending, complete_above=branch.complete)
-        if failure:
-            branch.failure_below = failure
+        below = branch.failure_below
+        if not branch.complete and not (below and below.complete_above):
+            # Of a method with both parts the direction is 1.
+            self.growth.run(branch, problem, start, self.method.rule, self.method.direction)
+            if below:
+                below = below._replace(ending_above=branch.ending, complete_above=branch.complete)
+        if below:
+            branch.failure_below = below
             branch.complete = False
-            raise ContinuationError(failure.finding)
+            if below.failed:
+                raise ContinuationError(below.finding)
+            branch.ending = below.finding
 
-    def _grow_below(self, below: Branch[Any], problem: PeriodicProblem[Any], start: Any) -> FailureBelow | None:
-        """Continue the part ``below`` the ``start`` of a branch to its end; returns its failure, if it fails.
+    def _grow_below(
+        self, below: Branch[Any], problem: PeriodicProblem[Any], start: Any, points_above: int = 0
+    ) -> FailureBelow | None:
+        """Continue the part ``below`` the ``start`` of a branch; returns why it is not complete, or None if it is.
 
+        ``points_above`` are the regular points above the start, which count against those that a branch may have.
         Raises StoppedError on request.
         """
         if below.points:
@@ -179,34 +202,37 @@ class Follower:
         if below.complete:
             return None
         try:
-            self.grow(below, problem, start, self.method.rule, direction=-1)
+            is_complete = self.growth.run(
+                below, problem, start, self.method.rule, direction=-1, points_elsewhere=points_above
+            )
         except self.method.failures as error:
             return FailureBelow(why=str(error), next_step=below.next_step)
+
         # From now on, until the whole branch is written, a kill does not take the part away.
         self.write(below)
-        return None
+        if is_complete:
+            return None
+        return FailureBelow(why=below.ending, next_step=below.next_step, failed=False)
 
-    def _retry_below(self, branch: Branch[Any], problem: PeriodicProblem[Any]) -> None:
-        """Continue the part of a branch below its start, which has failed before; raises StoppedError on request."""
+    def _resume_below(self, branch: Branch[Any], problem: PeriodicProblem[Any]) -> None:
+        """Continue the part of a branch below its start, which is not complete; raises StoppedError on request."""
         before = branch.failure_below
         assert before is not None
         first = next(i for i, p in enumerate(branch.points) if p.kind == "regular" and p.index == 0)
         above = branch.points[first + 1 :]
-        # Crossing branches are numbered from the far end below on: new special points there shift their names.
-        crossing_names = [crossing.name for crossing in self.method.further(branch, [])]
+        points_above = sum(p.kind == "regular" for p in above)
 
-        # There are files of the part only if a command was killed that tried it again.
-        below = self._begun(_name_below(branch))
+        # There are files of the part only if a command was killed that went on with it.
+        below = self._stored_or_new(_name_below(branch))
         if not below.points:
             below.points = [_reversed(p) for p in reversed(branch.points[: first + 1])]
             below.next_step = before.next_step
         branch.findings = [finding for finding in branch.findings if finding != before.finding]
-        specials = sum(p.kind != "regular" for p in branch.points[:first])
         try:
-            after = self._grow_below(below, problem, below.points[0])
+            after = self._grow_below(below, problem, below.points[0], points_above)
         except StoppedError:
             branch.failure_below = before._replace(next_step=below.next_step)
-            _put_below(branch, below, above)
+            self._lengthen_below(branch, below, above)
             raise
 
         if after is None:
@@ -214,144 +240,84 @@ class Follower:
             branch.ending = before.ending_above
             branch.complete = before.complete_above
         else:
-            branch.failure_below = before._replace(why=after.why, next_step=after.next_step)
+            branch.failure_below = before._replace(why=after.why, next_step=after.next_step, failed=after.failed)
+        self._lengthen_below(branch, below, above)
+
+    def _lengthen_below(self, branch: Branch[Any], below: Branch[Any], above: list[Any]) -> None:
+        """Put the part ``below`` into its ``branch``, before the points ``above``, in the place of a shorter one.
+
+        Names of crossing branches count special points from the far end below on. New ones there rename all: the files
+        that have the earlier names are removed, before the branch is written.
+        """
+        # ``further`` is asked for names alone: nothing that it yields is followed here.
+        earlier_names = [crossing.name for crossing in self.method.further(branch, [])]
+        specials = _count_special(branch.points)
         _put_below(branch, below, above)
-        if sum(p.kind != "regular" for p in below.points) > specials:
-            for name in crossing_names:
+        if _count_special(branch.points) > specials:
+            for name in earlier_names:
                 self._remove(name)
 
-    def grow(
-        self,
-        branch: Branch[Any],
-        problem: PeriodicProblem[Any],
-        start: Any,
-        rule_of: Callable[[PeriodicProblem[Any], Any, int], StepRule[Any]],
-        direction: int = 1,
-    ) -> None:
-        """Continue ``branch`` from the motion ``start`` until it ends, and locate its special points.
+    def _stored_or_new(self, name: str) -> Branch[Any]:
+        """The branch of that ``name`` as it is in its file when results are resumed, else one without points.
 
-        ``rule_of(problem, start, done)`` gives the steps and the end of a branch that has ``done`` regular points after
-        its start. A ``start`` with a tangent is continued along it. From one without, a branch goes towards growing
-        energy (of an NFRC, its parameter) if the ``direction`` is 1, towards falling energy if it is -1. The branch is
-        saved every ``SAVE_EVERY`` seconds.
-
-        Raises ContinuationError, FlowError or another of the method's ``failures`` if it cannot go on, StoppedError
-        on request; the branch holds the points so far.
+        The ``extra`` variables of the file are not read: those of a branch that is not complete are computed again.
         """
-        method = self.method
-        # Points of an earlier run, and of the part below the start, count against the number that a branch may have;
-        # its start does not.
-        regular = branch.regular()
-        done = max(len(regular) - 1, 0)
-        rule = rule_of(problem, start, done)
-        # ``next_step`` is 0 of a branch without points: its first step is then the rule's.
-        continuation = Continuation(problem, start, rule, direction, branch.next_step or None)
-        check = method.monitor(problem)
-        # The monitor compares a point with all earlier ones, and says so where the branch retraces itself or returns to
-        # the linear mode. A resumed branch has to be judged as one that never stopped.
-        for point in regular:
-            check(point)
-        # The last two points: a special point between the newest two may need the direction of the one before them.
-        one_before_last = None
-        if len(regular) > 1:
-            one_before_last = regular[-2]
-        last = continuation.point
-        why_ended = None
-        saved = time.monotonic()
-        if not branch.points:
-            branch.points = [method.assess(problem, last)]
-
-        try:
-            for point in continuation:
-                sys.audit("vipetsc.step")
-                if method.locates:
-                    missed: list[str] = []
-                    # The step's own end, ``passed``: the rule may have moved ``point`` back to the end of a range, and
-                    # special points of the whole step are wanted.
-                    special = locate(
-                        problem,
-                        left=last,
-                        right=continuation.passed,
-                        chart=rule.chart,
-                        grazing=method.locates_grazing,
-                        before=one_before_last,
-                        missed=missed,
-                    )
-                    branch.findings += missed
-                    # As in regular points, ``next_step`` is that of the step after the one that found them.
-                    branch.points += [method.assess(problem, replace(p, next_step=point.next_step)) for p in special]
-                assessed = method.assess(problem, point)
-                branch.points.append(assessed)
-                branch.next_step = continuation.step
-                if self.listener is not None and self.comm.rank == 0:
-                    self.listener(branch, assessed)
-                why_ended = check(assessed)
-                if why_ended is not None:
-                    branch.findings.append(why_ended)
-                    break
-
-                # Agreed on by all: a signal reaches ranks at different points, and they stop at the same one.
-                stopped = self.stop.agreed(self.comm) and not continuation.finished
-                # One rank's clock decides for all: writing is collective.
-                is_due = self.comm.bcast(time.monotonic() - saved > SAVE_EVERY)
-                # A branch that has ended is written as complete, later: it would go on beyond its end after a kill.
-                if stopped or (is_due and not continuation.finished):
-                    self.write(branch)
-                    saved = time.monotonic()
-                if stopped:
-                    raise StoppedError(f"stopped on request after point {assessed.index}; continue with --resume")
-                one_before_last = last
-                last = point
-        # Where two points may lie on different branches (``Method.jumps``). A branch that fails or is stopped is looked
-        # at as well; one that is resumed finds the same jumps again.
-        finally:
-            jumps = method.jumps(problem, branch.regular())
-            branch.findings += [jump for jump in jumps if jump not in branch.findings]
-        branch.ending = why_ended or continuation.ending
-        branch.complete = why_ended is not None or continuation.finished
-
-    def _begun(self, name: str) -> Branch[Any]:
-        """The branch as it is in its file when results are resumed, else one without points."""
-        fresh = self.method.new_branch(name)
+        new = self.method.new_branch(name)
         folder = self.folder
         if folder is None:
-            return fresh
+            return new
         path = folder / f"branch-{name}.h5"
-        if self.resume and on_root(self.comm, path.exists):
-            try:
-                # Read by one rank: the others must not find another file, or none.
-                stored = on_root(self.comm, lambda: read_branch(path))
-                # The case's bounds may be new, and what a file holds of a whole branch, ``extra``, is computed again.
-                branch = replace(stored, case=fresh.case, about=fresh.about, extra=fresh.extra)
-                # A branch that is complete is not computed again, and its table would stay away.
-                on_root(self.comm, lambda: restore_table(branch, folder))
-                return branch
-            except OSError as error:
-                logger.warning("vipetsc: warning: %s; computed again", error)
-        return fresh
+        if not (self.resume and on_root(self.comm, path.exists)):
+            return new
 
-    def _further(self, branch: Branch[Any]) -> list[Branch[Any]]:
+        try:
+            # Read by one rank: the others must not find another file, or none.
+            stored = on_root(self.comm, lambda: read_branch(path))
+        except OSError as error:
+            self._warn(f"{error}; computed again")
+            return new
+        # The case's bounds may be new.
+        branch = replace(stored, case=new.case, about=new.about, extra=new.extra)
+        try:
+            # A branch that is complete is not written again, and a table that is missing would stay away.
+            on_root(self.comm, lambda: restore_table(branch, folder))
+        except OSError as error:
+            self._warn(f"the table of branch {name} is not written: {error}")
+        return branch
+
+    def _warn(self, text: str) -> None:
+        """Log a warning that all ranks have, on one of them."""
+        if self.comm.rank == 0:
+            logger.warning("vipetsc: warning: %s", text)
+
+    def _follow_crossing(self, branch: Branch[Any]) -> list[Branch[Any]]:
         """The branches that cross ``branch``, and isolated ones near it, as far as they are asked for."""
         branches: list[Branch[Any]] = []
+        # ``further`` looks at ``branches`` whenever it is asked for the next one: no branch is begun twice.
         for crossing in self.method.further(branch, branches):
-            other = self._begun(crossing.name)
+            other = self._stored_or_new(crossing.name)
             branches.append(other)
             if not other.complete:
-                self._save(other, partial(self._cross, other, crossing))
+                self._follow_and_write(other, partial(self._cross, other, crossing))
         return branches
 
     def _cross(self, branch: Branch[Any], crossing: CrossingBranch) -> None:
         """Follow a ``branch`` that crosses another one, or an isolated one near it."""
         sys.audit("vipetsc.switch", branch.name)
-        problem, begin = crossing.start()
+        problem, start = crossing.start()
         if branch.points:
-            begin = branch.regular()[-1]
-        self.grow(branch, problem, begin, crossing.rule)
+            start = branch.regular()[-1]
+        self.growth.run(branch, problem, start, crossing.rule)
 
 
 def _name_below(branch: Branch[Any]) -> str:
     """The name under which the part of a branch below its start is followed."""
     return f"{branch.name}-down"
+
+
+def _count_special(points: list[Any]) -> int:
+    """The number of special points among ``points``."""
+    return sum(p.kind != "regular" for p in points)
 
 
 def _reversed(point: Any) -> Any:

@@ -1,0 +1,160 @@
+"""One continuation of a branch from a motion to its end: its points, special points, warnings and writings.
+
+``Continuation`` makes the steps. Around it, each regular point is *assessed* (``Method.assess`` adds the quantities of
+its file that continuation does not need), compared with all earlier ones by the method's *monitor*, shown to a
+listener, and written from time to time.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from mpi4py import MPI
+
+from vipetsc.modes.branches.branch import Branch
+from vipetsc.modes.branches.method import Method, Monitor
+from vipetsc.modes.continuation.arclength import Continuation, StepRule
+from vipetsc.modes.continuation.special import locate
+from vipetsc.modes.problem import PeriodicProblem
+from vipetsc.parallel import StoppedError, StopRequest, on_root
+
+# Seconds between two writings of a growing branch.
+SAVE_EVERY = 10.0
+
+Listener = Callable[[Branch[Any], Any], None]
+RuleOf = Callable[[PeriodicProblem[Any], Any, int], StepRule[Any]]
+
+
+@dataclass
+class Growth:
+    """Continues branches of a ``method`` on the ranks ``comm``, all of which call it together.
+
+    ``write(branch)`` writes a branch as far as it has come. ``listener(branch, point)``, if there is one, is called on
+    rank 0 after each regular point; what it raises is raised on all ranks. A ``stop`` ends the branch at its next
+    point.
+    """
+
+    method: Method[Any]
+    comm: MPI.Comm
+    write: Callable[[Branch[Any]], None]
+    listener: Listener | None
+    stop: StopRequest
+
+    def run(
+        self,
+        branch: Branch[Any],
+        problem: PeriodicProblem[Any],
+        start: Any,
+        rule_of: RuleOf,
+        direction: int = 1,
+        points_elsewhere: int = 0,
+    ) -> bool:
+        """Continue ``branch`` from the motion ``start`` until it ends; returns whether it is complete then.
+
+        Special points are located between the regular ones.
+
+        ``rule_of(problem, start, done)`` gives the steps and the end of a branch that has ``done`` regular points after
+        its start: those of ``branch``, and ``points_elsewhere`` on the other side of the start. A ``start`` with a
+        tangent is continued along it. From one without, a branch goes towards growing energy (of an NFRC, its
+        parameter) if the ``direction`` is 1, towards falling energy if it is -1.
+
+        Raises ContinuationError, FlowError or another of the method's ``failures`` if it cannot go on, StoppedError
+        on request; the branch holds the points so far.
+        """
+        regular = branch.regular()
+        # Points of an earlier run count against the number that a branch may have; its start does not.
+        done = max(len(regular) - 1, 0) + points_elsewhere
+        rule = rule_of(problem, start, done)
+        # ``next_step`` is 0 of a branch without points: its first step is then the rule's.
+        continuation = Continuation(problem, start, rule, direction, branch.next_step or None)
+        monitor = self.method.monitor(problem)
+        # The monitor compares a point with all earlier ones, and says so where the branch retraces itself or returns to
+        # the linear mode. A resumed branch has to be judged as one that never stopped.
+        for point in regular:
+            monitor(point)
+        if not branch.points:
+            branch.points = [self.method.assess(problem, continuation.point)]
+
+        try:
+            why_ended = self._steps(branch, problem, continuation, rule.chart, monitor)
+        # Also of a branch that fails or is stopped, pairs of neighbouring points are recorded of which one may lie on
+        # another branch. One that is resumed finds the same jumps again.
+        finally:
+            jumps = self.method.jumps(problem, branch.regular())
+            branch.findings += [jump for jump in jumps if jump not in branch.findings]
+        branch.ending = why_ended or continuation.ending
+        branch.complete = why_ended is not None or continuation.finished
+        return branch.complete
+
+    def _steps(
+        self,
+        branch: Branch[Any],
+        problem: PeriodicProblem[Any],
+        continuation: Continuation[Any],
+        chart: str,
+        monitor: Monitor[Any],
+    ) -> str | None:
+        """Add all points to the ``branch``; returns why the ``monitor`` has ended it, or None if it has not.
+
+        ``chart`` is the name of the unknowns in which steps are taken (``Continuation``).
+        """
+        last = continuation.point
+        # A special point between the newest two points may need the direction of the one before them.
+        one_before_last = None
+        regular = branch.regular()
+        if len(regular) > 1:
+            one_before_last = regular[-2]
+
+        saved = time.monotonic()
+        for point in continuation:
+            sys.audit("vipetsc.step")
+            if self.method.locates:
+                missed: list[str] = []
+                special = locate(
+                    problem,
+                    left=last,
+                    # The end of the step itself. It is ``point``, unless the rule has moved that back to the end of a
+                    # range: special points of the whole step are wanted.
+                    right=continuation.passed,
+                    chart=chart,
+                    grazing=self.method.locates_grazing,
+                    before=one_before_last,
+                    missed=missed,
+                )
+                branch.findings += missed
+                # As in regular points, ``next_step`` is that of the step after the one that found them.
+                branch.points += [self.method.assess(problem, replace(p, next_step=point.next_step)) for p in special]
+
+            assessed = self.method.assess(problem, point)
+            branch.points.append(assessed)
+            branch.next_step = continuation.step
+            self._show(branch, assessed)
+            why_ended = monitor(assessed)
+            if why_ended is not None:
+                branch.findings.append(why_ended)
+                return why_ended
+
+            # Agreed on by all: a signal reaches ranks at different points, and they stop at the same one.
+            stopped = self.stop.agreed(self.comm) and not continuation.finished
+            # One rank's clock decides for all: writing is collective.
+            is_due = self.comm.bcast(time.monotonic() - saved > SAVE_EVERY)
+            # A branch that has ended is written later, as complete: after a kill it would go on beyond its end.
+            if stopped or (is_due and not continuation.finished):
+                self.write(branch)
+                saved = time.monotonic()
+            if stopped:
+                raise StoppedError(f"stopped on request after point {assessed.index}; continue with --resume")
+            one_before_last = last
+            last = point
+        return None
+
+    def _show(self, branch: Branch[Any], point: Any) -> None:
+        """Show a regular ``point`` to the listener on rank 0."""
+
+        def call() -> None:
+            if self.listener is not None:
+                self.listener(branch, point)
+
+        on_root(self.comm, call)
