@@ -32,10 +32,13 @@ class CosineTransform:
     """
 
     def __init__(self, rows: int, most: int) -> None:
-        last = rows - 1
-        self._waves = _half_waves(last)
-        self._combined = np.zeros((last, most + most % 2))
-        self._out = np.zeros((rows, most))
+        self._waves = _half_waves(rows - 1)
+        shape = rows, most + most % 2
+        # Whole arrays, which are contiguous, are the only ones that the kernels get: for each layout of an array
+        # there would be one more of them to compile.
+        self._columns = np.zeros(shape)
+        self._combined = np.zeros((rows - 1, shape[1]))
+        self._out = np.zeros(shape)
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
         """``scipy.fft.dct(columns, type=1, axis=0)`` of ``columns`` (t, column): twice the F of each column.
@@ -43,15 +46,16 @@ class CosineTransform:
         The array that is returned is filled anew by the next call.
         """
         count = columns.shape[1]
-        combined = self._combined[:, : count + count % 2]
+        width = count + count % 2
+        self._columns[:, :count] = columns
         # An odd number of columns has one of zeros as the partner of its last one.
-        combined[:, count:] = 0.0
-        out = self._out[:, :count]
+        self._columns[:, count:width] = 0.0
 
-        _combine(columns, self._waves, combined, out)
-        transformed = fft.fft(combined.view(complex), axis=0, overwrite_x=True)
-        _separate(transformed.view(float), out)
-        return out
+        _combine(self._columns, self._waves, width, self._combined, self._out)
+        used = self._combined[:, :width].view(complex)
+        used[:] = fft.fft(used, axis=0, overwrite_x=True)
+        _separate(self._combined, width, self._out)
+        return self._out[:, :count]
 
 
 @lru_cache(maxsize=32)
@@ -62,16 +66,16 @@ def _half_waves(last: int) -> np.ndarray:
 
 
 @kernel
-def _combine(columns: np.ndarray, waves: np.ndarray, combined: np.ndarray, out: np.ndarray) -> None:
-    """Fill ``combined`` (j, column) with y, and row 1 of ``out`` with twice F_1."""
+def _combine(columns: np.ndarray, waves: np.ndarray, width: int, combined: np.ndarray, out: np.ndarray) -> None:
+    """Fill ``width`` columns of ``combined`` (j, column) with y, and of row 1 of ``out`` with twice F_1."""
     last = columns.shape[0] - 1
-    for c in range(columns.shape[1]):
+    for c in range(width):
         out[1, c] = columns[0, c] - columns[last, c]
         combined[0, c] = 0.5 * (columns[0, c] + columns[last, c])
     for j in range(1, last):
         cosine = 2.0 * waves[0, j]
         sine = waves[1, j]
-        for c in range(columns.shape[1]):
+        for c in range(width):
             here = columns[j, c]
             mirrored = columns[last - j, c]
             out[1, c] += cosine * here
@@ -79,16 +83,18 @@ def _combine(columns: np.ndarray, waves: np.ndarray, combined: np.ndarray, out: 
 
 
 @kernel
-def _separate(transformed: np.ndarray, out: np.ndarray) -> None:
-    """Fill ``out`` from the transform (k, column) of y: of each pair of columns its real and its imaginary part."""
+def _separate(transformed: np.ndarray, width: int, out: np.ndarray) -> None:
+    """Fill ``width`` columns of ``out`` from the transform (k, column) of y.
+
+    Of each pair of columns it has the real and the imaginary part.
+    """
     last = out.shape[0] - 1
     for k in range(last // 2 + 1):
         opposite = (last - k) % last
-        for c in range(out.shape[1]):
+        for c in range(width):
             out[2 * k, c] = transformed[k, c] + transformed[opposite, c]
         if k > 0 and 2 * k < last:
             # Of the first column of a pair the imaginary part is in the second one, and the other way round.
-            for c in range(0, out.shape[1], 2):
+            for c in range(0, width, 2):
                 out[2 * k + 1, c] = out[2 * k - 1, c] - (transformed[k, c + 1] - transformed[opposite, c + 1])
-            for c in range(1, out.shape[1], 2):
-                out[2 * k + 1, c] = out[2 * k - 1, c] + (transformed[k, c - 1] - transformed[opposite, c - 1])
+                out[2 * k + 1, c + 1] = out[2 * k - 1, c + 1] + (transformed[k, c] - transformed[opposite, c])

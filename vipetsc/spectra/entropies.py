@@ -149,9 +149,9 @@ def local_entropy(velocity: np.ndarray, stride: int = 1) -> tuple[np.ndarray, np
 
 
 class _FilterPart(NamedTuple):
-    """A ``band`` of the wavenumbers of a transform, and the ``values`` (kappa, k) of filters in it."""
+    """The ``values`` (kappa, k) of filters in a band of the wavenumbers of a transform, from its ``first`` one on."""
 
-    band: slice
+    first: int
     values: np.ndarray
 
 
@@ -174,8 +174,7 @@ class _FastOctave(NamedTuple):
             for part in group:
                 # Folded onto the length: wavenumbers a whole number of lengths apart look the same at every
                 # ``stride``-th cell.
-                start = part.band.start % self.length
-                _filter(spectrum[:, part.band], part.values, x[:, :, start : start + part.values.shape[1]])
+                _filter(spectrum, part.first, part.values, x, part.first % self.length)
             yield fft.ifft(x, overwrite_x=True)
 
 
@@ -249,21 +248,29 @@ def _parts(filters: np.ndarray, length: int) -> list[_FilterPart]:
     inside = np.flatnonzero(_lets_through(filters))
     parts = []
     for cut in range(inside[0] // length * length, inside[-1] + 1, length):
-        band = slice(max(inside[0], cut), min(inside[-1] + 1, cut + length))
-        parts.append(_FilterPart(band=band, values=filters[:, band]))
+        first = max(inside[0], cut)
+        end = min(inside[-1] + 1, cut + length)
+        parts.append(_FilterPart(first=first, values=np.ascontiguousarray(filters[:, first:end])))
     return parts
 
 
 @kernel
-def _filter(spectrum: np.ndarray, values: np.ndarray, x: np.ndarray) -> None:
-    """Add ``spectrum`` (t, k) times the ``values`` (kappa, k) of filters to ``x`` (t, kappa, k)."""
+def _filter(spectrum: np.ndarray, first: int, values: np.ndarray, x: np.ndarray, start: int) -> None:
+    """Add a ``spectrum`` (t, k) times the ``values`` (kappa, k) of filters to ``x`` (t, kappa, k).
+
+    The first of the values belongs to ``first`` in the spectrum, and to ``start`` in ``x``. Whole arrays are
+    contiguous: for views of them there would be one more kernel to compile.
+    """
+    width = values.shape[1]
     for t in range(x.shape[0]):
+        unfiltered = spectrum[t, first : first + width]
         for i in range(x.shape[1]):
-            for k in range(x.shape[2]):
-                z = spectrum[t, k]
+            filtered = x[t, i, start : start + width]
+            for k in range(width):
+                z = unfiltered[k]
                 value = values[i, k]
                 # Part by part: a real factor would be multiplied as a complex one, which takes longer.
-                x[t, i, k] += complex(z.real * value, z.imag * value)
+                filtered[k] += complex(z.real * value, z.imag * value)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
