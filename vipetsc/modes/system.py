@@ -240,6 +240,10 @@ class System:
 
     def linear_modes(self) -> tuple[np.ndarray, np.ndarray]:
         """Frequencies (n,) in rad/s, lowest first, and mass-normalised shapes (n, mode) of small motions about rest."""
+        return self._small_motions
+
+    @cached_property
+    def _small_motions(self) -> tuple[np.ndarray, np.ndarray]:
         # Only dense solvers give all modes.
         squared, shapes = eigh(self.stiffness_at_rest, np.diag(self.masses))
         # eigh leaves the signs open: the largest displacement of each mode is positive.

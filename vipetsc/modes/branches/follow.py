@@ -7,11 +7,13 @@ from typing import Any
 
 from mpi4py import MPI
 
+from vipetsc.case import NnmCase
 from vipetsc.io.folder import BRANCHES, Claim, claimed, provenance
 from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.follower import BranchCase, Follower, method_of
 from vipetsc.modes.branches.growth import Listener
-from vipetsc.parallel import StopRequest, on_every_rank
+from vipetsc.modes.shared_frequencies import check_modes_alone
+from vipetsc.parallel import StopRequest, on_every_rank, on_root
 
 
 def claim_branches(
@@ -20,8 +22,11 @@ def claim_branches(
     """Claim ``folder`` for the branches of ``case``, as ``claimed``.
 
     With ``resume`` the case must have the physics of the earlier one (``physics`` of its class). It may differ in what
-    does not move a branch: steps, bounds, and numbers of points and of Newton steps.
+    does not move a branch: steps, bounds, and numbers of points and of Newton steps. Raises CaseError, before anything
+    is written, for a mode that shares its frequency with others.
     """
+    if isinstance(case, NnmCase):
+        on_root(comm, lambda: check_modes_alone(case))
 
     def difference(earlier: str) -> str | None:
         # A branch that has used up its points is resumed with a case that allows more of them.

@@ -1,0 +1,85 @@
+"""Linear modes with which no branch can begin alone: others have their frequency, or a multiple of it.
+
+Small motions of such modes together are periodic with the period of the one alone. The orbits of that period then are
+no curve: which of them goes on once a contact acts is not determined by the mode. In a ring of equal cells the waves to
+the left and to the right have one frequency, so that nearly all modes come in pairs.
+"""
+
+from typing import NamedTuple
+
+from vipetsc.case import CaseError, NnmCase, Problem
+from vipetsc.modes.system import System
+
+# Squared frequencies are equal within this fraction, or within rounding of the largest one in the eigenvalues.
+SAME = 1e-10
+ROUNDING = 1e-13
+# Masses up to which modes are compared before anything is computed, which then takes a second at most.
+MOST_COMPARED = 1000
+REMEDY = (
+    "choose modes with a frequency of their own (nnm.modes), or make the system less symmetric: cells that differ "
+    '(lattice.profiles, lattice.scatter), ends = "fixed" or "free", other masses'
+)
+
+
+class Companion(NamedTuple):
+    """Another ``mode``, from 0, whose frequency is this ``multiple`` of the one that is asked for."""
+
+    mode: int
+    multiple: int
+
+
+def companions(system: System, mode: int) -> list[Companion]:
+    """The other modes of ``system`` that come to rest with ``mode`` (from 0) after its period.
+
+    Motions of an odd system are sought among those that repeat themselves with the other sign after half of it, in
+    which modes of even multiples have no part.
+    """
+    omega, _ = system.linear_modes()
+    rounding = ROUNDING * omega[-1] ** 2
+    lowest = omega[mode]
+    if not lowest**2 > rounding:
+        return []
+
+    shared = []
+    for other, frequency in enumerate(omega.tolist()):
+        multiple = round(frequency / lowest)
+        is_near = abs(frequency**2 - (multiple * lowest) ** 2) <= SAME * frequency**2 + rounding
+        takes_part = multiple > 0 and (multiple % 2 == 1 or not system.odd)
+        if other != mode and is_near and takes_part:
+            shared.append(Companion(other, multiple))
+    return shared
+
+
+def why_not_alone(system: System, mode: int) -> str:
+    """Why no branch begins with ``mode`` (from 0) alone, and the remedy; empty where one does.
+
+    Where springs or pressed contacts are nonlinear about rest small motions are not linear, and their equations decide.
+    """
+    if not system.is_linear_at_rest:
+        return ""
+    shared = companions(system, mode)
+    if not shared:
+        return ""
+    number = mode + 1
+    equal = [str(companion.mode + 1) for companion in shared if companion.multiple == 1]
+    if equal:
+        others = ", ".join(equal)
+        return f"mode {number} has the frequency of mode {others}: any mixture of these is a mode, too; {REMEDY}"
+    first = shared[0]
+    return (
+        f"mode {first.mode + 1} has {first.multiple} times the frequency of mode {number}: small motions of both "
+        f"together are periodic, too; {REMEDY}"
+    )
+
+
+def check_modes_alone(case: NnmCase) -> None:
+    """Raise CaseError if a mode of the ``case`` shares its frequency; of a large lattice its branch would say so."""
+    if case.nnm.start_frequency or case.nnm.system == "condensed":
+        return
+    system = System.from_case(case)
+    if system.dofs > MOST_COMPARED:
+        return
+    reasons = {mode: why_not_alone(system, mode - 1) for mode in case.nnm.modes}
+    problems = [Problem("nnm.modes", [mode], reason) for mode, reason in reasons.items() if reason]
+    if problems:
+        raise CaseError(problems, case.name)
