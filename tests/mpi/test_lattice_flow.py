@@ -12,6 +12,7 @@ import pytest
 from tests.conftest import on_two
 from tests.models import CLEARANCE, four_band_contact
 from vipetsc.case import NnmCase
+from vipetsc.dynamics.propagator.tangent import TangentPropagator
 from vipetsc.lattice import Chain
 from vipetsc.lattice.cell import four_band
 from vipetsc.modes.balance.stops import Stops
@@ -93,3 +94,26 @@ def test_variations_have_the_same_bits(restitution):
     assert end.tobytes() == end_alone.tobytes()
     assert moved.tobytes() == moved_alone.tobytes()
     assert closed == closed_alone > 0
+
+
+@pytest.mark.parallel([2])
+def test_one_rank_alone_may_look_at_an_orbit():
+    """All ranks stop at the samples that it looks at, and its orbit is the one that nobody looks at."""
+    chain = Chain(four_band("calibrated"), 18, "fixed", (8,), (CLEARANCE,))
+    flow = LatticeFlow(chain, [Stops.both(four_band_contact("hertz"), CLEARANCE)], COMM)
+    start = flow.scatter(1e-5 * np.random.default_rng(3).standard_normal(2 * 18 * 4))
+    seen = []
+    look = None
+    if COMM.rank == 0:
+        look = seen.append
+
+    def end(look):
+        engine = TangentPropagator(flow._model(2 * np.pi / 1600, 5), flow.layout)
+        engine.place(start, 1.0)
+        cells = engine.run(5, look)
+        engine.destroy()
+        return cells
+
+    looked_at = end(look)
+    assert len(seen) == (5 if COMM.rank == 0 else 0)
+    assert looked_at.tobytes() == end(None).tobytes()

@@ -144,8 +144,8 @@ def test_the_approach_velocity_enters_the_linearisation():
     moved = arc.move(change)
 
     arc.engine._forces.clusters.tape.rows["onset"] = 0
-    # The linear steps are recorded from the tape anew.
-    arc.engine._linear = None
+    # The matrices are computed from the tape anew.
+    arc.engine._linearisation = None
     arc.engine._release()
     assert np.abs(arc.move(change) - moved).max() > 1e-3 * np.abs(moved).max()
 
@@ -173,6 +173,42 @@ def test_an_orbit_without_a_tape_has_no_variations():
     engine = TangentPropagator(flow._model(PERIOD, 1), flow.layout, tape_rows=0)
     with pytest.raises(ValueError, match="tape_rows is 0"):
         engine.move(np.zeros((1, 2 * DOFS, CELLS)))
+
+
+def engine_of(flow: LatticeFlow) -> TangentPropagator:
+    """An engine for one orbit of a period, in one sample."""
+    return TangentPropagator(flow._model(PERIOD, 1), flow.layout)
+
+
+def test_an_engine_has_one_orbit_and_moves_variations_only_along_it():
+    """A second orbit would be moved along by the matrices of the first, and without an orbit nothing would move."""
+    flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
+    engine = engine_of(flow)
+    start = irregular_motion((5,))
+    with pytest.raises(RuntimeError, match="call run before move"):
+        engine.move(start[None])
+
+    engine.place(start, 1.0)
+    engine.run(1)
+    engine.move(start[None])
+    with pytest.raises(RuntimeError, match="run another one in another engine"):
+        engine.run(2)
+    with pytest.raises(RuntimeError, match="place a state before"):
+        engine.place(start, 1.0)
+
+
+def test_no_variations_are_moved_to_none():
+    flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
+    arc = flow.arc(irregular_motion((5,)), PERIOD)
+    assert arc.move(np.zeros((0, 2 * DOFS, CELLS))).shape == (0, 2 * DOFS, CELLS)
+
+
+def test_cells_that_are_not_exchanged_are_no_state(monkeypatch):
+    """An error of PETSc at the beginning is raised, as one on the way is."""
+    flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
+    monkeypatch.setattr("vipetsc.dynamics.propagator.tangent.exchange", lambda *_: 77)
+    with pytest.raises(RuntimeError, match="could not exchange cells: error 77"):
+        engine_of(flow).place(irregular_motion((5,)), 1.0)
 
 
 @pytest.mark.parametrize("look", [None, list])

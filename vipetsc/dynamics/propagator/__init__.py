@@ -102,7 +102,8 @@ of them count, and how far. ``groups``: contact DoFs and their groups. ``step_ch
 tables of the collocation. ``substeps``: records of a cluster and of a substep. ``collocation``: one substep. ``kinks``:
 where a contact opens or closes without a change of modes. ``advance``: substeps up to a change of modes. ``forces``:
 changes up to the step's end. ``engine``: steps up to the sample. ``dashpots``, ``free_losses``, ``loss_modes``,
-``loss_tables``, ``losses``: what dashpots dissipate. ``tangent`` and ``tangent_kernels``: variations.
+``loss_tables``, ``losses``: what dashpots dissipate. ``tangent`` and ``tangent_kernels``: variations. ``orbit_tape``:
+contacts of an orbit.
 
 References
 ----------

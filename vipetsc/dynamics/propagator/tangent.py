@@ -1,33 +1,60 @@
 """An orbit of a lattice that nothing drives, and the motion of variations along it.
 
 ``TangentPropagator`` runs the orbit as the engine does, from any given state, and writes each substep in which contacts
-were closed on a tape. From the tape it computes how variations of the orbit's beginning move to its end. Shooting for
-periodic orbits of a whole lattice asks for that: for products of the monodromy matrix with vectors, never the matrix.
+were closed on a tape (``orbit_tape``). From the tape it computes how variations of the orbit's beginning move to its
+end. Shooting for periodic orbits of a whole lattice asks for that: for products of the monodromy matrix with vectors,
+never the matrix.
 
-**Method.** A step of the length H takes the lattice's state y to P y, its free motion, plus L mu, the motion that the
-forces of contacts leave (sec. 5 of the derivation in the package's docstring). The numbers mu are the moments of each
-force F over the step, mu_k = integral of F (1 - s)^k dt, s from 0 to 1. The forces depend on y through few numbers: for
-each cluster, the Taylor coefficients a of the free motion of its DoFs, and the approach velocities q of its sites. With
-the relative displacement w of a site, q is w'_minus, the value of w' at which the present contact began; it is negative
-on the side -. The law scales its damping by q. A variation dy therefore moves by
+Sections are those of the derivation in ``vipetsc.dynamics.propagator``. A *DoF* is the relative displacement w of the
+two masses between which a contact acts, the contact being a *site*, or the displacement of a driven mass. A *cluster*
+is a set of DoFs that are solved for together, since they feel one another within a step (sec. 6). The *mode* of a site
+says whether it is free, closed on the side sigma = + or -, or closed with its force clipped to 0. A *substep* is a part
+of a step in which no mode changes (secs. 3, 4).
 
-    dy+ = P dy + L dmu,    (dmu, dq+) = J (da, dq),    da = T dy,
+**A step** goes from t_0 to t_0 + H, with s = (t - t_0)/H. It takes the lattice's state y = (u, u') to
 
-where T is ``expand_free_motion`` and L is ``apply_impulses``. J is one small matrix for each step and cluster in
-contact: the product of the linearised collocations of the step's substeps, which the tape has, one after the other
-(``tangent_kernels``). It is computed once for the orbit. After that a variation costs as much as a linear step, and the
-small products.
+    y+ = P y + L mu,    mu_k = integral of F (1 - s)^k dt over the step.
 
-**Times of onset and separation** vary with y, too. The variation of the state has no term for them: the force is
-continuous at each change of mode, zero at an onset, at a separation, and where clipping begins and ends. To act earlier
-by dt changes the state by the order of dt^2, and the saltation matrix is the identity (Leine and Nijmeijer 2004,
-ch. 7). Only q feels the instant: an onset at the velocity w' and acceleration w'' comes earlier by dw/w', so that
-dq = dw' - w'' dw/w'. Where the orbit grazes, w' = 0, there is no such derivative; near grazing dq is large, and so are
-the products with variations, if the contact dissipates. Nothing is done about that here.
+P y is the free motion (sec. 1). F is the force of a contact on its w, and L mu the motion that all forces leave. To
+find it, variation of constants is expanded in powers of the time 1 - s that remains after each impulse F dt: with
+A = H^2 M^-1 K and the row c of a DoF, w = c u, sec. 5 gives
 
-In J the ends of substeps are the orbit's, fixed in time. They only divide integrals over time, on whose value they have
-no influence but the error of the collocation: up to that J is the derivative of the flow. The derivative of a program
-that chooses its substeps by the state would have terms for that choice.
+    L mu = (M^-1 sum_m (c (-A)^m)^T H mu_(2m+1)/(2m+1)!,    M^-1 sum_m (c (-A)^m)^T mu_2m/(2m)!).
+
+There are as many moments mu_k as Taylor coefficients in P, 2 ``StepSeries.terms``: what is left out is below the
+truncation of sec. 1.
+
+**Forces** depend on y through few numbers: for each cluster, the Taylor coefficients a of the free motion w(s) =
+sum_k a_k s^k of its DoFs, a = T y with the rows c (-A)^m of sec. 2, and the *approach velocities* q of its sites. The
+approach velocity of a contact is w' at its onset, positive on the side + and negative on the side -. The law scales its
+damping by it:
+
+    F = -sigma f(x) (1 + c w'/q),    x = sigma w - D >= 0,
+
+with the elastic force f of the indentation x, f(0) = 0, the clearance D and the damping c. A law with clipping has
+F = 0 where the bracket is negative. For a contact that is pressed at rest D is negative and c = 0, and the force that
+it has at rest is taken off.
+
+**Variations.** A variation dy of y moves by the derivative of these lines,
+
+    dy+ = P dy + L dmu,    (dmu, dq+) = J (da, dq),    da = T dy.
+
+J is one small matrix for each step and cluster in contact: the product of the linearised collocations of the step's
+substeps, which the tape has, one after the other (``tangent_kernels``). It is computed once for the orbit. After that a
+variation costs as much as a linear step, and the small products. In the code T is ``expand_free_motion`` and L is
+``apply_impulses``.
+
+**Times of onset and separation** vary with y, too. The variation of the state has no term for them, since the force is
+continuous in time at each of these instants: f(0) = 0 at onsets and separations, also where a contact that is pressed
+at rest opens or closes, and the bracket is 0 where clipping begins and ends. To act earlier by dt changes the state by
+the order of dt^2, and the saltation matrix is the identity (Leine and Nijmeijer 2004, ch. 7). Only q depends on the
+instant: an onset at the velocity w' and acceleration w'' comes earlier by dw/w', so that dq = dw' - w'' dw/w'. Where
+the orbit grazes, w' = 0, there is no such derivative; near grazing dq is large, and so are the products with
+variations, if the contact dissipates. Nothing is done about that here.
+
+J treats the ends of substeps as constants. To move such an end changes the integrals by no more than the error of the
+collocation, so that J is the derivative of the exact flow, and not of the program, which chooses its substeps by the
+state.
 
 References
 ----------
@@ -38,6 +65,8 @@ import copy
 from collections.abc import Callable
 from typing import NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 
 from vipetsc.case import Model
@@ -46,7 +75,7 @@ from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.clusters import expand_free_motion
 from vipetsc.dynamics.propagator.engine import Propagator
-from vipetsc.dynamics.propagator.nodes import NODES, at_end
+from vipetsc.dynamics.propagator.orbit_tape import ClosedSubsteps, OrbitContacts, OrbitTape, clearance_on
 from vipetsc.dynamics.propagator.stencil import Halo, exchange
 from vipetsc.dynamics.propagator.step_choice import refusal as refusal_of_steps
 from vipetsc.dynamics.propagator.substeps import create_tape
@@ -55,10 +84,11 @@ from vipetsc.dynamics.propagator.unrecorded import unrecorded_samples
 from vipetsc.dynamics.site_dofs import site_records
 from vipetsc.parallel import on_every_rank
 
-# Rows of the tape of a cluster, one for each closed site in each substep, 208 B each with the motion at the nodes: 1.7
-# MB. A contact of the built-in case takes fewer than 30 substeps, so that there is room for hundreds of contacts in one
-# orbit; one that needs more is refused with the number of rows. The system gives memory to rows as they are written:
-# those that are never used cost none.
+# Rows of the tape of a cluster unless the caller gives another number. A site that is not free has a row in each
+# substep, of 208 B with the motion at the nodes: 1.7 MB. A contact of the built-in case takes fewer than 30 substeps,
+# so that there is room for hundreds of contacts in one orbit; a contact that is pressed at rest has a row in every
+# substep of the orbit. An orbit that needs more is refused with the number of rows. The system gives memory to rows as
+# they are written: those that are never used cost none.
 MOST_TAPE_ROWS = 8192
 
 
@@ -69,59 +99,34 @@ class _Linearisation(NamedTuple):
     the Taylor coefficients a of the cluster's first DoF, of the second and so on, then q of each site. Rows are what it
     gives: as many moments mu of the force on each DoF, then q of each site. All matrices have the size of the largest
     cluster's; a smaller cluster uses the first rows and columns. A DoF has some 30 of them, most of them coefficients:
-    8 kB a step in contact for a site alone, 800 kB for ten sites in one cluster.
+    8 kB a step in contact if no cluster has more than a site, 800 kB if one has ten sites, and then 0.8 GB for 1000
+    steps in contact.
     """
 
     places: np.ndarray
     matrices: np.ndarray
 
 
-class _Moving(NamedTuple):
-    """Workspace of ``variations`` moved together, the ``halo`` for their exchanges, and the PETSc objects behind it."""
+class _Workspace(NamedTuple):
+    """Workspace of ``variations`` that move together, the ``halo`` for their exchanges, the PETSc objects behind it."""
 
     variations: Variations
     halo: Halo
     petsc_objects: list
 
 
-class OrbitContacts(NamedTuple):
-    """Begins and ends (number, 2) in s of times in contact in an orbit.
-
-    One contact takes several ``closed_substeps``, which follow each other. ``departures`` are the times in which a site
-    is closed, or open if it is pressed at rest.
-    """
-
-    closed_substeps: np.ndarray
-    departures: np.ndarray
-
-
-class ClosedSubsteps(NamedTuple):
-    """Substeps (row,) of an orbit in which contacts were closed, in the order of time at each site.
-
-    A substep in which several sites were closed has a row for each. ``site`` counts the lattice's sites from 0,
-    ``side`` is 1 or -1; ``onset`` marks substeps with which a contact begins. A substep ends at ``end`` in s, counted
-    from the orbit's beginning. ``first_rate`` and ``last_rate`` are w' in m/s at both ends; ``w`` and ``rate`` (row,
-    node) are w in m and w' in m/s at the nodes, whose ``weights`` (row, node) in s integrate over the substep.
-    """
-
-    site: np.ndarray
-    side: np.ndarray
-    onset: np.ndarray
-    end: np.ndarray
-    first_rate: np.ndarray
-    last_rate: np.ndarray
-    w: np.ndarray
-    rate: np.ndarray
-    weights: np.ndarray
-
-
 class TangentPropagator(Propagator):
     """The engine of a lattice that nothing drives: one orbit from a given state, and the motion of its variations.
 
-    Call ``place`` once, then ``run`` once, then ``move`` any number of times. States are arrays (2 mass, owned cell)
-    over the masses of a cell, displacements in m before velocities in m/s. The drives of ``model`` are switched off.
-    ``tape_rows`` is the length of each cluster's tape, which takes a row for each closed site in each substep; with 0
-    there is no tape, and ``move`` raises ValueError.
+    It has one orbit: call ``place`` once, then ``run`` once, then ``move`` any number of times; in another order they
+    raise RuntimeError. States are arrays (2 mass, owned cell) over the masses of a cell, displacements in m before
+    velocities in m/s. The drives of ``model`` are switched off. ``tape_rows``, the same on all ranks, is the length of
+    each cluster's tape, which takes a row for each site that is not free in each substep; with 0 there is no tape, and
+    ``move`` raises ValueError.
+
+    Where PETSc fails to exchange cells, RuntimeError is raised on the rank where it does. The others may wait for that
+    rank within the exchange, so that they cannot agree on it: the front door ends all ranks then
+    (``parallel.install_abort_hook``).
     """
 
     def __init__(self, model: Model, layout: Layout, tape_rows: int = MOST_TAPE_ROWS) -> None:
@@ -132,8 +137,9 @@ class TangentPropagator(Propagator):
         # site may touch, as all others are.
         clusters.drives.rows["duration"] = 0.0
         self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), tape_rows))
-        self._linear: _Linearisation | None = None
-        self._moving: _Moving | None = None
+        self._tape = OrbitTape(self._forces, self.series.interval)
+        self._linearisation: _Linearisation | None = None
+        self._workspace: _Workspace | None = None
 
     @classmethod
     def refusal(cls, model: Model) -> str | None:
@@ -147,7 +153,8 @@ class TangentPropagator(Propagator):
         if not model.chain.is_linear:
             return "springs have a quadratic or cubic part; variations are not supported for them"
         sites = site_records(model, np.arange(len(model.chain.sites)))
-        # The clearance is 0 of a site that touches at rest, negative of one that is pressed, which has this one stop.
+        # A site that touches at rest has the clearance 0. A pressed one has a negative clearance, and the other one is
+        # inf: it has only that stop.
         clearance = np.minimum(sites["clearance"], sites["clearance_minus"])
         if (clearance == 0).any():
             return "contacts touch at rest; variations are not supported for them"
@@ -161,15 +168,18 @@ class TangentPropagator(Propagator):
         The errors of substeps in contact are relative to the approach velocity. That of a contact that is closed at the
         beginning is not part of the state: ``speed`` takes its place. All ranks must call it.
 
-        Raises StalledError, on all ranks, for a closed contact that dissipates, whose force depends on it.
+        Raises StalledError, on all ranks, for a closed contact that dissipates, whose force depends on it; RuntimeError
+        after ``run``, or where PETSc fails to exchange cells.
         """
+        if self.steps:
+            raise RuntimeError("the engine has run its orbit: place a state before, or in another engine")
         clusters = self._forces.clusters
         sites = clusters.contacts
         state = self._present_cells()
         state[:] = cells
 
         # The zeroth coefficients of free motion are the relative displacements themselves.
-        exchange(self._halo, 0, state)
+        _raise_failed(exchange(self._halo, 0, state))
         for c in range(len(clusters.state)):
             expand_free_motion(self._forces.dofs, c, self._halo.columns, clusters.taylor)
         w = clusters.taylor[:, 0]
@@ -178,7 +188,7 @@ class TangentPropagator(Propagator):
         # sign of the side that touches. A contact that is pressed at rest has one side, the others that of w.
         is_pressed = np.abs(sites["mode"]) == PERMANENT
         side = np.where(is_pressed, np.sign(sites["mode"]), np.sign(w))
-        closed = side * w > _clearance_on(side, sites)
+        closed = side * w > clearance_on(side, sites)
         if self._layout.comm.allreduce(bool((closed & (sites["damping"] != 0)).any())):
             raise StalledError("a contact that dissipates is closed at the beginning")
 
@@ -195,18 +205,22 @@ class TangentPropagator(Propagator):
     def run(self, samples: int, look: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
         """Advance to the sample number ``samples``, at least 1, counted from 0 at the start; returns the cells there.
 
-        Cells are states (2 mass, owned cell). ``look`` is called with those of the samples 1 to ``samples``. All ranks
-        must call it. Raises StalledError, on all ranks, where the engine stalls, and where the orbit needs more
-        substeps in contact than the tape has rows; ValueError for fewer samples than 1.
+        Cells are states (2 mass, owned cell). ``look``, which some ranks may not have, is called with those of the
+        samples 1 to ``samples``. All ranks must call ``run``. Raises StalledError, on all ranks, where the engine
+        stalls, and where the orbit needs more substeps in contact than the tape has rows; ValueError for fewer samples
+        than 1; RuntimeError for a second orbit.
         """
         if samples < 1:
             raise ValueError(f"samples is {samples}: an orbit needs at least 1")
+        if self.steps:
+            raise RuntimeError("the engine has run its orbit: run another one in another engine")
         tape = self._forces.clusters.tape
-        # Without anything to show the engine goes to the last sample at once.
+        # Where no rank has a state to show the engine goes to the last sample at once.
         numbers = range(samples, samples + 1)
-        if look:
+        if self._layout.comm.allreduce(look is not None, MPI.LOR):
             numbers = range(1, samples + 1)
         for number in numbers:
+            # ``fill`` goes on to the sample ``number``, all ranks alike; without records there is nothing to fill.
             result = self.fill(unrecorded_samples(self._model, self._layout, goal=number))
             # A full tape goes on to count the rows that it lacks; one without rows counts none.
             needed = self._layout.comm.allreduce(int(tape.used.max(initial=0)), max)
@@ -225,138 +239,78 @@ class TangentPropagator(Propagator):
 
     def contacts(self) -> OrbitContacts:
         """The times in contact of the sites that this rank logs."""
-        spans = [np.zeros((0, 2))]
-        departures = []
-        for c in np.flatnonzero(self._forces.logs).tolist():
-            rows = self._tape_rows(c)
-            is_open = self._is_open(c)
-            begin, end = self._times(rows)
-            spans.append(np.column_stack([begin, end])[~is_open])
-
-            # The first substep after an onset is marked. One that begins with the orbit is not, though it begins a
-            # contact as well: that of a site which is closed at the start.
-            is_pressed = np.abs(rows["mode"]) == PERMANENT
-            begins = (rows["onset"] > 0) | (begin == 0.0)
-            is_away = is_open | ~is_pressed
-            for site in np.unique(rows["site"]):
-                here = rows["site"] == site
-                # An opening begins behind a substep in which the contact is closed.
-                opens = is_open[here] & ~np.append(False, is_open[here][:-1])
-                is_first = np.where(is_pressed[here], opens, begins[here])
-                number = np.cumsum(is_first)
-                for departure in range(1, number.max(initial=0) + 1):
-                    of_it = is_away[here] & (number == departure)
-                    departures.append((begin[here][of_it].min(), end[here][of_it].max()))
-        return OrbitContacts(np.concatenate(spans), np.reshape(departures, (-1, 2)))
+        return self._tape.contacts()
 
     def closed_substeps(self) -> list[ClosedSubsteps]:
         """The substeps in which contacts were closed, one record for each cluster that this rank logs."""
-        clusters = self._forces.clusters
-        substeps = []
-        for c in np.flatnonzero(self._forces.logs).tolist():
-            is_closed = ~self._is_open(c)
-            rows = self._tape_rows(c)[is_closed]
-            motion = clusters.tape.motion[c, : clusters.tape.used[c]][is_closed]
-            rate = motion[:, 1]
-            _, end = self._times(rows)
-            length = rows["length"] * self.series.interval
-            # Rows have a site's number in its cluster; ``Forces.sites`` gives those in the lattice, from 1.
-            of_cluster = ClosedSubsteps(
-                site=np.array(self._forces.sites(c), int)[rows["site"]] - 1,
-                side=np.sign(rows["mode"]),
-                onset=rows["onset"] > 0,
-                end=end,
-                first_rate=rows["rate"],
-                last_rate=rate @ at_end(),
-                w=motion[:, 0],
-                rate=rate,
-                weights=clusters.nodes.weight[rows["kind"]] * length[:, None],
-            )
-            substeps.append(of_cluster)
-        return substeps
-
-    def _tape_rows(self, c: int) -> np.ndarray:
-        """The rows (row,) of the tape of cluster ``c`` that are written, of dtype ``TAPE_ROW``."""
-        tape = self._forces.clusters.tape
-        return np.asarray(tape.rows[c, : tape.used[c]])
-
-    def _times(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Begin and end (row,) in s of the substeps in ``rows`` of a tape."""
-        # "begin" is that of the linear step in s; position and length of the substep in it are in units of the step.
-        step = self.series.interval
-        begin = rows["begin"] + rows["position"] * step
-        return begin, begin + rows["length"] * step
-
-    def _is_open(self, c: int) -> np.ndarray:
-        """Mask (row,) of the rows of the tape of cluster ``c`` that belong to an open site.
-
-        The tape has the sites that are not free. Of these only a contact that is pressed at rest may be open.
-        """
-        tape = self._forces.clusters.tape
-        rows = self._tape_rows(c)
-        # A substep ends where such a contact opens or closes: at all nodes it is what it is at one. A node in the
-        # middle is farthest from the ends, where rounding decides.
-        w = tape.motion[c, : tape.used[c], 0, NODES // 2]
-        sites = self._forces.clusters.contacts[self._forces.dofs.first[c] + rows["site"]]
-        side = np.sign(rows["mode"])
-        return np.asarray((np.abs(rows["mode"]) == PERMANENT) & (side * w < _clearance_on(side, sites)))
+        return self._tape.closed_substeps()
 
     def _linearise(self) -> _Linearisation:
         """Compute the matrices J of the orbit from the tape."""
         clusters = self._forces.clusters
         dofs = self._forces.dofs
-        tape = clusters.tape
         places = np.full((self.steps, len(clusters.state)), -1)
-        matrices: list[np.ndarray] = []
+        count = sum(len(self._steps_in_contact(c)[0]) for c in range(len(clusters.state)))
         # Rows and columns as in ``_Linearisation``. Every site is a DoF, and drives are DoFs without q: one number more
         # than the coefficients of each DoF is enough.
         coefficients = clusters.taylor.shape[1]
         largest = int(np.diff(dofs.first).max(initial=0)) * (coefficients + 1)
 
-        # The kernels that carry variations through a substep are those of the motion itself: they add to the energies
-        # what the variations' forces would dissipate, which is taken off again.
+        # The kernels that carry variations through a substep are those of the motion itself. To ``energy`` they would
+        # add what the forces of unit variations dissipate: it is restored below.
         energy = clusters.energy.copy()
+        matrices = np.zeros((count, largest, largest))
+        number = 0
         for c in range(len(clusters.state)):
-            rows = self._tape_rows(c)
-            motion = tape.motion[c, : tape.used[c]]
-            # Rows are in the order of time: those of one step follow each other.
-            steps, first = np.unique(np.rint(rows["begin"] / self.series.interval), return_index=True)
+            rows = self._tape.rows(c)
+            motion = self._tape.motion(c)
+            steps, first = self._steps_in_contact(c)
             stop = np.append(first, len(rows))[1:]
             for step, a, b in zip(steps.astype(int), first, stop, strict=True):
-                places[step, c] = len(matrices)
-                matrices.append(np.zeros((largest, largest)))
-                linearise(clusters, dofs, c, rows[a:b], motion[a:b], matrices[-1])
+                places[step, c] = number
+                linearise(clusters, dofs, c, rows[a:b], motion[a:b], matrices[number])
+                number += 1
         clusters.energy[:] = energy
-        return _Linearisation(places, np.array(matrices).reshape(len(matrices), largest, largest))
+        return _Linearisation(places, matrices)
+
+    def _steps_in_contact(self, c: int) -> tuple[np.ndarray, np.ndarray]:
+        """The steps (step,) in which cluster ``c`` was in contact, and the first row (step,) of each on its tape.
+
+        Rows are in the order of time: those of one step follow each other.
+        """
+        steps, first = np.unique(np.rint(self._tape.rows(c)["begin"] / self.series.interval), return_index=True)
+        return steps, first
 
     def move(self, cells: np.ndarray) -> np.ndarray:
         """Move variations (variation, 2 mass, owned cell) of the beginning to the orbit's end; all ranks must call it.
 
-        The map is linear: variations may have any size, with velocities per s in the unit of the displacements. Raises
-        ValueError for an engine without a tape, and RuntimeError where PETSc fails to exchange cells.
+        The map is linear: if displacements are in any unit, velocities are in that unit per s. Raises ValueError for an
+        engine without a tape, and RuntimeError before ``run``, or where PETSc fails to exchange cells.
         """
         if self._forces.clusters.tape.rows.shape[1] == 0:
             raise ValueError("tape_rows is 0: an orbit without a tape has no variations; tape_rows must be at least 1")
+        if not self.steps:
+            raise RuntimeError("the engine has no orbit yet: call run before move")
         layout = self._layout
         count = len(cells)
+        if count == 0:
+            return cells.copy()
         rows = 2 * layout.dofs
-        if self._linear is None:
-            self._linear = on_every_rank(layout.comm, self._linearise)
-        if self._moving is None or len(self._moving.variations.components) != count:
+        if self._linearisation is None:
+            self._linearisation = on_every_rank(layout.comm, self._linearise)
+        if self._workspace is None or len(self._workspace.variations.components) != count:
             self._release()
-            self._moving = self._create_moving(count, self._linear)
+            self._workspace = self._create_workspace(count, self._linearisation)
 
-        variations = self._moving.variations
+        variations = self._workspace.variations
         variations.components[:, 0, : rows * layout.owned] = cells.reshape(count, -1)
         # dq = 0: of contacts that are closed at the beginning q is the fixed ``speed``, and the others have none yet.
         variations.approach[:] = 0.0
-        error = move_variations(variations, self._stencil, self._moving.halo, self._forces.dofs, layout.owned)
-        if error:
-            raise RuntimeError(f"PETSc could not exchange cells: error {error}")
+        _raise_failed(move_variations(variations, self._stencil, self._workspace.halo, self._forces.dofs, layout.owned))
         moved = variations.components[:, len(variations.places) % 2, : rows * layout.owned]
         return moved.reshape(count, rows, layout.owned).copy()
 
-    def _create_moving(self, count: int, linear: _Linearisation) -> _Moving:
+    def _create_workspace(self, count: int, linear: _Linearisation) -> _Workspace:
         """Create the workspace of ``count`` variations; all ranks must call it."""
         components = np.zeros((count, 2, self._components.shape[1]))
         states = [self._layout.create_vector(array) for pair in components for array in pair]
@@ -371,14 +325,14 @@ class TangentPropagator(Propagator):
             matrices=linear.matrices,
             taylor=taylor,
         )
-        return _Moving(variations, halo, [regions, *states])
+        return _Workspace(variations, halo, [regions, *states])
 
     def _release(self) -> None:
         """Free the workspace of variations, if there is one."""
-        if self._moving is not None:
-            for petsc_object in self._moving.petsc_objects:
+        if self._workspace is not None:
+            for petsc_object in self._workspace.petsc_objects:
                 petsc_object.destroy()
-        self._moving = None
+        self._workspace = None
 
     def destroy(self) -> None:
         """Free the PETSc objects of the variations and of the engine; all ranks must call it."""
@@ -386,6 +340,7 @@ class TangentPropagator(Propagator):
         super().destroy()
 
 
-def _clearance_on(side: np.ndarray, sites: np.ndarray) -> np.ndarray:
-    """The clearances (site,) in m of ``sites`` of dtype ``SITE``, each on its ``side``: + above 0, else -."""
-    return np.where(side > 0, sites["clearance"], sites["clearance_minus"])
+def _raise_failed(code: int) -> None:
+    """Raise RuntimeError for an error ``code`` of PETSc other than 0."""
+    if code:
+        raise RuntimeError(f"PETSc could not exchange cells: error {code}")

@@ -27,7 +27,7 @@ from scipy.integrate import trapezoid
 from scipy.sparse import csr_matrix
 
 from vipetsc.case import NnmCase
-from vipetsc.dynamics.propagator.tangent import ClosedSubsteps
+from vipetsc.dynamics.propagator.orbit_tape import ClosedSubsteps
 from vipetsc.lattice import Contact
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.modes.lattice.krylov import LatticeShooting
