@@ -11,13 +11,17 @@ import pytest
 import xarray as xr
 
 from tests.conftest import assert_same_bits, datasets, with_sections
+from vipetsc import spectra
 from vipetsc.case import Case, Sweep
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.opening import Opening
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest
+from vipetsc.spectra import entropies
 from vipetsc.studies import linear_history
+from vipetsc.studies.analysis import analyse
 from vipetsc.studies.linear_history import LinearHistory, begins_linearly, history_bytes, opening_of
+from vipetsc.studies.opening_entropies import OpeningEntropies
 from vipetsc.studies.sweep import run_sweep
 
 TABLE = {
@@ -175,7 +179,7 @@ def test_a_member_has_the_same_bits_in_every_sweep_and_alone(tmp_path):
     folders = {"all": amplitudes, "some": amplitudes[1:], "fields": amplitudes[1:]}
     records = {}
     for name, values in folders.items():
-        sweep = {"drive": {"amplitude": values}, "measures": ["transfer"], "fields": name == "fields"}
+        sweep = {"drive": {"amplitude": values}, "measures": ["transfer", "entropy"], "fields": name == "fields"}
         plan = Sweep.from_table(TABLE | {"sweep": sweep})
         assert run_sweep(plan, tmp_path / name).complete
         lines = (tmp_path / name / "members.jsonl").read_text().splitlines()
@@ -187,6 +191,8 @@ def test_a_member_has_the_same_bits_in_every_sweep_and_alone(tmp_path):
         other = records["all"][name]
         assert row["measures"] == other["measures"]
         assert row["statistics"]["dissipated"] == other["statistics"]["dissipated"]
+        stored = records["fields"][name]["measures"]
+        assert row["measures"]["entropy/history"] == stored["entropy/history"]
 
     name = plan.ids()[0]
     case = plan.case(0)
@@ -197,6 +203,49 @@ def test_a_member_has_the_same_bits_in_every_sweep_and_alone(tmp_path):
     # It is not by chance that they agree: a run from rest differs in the last bits.
     simulate(case, tmp_path / "rest")
     assert datasets(tmp_path / "rest" / "run.h5")["velocity"].tobytes() != alone["velocity"].tobytes()
+
+
+@pytest.mark.slow
+def test_entropies_before_the_first_contact_are_those_of_the_linear_run(monkeypatch):
+    """They are computed once for all members, whose other snapshots alone are transformed."""
+    sweep = {"drive": {"amplitude": [30.0, 40.0, 50.0]}, "measures": ["entropy"]}
+    plan = Sweep.from_table(TABLE | {"sweep": sweep})
+    transformed = []
+    compute = entropies.local_entropy
+
+    def counted(velocity: np.ndarray, stride: int = 1) -> entropies.LocalEntropy:
+        transformed.append(len(velocity))
+        return compute(velocity, stride)
+
+    monkeypatch.setattr(entropies, "local_entropy", counted)
+    monkeypatch.setattr(spectra, "local_entropy", counted)
+    results = run_sweep(plan)
+    assert results.complete
+
+    # First all snapshots of the linear run, of which none is left.
+    snapshots = transformed[0]
+    assert transformed[:2] == [snapshots, 0]
+    assert max(transformed[2:]) < 0.8 * snapshots
+
+    data = results.dataset
+    for number in range(3):
+        run, _, _ = run_of(plan.case(number), begins=False)
+        alone = analyse(run, ["entropy"], arrival=float(data["entropy/start"][number]))
+        for name in ("energy_weighted", "masked", "joint", "error", "history"):
+            expected = alone[f"entropy/{name}"].values
+            assert data[f"entropy/{name}"][number].values == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_first_entropies_are_those_of_the_scaled_motion():
+    """H does not depend on the amplitude, W goes with its square; the linear run's stay as they are for others."""
+    velocity = np.random.default_rng(3).standard_normal((41, 24, 2))
+    computed: dict = {}
+    for factor in (-3.0, 0.7):
+        first = OpeningEntropies(velocity, computed, samples=22, factor=factor).first(dof=1, every=4, stride=2)
+        expected = entropies.local_entropy(factor * velocity[:22:4, :, 1], stride=2)
+        assert first.local == pytest.approx(expected.local, rel=1e-9, abs=1e-12)
+        assert first.weight == pytest.approx(expected.weight, rel=1e-12)
+    assert len(computed) == 1
 
 
 def test_a_checkpoint_is_scaled_by_what_its_numbers_are():

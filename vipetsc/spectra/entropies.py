@@ -42,6 +42,13 @@ FLOOR = 0.01
 """Points below this fraction of the largest weight are masked, Eq. (d)."""
 
 
+class LocalEntropy(NamedTuple):
+    """H of Eq. (a) in bits, ``local`` (t, cell), and W in the signal's unit squared, ``weight`` (t, cell)."""
+
+    local: np.ndarray
+    weight: np.ndarray
+
+
 @dataclass(frozen=True)
 class Entropy:
     """Entropies in bits over the wavenumber nodes; the means are over the samples from ``start`` on.
@@ -60,26 +67,34 @@ class Entropy:
     error: float
 
 
-def entropy(velocity: np.ndarray, start: int = 0, stride: int = 1, every: int = 1) -> Entropy:
+def entropy(
+    velocity: np.ndarray, start: int = 0, stride: int = 1, every: int = 1, first: LocalEntropy | None = None
+) -> Entropy:
     """Entropy of ``velocity`` (t, cell) in m/s with wavelets at the NODES wavenumbers i pi/NODES, i = 1, 2, ...
 
     ``velocity`` may be an HDF5 dataset: a few snapshots at a time are read. ``start`` is the sample of the linear
     wave's arrival at the first site. Every ``every``-th sample is transformed, and every ``stride``-th cell averaged
-    over; the largest weight of Eq. (d) is sought in the other samples too. Raises ValueError if no sample comes from
-    ``start`` on, or one is not finite.
+    over; the largest weight of Eq. (d) is sought in the other samples too. ``first`` are the entropies of the first
+    snapshots, where they are known. Raises ValueError if no sample comes from ``start`` on, or one is not finite.
     """
     nt = len(velocity)
     if not 0 <= start < nt:
         raise ValueError(f"start = {start}: outside the {nt} samples")
-    local, weight = local_entropy(velocity[::every], stride)
+    snapshots = velocity[::every]
+    if first is None:
+        local, weight = local_entropy(snapshots, stride)
+    else:
+        rest = local_entropy(snapshots[len(first.local) :], stride)
+        local = np.concatenate([first.local, rest.local])
+        weight = np.concatenate([first.weight, rest.weight])
     largest = 0.0
     if every > 1:
         energy = uniform_filter1d(np.square(velocity[start:]), STRONGEST, axis=1).max(axis=1)
         strongest = np.argsort(energy)[-STRONGEST:]
         largest = local_entropy(velocity[start:][strongest], stride)[1].max()
 
-    first = min(-(-start // every), len(local) - 1)
-    return averages(local, weight, first, stride, largest)
+    arrival = min(-(-start // every), len(local) - 1)
+    return averages(local, weight, arrival, stride, largest)
 
 
 def averages(local: np.ndarray, weight: np.ndarray, start: int, stride: int, largest: float = 0.0) -> Entropy:
@@ -120,7 +135,7 @@ def averages(local: np.ndarray, weight: np.ndarray, start: int, stride: int, lar
     )
 
 
-def local_entropy(velocity: np.ndarray, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def local_entropy(velocity: np.ndarray, stride: int = 1) -> LocalEntropy:
     """H (t, cell) in bits and W (t, cell) at every ``stride``-th cell of ``velocity`` (t, cell), in chunks of time.
 
     Every snapshot is scaled by a power of two before and after, so H does not depend on the amplitude. Raises
@@ -145,7 +160,7 @@ def local_entropy(velocity: np.ndarray, stride: int = 1) -> tuple[np.ndarray, np
 
         _entropies(total, s_log_s, local[rows])
         weight[rows] = np.ldexp(total, 2 * exponent[:, None])
-    return local, weight
+    return LocalEntropy(local, weight)
 
 
 class _FilterPart(NamedTuple):

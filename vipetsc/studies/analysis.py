@@ -29,6 +29,7 @@ from vipetsc.studies.analysis_options import describe_options
 from vipetsc.studies.band_measures import BANDS, band_energies
 from vipetsc.studies.dispersion_measures import dispersions_by_side
 from vipetsc.studies.modal_measures import MODAL, modal_energies
+from vipetsc.studies.opening_entropies import OpeningEntropies
 from vipetsc.studies.run_record import record_of
 from vipetsc.studies.velocity_record import VelocityRecord
 
@@ -93,13 +94,15 @@ def analyse(
     options: AnalysisTable | None = None,
     comm: MPI.Comm = MPI.COMM_SELF,
     case: Case | None = None,
+    opening: OpeningEntropies | None = None,
 ) -> xr.Dataset:
     """The content of ``analysis.h5``, from a ``run``, open or in memory, with its case in the attribute ``case``.
 
     Those ``measures`` of ``FULL`` are taken; "maps" are the space-time maps of what else is named. ``arrival`` is the
     paper's t_hat in s, the time of the largest host velocity at the first site in the linear run; by default it is
     estimated from the group velocity: half the burst and the time to the site. ``options`` are the case's where none
-    are given. ``case`` is the run's, where the caller has it. Measures that the run does not allow (no sites, a single
+    are given. ``case`` is the run's, where the caller has it, and ``opening`` the entropies of the snapshots with which
+    a member of a sweep begins. Measures that the run does not allow (no sites, a single
     cell) are left out and named in the attribute ``left_out``; those that the stored samples and cells do not resolve
     are also named in the list ``warnings``.
 
@@ -124,7 +127,8 @@ def analyse(
         return _dataset(LAYOUT | numbers.layout, numbers.values, about, numbers.attributes)
 
     record = on_every_rank(comm, lambda: VelocityRecord(run, case, options))
-    values = _measure(run, record, set(measures) - record.unresolved(), arrival, comm) | numbers.values
+    wavelets = partial(_wavelets, arrival=arrival, opening=opening)
+    values = _measure(run, record, set(measures) - record.unresolved(), wavelets, comm) | numbers.values
     layout = LAYOUT | numbers.layout
     record.warnings += numbers.warnings
     about["left_out"] = "; ".join(record.left_out + record.warnings)
@@ -188,9 +192,16 @@ class MeasuredKind(NamedTuple):
 
 
 def _measure(
-    run: xr.Dataset, record: VelocityRecord, measures: Collection[str], arrival: float | None, comm: MPI.Comm
+    run: xr.Dataset,
+    record: VelocityRecord,
+    measures: Collection[str],
+    by_wavelets: Callable[[VelocityRecord, Collection[str]], dict[str, Any]],
+    comm: MPI.Comm,
 ) -> dict[str, Any]:
-    """The variables of ``measures``, by the ranks of ``comm`` together; the ``record`` says what cannot be computed."""
+    """The variables of ``measures``, by the ranks of ``comm`` together; the ``record`` says what cannot be computed.
+
+    ``by_wavelets`` gives the partition and the entropy of a record.
+    """
     measures = set(measures)
     samples, cells = record.velocity.shape[:2]
 
@@ -207,7 +218,7 @@ def _measure(
         return band_energies(part, measures) if samples > 1 and "bands" in measures else {}
 
     def wavelets(part: VelocityRecord) -> dict[str, Any]:
-        return _wavelets(part, measures, arrival) if samples > 1 and cells > 1 else {}
+        return by_wavelets(part, measures) if samples > 1 and cells > 1 else {}
 
     def modes(part: VelocityRecord) -> dict[str, Any]:
         # The energies of the modes at an instant need no second sample.
@@ -261,7 +272,9 @@ def _maps(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     return values
 
 
-def _wavelets(record: VelocityRecord, measures: Collection[str], arrival: float | None) -> dict[str, Any]:
+def _wavelets(
+    record: VelocityRecord, measures: Collection[str], arrival: float | None, opening: OpeningEntropies | None
+) -> dict[str, Any]:
     """Wavenumber entropy of the host velocity, and partition of the velocity, at snapshots."""
     nt, cells = record.velocity.shape[:2]
     if cells > MOST_CELLS and {"partition", "entropy"} & set(measures):
@@ -274,11 +287,13 @@ def _wavelets(record: VelocityRecord, measures: Collection[str], arrival: float 
     if "partition" in measures:
         values |= _partition(record, stride * record.options.snapshot_stride, maps)
     if "entropy" in measures:
-        values |= _entropies(record, stride, arrival, maps)
+        values |= _entropies(record, stride, arrival, opening, maps)
     return values
 
 
-def _entropies(record: VelocityRecord, stride: int, arrival: float | None, maps: bool) -> dict[str, Any]:
+def _entropies(
+    record: VelocityRecord, stride: int, arrival: float | None, opening: OpeningEntropies | None, maps: bool
+) -> dict[str, Any]:
     """Entropy of the host velocity at every ``stride``-th sample, with its ``maps``."""
     options = record.options
     time = record.time[:: stride * options.snapshot_stride]
@@ -289,8 +304,18 @@ def _entropies(record: VelocityRecord, stride: int, arrival: float | None, maps:
     # A record that ends before keeps its last snapshot.
     start = min(int(np.searchsorted(time, arrival)), len(time) - 1)
 
-    host = np.ascontiguousarray(record.velocity[::stride, :, record.model.chain.cell.host])
-    entropy = spectra.entropy(host, start * options.snapshot_stride, options.cell_stride, options.snapshot_stride)
+    host = record.model.chain.cell.host
+    velocity = np.ascontiguousarray(record.velocity[::stride, :, host])
+    first = None
+    if opening:
+        first = opening.first(host, stride * options.snapshot_stride, options.cell_stride)
+    entropy = spectra.entropy(
+        velocity,
+        start=start * options.snapshot_stride,
+        stride=options.cell_stride,
+        every=options.snapshot_stride,
+        first=first,
+    )
     # The result from half of the snapshots and cells estimates the error of the result from all.
     local = entropy.local[start:][::2, ::2]
     weight = entropy.weight[start:]

@@ -28,6 +28,7 @@ from vipetsc.studies.linear_run import (
     reached,
     signed_factor,
 )
+from vipetsc.studies.opening_entropies import Computed, OpeningEntropies
 from vipetsc.studies.recorded_runs import completed
 
 FEWEST_MEMBERS = 3  # of a linear run whose history is worth its computation: it costs a run, and saves a part of each
@@ -46,13 +47,14 @@ class LinearHistory(NamedTuple):
     """A linear run with all samples of its motion: the dataset ``run``, empty on all ranks but the first.
 
     ``checkpoints`` are the parts of all ranks; ``envelope`` (checkpoint, cell) in m is that of ``LinearRun``, of the
-    samples before each checkpoint. ``statistics`` are the run's.
+    samples before each checkpoint. ``statistics`` are the run's, ``entropies`` those that members have asked for.
     """
 
     run: xr.Dataset
     checkpoints: list[list[Arrays]]
     envelope: np.ndarray
     statistics: dict[str, Any]
+    entropies: Computed
 
     @classmethod
     def of(cls, case: Case, comm: MPI.Comm, stop: StopRequest) -> Self:
@@ -65,7 +67,7 @@ class LinearHistory(NamedTuple):
             stops = [int(parts[0]["samples"]) for parts in memory.states]
             envelope = np.sqrt(np.maximum.accumulate(envelope_squares(memory.dataset, stops), axis=0))
         run = xr.Dataset() if memory.dataset is None else memory.dataset
-        return cls(run, memory.states, comm.bcast(envelope), result.statistics)
+        return cls(run, memory.states, comm.bcast(envelope), result.statistics, entropies={})
 
     def with_velocity_alone(self) -> Self:
         """The history without displacements, which takes half of the memory."""
@@ -83,6 +85,10 @@ class LinearHistory(NamedTuple):
         if not before_contact:
             return None
         return Opening(self.run, self.checkpoints[before_contact - 1], signed_factor(case))
+
+    def opening_entropies(self, samples: int, factor: float) -> OpeningEntropies:
+        """The entropies of the first ``samples``, of a run that has them times a ``factor``; on the first rank."""
+        return OpeningEntropies(self.run["velocity"].values, self.entropies, samples, factor)
 
 
 def begins_linearly(plan: Sweep, case: Case) -> bool:

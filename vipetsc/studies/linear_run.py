@@ -23,6 +23,7 @@ from vipetsc.lattice.chain import Pair, cells_between
 from vipetsc.spectra.measures import MEASURES as REGISTRY
 from vipetsc.spectra.measures import PART, UNSETTLED, group_of, is_measure, row_of
 from vipetsc.studies.analysis import analyse
+from vipetsc.studies.opening_entropies import OpeningEntropies
 from vipetsc.studies.recorded_runs import RecordPaths
 
 # A member is scaled where its linear wave stays below this fraction of every clearance: the largest w between samples
@@ -51,10 +52,18 @@ class LinearRun(NamedTuple):
     measures: dict[int, Record]
 
     @classmethod
-    def of(cls, run: xr.Dataset, statistics: dict[str, Any], sites: Collection[int], names: Collection[str]) -> Self:
+    def of(
+        cls,
+        run: xr.Dataset,
+        statistics: dict[str, Any],
+        sites: Collection[int],
+        names: Collection[str],
+        entropies: OpeningEntropies | None = None,
+    ) -> Self:
         """Take the wave of a ``run`` with both fields of all cells, and the measures ``names`` of it.
 
-        They are measured for each of the first ``sites`` (cells; 0 for none).
+        They are measured for each of the first ``sites`` (cells; 0 for none), with the ``entropies`` of all its
+        snapshots where the caller keeps them.
         """
         samples = run.sizes["time"]
         blocks = [*range(BLOCK, samples, BLOCK), samples]
@@ -66,7 +75,8 @@ class LinearRun(NamedTuple):
             measures={},
         )
         for site in sites:
-            wave.measures[site] = measured(analyse(with_site(run, site), names, wave.arrival_at(site)))
+            analysis = analyse(with_site(run, site), names, wave.arrival_at(site), opening=entropies)
+            wave.measures[site] = measured(analysis)
         return wave
 
     def arrival_at(self, site: int) -> float | None:

@@ -2,8 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import partial
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from mpi4py import MPI
@@ -69,7 +68,8 @@ class SweepRuns:
             history = self._make_history(case)
 
             def measure() -> LinearRun:
-                linear = LinearRun.of(history.run, history.statistics, sites, self.measures)
+                entropies = history.opening_entropies(samples=history.run.sizes["time"], factor=1.0)
+                linear = LinearRun.of(history.run, history.statistics, sites, self.measures, entropies)
                 self.recorded.file.append(linear.record(name))
                 return linear
 
@@ -127,8 +127,7 @@ class SweepRuns:
             record = _scaled(case, linear, name, site)
         else:
             status = COMPLETE
-            opening = partial(self._opening, case, name)
-            record = self._simulate(case, self.folder / self.ids[number], linear.arrival_at(site), opening)
+            record = self._simulate(case, self.folder / self.ids[number], linear.arrival_at(site), name)
         record |= {"rtol": case.time.rtol, "cpu_seconds": round(time.process_time() - begin, 4)}
         on_root(self.recorded.team, lambda: self._append(number, status, record))
 
@@ -160,10 +159,11 @@ class SweepRuns:
         }
         self.recorded.file.append(about | record)
 
-    def _simulate(
-        self, case: Case, folder: Path, arrival: float | None, opening: Callable[[], Opening | None]
-    ) -> Record:
-        """Simulate and measure a member with all its samples and cells; what is kept of them is cut out after that."""
+    def _simulate(self, case: Case, folder: Path, arrival: float | None, name: str) -> Record:
+        """Simulate and measure a member with all its samples and cells; what is kept of them is cut out after that.
+
+        ``name`` is that of its linear run.
+        """
         fields = self.plan.options.fields
         all_kept = keeps_all(case) and "displacement" in case.output.fields
 
@@ -186,21 +186,27 @@ class SweepRuns:
             simulated = _with_everything(case, [*FIELDS])
             if all_kept:
                 simulated = case
-        result = self.recorded.simulate(simulated, output, opening)
+        # A run that is resumed needs none; its measures do, which have the same bits as without a stop.
+        opening = self._opening(case, name)
+        result = self.recorded.simulate(simulated, output, lambda: opening)
 
         def measure() -> Record:
+            entropies = None
+            history = self._histories.get(name)
+            if opening and history:
+                entropies = history.opening_entropies(opening.samples, opening.factor)
             run = memory.dataset
             if run is None:
                 run = open_run(folder / "run.h5")
             with run:
-                analysis = analyse(run, self.measures, arrival, case=simulated)
+                analysis = analyse(run, self.measures, arrival, case=simulated, opening=entropies)
                 if fields and not all_kept:
                     write_netcdf(folder / "run.h5", thinned(run, case).assign_attrs(case=case.to_toml()))
             if fields:
                 about = origin() | analysis.attrs
                 write_netcdf(folder / "analysis.h5", analysis.assign_attrs(about, case=case.to_toml()))
-                for name in ("summary.json", "case.toml"):  # their content is in the record and in the run
-                    (folder / name).unlink(missing_ok=True)
+                for file in ("summary.json", "case.toml"):  # their content is in the record and in the run
+                    (folder / file).unlink(missing_ok=True)
             return {
                 "reason": result.sentence,
                 "statistics": result.statistics,
