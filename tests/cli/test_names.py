@@ -13,6 +13,7 @@ import pytest
 
 from tests.conftest import clean_environment
 from tests.faults.scenarios import SCENARIOS, prepare, words_of
+from vipetsc.figures.registry import FIGURES
 from vipetsc.io.names import path_named, readable
 
 # Without the last two Python would replace the locale by UTF-8 itself.
@@ -75,20 +76,24 @@ def test_a_name_becomes_a_path_in_any_locale():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("verb", ["run", "sweep"])
-def test_an_ascii_locale_takes_names_in_utf_8(by_shell, tmp_path, verb):
+@pytest.mark.parametrize(
+    ("verb", "options", "file"), [("run", "", "runs/λ/run.h5"), ("sweep", " --out hülle", "hülle/ensemble.h5")]
+)
+def test_an_ascii_locale_takes_names_in_utf_8(by_shell, tmp_path, verb, options, file):
+    """The folder has the name of the case or that of ``--out``, which the verbs read by the same code."""
     (tmp_path / "größe.toml").write_text(f'name = "λ"\n{TINY}', encoding="utf-8")
-    ended = by_shell(verb, "größe.toml".encode())
+    command = f"{verb} größe.toml{options} --log größe.log"
+    # As bytes, since in this test's own locale subprocess might encode them otherwise.
+    ended = by_shell(*command.encode().split())
     assert ended.returncode == 0, ended.stderr.decode()
     assert b"Traceback" not in ended.stderr
-    assert (tmp_path / "runs/λ/case.toml").read_text(encoding="utf-8").startswith('name = "λ"')
-    # As bytes, since in this test's own locale subprocess might encode them otherwise.
-    again = by_shell(verb, "größe.toml".encode(), "--out", "hülle".encode(), "--log", "größe.log".encode())
-    assert again.returncode == 0, again.stderr.decode()
-    name = "run.h5" if verb == "run" else "ensemble.h5"
-    with h5py.File(tmp_path / "hülle" / name) as file:
+    assert (tmp_path / "größe.log").read_text(encoding="utf-8")
+
+    result = tmp_path / file
+    assert (result.parent / "case.toml").read_text(encoding="utf-8").startswith('name = "λ"')
+    with h5py.File(result) as results:
         # HDF5 stores text as UTF-8: a surrogate in it would have failed.
-        assert file.attrs["command"] == f"vipetsc {verb} größe.toml --out hülle --log größe.log"
+        assert results.attrs["command"] == f"vipetsc {command}"
 
 
 @pytest.mark.slow
@@ -98,6 +103,9 @@ def test_a_folder_may_have_bytes_that_are_no_text(in_process, monkeypatch, tmp_p
     scenario = SCENARIOS[verb]
     case = prepare(scenario, tmp_path)
     out = tmp_path / NO_TEXT
+    # All pictures of a run go into one folder: one is enough.
+    for name in FIGURES.keys() - {"ledger"}:
+        monkeypatch.delitem(FIGURES, name)
     for words in filter(None, (scenario.before, scenario.words)):
         call = words_of(words, case, out)
         # The recorded command is that of the process.

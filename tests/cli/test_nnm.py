@@ -32,10 +32,10 @@ def case(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
-def test_a_branch_leaves_its_files_and_its_picture_and_is_not_computed_twice(vipetsc, in_process, case, tmp_path):
+def test_a_branch_leaves_its_files_and_its_picture_and_is_not_computed_twice(in_process, case, tmp_path):
     """The same command writes nothing, mends what was cut off, and replaces another case's branch by force alone."""
     out = tmp_path / "out"
-    done = vipetsc(0, "nnm", case, "--out", out)
+    done = in_process("nnm", case, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "fold-energy: 2" in done.stdout
     # The live table.

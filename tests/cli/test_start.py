@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -14,42 +15,52 @@ pytestmark = pytest.mark.parallel(1)
 HEAVY = {"matplotlib", "numba", "pandas", "scipy.interpolate", "scipy.optimize", "xarray"}
 CASE = Path("runs/examples/three-mass.toml")
 
-REPORT = f"""
-import sys
+# Several commands in turn: none of the first ones may load what it could leave to a later one.
+REPORT = """
+import json, sys
+from tests.coarse import coarse_pictures
 from vipetsc.__main__ import main
 
-try:
-    main(sys.argv[1:])
-finally:
-    print("loaded:", *sorted({HEAVY!r} & sys.modules.keys()))
+# PETSc takes a name that begins with a dash for an option.
+commands = json.loads(sys.argv[1])
+sys.argv[0] = "vipetsc"
+for command in commands:
+    if command[0] == "plot":
+        # What a picture looks like is of no matter here.
+        coarse_pictures(setattr)
+    try:
+        code = main(command)
+    except SystemExit as end:
+        code = end.code
+    print("ended:", code, *sys.modules)
 """
 
 
-def loaded_by(*arguments: object) -> set[str]:
-    """The heavy libraries that a command has loaded at its end."""
-    words = [sys.executable, "-c", REPORT, *map(str, arguments)]
-    ended = subprocess.run(words, capture_output=True, text=True, check=True)
-    return set(ended.stdout.splitlines()[-1].split()[1:])
+def loaded_by(*commands: tuple[object, ...]) -> list[set[str]]:
+    """The heavy libraries that one process has loaded at the end of each of its commands, which end well."""
+    words = json.dumps([list(map(str, command)) for command in commands])
+    ended = subprocess.run([sys.executable, "-c", REPORT, words], capture_output=True, text=True, check=True)
+    lines = [line.split() for line in ended.stdout.splitlines() if line.startswith("ended: ")]
+    assert [line[1] for line in lines] == ["0"] * len(commands), ended.stderr
+    return [HEAVY & {*line[2:]} for line in lines]
 
 
-@pytest.mark.parametrize("arguments", [("--help",), ("sweep", "--help"), ("schema",), ("manual", "contacts")])
-def test_a_verb_that_computes_nothing_loads_none_of_them(arguments):
-    assert not loaded_by(*arguments)
-
-
-def test_bands_are_refined_by_a_search_alone():
-    assert loaded_by("bands") <= {"scipy.optimize"}
-
-
-def test_a_check_loads_no_tables_no_pictures_and_no_kernels():
-    """The cost of a run follows from the length of its steps, which is chosen without its engine."""
-    assert loaded_by("validate", CASE) <= {"scipy.optimize"}
+def test_verbs_that_compute_nothing_load_none_of_them_and_checks_and_bands_no_kernels(tmp_path):
+    """Bands are refined by a search; the cost of a run follows from its steps, which are chosen without its engine."""
+    nothing = [("--help",), ("sweep", "--help"), ("schema",), ("manual", "contacts")]
+    loaded = loaded_by(*nothing, ("validate", CASE), ("bands", CASE, "--out", tmp_path))
+    assert loaded[:4] == [set()] * 4
+    assert loaded[4] <= {"scipy.optimize"}
+    # Bands are drawn as well, by a module that draws runs.
+    assert "numba" not in loaded[5]
 
 
 def test_a_run_without_pictures_loads_no_pictures_and_its_pictures_load_no_kernels(tmp_path):
     small = ("--set", "time.end=0.01", "--set", "output.figures=false")
-    assert "matplotlib" not in loaded_by("run", CASE, "--out", tmp_path / "run", *small)
-    assert "numba" not in loaded_by("plot", tmp_path / "run")
+    (loaded,) = loaded_by(("run", CASE, "--out", tmp_path / "run", *small))
+    assert "matplotlib" not in loaded
+    (loaded,) = loaded_by(("plot", tmp_path / "run"))
+    assert "numba" not in loaded
 
 
 def test_the_second_process_loads_neither_kernels_nor_mpi():

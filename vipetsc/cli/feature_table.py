@@ -152,7 +152,7 @@ IDENTIFY = {"records": [RECORD], "unknowns": [AMPLITUDE], "impacts": 1000, "grow
 COLUMNS: tuple[Column, ...] = (
     Column("run", Case, DRIVEN),
     Column("propagator", Case, merged(DRIVEN, {"time": {"engine": "propagator"}}), _propagator_refusal),
-    Column("sweep", Sweep, merged(DRIVEN, {"sweep": {"measures": ["motion"], "time": {"rtol": [1e-8, 1e-9]}}} | SHORT)),
+    Column("sweep", Sweep, merged(DRIVEN, {"sweep": {"measures": ["motion"], "time": {"rtol": [1e-8]}}} | SHORT)),
     Column("optimise", OptimiseCase, merged(DRIVEN, {"optimise": SEARCH} | SHORT)),
     Column("identify", IdentifyCase, merged(DRIVEN, {"identify": IDENTIFY})),
     Column("bands", Case, DRIVEN, _modes_refusal),

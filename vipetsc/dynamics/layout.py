@@ -58,6 +58,8 @@ class Layout:
         self.sites, self.contacts = sites_within(chain, self.start, self.stop)
         self.drives = tuple(np.flatnonzero((driven >= self.start) & (driven < self.stop)).tolist())
         self.dissipated = self.rows * self.owned + len(self.drives)
+        # Asked for at every change of a contact.
+        self._is_own = np.isin(self.contacts, self.sites)
 
     def neighbours(self) -> tuple[int | None, int | None]:
         """Cells to the left and to the right of this rank's; None beyond an end, or on an empty rank."""
@@ -100,7 +102,7 @@ class Layout:
         ``y`` (component,) is the rank's part of the state.
         """
         losses = np.zeros(len(self.contacts))
-        losses[np.isin(self.contacts, self.sites)] = y[self.dissipated : self.size]
+        losses[self._is_own] = y[self.dissipated : self.size]
         return losses
 
     def place(self, cells: np.ndarray, work: float, y: np.ndarray) -> None:
