@@ -7,16 +7,18 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.colors import to_rgba
 from matplotlib.image import imread
 
 from vipetsc.case import Case, Sweep
+from vipetsc.figures import sweep_members
 from vipetsc.figures.entropy import AVERAGES, COLOURS
 from vipetsc.figures.registry import FIGURES, draw
-from vipetsc.figures.scattering import KC, LEAST_WEIGHT
-from vipetsc.figures.style import GREY, rc_style
+from vipetsc.figures.scattering import KC, LEAST_WEIGHT, ROWS, amplitudes
+from vipetsc.figures.style import GREY, SKY, rc_style
 from vipetsc.figures.sweep_members import DrivenWave, Files, Sweeps, series_of
-from vipetsc.figures.wavenumber_bins import FIELD, bin_colours, partition, shown_bins
+from vipetsc.figures.wavenumber_bins import FIELD, bin_colours, partition, partition_explained, shown_bins
 from vipetsc.io.read import field_time, open_ensemble, open_run, select, whole_members
 from vipetsc.lattice import bloch
 from vipetsc.spectra import filter_bank, normalised, transform
@@ -274,6 +276,46 @@ def test_explained_inverse_is_the_filter_banks(whole):
         title, trace = next(pair for pair in titled if pair[0].endswith(f"(m/s) of $K_{{{b + 1}}}$"))
         assert f"(c.{numeral})" in title
         np.testing.assert_allclose(trace.lines[0].get_ydata(), parts[b], atol=1e-10 * np.abs(snapshot).max())
+
+
+@pytest.mark.slow
+def test_bins_of_another_number_are_not_explained_with_those_of_this_program(whole):
+    """The analysis is asked for anew, where the traces would belong to other bins."""
+    with Files() as files:
+        (series,) = series_of(Sweeps([whole], files), FIELD)
+        fewer = [
+            run._replace(analysis=run.analysis.isel({run.analysis[FIELD].dims[0]: slice(3)})) for run in series.runs
+        ]
+        with rc_style(), pytest.raises(ValueError, match="the analysis has 3 wavenumber bins, not 12"):
+            partition_explained.__wrapped__(series._replace(runs=tuple(fewer)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("band", [0, 2])
+def test_the_driven_wavenumber_is_marked_if_there_is_one(whole, band):
+    """A drive in a gap has none, and all the rest of the picture."""
+    with Files() as files:
+        (series,) = series_of(Sweeps([whole], files), *ROWS)
+        wave = series.wave
+        if band == 0:
+            wave = DrivenWave(band=0, wavenumber=np.nan, speed=np.nan)
+        with rc_style():
+            figure = amplitudes.__wrapped__(series._replace(wave=wave))
+    # Sites have the same mark, with a label.
+    lines = [line for axes in figure.axes for line in axes.lines]
+    marks = [line for line in lines if line.get_color() == SKY and line.get_label() != "contact sites"]
+    assert len(marks) == (3 if band else 0)
+
+
+@pytest.mark.parametrize(("swept", "shown"), [([0.0, 1.0, 2.0, 4.0, 8.0], [1.0, 4.0, 8.0]), ([0.0, 1.0, 2.0], [])])
+def test_a_member_without_a_drive_is_none_of_the_three_amplitudes(monkeypatch, swept, shown):
+    """Its energies are not divided by the square of 0."""
+    monkeypatch.setattr(sweep_members, "axes", lambda _: ("amplitude",))
+    rows = [xr.Dataset(coords={"amplitude": amplitude}) for amplitude in swept]
+    monkeypatch.setattr(sweep_members, "whole_members", lambda _: [(row, Path()) for row in rows])
+
+    triples = sweep_members._triples(xr.Dataset())
+    assert [member.row["amplitude"].item() for triple in triples for member in triple] == shown
 
 
 @pytest.mark.slow

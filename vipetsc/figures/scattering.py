@@ -2,17 +2,28 @@
 
 A sweep over the amplitude A of the drive has a run at its lowest, medium and highest amplitude in each figure. In a
 linear lattice energies grow as A^2 and velocities as A: over these, what differs between the panels is nonlinear. The
-*driven wavenumber* is that of the linear wave at the drive's frequency, in the pass band that is driven. Each figure
-names what it needs (``from_series``): a sweep without that has no such picture.
+*driven wavenumber* is that of the linear wave at the drive's frequency, in the pass band that is driven; in a gap there
+is none, and its mark is missing. Each figure names what it needs (``from_series``): a sweep without that has no such
+picture.
 
-X(kappa, x) is the Morlet wavelet transform in space of the velocity of the cells' host masses (``spectra.wavelet``);
-H(x, t) the local entropy of |X|^2 over the wavenumbers kappa, and H(t) its mean over the cells with the weight W(x, t),
-the sum of |X|^2 over kappa (``spectra.entropies``). "Paper, Fig. n" is a figure of Phys. Rev. E 108, 044214 (2023).
+The velocity v(x, t) of the cells' host masses, x being the number of the cell, has the Morlet wavelet transform
+
+    X(kappa, x, t) = sqrt(kc/kappa) 1/(2 pi) integral_0^pi V(eta, t) exp[-(kc eta/kappa - kc)^2/2] exp(i eta x) deta,
+
+with V(eta, t) = sum_x v exp(-i eta x): it is the part of the velocity about the wavenumber kappa and the cell x
+(``vipetsc.spectra.wavelet``, with the inverse). Its power S = |X|^2 at the wavenumbers kappa_j gives the local entropy
+in bits
+
+    W(x, t) = sum_j S,    H(x, t) = -sum_j (S/W) log2 (S/W),    H(t) = sum_x W H / sum_x W
+
+and the mean H(t) over the cells with the weight W (``vipetsc.spectra.entropies``). "Paper, Fig. n" is a figure of Phys.
+Rev. E 108, 044214 (2023).
 """
 
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vipetsc.figures import panels, style
@@ -23,7 +34,7 @@ from vipetsc.spectra import transform
 
 # The Morlet parameter kc, in rad: the phase of a wavelet over one standard deviation of its envelope. A wavelet of the
 # wavenumber kappa is kc/kappa wide in x and kappa/kc wide in wavenumber. This is the paper's for entropies: it resolves
-# wavenumbers better than the smaller one of the bins, and positions worse.
+# wavenumbers better than the smaller one of ``wavenumber_bins``, and positions worse.
 KC = 12.0
 # Wavenumbers in a map of |X|. The entropy's 60 would be seen as steps.
 WAVENUMBERS = 120
@@ -31,20 +42,26 @@ WAVENUMBERS = 120
 WAVELET_DECADES = 2.5
 # Cells whose weight W is below this fraction of the largest one show no entropy.
 LEAST_WEIGHT = 1e-5
+# Fields of the analysis, one a row, by what a pixel of their maps is: the energy of a cell at a time, that of a
+# wavenumber at a time, and that of a bin of wavenumber and frequency in the mean over time.
 ROWS = {
     "kinetic_energy": "Energy of a cell",
     "wavenumber_content": "Energy of a wavenumber",
     "dispersion": "Mean energy of a bin",
 }
+# Where the mark of the driven wavenumber stands, as a fraction of the panel's width.
+MARK_AT = 0.015
+# Dispersion maps end at this multiple of the highest frequency of the pass bands.
+BEYOND_BANDS = 1.1
 # The times of ``AmplitudeSeries.snapshot_times``, in their order.
 MOMENTS = ("Before the first site", "At the first site", "Past the last site", "Near the end")
 
 
 @from_series(*ROWS)
 def amplitudes(series: AmplitudeSeries) -> Figure:
-    """Draw three amplitudes by (space-time kinetic energy, wavenumber content, dispersion); paper, Fig. 2.
+    """Draw space-time kinetic energy, wavenumber content and dispersion, a row each, in J/N^2; paper, Fig. 2.
 
-    Energies are divided by the square of the amplitude, so that one scale serves a row.
+    Energies are divided by the square of the amplitude A, so that one scale serves a row.
     """
     figure, grid = series.page(3, 6.4, sharey="row")
     for row, (name, label) in zip(grid, ROWS.items(), strict=True):
@@ -53,16 +70,16 @@ def amplitudes(series: AmplitudeSeries) -> Figure:
         for axes, field, member in zip(row, fields, series.runs, strict=True):
             if name == "kinetic_energy":
                 image = panels.space_time_map(axes, field, norm, member.run)
+
             elif name == "wavenumber_content":
                 image = panels.content_map(axes, field, norm)
-                look = {"color": style.SKY, "mec": "white", "mew": 0.3, "ms": 4}
-                driven = series.wave.wavenumber / np.pi
-                axes.plot(0.015, driven, ">", transform=axes.get_yaxis_transform(), **look)
+                _mark_driven(axes, series)
+
             else:
                 cell = member.model.chain.cell
                 image = panels.dispersion_map(axes, field, norm, cell)
-                # In krad/s, with a tenth more than the highest pass band.
-                axes.set_ylim(0, 1.1e-3 * pass_bands(cell)[-1].high)
+                # From rad/s to krad/s.
+                axes.set_ylim(0, BEYOND_BANDS * 1e-3 * pass_bands(cell)[-1].high)
         panels.colour_bar(image, row, f"{label} / A² (J/N²)")
 
     for axes in grid[:, 1:].flat:
@@ -70,8 +87,16 @@ def amplitudes(series: AmplitudeSeries) -> Figure:
     return figure
 
 
-class Wavelets(NamedTuple):
-    """|X| of the host velocity over the drive's amplitude, ``values`` (time, wavenumber, cell), at ``time`` in s."""
+def _mark_driven(axes: Axes, series: AmplitudeSeries) -> None:
+    """Mark the driven wavenumber at the left end of ``axes``, whose ordinate is kappa/pi, if there is one."""
+    if series.wave.band:
+        look = {"color": style.SKY, "mec": "white", "mew": 0.3, "ms": 4}
+        transform_of_axes = axes.get_yaxis_transform()
+        axes.plot(MARK_AT, series.wave.wavenumber / np.pi, ">", transform=transform_of_axes, **look)
+
+
+class Magnitudes(NamedTuple):
+    """|X| of the host velocity over the amplitude, ``values`` (time, wavenumber, cell) in m/s/N, at ``time`` in s."""
 
     time: np.ndarray
     values: np.ndarray
@@ -79,13 +104,14 @@ class Wavelets(NamedTuple):
 
 @from_series(needs_wave=True, needs_sites=True)
 def wavelets(series: AmplitudeSeries) -> Figure:
-    """Draw |X(kappa, x)| of the host velocity at four times for three amplitudes, over the amplitude; paper, Fig. 3.
+    """Draw |X(kappa, x)| of the host velocity over the amplitude, in m/s/N, at four times for three amplitudes.
 
-    A black line marks the driven wavenumber.
+    That is the paper's Fig. 3. A black line marks the driven wavenumber. The times are those of the linear wave
+    (``AmplitudeSeries.snapshot_times``), the same for all three runs.
     """
     kappa = np.pi * np.arange(1, WAVENUMBERS + 1) / WAVENUMBERS
     times = series.snapshot_times()
-    transforms = [_wavelets(member, times, kappa) for member in series.runs]
+    transforms = [_magnitudes(member, times, kappa) for member in series.runs]
     norm = panels.log_norm(*(transformed.values for transformed in transforms), decades=WAVELET_DECADES)
 
     figure, grid = series.page(4, 6.6, sharex=True, sharey=True)
@@ -105,7 +131,7 @@ def wavelets(series: AmplitudeSeries) -> Figure:
     return figure
 
 
-def _wavelets(member: MemberRun, times: np.ndarray, kappa: np.ndarray) -> Wavelets:
+def _magnitudes(member: MemberRun, times: np.ndarray, kappa: np.ndarray) -> Magnitudes:
     """Return the transforms of the samples nearest to ``times`` (s) at the wavenumbers ``kappa``, in rad per cell."""
     time = field_time(member.run)
     samples = [int(np.argmin(np.abs(time - t))) for t in times]
@@ -114,15 +140,16 @@ def _wavelets(member: MemberRun, times: np.ndarray, kappa: np.ndarray) -> Wavele
     # The transform is that of the lattice with rest beyond its last cell: only the lattice's own cells are shown.
     cells = host.shape[-1]
     magnitude = np.abs(transform(host, kappa, KC)[..., :cells])
-    return Wavelets(time=time[samples], values=magnitude / abs(member.case.drive.amplitude))
+    return Magnitudes(time=time[samples], values=magnitude / abs(member.case.drive.amplitude))
 
 
 @from_series("entropy/local")
 def entropy_maps(series: AmplitudeSeries) -> Figure:
-    """Draw H(x, t) at three amplitudes to one scale, with the energy-weighted H(t) over each; paper, Fig. A2.
+    """Draw H(x, t) in bits at three amplitudes to one scale, with the energy-weighted H(t) over each; paper, Fig. A2.
 
-    A dashed line marks the time from which averages of H are taken, that of the linear wave's arrival. Cells are blank
-    where the weight W is below ``LEAST_WEIGHT`` of the largest: only the wavelets' tails are there.
+    A dashed line marks the time from which averages of H are taken. The analysis has it, as ``entropy/start``: the
+    linear wave's arrival at the first site, by the linear run or by the group velocity. Cells are blank where the
+    weight W is below ``LEAST_WEIGHT`` of the largest: only the wavelets' tails are there.
     """
     fields = []
     for member in series.runs:

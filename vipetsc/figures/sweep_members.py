@@ -256,7 +256,10 @@ def _series_title(member: xr.Dataset, ensemble: xr.Dataset, case: Case, wave: Dr
 
 
 def _triples(ensemble: xr.Dataset) -> list[list[_MemberFolder]]:
-    """Return the members at the lowest, middle and highest amplitude of every configuration that has three."""
+    """Return the members at the lowest, middle and highest amplitude of every configuration that has three.
+
+    A member of the amplitude 0 is left out: figures show what is divided by the amplitude.
+    """
     if AMPLITUDE not in axes(ensemble):
         return []
     others = [name for name in axes(ensemble) if name != AMPLITUDE]
@@ -264,7 +267,7 @@ def _triples(ensemble: xr.Dataset) -> list[list[_MemberFolder]]:
     def configuration(member: _MemberFolder) -> str:
         return repr([member.row[name].item() for name in others])
 
-    members = [_MemberFolder(row, folder) for row, folder in whole_members(ensemble)]
+    members = [_MemberFolder(row, folder) for row, folder in whole_members(ensemble) if row[AMPLITUDE].item() != 0]
     triples = []
     for group in grouped(members, configuration).values():
         if len(group) >= len(LEVELS):

@@ -1,13 +1,15 @@
 """Wavenumber bins at three amplitudes: energies of the bins in space and time, and how they are made.
 
-As in ``figures.scattering``, a sweep over the amplitude A of the drive has a run at its lowest, medium and highest
-amplitude in each figure; the *driven wavenumber* is that of the linear wave at the drive's frequency.
+As in ``vipetsc.figures.scattering``, a sweep over the amplitude A of the drive has a run at its lowest, medium and
+highest amplitude in each figure; the *driven wavenumber* is that of the linear wave at the drive's frequency.
 
-The *bins* K_1, K_2, ... are equal parts of the wavenumbers from 0 to pi. The velocity of the cells' host masses is
-transformed by Morlet wavelets, X(kappa, x), and the nodes kappa that lie in a bin are inverted alone, which gives the
-bin's part of the velocity (``spectra.wavelet``). Nodes above pi, whose wavelets reach below pi, belong to the last bin.
-All parts together are the velocity, but for its mean and the longest waves. "Paper, Fig. n" is a figure of Phys. Rev. E
-108, 044214 (2023).
+The *bins* K_1, K_2, ... are equal parts of the wavenumbers from 0 to pi. The velocity v(x) of the masses of one kind,
+one in each cell x, has the Morlet wavelet transform X(kappa, x) of ``vipetsc.figures.scattering``. Of the nodes kappa
+those that lie in a bin b are inverted alone, which gives the bin's part v_b of the velocity. That amounts to a filter
+T_b(eta) over the wavenumbers eta (formulas in ``vipetsc.spectra.wavelet``). Nodes above pi, whose wavelets reach below
+pi, belong to the last bin. All parts together are the velocity, but for its mean and the longest waves. The energies
+of bins are those of all masses of a cell; the picture that explains them shows the velocity of the hosts. "Paper, Fig.
+n" is a figure of Phys. Rev. E 108, 044214 (2023).
 """
 
 from itertools import pairwise
@@ -43,24 +45,28 @@ BINS_DECADES = 4
 LEVEL = 0.003
 FIELD = "partition/kinetic_energy"  # (bin, snapshot, cell)
 # Standard deviations of the smoothing before contours are drawn, as fractions of the number of snapshots and of cells.
-# The kinetic energy of a wave oscillates at twice its frequency and twice its wavenumber: the smoothing is wider than
-# that, and narrower than a packet.
+# The kinetic energy of a wave oscillates at twice its frequency and twice its wavenumber: in records of the default
+# length and lattices of the default size the smoothing is wider than that, and narrower than a packet.
 BLUR = 0.006, 0.01
+# Factor of the colours of the map "turbo": its middle, yellow, would not be seen as a line on white.
+DARKENED = 0.85
+# Panels of traces end at this multiple of the largest value that they show.
+MARGIN = 1.1
 # The relative error up to which the paper takes its partition to be complete (its Eq. (A8)).
 COMPLETE = 0.01
 
 
 def bin_colours(count: int) -> np.ndarray:
     """Return colours (bin, rgba) in the order of the spectrum, dark enough for lines."""
-    return mpl.colormaps["turbo"](np.linspace(0.04, 0.96, count)) * (0.85, 0.85, 0.85, 1.0)
+    return mpl.colormaps["turbo"](np.linspace(0.04, 0.96, count)) * (DARKENED, DARKENED, DARKENED, 1.0)
 
 
 def shown_bins(wavenumber: float, count: int, shown: int = SHOWN) -> list[int]:
     """Return at most ``shown`` of ``count`` bins (0-based), spread evenly, with the driven bin and a neighbour.
 
     The driven bin is that of the ``wavenumber`` in rad/cell. The neighbour is the one on the side of the bin on which
-    the wavenumber lies: the packet, which has a width, reaches over into it. At 5 pi/9 these are bins 1, 3, 5, 7, 8, 10
-    and 12 of twelve. One bin that is shown is the driven one.
+    the wavenumber lies: the packet, which has a width, reaches over into it. With ``shown`` = 1 it is the driven bin
+    alone. At 5 pi/9 seven of twelve are, counted from 1 as K_b, the bins 1, 3, 5, 7, 8, 10 and 12.
     """
     if count <= shown:
         return list(range(count))
@@ -89,7 +95,7 @@ def shown_bins(wavenumber: float, count: int, shown: int = SHOWN) -> list[int]:
 
 @from_series(FIELD, needs_wave=True)
 def partition(series: AmplitudeSeries) -> Figure:
-    """Draw the energies of wavenumber bins (paper, Fig. 4).
+    """Draw the kinetic energies of wavenumber bins in J (paper, Fig. 4).
 
     (a) Maps of some bins over space and time at the medium amplitude; (b) contours of all bins at each of the three
     amplitudes; (c) the dispersion of the driven band with each bin in the colour of its contours.
@@ -103,7 +109,7 @@ def partition(series: AmplitudeSeries) -> Figure:
     upper, lower = figure.subfigures(2, 1, height_ratios=(2, 1.1))
 
     # A panel for each bin that is shown, and the last one for the driven band.
-    grid = upper.subplots(2, (SHOWN + 1) // 2)
+    grid = upper.subplots(2, SHOWN // 2 + 1)
     *maps, band = grid.flat
     for axes, b, roman in zip(maps, bins, ROMAN, strict=False):
         image = panels.space_time_map(axes, field[b], norm, medium.run)
@@ -133,6 +139,7 @@ def _draw_driven_band(axes: Axes, series: AmplitudeSeries, colours: np.ndarray) 
     wave = series.wave
     for ends, colour in zip(pairwise(medium.analysis["partition/bounds"].values), colours, strict=True):
         kappa = np.linspace(*ends, 31)
+        # Frequencies are in rad/s, and bands count from 1.
         frequency = bloch(medium.model.chain.cell, kappa).frequency[:, wave.band - 1]
         axes.plot(kappa / np.pi, frequency / 1e3, color=colour, lw=3, solid_capstyle="butt")
     axes.axvline(wave.wavenumber / np.pi, color=style.BLACK, lw=0.6, ls=":")
@@ -162,12 +169,21 @@ def _draw_contours(axes: Axes, member: MemberRun, colours: np.ndarray) -> None:
 
 @from_series("partition/reconstructed")
 def reconstruction(series: AmplitudeSeries) -> Figure:
-    """Draw total and reconstructed energy over time, relative error, energy between bins (paper, Fig. A1).
+    """Draw total and reconstructed kinetic energy over time, their relative error, and what is between bins.
 
-    The velocities v_b of the bins add up to that of the lattice, but their energies do not: the square of the sum has
-    products of the velocities of two bins, too. ``cross_share`` of the analysis is the part of these products in the
-    kinetic energy (KE) of the lattice, at each time: 1 - sum_b KE_b / KE. It is not negative, since the filters of the
-    bins are not, though in single cells a product may be.
+    That is the paper's Fig. A1. The parts v_b of the velocity add up to it, but their kinetic energies KE_b do not add
+    up to that of all masses of the lattice, KE: with the masses m
+
+        KE = sum_b KE_b + sum_(b<c) sum_x m v_b v_c,
+
+    up to the error of the second row. ``cross_share`` of the analysis is 1 - sum_b KE_b / KE, at each time, the part
+    of the products in KE. It is not negative. On the line that goes on at rest beyond the ends of the lattice,
+
+        KE - sum_b KE_b = 1/(2 pi) integral of m/2 [1 - sum_b T_b(eta)^2] |V(eta)|^2 deta,
+
+    with the spectrum V of the velocity; the filters T_b are not negative and add up to 1 at most (to 1 %), and so do
+    their squares. The analysis sums KE_b over the lattice's own cells alone, which makes them smaller still. In a
+    single cell m v_b v_c has either sign.
     """
     figure, grid = series.page(3, 5.0, sharex="col", sharey="row")
     for (energies, errors, crosses), member in zip(grid.T, series.runs, strict=True):
@@ -201,7 +217,11 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
 
 
 class Snapshot(NamedTuple):
-    """The host velocity (cell) in m/s at ``time`` in s, its transform (wavenumber, cell) and bins (bin, cell)."""
+    """The host ``velocity`` (cell) in m/s at ``time`` in s, and how it is divided into bins.
+
+    ``transformed`` (node, cell) in m/s is its transform X at the ``nodes``, ``parts`` (bin, cell) in m/s are the
+    velocities of the bins.
+    """
 
     time: float
     velocity: np.ndarray
@@ -211,16 +231,22 @@ class Snapshot(NamedTuple):
 
     @classmethod
     def nearest(cls, member: MemberRun, wanted: float) -> Self:
-        """Return the snapshot of the partition that is nearest to the time ``wanted`` in s."""
+        """Return the snapshot of the partition that is nearest to the time ``wanted`` in s.
+
+        Raises ValueError for an analysis whose bins are not those of ``Nodes.bins``.
+        """
         snapshots = member.analysis["partition/snapshot"].values
         time = float(snapshots[np.argmin(np.abs(snapshots - wanted))])
         sample = int(np.argmin(np.abs(field_time(member.run) - time)))
         velocity = member.run["velocity"][sample, :, member.model.chain.cell.host].values
 
-        # ``inverse`` sums the nodes of each bin apart, by ``Nodes.bins``: the bounds are those of the analysis.
+        # ``inverse`` sums the nodes of each bin apart, by ``Nodes.bins``.
         nodes = Nodes.log(BINS_KC)
         transformed = transform(velocity, nodes.kappa, BINS_KC)
         parts = inverse(transformed, nodes, BINS_KC)
+        bins = member.analysis[FIELD].shape[0]
+        if bins != len(parts):
+            raise ValueError(f"the analysis has {bins} wavenumber bins, not {len(parts)}: analyse the run again")
 
         # The lattice's own cells: the transform goes on beyond the last one, and the inverse needs all of it.
         cells = len(velocity)
@@ -250,9 +276,9 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
     above.set(title=title, ylabel="Host velocity (m/s)", xlim=cells[[0, -1]])
     _draw_domain(below, cells, snapshot, bounds)
 
-    largest = 1.1 * np.abs(snapshot.parts[bins]).max()
+    largest = MARGIN * np.abs(snapshot.parts[bins]).max()
     norm = panels.log_norm(field[bins], decades=BINS_DECADES)
-    grid = right.subplots(EXPLAINED, 2, sharex="col", sharey="col")
+    grid = right.subplots(len(bins), 2, sharex="col", sharey="col", squeeze=False)
     # Bins rise upwards, as in the wavelet domain.
     for roman, b, (trace, energy) in zip(ROMAN, reversed(bins), grid, strict=False):
         trace.plot(cells, snapshot.parts[b], color=colours[b], lw=0.5)
@@ -263,26 +289,28 @@ def partition_explained(series: AmplitudeSeries) -> Figure:
         energy.axvline(snapshot.time, color="white", lw=0.6)
         energy.set(title=f"(d.{roman}) Energy of $K_{{{b + 1}}}$", xlabel="")
 
-        # An arrow from the middle of the bin in the wavelet domain to the trace. The domain shows no wavenumbers below
-        # the lowest node and none above pi.
-        middle = 0.5 * (bounds[b] + bounds[b + 1])
-        tail = float(np.clip(middle, snapshot.nodes.kappa[0], np.pi)) / np.pi
-        arrow = ConnectionPatch(
-            xyA=(1.0, tail),
-            coordsA=below.get_yaxis_transform(),
-            xyB=(0.0, 0.5),
-            coordsB=trace.transAxes,
-            arrowstyle="-|>",
-            color=colours[b],
-            lw=0.7,
-            mutation_scale=6,
-        )
-        right.add_artist(arrow)
+        # The domain shows no wavenumbers below the lowest node and none above pi.
+        middle = np.clip(0.5 * (bounds[b] + bounds[b + 1]), snapshot.nodes.kappa[0], np.pi)
+        right.add_artist(_arrow(below, float(middle) / np.pi, trace, colours[b]))
 
     grid[-1, 0].set_xlabel("Cell")
     grid[-1, 1].set_xlabel("Time (s)")
     panels.colour_bar(image, grid[:, 1], "Energy of a bin in a cell (J)", aspect=40)
     return figure
+
+
+def _arrow(domain: Axes, height: float, trace: Axes, colour: np.ndarray) -> ConnectionPatch:
+    """Return an arrow from the right edge of ``domain``, at the ordinate ``height``, to the left edge of ``trace``."""
+    return ConnectionPatch(
+        xyA=(1.0, height),
+        coordsA=domain.get_yaxis_transform(),
+        xyB=(0.0, 0.5),
+        coordsB=trace.transAxes,
+        arrowstyle="-|>",
+        color=colour,
+        lw=0.7,
+        mutation_scale=6,
+    )
 
 
 def _draw_domain(axes: Axes, cells: np.ndarray, snapshot: Snapshot, bounds: np.ndarray) -> None:
