@@ -108,6 +108,14 @@ def test_branch_switching(kind, periods, kerschen_in_phase):
     assert np.abs(vanishing).max() > 1e-4 * np.abs(quarter).max()
 
 
+def test_a_crossing_branch_has_the_newton_steps_that_were_asked_for(kerschen_in_phase):
+    """Its failures name the key nnm.max_newton, which would not help otherwise."""
+    old = kerschen_in_phase.problem
+    patient = Shooting(old.flow, old.map, old.tolerance, max_newton=9)
+    problem, _ = switch(patient, kerschen_in_phase.of_kind("symmetry-breaking")[0])
+    assert problem.newton.max_newton == 9
+
+
 def test_a_failure_states_where_it_stopped_why_and_what_to_change():
     problem = Shooting(Dop853Flow(reduced_model()), MAPS["quarter"], max_newton=1)
     start = linear_start(problem, OUT_OF_PHASE, 2.9e-2)

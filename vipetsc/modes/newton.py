@@ -46,6 +46,7 @@ class BorderedNewton(ABC, Generic[E]):
     """
 
     def __init__(self, size: int, max_newton: int = 7) -> None:
+        self.max_newton = max_newton
         self._errors = CallbackErrors()
         self._xi, jacobian = self._allocate(size)
         self._snes = snes = PETSc.SNES().create(self._xi.comm)

@@ -1,4 +1,20 @@
-"""Branch switching: the first point of a branch of less symmetry that crosses at a special point."""
+"""Branch switching: the first point of a branch of less symmetry that crosses at a special point.
+
+On a branch the derivative dH/dxi (n, n + 1) of the shooting equations H(xi) = 0 has one null vector, the tangent. Where
+another branch crosses it has two: the directions of both branches lie in their plane. Let t be the old branch's
+direction, projected on the plane, and r the unit vector in the plane that is orthogonal to it. With the special point
+xi_0 and a small step s the equations
+
+    H(xi) = 0,    r . (xi - xi_0) = s
+
+have a solution on the crossing branch and none on the old one, along which r . (xi - xi_0) is of second order. Newton's
+method begins at xi_0 + s r.
+
+A map that assumes the symmetry which the new orbits lack does not see them: its derivative has one null vector there.
+Orbits of the quarter-period map are symmetric twice, u(-t) = u(t) and u(t + T/2) = -u(t). A crossing branch may keep
+the first, from rest to rest in half a period, or the product of both, u(T/2 - t) = -u(t), from centre to centre. At a
+period doubling the new orbits close after 2 T, and T is doubled in the unknowns.
+"""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -11,26 +27,26 @@ from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.orbit import repetitions
 from vipetsc.modes.shooting.shooting import DenseFrame, Shooting
 
-# Fractions of the first step along a crossing branch that are tried.
+# Fractions of the first step s along a crossing branch that are tried.
 FRACTIONS = np.array([1.0, 0.1, 0.01, 0.001])
-# How many steps Newton's method may add to the first, since the branch leaves at an angle: up to 5 on the paper's
-# branches, beyond 100 on others.
+# Newton's method may move xi by so many s, since the branch leaves at an angle to r: up to 5 on the paper's branches,
+# beyond 100 where it ends on others.
 ASTRAY = 20.0
-# The loosest tolerance of the crossing branch.
+# The tolerance of a crossing branch is this many residuals of the special point in the map that sees it, where that is
+# more than the tolerance asked for, and LOOSEST at most.
+ROUNDINGS = 10
 LOOSEST = 1e-9
 # A residual of the special point above this: it is no orbit of the map, as the doubled period's is none of a quarter.
 NO_ORBIT = 1e-6
 # The smallest singular value over the largest, up to which a map has a second null direction.
 SINGULAR = 1e-5
-# Step along the old branch's tangent, in units of (x, period), that gives its direction in another map's unknowns.
+# Step along the old branch's tangent, over that of a unit step in the unknowns, that gives its direction in another
+# map's unknowns by a difference.
 ALONG = 1e-6
 
 
 class Crossing(NamedTuple):
-    """A crossing of branches seen by a ``problem`` with another map, at the unknowns of its ``frame``.
-
-    ``row`` (n + 1,) is the unit direction across the old branch in the plane of the null vectors.
-    """
+    """A crossing as the map of ``problem`` sees it: the unknowns xi_0 of its ``frame``, and r, the ``row`` (n + 1,)."""
 
     problem: Shooting
     frame: DenseFrame
@@ -42,11 +58,11 @@ def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooti
 
     The new orbits have less symmetry: they are shot over half a period, from rest to rest or from centre to
     centre, whichever map has a second null direction at ``point``; over the doubled period at a period doubling.
-    ``amplitude`` is the first step along the new direction, relative to the orbit's size; where Newton's method goes
-    astray, parts of it are tried. The tolerance is what the map's rounding at the special point allows. Raises
-    ContinuationError if no map has a second null direction, or no orbit off the old branch is found.
+    ``amplitude`` is the first step s, relative to the orbit's size; where Newton's method goes astray, parts of it are
+    tried. The tolerance is what the map's rounding at the special point allows, the number of Newton steps is that of
+    ``old``. Raises ContinuationError if no map has a second null direction, or no orbit off the old branch is found.
     """
-    # An orbit over a quarter of its period has two symmetries, and a crossing branch may lack either.
+    # Of the quarter's two symmetries a crossing branch may keep either. A quarter map sees a branch that keeps both.
     names: tuple[str, ...] = (old.map.name,)
     if old.map.quarter:
         names = ("quarter", "half", "half-centre")
@@ -65,7 +81,7 @@ def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Cr
 
     A text with the smallest singular value is appended to ``singular``.
     """
-    problem = Shooting(old.flow, MAPS[name], old.tolerance)
+    problem = Shooting(old.flow, MAPS[name], old.tolerance, old.newton.max_newton)
     x, period = _re_expressed(old, point, problem)
     frame = problem.relative_frame(x, period)
     rounding = float(np.abs(problem.residual(problem.arc(x, period))).max() / frame.chart.size)
@@ -79,11 +95,12 @@ def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Cr
 
     ahead = replace(point, x=point.x + ALONG * point.tangent[:-1], period=point.period + ALONG * point.tangent[-1])
     along = frame.chart.encode(*_re_expressed(old, ahead, problem)) - frame.xi
+    # The null vectors are orthogonal: in their plane t has the coordinates (first, second). Turned by 90 deg it is r.
     plane = directions[-2:]
     first, second = plane @ (plane.T @ plane @ along)
     row = unit(plane.T @ np.array([-second, first]))
-    tolerance = max(old.tolerance, min(10 * rounding, LOOSEST))
-    problem = Shooting(old.flow, MAPS[name], tolerance)
+    tolerance = max(old.tolerance, min(ROUNDINGS * rounding, LOOSEST))
+    problem = Shooting(old.flow, MAPS[name], tolerance, old.newton.max_newton)
     return Crossing(problem, problem.relative_frame(x, period), row)
 
 
@@ -106,10 +123,14 @@ def _first_point(crossing: Crossing, point: Point, amplitude: float) -> Point:
 
 
 def _re_expressed(old: Shooting, point: Point, new: Shooting) -> tuple[np.ndarray, float]:
-    """Initial values and period of a special point's orbit for another map; the period is doubled where it doubles."""
+    """Initial values (n,) and period in s of a special point's orbit for another map.
+
+    The period is doubled at a period doubling.
+    """
     period = point.period
     if point.kind == "period-doubling":
         period *= 2
     if old.map.start == new.map.start:
         return point.x, period
-    return old.end(old.arc(point.x, point.period))[old.system.dofs :], period  # the centre of a quarter-period orbit
+    # A map from the centre begins with the velocities there, at the end of the quarter from rest.
+    return old.end(old.arc(point.x, point.period))[old.system.dofs :], period

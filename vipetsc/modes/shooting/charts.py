@@ -1,8 +1,23 @@
-"""Charts: unknowns xi (n + 1,) of order one in place of the initial values x (n,) and the period of an orbit.
+"""Charts: unknowns xi (n + 1,) of order one in place of the initial values x (n,) and the period T of an orbit.
 
-A chart belongs to a point of the branch. It encodes (x, period) as xi, decodes it, and gives d(x, period)/d xi
-(n + 1, n + 1); ``size`` is the unit of initial values. ``logarithmic`` is not needed by any other room: the case key
-``nnm.chart`` offers it to users, to compare charts with.
+A chart belongs to a point of the branch, with the initial values x_0 and the period T_0. It encodes (x, T) as xi,
+decodes it, and gives d(x, T)/dxi (n + 1, n + 1); ``size`` = max |x_0| is the unit of initial values. Initial values are
+displacements in m where an arc starts at rest, velocities in m/s where it starts at the centre. The last unknown is
+T/T_0 (``logarithmic``: ln(T/T_0)), the others are
+
+    relative       x_i/size; in the place of a site's resonator w/scale, with w = c . x, where the arc starts at rest
+    grazing        x_i/size; in the place of one site's resonator y, where y |y| = (sigma w - D)/D
+    logarithmic    x_i/x_lead; in the place of the largest one ln(x_lead/x_0,lead)
+
+w is the elongation of a contact, c its row with 1 at the resonator and -1 at the other mass, if there is one, and D its
+clearance in m on the side sigma. D is not 0: contacts that touch at rest have no linear motions, with which branches
+begin, and are refused before. ``logarithmic`` is not needed by any other module: the case key ``nnm.chart`` offers it
+to users, to compare charts with.
+
+**Why grazing needs a chart.** An orbit that starts at rest on its largest sigma w, beyond D, is in contact for the time
+2 [2 (sigma w - D)/|w''|]^1/2. The impulse of a force that grows as (sigma w - D)^n then changes the orbit by the order
+(sigma w - D)^(n + 1/2). Of the bilinear contact, n = 1, the derivative by w has a square root, whose slope at D is
+infinite: tangents turn without bound there. In y the change is of the order y^(2 n + 1), and smooth enough.
 """
 
 from abc import ABC, abstractmethod
@@ -57,10 +72,11 @@ class DenseChart(Chart):
 
 
 class Relative(DenseChart):
-    """Initial values over the largest one, period over its value; gaps over their clearance D.
+    """Initial values over the largest one, and elongations of contacts over a scale of their own.
 
-    Where an arc starts at rest, the resonator's displacement is replaced by w = u_resonator - u_host over
-    max(|w|, |D|), or else a large common motion would hide the changes of w that make and break contacts.
+    The scale of w is max(|w_0|, |D|), with the smaller clearance D of the contact, and ``size`` at most. Over ``size``
+    itself a large common motion would hide the changes of w that make and break contacts. Without ``rest``, where an
+    arc starts at the centre, all initial values are over ``size``: they are velocities, and all w are 0.
     """
 
     def __init__(self, system: System, x: np.ndarray, period: float, rest: bool = True) -> None:
@@ -91,7 +107,10 @@ class Relative(DenseChart):
 
 
 class Logarithmic(DenseChart):
-    """Logarithms of the largest initial value and of the period; the other values over the largest one."""
+    """Logarithms of the largest initial value and of the period; the other values over the largest one.
+
+    It ends where the value that was the largest has another sign: its logarithm is then NaN.
+    """
 
     def __init__(self, system: System, x: np.ndarray, period: float) -> None:
         self.size = float(np.abs(x).max())
@@ -121,11 +140,10 @@ class Logarithmic(DenseChart):
 
 
 class Grazing(DenseChart):
-    """Relative, with y in place of the displacement of the contact nearest to its clearance: (|w| - D)/D = y |y|.
+    """Initial values over the largest one, with y for the contact that is nearest to its clearance.
 
-    An orbit that starts on its largest |w| depends on w - D through a square root (bilinear contact), so that
-    this unknown makes the branch smooth through grazing. Where the nearest contact has no stop on the side of w, the
-    gap is that to the other stop.
+    Nearest is the contact with the smallest |sigma w/D - 1|, sigma being the side of w. Where it has no stop on that
+    side, the gap is that to the other stop. ``index`` is the place of y.
     """
 
     def __init__(self, system: System, x: np.ndarray, period: float) -> None:

@@ -1,4 +1,32 @@
-"""Floquet multipliers of a shot orbit, from the sensitivities of the arc that was integrated."""
+"""Floquet multipliers of a shot orbit, from the sensitivities of the arc that was integrated.
+
+S = [[A, B], [C, D]] is the derivative of the arc's end by its start, of displacements before velocities, in coordinates
+M^1/2 u: the block A becomes M^1/2 A M^-1/2, and so do the others. In these coordinates S is symplectic, that is
+
+    D^T A - B^T C = 1,    S^-1 = [[D^T, -B^T], [-C^T, A^T]],
+
+and D^T B and C^T A are symmetric. The rest of the period is the arc's mirror image. With R = diag(1, -1), which
+reverses time, the multipliers mu are the eigenvalues of the *basic map*, or their squares:
+
+    arc                 basic map             its diagonal block           multipliers
+    half, from rest     R S^-1 R S            1 + 2 B^T C (upper)          mu
+    half, from centre   R S^-1 R S            1 + 2 C^T B (lower)          mu
+    quarter, from rest  -R S^-1 R S           1 - 2 D^T A (upper)          mu^2: the map is over half a period
+    whole, from rest    S                     A = 1 + 2 (A - 1)/2 (upper)  mu
+
+The eigenvalues of a basic map Q come in pairs, mu and 1/mu, since Q^-1 = R Q R. (Q + Q^-1)/2 has the two diagonal
+blocks of Q and else zeros. The eigenvalues of each block are
+
+    c = (mu + 1/mu)/2,
+
+the *half-traces*, n of them. In (-1, 1) the pair is on the unit circle, mu = exp(+-i arccos c): the orbit is stable.
+One half-trace is 1 for every orbit, that of a shift in time and of a change of energy. Its left eigenvector l in the
+product of blocks above is the rate at which the start passes its section: at rest the acceleration a, at the centre the
+velocity v. For S takes the state's rate at the start to that at the end. From rest to rest these are (0, a) and (0,
+a'), so that B a = 0 and l^T B^T C = 0; from rest to the centre (0, a) and (v', 0), so that D a = 0; from centre to
+centre (v, 0) and (v', 0), so that C v = 0. The other half-traces belong to the space orthogonal to l, into which the
+product maps.
+"""
 
 import numpy as np
 
@@ -9,11 +37,9 @@ from vipetsc.modes.system import System
 
 
 def half_traces(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarray:
-    """Half-traces c (n - 1,) = (mu + 1/mu)/2 of the basic map's multipliers, the trivial pair left out.
+    """Half-traces c (n - 1,) of the basic map of an ``arc``, without that of its trivial pair, by their real parts.
 
-    The basic map is the half period (seen with the sign reversed) for the quarter-period map and the period for the
-    others; its diagonal block is derived in the package's docstring. The left eigenvector of its trivial eigenvalue is
-    the velocity (or acceleration) at the start, so that it is removed exactly.
+    They are real, or complex if one of them is not.
     """
     root = np.sqrt(system.masses)
     n = len(root)
@@ -21,7 +47,7 @@ def half_traces(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarr
     blocks = sensitivity[:n, :n], sensitivity[:n, n:], sensitivity[n:, :n], sensitivity[n:, n:]
     a, b, c, d = (root[:, None] * block / root for block in blocks)
 
-    # The whole period needs no mirror image.
+    # The product of blocks in the table of this module, of which the half-traces are 1 + 2 eigenvalues, or 1 - 2.
     if shooting_map.fraction == 1.0:
         product = (a - np.eye(n)) / 2
     elif shooting_map.quarter:
@@ -36,6 +62,7 @@ def half_traces(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarr
         eigenvalues = np.array([np.trace(product)])
     else:
         trivial = _start_rate(system, shooting_map, arc) * root
+        # The right singular vectors of a row are the row itself, then a basis of what is orthogonal to it.
         basis = np.linalg.svd(trivial[None, :])[2][1:].T
         eigenvalues = np.linalg.eigvals(basis.T @ product @ basis)
 
@@ -51,7 +78,7 @@ def half_traces(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarr
 
 
 def _start_rate(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarray:
-    """The time derivative (n,) of what is zero at the arc's start."""
+    """The time derivative (n,) of what is zero at the arc's start: acceleration at rest, velocity at the centre."""
     n = system.dofs
     if not shooting_map.starts_at_rest:
         return arc.start[n:]
@@ -59,7 +86,10 @@ def _start_rate(system: System, shooting_map: ShootingMap, arc: Arc) -> np.ndarr
 
 
 def multipliers(traces: np.ndarray, quarter: bool) -> np.ndarray:
-    """Floquet multipliers (2n - 2,) over the whole period from half-traces (n - 1,)."""
+    """Floquet multipliers (2n - 2,) over the whole period from half-traces (n - 1,), those of a ``quarter`` map or not.
+
+    The first half has |mu| >= 1, the second half their inverses.
+    """
     c = traces.astype(complex)
     root = np.sqrt(c * c - 1)
     # The larger root of mu^2 - 2 c mu + 1 = 0 without cancellation; the smaller one is its inverse.
