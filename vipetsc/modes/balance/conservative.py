@@ -127,6 +127,10 @@ class ConservativeMotions:
         balance = self.balance(point.order)
         return departures_of(self.forces, balance.series(point.x, 2 * np.pi / point.period).episodes)
 
+    def grazing(self, point: Point) -> list[int]:
+        """No contact: at a touch the number of harmonics limits a branch, and not the length of its steps."""
+        return []
+
     @property
     def highest_order(self) -> int:
         """The highest order that is taken: ``nnm.harmonics``, or the odd number below it."""

@@ -27,7 +27,7 @@ import numpy as np
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.modes.continuation.guards import GUARDED, OrbitProblem, strain
 from vipetsc.modes.point import Point
-from vipetsc.modes.problem import Attempt, ContinuationError, PeriodicProblem, S
+from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, PeriodicProblem, S
 
 # These numbers decide how many points lie on a branch, not its course: each point solves the equations and keeps the
 # guards. None is sharp. On the out-of-phase branch of the paper's reduced model up to 10 kJ (176 points, 21 attempts in
@@ -154,8 +154,24 @@ class GuardedSteps:
             residuals = attempt.residuals
         return (
             f"step below {self.smallest_step:g} after point {last.index} "
-            f"(E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): {verdict.why}; "
+            f"(E = {last.energy:.9g} J, f = {last.frequency:.9g} Hz): {verdict.why}; {self._touch(last)}"
             f"residuals of the last attempt: {residuals}; change nnm.smallest_step or {verdict.remedy}"
+        )
+
+    def _touch(self, point: Point) -> str:
+        """A sentence about contacts that graze in the orbit of a ``point``; empty for none."""
+        try:
+            numbers = self.problem.grazing(point)
+        except FlowError:
+            return ""
+        if not numbers:
+            return ""
+        graze = f"contact {numbers[0]} grazes"
+        if len(numbers) > 1:
+            graze = f"contacts {', '.join(map(str, numbers))} graze"
+        return (
+            f"{graze} there, at no speed, where a stiff contact bends the branch within less than a step: "
+            'try nnm.chart = "grazing", or nnm.guards.corrector = 0.5 with nnm.smallest_step = 1e-18; '
         )
 
 

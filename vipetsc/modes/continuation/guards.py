@@ -36,6 +36,12 @@ class OrbitProblem(PeriodicProblem[Point], Protocol):
         Raises FlowError if the arc cannot be integrated.
         """
 
+    def grazing(self, point: Point) -> list[int]:
+        """The numbers, from 1, of contacts that graze in an orbit, where they are looked for.
+
+        All ranks must call it. Raises FlowError if the arc cannot be integrated.
+        """
+
 
 class Strain(NamedTuple):
     """Largest change in a step over the bound of its ``guard``; 1 is the bound."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vipetsc.modes.grazing import grazing_contacts
 from vipetsc.modes.latest import LatestValues
 from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
@@ -22,6 +23,8 @@ from vipetsc.modes.shooting.stability import HalfTraceAbove, half_traces, multip
 LEAST_CROSSING = 1e-6
 # Singular values of the Jacobian below this fraction of the largest leave the tangent open.
 DEGENERATE = 1e-12
+# Samples of an arc in which contacts that graze are looked for.
+SAMPLES = 2000
 
 
 class DenseFrame(ShootingFrame[Arc]):
@@ -138,6 +141,13 @@ class Shooting(ShootingEquations[Arc]):
                 f"{values}; start at another energy (nnm.start_energy) or switch branches there"
             )
         return chart.derivative(xi) @ directions[-1]
+
+    def grazing(self, point: Point) -> list[int]:
+        """The numbers, from 1, of contacts that graze in an orbit; raises FlowError if it cannot be integrated."""
+        start = self.arc(point.x, point.period).start
+        interval = self.map.fraction * point.period / SAMPLES
+        u = self.flow.states(start, interval, SAMPLES, point.period)[:, : self.system.dofs]
+        return grazing_contacts(self.system, u)
 
     def special_kinds(self, left: Point, right: Point) -> Iterator[SpecialKind[Point]]:
         """Folds, what the half-traces tell, and a contact that just touches.

@@ -234,6 +234,10 @@ class ShootingEquations(ABC, Generic[A]):
         in_periods = [(begin / point.period, end / point.period) for begin, end in spans]
         return within_arc(in_periods, self.map.fraction, self.map.ends_at_rest)
 
+    def grazing(self, point: Point) -> list[int]:
+        """No contact: a subclass whose orbits have all masses on one rank may look for those that graze."""
+        return []
+
     @abstractmethod
     def null_vector(self, start: Point) -> np.ndarray:
         """Tangent d(x, period) at a corrected orbit, of either sign; raises ContinuationError if it is not unique."""
