@@ -253,9 +253,9 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
     @numba.njit
     def slope(t: float, y: np.ndarray) -> np.ndarray:
         f = np.empty_like(y)
-        f[:n] = y[n:]
-
         for i in range(n):
+            # One by one: numba takes seconds to compile the assignment of a slice.
+            f[i] = y[n + i]
             total = 0.0
             for k in range(first[i], first[i + 1]):
                 total -= values[k] * y[columns[k]]
