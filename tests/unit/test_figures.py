@@ -14,6 +14,7 @@ from scipy.integrate import trapezoid
 
 from tests.readable import complaints
 from vipetsc.case import Case
+from vipetsc.figures import style
 from vipetsc.figures.lattice_strip import draw_lattice
 from vipetsc.figures.log_ticks import label_log_axis
 from vipetsc.figures.registry import draw, draw_bands, drawings, figure_names
@@ -182,8 +183,10 @@ def assert_not_blank(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", figure_names("run"))
-def test_every_figure_is_drawn_from_every_shape_of_run(measured, name):
+def test_every_figure_is_drawn_from_every_shape_of_run(measured, name, monkeypatch):
     folder, shape = measured
+    # Laid out as ever: what is cut off there is cut off in a coarse picture.
+    monkeypatch.setattr(style, "SCREEN", 100)
     paths = draw("run", [folder], [name])
     if name in WITHOUT.get(shape, {}):
         assert paths == []
