@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -56,8 +57,14 @@ SOURCES = [path for path in sorted(ROOT.rglob("*.py")) if path.parent != ROOT / 
 MODULES = {module_of(path): path for path in SOURCES}
 
 
-def imported(path: Path) -> Iterator[str]:
+# Five tests ask for the same files, and to parse all of them takes a second.
+@cache
+def imported(path: Path) -> list[str]:
     """Every name that a file imports, inside functions and for type checkers too."""
+    return [*_imported(path)]
+
+
+def _imported(path: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             for alias in node.names:

@@ -57,7 +57,9 @@ TEN_CELLS["contacts"]["each"] = {
 
 @pytest.fixture(scope="module")
 def two_masses(tmp_path_factory):
-    return followed(NfrcCase.from_table(TWO_MASSES), tmp_path_factory.mktemp("rig") / "two")
+    # Over the first resonance, with its two folds and its pair of multipliers that grows.
+    first = TWO_MASSES | {"nfrc": TWO_MASSES["nfrc"] | {"range": [1.0, 1.5]}}
+    return followed(NfrcCase.from_table(first), tmp_path_factory.mktemp("rig") / "two")
 
 
 @pytest.fixture(scope="module")

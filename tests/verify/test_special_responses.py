@@ -33,8 +33,8 @@ UNEVEN = {"contacts": {"side": "both", "clearance": 0.05}, "nfrc": {"range": [0.
 
 
 def case_of(changes: dict[str, Any], **nfrc: Any) -> NfrcCase:
-    """Two masses with these ``changes`` by section."""
-    table = TWO_MASSES | {"nfrc": TWO_MASSES["nfrc"] | {"harmonics": 61}}
+    """Two masses with these ``changes`` by section, in as long steps as the curve allows."""
+    table = TWO_MASSES | {"nfrc": TWO_MASSES["nfrc"] | {"harmonics": 41, "largest_step": 1.0}}
     table |= {section: table[section] | values for section, values in changes.items()}
     return NfrcCase.from_table(table | {"nfrc": table["nfrc"] | nfrc})
 
