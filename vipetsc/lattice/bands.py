@@ -26,8 +26,8 @@ BLOCK = 16  # wavenumbers whose matrices are held at once: with 8 a seventh slow
 # a speed by far less than a tenth: 0.8 and 0.95 find the same.
 NEARLY_FASTEST = 0.9
 FLAT = 1e-12  # part of a frequency by which rounding moves it
-# Smallest wavenumber at which group velocities are computed. Half of it changes the limit by 9e-8 of it, twice by 4e-7:
-# below, rounding of omega^2 counts, above, the curvature of the band.
+# Smallest wavenumber at which group velocities are computed. The limit at 0 changes by 9e-8 of itself with half of it,
+# by 4e-7 with twice: at smaller ones rounding of omega^2 counts, at larger ones the curvature of the band.
 OFF_ZERO = 3e-4
 
 
@@ -56,8 +56,9 @@ class Band:
 def bloch(cell: UnitCell, kappa: ArrayLike) -> BlochPoint:
     """Frequencies, eigenvectors and group velocities of ``cell`` at wavenumbers ``kappa`` (...) in rad per cell.
 
-    Solves (K(kappa) - omega^2 M) u = 0; the group velocity is d omega/d kappa = u* K' u / (2 omega), taken
-    as the limit from kappa > 0 where omega = 0.
+    Solves (K(kappa) - omega^2 M) u = 0 with u* M u = 1. The group velocity is d omega/d kappa = u* K' u / (2 omega)
+    with K' = dK/d kappa, as follows from the derivative of u* K u = omega^2; where omega = 0 it is the limit from
+    kappa > 0.
     """
     kappa = np.asarray(kappa, float)
     root = 1 / np.sqrt(cell.masses)
@@ -196,7 +197,7 @@ def fastest_speed(cell: UnitCell) -> float:
 
 @lru_cache
 def waves_at(cell: UnitCell, frequency: float) -> tuple[tuple[int, float, float], ...]:
-    """Propagating waves of ``frequency`` (rad/s): (band, kappa in (0, pi), |v_g| in cells/s); () in a gap."""
+    """Propagating waves of ``frequency`` (rad/s): (band from 1, kappa in [0, pi], |v_g| in cells/s); () in a gap."""
     waves = []
     grid = _grid(cell)
     for number, offset in enumerate((grid.frequency - frequency).T, 1):

@@ -1,4 +1,9 @@
-"""The unit cell: masses, springs within it and to the next cell, and the contact pair."""
+"""The unit cell: masses, springs within it and to the next cell, and the contact pair.
+
+A Bloch wave has u_n = U exp(i kappa n) in cell n. A spring k from mass i of cell n to mass j of cell n + o then pulls
+at i with k (U_i - U_j exp(i kappa o)), and such rows make up the Bloch stiffness K(kappa); dashpots make up C(kappa)
+likewise.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -53,7 +58,10 @@ class Spring:
 
 
 class Coupling(NamedTuple):
-    """A spring as one of its masses sees it: cells to the ``other`` mass, N/m, N s/m, the spring's number (from 0)."""
+    """A spring as one of its masses sees it: from ``mass`` of a cell to ``other``, which is ``offset`` cells further.
+
+    ``stiffness`` in N/m and ``damping`` in N s/m are the spring's, ``spring`` is its number in the cell (from 0).
+    """
 
     mass: int
     offset: int
@@ -118,8 +126,7 @@ class UnitCell:
     def stiffness_matrix(self, kappa: ArrayLike) -> np.ndarray:
         """Bloch stiffness (..., dofs, dofs) in N/m at wavenumber ``kappa`` in rad per cell; Hermitian.
 
-        The paper's printed matrix lacks the -1/2 in row 1, column 2 of Eq. (S1); this one follows from
-        the springs.
+        It follows from the springs. The matrix that the paper prints, Eq. (S1), lacks the -1/2 in row 1, column 2.
         """
         return self._bloch(kappa, [c.stiffness for c in self.couplings()])
 
@@ -196,7 +203,7 @@ def _dashpot_problems(grounding: tuple[float, ...], n: int) -> list[tuple[str, s
 
 @lru_cache
 def connected_groups(n: int, pairs: tuple[tuple[int, int], ...]) -> list[int]:
-    """Numbers of the groups into which ``pairs`` tie ``n`` nodes (0-based): that of each node, in their order."""
+    """The group (from 0) of each of ``n`` nodes, in their order; ``pairs`` are the nodes (0-based) tied together."""
     # Asked once for each kind of cell: sweeps and searches have thousands of one kind.
     graph = coo_matrix((np.ones(len(pairs)), np.transpose(pairs)), (n, n))
     return scipy.sparse.csgraph.connected_components(graph, directed=False)[1].tolist()
@@ -215,10 +222,12 @@ def diatomic(reading: Reading = "printed") -> UnitCell:
 
 
 def four_band(reading: Reading = "printed", lam: float = 0.1, eta: float = 0.5) -> UnitCell:
-    """The paper's four-band cell, Eq. (7), in its Hermitian reading: u4-u1(next), u1-u2-u4, u2-u3.
+    """The paper's four-band cell, Eq. (7), in its Hermitian reading.
 
-    ``lam`` and ``eta`` set the resonator's spring and mass. The printed reading has the spring
-    lam k = 2000 N/m; the calibrated one lam k2 = 1000 N/m, which gives the paper's transfer of 0.30 to 0.35.
+    Springs, with masses counted from 1: k = 2e4 N/m from u4 to u1 of the next cell, k2 = 1e4 N/m from u1 to u2 and from
+    u2 to u4, and from the host u2 to the resonator u3 one that ``lam`` sets: lam k = 2000 N/m in the printed reading,
+    lam k2 = 1000 N/m in the calibrated one, which gives the paper's transfer of 0.30 to 0.35. ``eta`` is the
+    resonator's part of the mass of host and resonator together.
     """
     m = 0.005
     k = 2e4

@@ -15,8 +15,8 @@ from vipetsc.lattice.variation import Coefficients, SpringTerms, Variation
 
 Ends = Literal["fixed", "free", "periodic"]
 
-# Cells whose linear response is solved for, in 2 ms. The scale of waves differs by 5e-4 with 200, by 2.5e-4 with 800,
-# for a burst of almost no frequency; for others by 1e-13 to 1e-4.
+# Cells at most whose linear response is solved for, in 2 ms. With 200 or 800 in its place the scale of waves changes by
+# 5e-4 and 2.5e-4 for a burst whose frequency is almost 0, and by 1e-13 to 1e-4 for others.
 LONGEST = 400
 
 
@@ -44,9 +44,9 @@ class Chain:
     """``cells`` unit cells in a row; contact ``sites`` are 0-based cells, ``clearances`` in m, one a site.
 
     ``ends``: ``fixed`` puts a wall at either end, held by the inter-cell springs; ``free`` cuts those
-    springs; ``periodic`` joins the last cell to the first. ``pairs`` are what contacts join, the cell's pair if
-    (). ``variation`` holds what differs from ``cell``, whose bands are taken for the lattice's. Raises ValueError if
-    it is not of all cells.
+    springs; ``periodic`` joins the last cell to the first. ``pairs`` are the masses that contacts join, a pair a site;
+    with () all sites have the cell's pair. ``variation`` holds what differs from ``cell``; bands are those of ``cell``
+    alone. Raises ValueError if an array of ``variation`` has not one row for each cell.
     """
 
     cell: UnitCell
@@ -215,7 +215,7 @@ class Chain:
         return replace(self.cell, masses=tuple(mean.masses), springs=springs, grounding=tuple(mean.grounding))
 
     def stiffness_matrix(self) -> csc_matrix:
-        """Sparse stiffness (cells dofs, cells dofs) in N/m, ordered cell by cell; needs little for <= 1e6."""
+        """Sparse stiffness (cells dofs, cells dofs) in N/m, ordered cell by cell; memory grows as the cells."""
         return self.stiffness_rows(0, self.cells).tocsc()
 
     def stiffness_rows(self, start: int, stop: int) -> csr_matrix:
@@ -279,11 +279,12 @@ class Chain:
         return self.coefficients(0, self.cells).masses.ravel()
 
     def wave_scale(self, drive: Waveform, cell: int = 0, mass: int = 0) -> float:
-        """Displacement amplitude in m of the linear wave that ``drive`` makes; velocity is Om times that.
+        """Displacement amplitude in m of the linear wave that ``drive`` makes on a ``mass`` of a ``cell`` (0-based).
 
-        The largest steady response to the burst's peak force at the complex frequency Om (1 - i/Nc), whose
-        imaginary part stands for the finite burst. Scales exactly with the drive's amplitude. A lattice
-        longer than LONGEST cells is cut there: the wave is evanescent at that frequency.
+        With the drive's main frequency Om and its Nc cycles it is the largest steady response to the peak force at the
+        complex frequency Om (1 - i/Nc), whose imaginary part stands for the finite burst; Om times that is the scale of
+        velocities. It scales exactly with the drive's amplitude. Of a lattice longer than ``LONGEST`` cells so many are
+        kept: at a complex frequency waves decay before they reach the cut.
         """
         cells = min(self.cells, LONGEST)
         driven = cell
@@ -313,7 +314,7 @@ def _largest_response(cell: UnitCell, cells: int, ends: Ends, driven: int, omega
 
 
 def cells_between(cell: ArrayLike, other: int, cells: int, ends: Ends) -> np.ndarray:
-    """Number of cells from ``cell`` (...) to ``other`` in a lattice of ``cells``; in a ring the shorter direction."""
+    """Distance (...) in cells of each ``cell`` (...) to ``other`` in a chain of ``cells``; the shorter on a ring."""
     distance = np.abs(np.asarray(cell, np.int64) - other)
     if ends == "periodic":
         distance = np.minimum(distance, cells - distance)

@@ -1,9 +1,12 @@
 r"""Compliance between contact pairs: relative displacements per harmonic force in a lattice of any length.
 
-Of the Bloch waves (``waves``) half decay or carry energy to higher cells, half to lower ones. Loaded cells and the ends
-are solved for with the amplitudes of both kinds in every stretch between, each counted from the end that it leaves: all
-factors are at most one, and a stretch costs the same whatever its length. An infinite lattice has outgoing waves alone
-on either side. Cf. Lopez Sancho et al., J. Phys. F 15 (1985) 851, who double stretches.
+With b_i = 1 at the resonator and -1 at the host of pair i it is G_ij = b_i^T (K - omega^2 M)^-1 b_j in m/N, here of
+equal cells without dashpots. Of the Bloch waves (``waves``) half decay or carry energy to higher cells, half to lower
+ones. The unknowns are the displacements of the loaded cells and of those at the ends, and the amplitudes of both kinds
+of waves in every stretch without loads between them. Each wave has its amplitude at the end of the stretch that it
+leaves: all powers of factors are then at most one, and a stretch costs the same whatever its length. An infinite
+lattice has outgoing waves alone on either side. Cf. Lopez Sancho et al., J. Phys. F 15 (1985) 851, who double stretches
+in place of waves.
 """
 
 from dataclasses import dataclass, replace
@@ -24,8 +27,9 @@ class IncidentWave(NamedTuple):
     """A Bloch wave whose relative displacement at the first site is 1 m: ``relative`` (pairs,) at all of them.
 
     ``frequency`` in rad/s, ``band`` (from 1), ``direction`` +1 to higher cells or -1, ``wavenumber`` in (0, pi) rad a
-    cell, energy ``flux`` in W/m^2. ``shape`` (dofs,) is the displacement at cell ``origin``, that of the next cell
-    ``factor`` times it; ``channel`` is the wave's place among those of its direction.
+    cell. ``flux`` in W/m^2 is the power of a wave over the square of its relative displacement. ``shape`` (dofs,) is
+    the displacement at cell ``origin``, that of the next cell ``factor`` times it; ``channel`` is the wave's place
+    among those of its direction.
     """
 
     frequency: float
@@ -72,9 +76,9 @@ class _Solution(NamedTuple):
 class WaveCompliance:
     """Compliance of the sites of ``chain``, from Bloch waves; ``infinite``: its cells go on beyond both ends.
 
-    Relative displacements w = u_resonator - u_host of the contact pairs follow from pairs of opposite forces, and by
-    forces on single masses at the ``points``, which are (cell, mass) from 0. At omega = 0 forces on a lattice that is
-    free to move, as an infinite one is, must sum to zero.
+    All cells are as ``chain.cell``, whose dashpots are left out. Relative displacements w = u_resonator - u_host of the
+    contact pairs follow from pairs of opposite forces, and from forces on single masses at the ``points``, which are
+    (cell, mass) from 0. At omega = 0 forces on a lattice that is free to move, as an infinite one is, must sum to zero.
     """
 
     chain: Chain
@@ -114,7 +118,7 @@ class WaveCompliance:
         return self.response(omegas)[:, :, : len(self.chain.sites)]
 
     def field(self, omega: complex, forces: ArrayLike, cells: ArrayLike) -> np.ndarray:
-        """Displacement (cells, dofs) in m at ``cells`` (from 0), of an infinite lattice any.
+        """Displacement (cells, dofs) in m at ``cells`` (from 0); an infinite lattice has any cell, negative ones too.
 
         ``forces`` in N are those of the pairs, which pull back (-F on the resonator, F on the host), then those on the
         points, if there are any. Raises ValueError for a cell that the lattice does not have.

@@ -79,7 +79,12 @@ def contact_stiffness(modulus: float, radius: float, poisson: float) -> float:
 
 
 def rebound(damping: float, restitution: float) -> float:
-    """c (1 + e) + log(1 - c e) - log(1 + c): zero where an impact with the damping c has the restitution e."""
+    """c (1 + e) + log(1 - c e) - log(1 + c): zero where an impact with the damping c has the restitution e.
+
+    For s = w'/w'_minus the motion m w'' = -f (1 + c s) gives s ds/(1 + c s) = -f dx/(m w'_minus^2). The indentation is
+    0 at both ends of an impact, and with it the integral of f dx: that of s/(1 + c s) from s = -e to 1 must be 0. It is
+    this expression over c^2.
+    """
     return float(damping * (1 + restitution) + np.log1p(-damping * restitution) - np.log1p(damping))
 
 
@@ -119,7 +124,10 @@ class Contact:
 
     @property
     def onset_exponent(self) -> float:
-        """The power of the indentation with which the force begins; raises KeyError for a law that there is not."""
+        """The power of the indentation with which the force begins.
+
+        Raises KeyError for a law that there is not, ValueError for the law ``power`` without an ``exponent``.
+        """
         registered = registered_law(self.law)
         if registered:
             return registered.onset_exponent
@@ -212,7 +220,7 @@ class Contact:
 
     @property
     def damping(self) -> float:
-        """The factor c of w'/w'_minus in g, by its name.
+        """The damping c in g = 1 + c w'/w'_minus, by the name in ``factor``.
 
         3 (1 - r)/2, the paper's: Hunt and Crossley, J. Appl. Mech. 42 (1975) 440. 3 (1 - r^2)/4: Lankarani and
         Nikravesh, J. Mech. Des. 112 (1990) 369. 8 (1 - r)/(5 r): Flores, Machado, Silva and Martins, Multibody Syst.
@@ -226,20 +234,22 @@ class Contact:
             return 0.75 * (1 - e**2)
         if self.factor == "flores":
             return 1.6 * (1 - e) / e
-        # Close to 1 the equation has lost its digits, and both dampings are the same to 1e-12.
+        # Close to e = 1 the terms of ``rebound`` cancel, and both dampings are the same to 1e-12.
         if self.factor != "exact" or e > 1 - 1e-6:
             return 1.5 * (1 - e)
+        # To first order in c the root is 3 (1 - e^2)/(2 (1 + e^3)). It is above half of that, and below 1/e, where the
+        # logarithm diverges.
         return float(scipy.optimize.brentq(rebound, 0.75 * (1 - e**2) / (1 + e**3), (1 - 1e-12) / e, (e,)))
 
     @property
     def effective_restitution(self) -> float:
         """-w'_plus/w'_minus of two masses that nothing but the contact acts on, above the ``approach_floor``."""
         c = self.damping
-        # Near c = 0 the equation's terms cancel: its expansion takes their place.
+        # Near c = 0 the terms of ``rebound`` cancel: its expansion takes their place.
         if c < 1e-6:
             return 1 - 2 * c / 3
         most = min(1.0, (1 - 1e-12) / c)
-        # Of strong damping the masses part at the speed at which the force vanishes, e = 1/c, to all digits sought.
+        # With strong damping the masses part at the speed at which g vanishes, e = 1/c, to all digits sought.
         if rebound(c, most) > 0:
             return most
         return float(scipy.optimize.brentq(lambda e: rebound(c, e), 0.0, most))

@@ -1,9 +1,10 @@
 r"""Bloch waves of a cell with dashpots, and the dashpots that give bands a loss.
 
 At a real wavenumber (s^2 M + s C(kappa) + K(kappa)) u = 0 for motion exp(s t): each wave has a damping ratio
--Re s/|s| and decays by 1/e in -1/Re s. At a real frequency, motion exp(i omega t), the cells obey
-(B^T/lambda + D + B lambda) u = 0 with u_{n+1} = lambda u_n, D + B + B^T = K(0) + i omega C(0) - omega^2 M and B the
-coupling to the next cell: a wave decays by 1/e in 1/|log |lambda|| cells. Cf. Mead, J. Sound Vib. 27 (1973) 235.
+-Re s/|s| and decays by 1/e in the time -1/Re s. At a real frequency, motion exp(i omega t) and u_{n+1} = lambda u_n,
+the cells obey (B^T/lambda + D + B lambda) u = 0. B is the coupling to the next cell and D the block of a cell itself,
+both complex: D + B exp(i kappa) + B^T exp(-i kappa) = K(kappa) + i omega C(kappa) - omega^2 M. A wave decays by 1/e in
+1/|log |lambda|| cells. Cf. Mead, J. Sound Vib. 27 (1973) 235.
 """
 
 from functools import lru_cache
@@ -52,8 +53,8 @@ def damped_bloch(cell: UnitCell, kappa: ArrayLike) -> DampedPoint:
     stiffness = inverse * cell.stiffness_matrix(kappa)
     damping = inverse * cell.damping_matrix(kappa)
 
-    # The state is (scale u, u'): displacements and velocities of one size. Nothing but dashpots resists a motion of
-    # equal masses together.
+    # The state is (scale u, u'): displacements and velocities of one size. The stiffness of a cell of one mass vanishes
+    # at kappa = 0: dashpots give the scale then, and without them any will do.
     scale = np.sqrt(np.abs(stiffness).sum(axis=-1).max()) or np.abs(damping).sum(axis=-1).max() or 1.0
     state = np.zeros((*kappa.shape, 2 * d, 2 * d), complex)
     state[..., :d, d:] = scale * np.eye(d)
@@ -74,9 +75,11 @@ def damped_bloch(cell: UnitCell, kappa: ArrayLike) -> DampedPoint:
 def fitted_dashpots(cell: UnitCell, loss: tuple[tuple[int, float], ...]) -> tuple[np.ndarray, np.ndarray]:
     """Dashpots in N s/m to ground (dof,) and parallel to the springs (spring,) that bring bands near to a ``loss``.
 
-    It is given by band (from 1), as twice the damping ratio. A wave phi of omega, phi* M phi = 1, has phi* C phi/omega
-    if C is small, which is linear in the dashpots: not negative, they minimise the sum over ``KAPPAS`` and these bands
-    of the squared difference over the loss asked, over the mean where none is. Those that ``cell`` has are counted.
+    ``loss`` has pairs of a band (from 1) and the loss asked of it, twice the damping ratio. A wave phi of frequency
+    omega, phi* M phi = 1, has the loss phi* C phi/omega if C is small, which is linear in the dashpots. They are not
+    negative and minimise the sum, over ``KAPPAS`` and these bands, of ((loss - asked)/scale)^2, where the scale is the
+    loss asked, or the mean of all where a band is asked to have none. The dashpots of ``cell`` count and remain: those
+    returned are in addition.
     """
     numbers, asked = np.array(loss).T
     bands = numbers.astype(int) - 1
@@ -140,7 +143,8 @@ def damped_waves(cell: UnitCell, omega: float) -> Waves:
     shape = vectors[:d, finite]
     shape = shape / np.linalg.norm(shape, axis=0)
 
-    # The mean power of the coupling's force on the next cell, Re(f* v)/2 with v = i omega u.
+    # The mean power that a cell gives to the coupling: -Re(f* v)/2 of the force f = -B lambda u with which the next
+    # cell pulls, and v = i omega u.
     flux = omega / 2 * np.imag(factor * np.einsum("dw,de,ew->w", shape.conj(), coupling, shape))
     growth = np.log(np.abs(factor))
     # By growth, those that decay to higher cells first; of those that do neither, the flux is the sign.

@@ -1,4 +1,8 @@
-"""Compliance of a small system between its contact pairs, from all its linear modes."""
+"""Compliance of a small system between its contact pairs, from all its linear modes.
+
+With K phi_n = Om_n^2 M phi_n and phi_n^T M phi_n = 1, and z = rows u, it is the sum over modes of
+z_n z_n^T/(Om_n^2 - omega^2) with z_n = rows phi_n.
+"""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,8 +40,11 @@ class DenseCompliance:
         return np.asarray((self.parts * gain[:, None, :]) @ self.parts.T)
 
     def with_springs(self, omegas: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
-        """The compliance with a spring of ``stiffness`` (omega,) in N/m added at each pair, also on a linear mode."""
-        # Where the compliance itself has a pole, as many digits of it are lost as it is large.
+        """The compliance (omega, pair, pair) in m/N with a spring of ``stiffness`` (omega,) in N/m added at each pair.
+
+        It is Z (diag(Om_n^2 - omega^2) + k Z^T Z)^-1 Z^T, with the columns z_n in Z and the stiffness k.
+        """
+        # (1 + k G)^-1 G of the compliance G without springs is the same, but loses digits close to a pole of G.
         gap = self.squared - np.asarray(omegas)[:, None] ** 2
         dynamic = np.eye(len(self.squared)) * gap[:, None]
         dynamic = dynamic + np.asarray(stiffness)[:, None, None] * (self.parts.T @ self.parts)

@@ -1,5 +1,6 @@
 """Compliance of a finite lattice of any cells and dashpots, by elimination at each frequency.
 
+It is R^T (K + i omega C - omega^2 M)^-1 L for loads in the columns of L and motions that those of R pick.
 ``ModalCompliance`` computes all modes, which takes a minute for a thousand masses with dashpots; here each frequency
 takes a few milliseconds, and time in proportion to the number of cells.
 """
@@ -36,7 +37,10 @@ class DirectCompliance:
         return unit_loads(self.chain, self.chain.resonator_cells, self.points, range(self.chain.cells))
 
     def response(self, omegas: ArrayLike) -> np.ndarray:
-        """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s, below the real axis."""
+        """Relative displacements (omega, pair, pair and point) in m/N at ``omegas`` in rad/s.
+
+        They lie below the real axis, where no mode makes the matrix singular.
+        """
         return self.motion(omegas, self.loads[:, : len(self.chain.sites)])
 
     def motion(self, omegas: ArrayLike, rows: np.ndarray) -> np.ndarray:

@@ -127,8 +127,8 @@ class Pieces:
     """A waveform of pieces: ``table`` (piece,) of dtype ``PIECE``, scaled by ``amplitude`` already.
 
     It begins with the first piece and ends at ``duration`` in s, which may be inf. ``frequency`` in rad/s is its main
-    one, ``cycles`` the length over which it lasts or rises, in periods of that. Waveforms are equal if their digests
-    are.
+    one. ``cycles`` is the time for which it lasts, or rises if it does not end, in periods of that frequency, at least
+    1. Waveforms are equal if their numbers and the ``digest`` of their tables are.
     """
 
     amplitude: float
@@ -271,7 +271,8 @@ Waveform = ToneBurst | Pieces
 class Drive:
     """A ``waveform`` that acts on a ``mass`` of a ``cell`` (0-based): a force in N.
 
-    With a ``stiffness`` in N/m it is k U: of a wall whose motion is U, through a spring to that mass.
+    With a ``stiffness`` k in N/m, not 0, the waveform is the motion U of a wall to which a spring k ties that mass, and
+    the force is k U.
     """
 
     waveform: Waveform

@@ -1,8 +1,13 @@
 r"""Waves that the cells at an end of a lattice send back when a wave comes to them, and ends that absorb.
 
-The section of the last cells is condensed onto its innermost cell: from the outermost one inwards, with B the coupling
-outwards, Z_n = K_nn + i omega C_nn - omega^2 M_n - B Z_{n+1}^-1 B^T. There Z u = -B^T u_before, where the waves that
-come and those that go back make up u_before, and u as far as the coupling feels it.
+The section of the last cells is condensed onto its innermost cell. From the outermost one inwards, with n counted
+outwards and B the coupling outwards, Z_n = K_nn + i omega C_nn - omega^2 M_n - B Z_{n+1}^-1 B^T. The innermost cell
+then obeys Z u = -B^T u_before, where u_before is the motion of the last cell before the section. That is a sum of waves
+that come and waves that go back; the coupling B does not distinguish u from the same sum one cell further outwards:
+
+    B (sum_j a_j step_j shape_j + Z^-1 B^T sum_j a_j shape_j) = 0
+
+gives the amplitudes a_j of those that go back, with step_j the factor of wave j from a cell to the next one outwards.
 """
 
 from typing import Literal, NamedTuple
@@ -93,7 +98,10 @@ def _blocks(rows: csr_matrix, first: int, d: int) -> np.ndarray:
 
 
 def amplitudes_back(z: np.ndarray, waves: Waves, end: End) -> np.ndarray:
-    """Amplitudes (wave back, wave towards), at the cell next to a section that is condensed to ``z`` (dof, dof)."""
+    """Amplitudes (wave back, wave towards) of the waves that each wave of amplitude 1 towards an ``end`` sends back.
+
+    Both are at the last cell before the section, which is condensed to ``z`` (dof, dof).
+    """
     towards, back, coupling, step = Side.at(end, waves)
     half = len(waves.factor) // 2
     # The coupling has rank ``half``: only its range is compared, in an orthonormal basis.

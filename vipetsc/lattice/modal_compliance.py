@@ -9,6 +9,9 @@ Without dashpots each mode answers for itself. With dashpots the state (S q, q')
 
     G(omega) = sum_r a_r b_r / (i omega - p_r).
 
+With the eigenvectors x_r as columns of X, a_r = phi S^-1 (upper half of x_r) is the motion of pole r, and
+b_r = (right half of row r of X^-1) phi^T is what a force adds to it.
+
 A motion as a rigid body, which neither a spring nor a dashpot opposes, is kept apart: its pole is double, and such a
 matrix has too few eigenvectors. Where dashpots to the ground oppose it, one of its poles is 0. Cf. F. Tisseur, K.
 Meerbergen, The quadratic eigenvalue problem, SIAM Rev. 43 (2001) 235.
@@ -151,7 +154,8 @@ class ModalCompliance:
     def _gain(self, omega: np.ndarray, moved: np.ndarray) -> np.ndarray:
         """The factor 1/(i omega - p) (omega, pole) at ``omega`` in rad/s.
 
-        At rest a body that nothing holds may be anywhere: at p = 0 it is 0 unless the pole is ``moved`` (pole,).
+        It is unbounded for p = 0 at omega = 0, where a body that nothing holds may be anywhere. It is set to 0 there
+        unless the pole is ``moved`` (pole,).
         """
         poles = self._poles.poles
         gap = 1j * omega[:, None] - poles

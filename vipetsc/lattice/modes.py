@@ -1,12 +1,13 @@
 """The linear modes of a finite lattice, or waves on a ring where modes are too many.
 
 Without contacts M u'' + K u = f. With x = M^(1/2) u and the orthonormal vectors of M^(-1/2) K M^(-1/2) v = Om^2 v the
-complex amplitudes z = v*.x' + i Om v*.x obey z' = i Om z + v*.M^(-1/2) f. The energy |z|^2/2 of a mode changes by
-forces alone, and the energies of all modes sum to the kinetic energy and that of the springs.
+complex amplitudes z = v*.x' + i Om v*.x obey z' = i Om z + v*.M^(-1/2) f. Forces alone change the energy |z|^2/2 of a
+mode, and the energies of all modes sum to the kinetic energy and that of the springs.
 
-The modes of a ring are Bloch waves, at 2 pi/cells times whole numbers. Beyond ``MOST_DOFS`` a lattice with ends is
-taken for a part of a ring: with one more cell, at rest, that is a wall on both sides, and energies sum up; free ends
-lack the spring that a ring has between them. A wave that meets an end is seen in other bands too until it has left.
+The modes of a ring are Bloch waves, at 2 pi/cells times whole numbers. Beyond ``MOST_DOFS`` the modes of a lattice with
+ends are replaced by the waves of a ring of which it is a part, and are not exact. Between fixed ends the ring has one
+more cell, at rest, which is the wall on both sides: energies still sum to the whole. Free ends lack the spring that the
+ring has between them. A wave that meets an end is seen in other bands too until it has left.
 """
 
 from collections.abc import Callable
@@ -39,8 +40,9 @@ class Modes:
     """Modes of ``chain``: ``frequency`` (mode) in rad/s, ``wavenumber`` (mode) in rad per cell, ``vectors``.
 
     Of a lattice with ends ``vectors`` is (cell and dof, mode), and a wavenumber, in [0, pi], is that of the standing
-    wave, in a gap its real part. If it is ``exact`` no more, and of a ring, modes are waves on ``cells`` cells with
-    vectors (k, dof, band) for k >= 0; positive wavenumbers go to higher cells.
+    wave, in a gap its real part. A ring, and a lattice with ends of more than ``MOST_DOFS`` masses, whose modes are not
+    ``exact``, have waves on a ring of ``cells`` cells instead: ``vectors`` is (k, dof, band) for k >= 0, and waves of
+    positive wavenumber go to higher cells.
     """
 
     chain: Chain

@@ -1,7 +1,8 @@
 r"""Compliance far above the pass bands, from moments: no waves are solved for, and nothing is lost to rounding.
 
-b^T (K - omega^2 M)^-1 b = -sum_n b^T (M^-1 K)^n M^-1 b / omega^(2n + 2) converges where omega is above all linear
-modes, which lie below the top of the highest band; a term reaches one cell further than the last.
+With b = 1 at a resonator and -1 at its host, b^T (K - omega^2 M)^-1 b = -sum_n b^T (M^-1 K)^n M^-1 b / omega^(2n + 2).
+The series converges where omega is above all linear modes, which lie below the top of the highest band. Term n reaches
+n cells to either side of b.
 """
 
 from functools import cached_property
@@ -13,7 +14,8 @@ from vipetsc.lattice.bands import pass_bands
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.compliance import WaveCompliance
 
-# Frequencies above FAST_FROM times the top of the bands, and terms of the series: 4^-28 is below rounding.
+# The series is used above FAST_FROM times the top of the bands, where each term is at most a quarter of the last: after
+# 28 terms 4^-28 is below rounding.
 FAST_FROM = 2.0
 TERMS = 28
 

@@ -6,9 +6,11 @@ length in each step:
 
     g = e^-1,   s <- s - a g b,   e <- e - a g b - b g a,   a <- -a g a,   b <- -b g b,
 
-from e = s = K_nn + i omega C_nn - omega^2 M, a = B, b = B^T with the coupling B to the next cell outwards; s becomes Z.
-The last cell of the finite part then has the additional dynamic stiffness S = -B Z^-1 B^T, and with the compliance G of
-the finite part alone (its modes) that of the whole is
+from e = s = K_nn + i omega C_nn - omega^2 M, a = B, b = B^T with the coupling B to the next cell outwards. Here e is
+the stiffness of a cell inside and s that of the first one, a and b couple it outwards and back; s becomes Z. The half
+lattice adds the dynamic stiffness S = -B Z^-1 B^T to the last cell of the finite part. With the compliance G of the
+finite part alone (its modes), and e in an index for the masses of that last cell, f and g for any others, that of the
+whole is
 
     G_fg - G_fe S (1 + G_ee S)^-1 G_eg.
 
@@ -80,6 +82,7 @@ class OpenCompliance(ModalCompliance):
     def _shifted(self, omegas: ArrayLike) -> np.ndarray:
         """The frequencies (omega,) with an imaginary part below zero."""
         omega = np.atleast_1d(np.asarray(omegas, complex))
+        # At omega = 0 its own size would give no decay: a thousandth of the highest frequency stands for it there.
         scale = np.maximum(np.abs(omega), 1e-3 * self._highest)
         return omega.real + 1j * np.minimum(omega.imag, -DECAY * scale)
 

@@ -50,8 +50,9 @@ def narrow_fraction(cell: UnitCell, waveform: Waveform, mass: int, width: float)
 
 
 class Packet(NamedTuple):
-    """A packet of 1 m at its ``centre`` cell (0-based): fields (cell, dof) in m and m/s from ``centre - len/2`` on.
+    """A packet whose envelope is largest, 1 m, at the ``centre`` cell (0-based).
 
+    ``displacement`` and ``velocity`` (cell, dof) in m and m/s are of the cells from ``centre - len(velocity)//2`` on.
     ``energy`` in J is that of all waves together.
     """
 
@@ -81,7 +82,8 @@ def gaussian_packet(cell: UnitCell, band: int, kappa: float, centre: int, width:
     envelope is a Gaussian of standard deviation ``width``. Vectors phi_k are turned so that they are in phase with that
     at ``kappa``; a wave that stands counts as going to higher cells.
     """
-    # Long enough for the envelope to be below rounding at the ring's far side.
+    # At the far side of the ring, 16 standard deviations away, the envelope is below rounding. A power of two is fast
+    # to transform.
     ring = 1 << max(int(np.ceil(np.log2(32 * width))), 7)
     k = 2 * np.pi * np.fft.fftfreq(ring, 1.0)
     backward = bloch(cell, kappa).group_velocity[band - 1] < 0

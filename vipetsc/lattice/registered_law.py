@@ -16,6 +16,7 @@ from numba.extending import intrinsic
 from vipetsc.compiled import c_address, kernel, users_function
 from vipetsc.register import MOST_PARAMETERS, LawPart
 
+# Of x, the stiffness k and four parameters: one for all laws, so that a kernel calls any of them.
 SIGNATURE = "float64(float64, float64, float64, float64, float64, float64)"
 
 

@@ -7,7 +7,7 @@ stretch without loads v_{n+1} = lambda v_n: with D = K_nn - omega^2 M and any s,
     u_n = -H (P (q - s p) + Q p'),  (q, p) = v_{n+1}, (q', p') = v_n,
     [1, Q^T H Q; 0, P^T H Q] v_n = lambda [-Q^T H P, s Q^T H P; -P^T H P, s P^T H P - 1] v_n.
 
-An imaginary s, a dashpot's, keeps H finite at all frequencies on and below the real axis. Half of the 2r Bloch waves
+An imaginary s, as a dashpot's, keeps H finite at all frequencies on and below the real axis. Half of the 2r Bloch waves
 decay or carry energy to higher cells, half to lower ones (omega stands for omega - i0). At omega = 0 the wave that is a
 shift in common has a linear one for its counterpart. Cf. Mead, J. Sound Vib. 27 (1973) 235.
 """
@@ -28,7 +28,7 @@ RANK = 1e-13  # singular values of B below this fraction of the largest are roun
 
 
 class BlochWaves(NamedTuple):
-    """All 2r waves of frequencies ``omega`` (w,): of half the last axis to higher cells, then to lower ones.
+    """All 2r waves at each of some frequencies (w,): the first r of the last axis go to higher cells, r to lower ones.
 
     ``factor`` (w, 2r) is lambda, of waves to lower cells 1/lambda: at most one. ``state`` (w, 2r, 2r) holds v = (q, p)
     of a wave in a column, ``slope`` what is added a cell (at omega = 0). ``inner`` (w, dofs, dofs) is H, ``port`` s.
