@@ -68,7 +68,7 @@ class Growth:
         done = max(len(regular) - 1, 0) + points_elsewhere
         rule = rule_of(problem, start, done)
         # ``next_step`` is 0 of a branch without points: its first step is then the rule's.
-        continuation = Continuation(problem, start, rule, direction, branch.next_step or None)
+        continuation = Continuation(problem, start, rule, direction, step=branch.next_step or None, points_before=done)
         monitor = self.method.monitor(problem)
         # The monitor compares a point with all earlier ones, and says so where the branch retraces itself or returns to
         # the linear mode. A resumed branch has to be judged as one that never stopped.

@@ -188,9 +188,9 @@ class Continuation(Generic[S]):
     before the rule's ``end`` may have moved it to the end of a range. ``ending`` says in a sentence how the branch
     ended, and ``finished`` whether it did so by the rule's ``end``.
 
-    The whole state is the last point and the next ``step``: a stored branch can be resumed, and ``points``
-    then counts from there. Raises ContinuationError if the step falls below the smallest or the tangent at the start is
-    degenerate.
+    The whole state is the last point and the next ``step``: a stored branch can be resumed, and ``points`` then counts
+    from there; the ending tells their number together with the ``points_before``. Raises ContinuationError if the step
+    falls below the smallest or the tangent at the start is degenerate.
     """
 
     def __init__(
@@ -200,8 +200,10 @@ class Continuation(Generic[S]):
         control: NnmTable | StepRule[S],
         direction: int = 1,
         step: float | None = None,
+        points_before: int = 0,
     ) -> None:
         self.problem = problem
+        self.points_before = points_before
         self.rule: StepRule[S] = _rule(problem, control)
         self.point = self.passed = start
         if not start.tangent.size:
@@ -222,7 +224,8 @@ class Continuation(Generic[S]):
             yield self.point
             if self.finished:
                 return
-        self.ending = f"{self.rule.points} points reached: increase {self.rule.points_key} and resume to continue"
+        total = self.points_before + self.rule.points
+        self.ending = f"{total} points reached: increase {self.rule.points_key} and resume to continue"
 
     def _next(self) -> S:
         """The next point; raises ContinuationError where no step is short enough."""
