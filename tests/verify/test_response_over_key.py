@@ -43,7 +43,7 @@ def equations(case: NfrcCase):
 def clearances(tmp_path_factory):
     """A folder with the curve over the clearance, on which two folds and a period doubling lie."""
     folder = tmp_path_factory.mktemp("clearances")
-    case = over("contacts.clearance", 0.1, 1.0, harmonics=31, largest_step=0.3)
+    case = over("contacts.clearance", 0.1, 1.0, harmonics=31, largest_step=1.0)
     (curve,) = follow_all(case, folder, MPI.COMM_SELF)
     return case, folder, curve
 
