@@ -1,4 +1,9 @@
-"""A case of ``nfrc`` condensed onto its contacts: their stops, the masses that the drive acts on, the compliance."""
+"""What a case of ``nfrc`` is condensed to: contacts, nonlinear springs, driven masses and the compliance between them.
+
+Everything else in the lattice is linear. Its response to harmonic forces at these places is the compliance G(omega) in
+m/N, a matrix with a row and a column for each contact, nonlinear spring and driven mass. The equations of steady states
+(``steady``) have the motions at these places alone as unknowns.
+"""
 
 from typing import NamedTuple
 
@@ -22,8 +27,9 @@ class DrivenPoints(NamedTuple):
 def driven_points(case: NfrcCase) -> DrivenPoints:
     """The driven masses of a ``case``; none under an incident wave.
 
-    A wall acts on each mass that a spring ties to it, with that spring's stiffness times its motion. The amplitude is
-    that of the first drive; all others keep their ratios to it.
+    A force of the drive acts on its mass. A wall that moves acts on each mass that a spring ties to it, with the
+    spring's stiffness times the wall's motion: the amplitude is then in m. It is that of the first drive; all others
+    keep their ratios to it.
     """
     if case.nfrc.source == "wave":
         return DrivenPoints((), np.empty(0))
@@ -33,14 +39,17 @@ def driven_points(case: NfrcCase) -> DrivenPoints:
     for drive, ratio in case.drive.ratios:
         for built in build_drive(drive, case.model().chain):
             places.append((built.cell, built.mass))
+            # A force has no stiffness: for the amplitude 1 it is 1 N. Stiffnesses of springs are positive.
             weights.append(ratio * (built.stiffness or 1.0))
     return DrivenPoints(tuple(places), np.array(weights))
 
 
 def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
-    """The compliance of the lattice of a ``case`` between its contacts and driven masses.
+    """The compliance of the lattice of a ``case`` between its contacts, nonlinear springs and driven masses.
 
-    That of modes costs up to a minute at its first call: curves of one case are computed with one.
+    Bloch waves give it of an infinite lattice, and of a finite one of equal cells without dashpots whose contacts join
+    the pair of their cell; else the modes of the finite lattice do, continued beyond ends that are open. That of modes
+    costs up to a minute at its first call: curves of one case are computed with one.
     """
     chain = case.model().chain
     places = driven_points(case).places
@@ -50,6 +59,7 @@ def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
         ends: tuple[str, ...] = (absorbing.end,)
         if absorbing.end == "both":
             ends = ("left", "right")
+        # The half lattice beyond an open end takes the place of the dashpots that absorb there.
         without = build_chain(case.lattice.model_copy(update={"absorbing": None}), case.contacts)
         return OpenCompliance(without, places, contact_springs(case), open_ends=ends)
     if needs_modes(chain) and not case.nfrc.infinite:
@@ -65,7 +75,10 @@ def forces_of(case: NfrcCase, restitution: float) -> SiteForces:
 
 
 def stops_of(case: NfrcCase, restitution: float) -> list[Stops]:
-    """The law and the stops of each site of a ``case``, with a ``restitution``."""
+    """The law and the stops of each site of a ``case``, with a ``restitution``.
+
+    Where a pressed contact is a spring of the linear lattice, its ``Stops.spring`` is the slope of its law at rest.
+    """
     model = case.model()
     gaps = model.gaps or [(clearance, clearance) for clearance in model.chain.clearances]
     stops = [Stops(law, plus, minus) for law, (plus, minus) in zip(case.laws(restitution), gaps, strict=True)]
@@ -78,5 +91,5 @@ def contact_springs(case: NfrcCase) -> tuple[float, ...]:
     """Stiffness in N/m of the spring that the linear lattice of a ``case`` has at each contact; () without any."""
     if not case.are_contacts_springs:
         return ()
-    # Contacts that are pressed at rest have no loss, and a spring that does not depend on the restitution.
+    # The spring is the slope of the elastic law, on which the restitution has no influence: any value serves here.
     return tuple(one.spring for one in stops_of(case, 1.0))

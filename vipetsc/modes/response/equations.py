@@ -1,4 +1,19 @@
-"""The equations of steady states under a harmonic drive, and the frames in which continuation follows them."""
+"""The equations of steady states under a harmonic drive, and the frames in which continuation follows them.
+
+The harmonics Z in m of the elongations under a drive of the frequency Om and the amplitude a obey
+
+    R(Z, Om, a) = Z + G_s (F(Z) - s Z) - a A w(Om) = 0,    G_s = A G,    A = (1 + s G)^-1,
+
+with the forces F, the compliance G at the multiples of Om, the stiffnesses s by which it is shifted
+(``balance.harmonic_balance``), and the motion w of the linear lattice under the drive of amplitude 1. One of Om and a
+varies along a curve, or a key of the case with both fixed: this is the parameter. The unknowns are
+
+    xi = (x/clearance, p),
+
+where x (n,) in m are the real and imaginary parts of Z and p is the parameter over a unit, its ``scale``. The residual
+is R over the clearance. Its derivative by p over the amplitude is -A w times the scale; over the frequency it is that
+of G_s (``HarmonicBalance.rate``) plus a central difference of the drive's term -a A w.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -13,23 +28,30 @@ from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, SpecialKind
 from vipetsc.modes.response.state import Response
 
-# Relative step of a difference in frequency.
+# Relative step of the central difference in frequency. Rounding makes an error of 1e-16/SLOPE = 1e-10, which slows
+# Newton's method by as little; the solutions do not depend on it.
 SLOPE = 1e-6
 # What may end a curve of steady states, or keep Newton's method from one.
 FAILURES = ContinuationError, FlowError, ArithmeticError, ValueError
 
 
 class LinearMotion(NamedTuple):
-    """Harmonics (pairs, K + 1) in m that a drive of amplitude 1 alone makes at the sites; its wave if it is one."""
+    """The motion of the linear lattice, on which no contact acts, under a drive of amplitude 1.
+
+    ``harmonics`` (pairs, K + 1) in m are those of the elongations, of which only the first is not zero. ``wave`` is the
+    incident wave; None under a force.
+    """
 
     harmonics: np.ndarray
     wave: IncidentWave | None
 
 
 class ContinuationParameter(NamedTuple):
-    """Parameter of a curve, the value of the amplitude or frequency that is ``fixed``, and the parameter's unit.
+    """What varies along a curve and what does not.
 
-    It varies ``over`` the "amplitude", the "frequency" or a key of the case; then the amplitude is fixed.
+    ``over`` is "amplitude", "frequency" or the path of a key of the case. ``fixed`` is the frequency in rad/s of a
+    curve over the amplitude, else the amplitude. ``scale`` is the unit of the parameter: the last unknown is the value
+    over it.
     """
 
     over: str
@@ -38,7 +60,10 @@ class ContinuationParameter(NamedTuple):
 
 
 class SteadyFrame:
-    """Steady states at and near one state, with its unknowns and tangent, and the ``shift`` of its compliance."""
+    """The equations at and near one state, with its unknowns ``xi`` (n + 1,) and unit ``tangent`` (n + 1,).
+
+    The ``shift`` (orders, 1, 1) in N/m of the compliance is chosen at this state and stays the same within a step.
+    """
 
     def __init__(self, equations: "SteadyEquations", xi: np.ndarray, tangent: np.ndarray) -> None:
         self.equations = equations
@@ -64,7 +89,8 @@ class SteadyFrame:
 
     def correct(self, guess: np.ndarray, arclength: float) -> Attempt:
         """Newton's method from ``guess`` (n + 1,) for the state at an ``arclength`` along the tangent."""
-        # The plane is that of the predictor, whose rounding the first residual then does not see.
+        # The plane goes through the predictor as it is rounded, so that the row's first residual is exactly zero where
+        # the predictor is the guess.
         predicted = self.xi + arclength * self.tangent
         return self.solve(guess, self.tangent, self.tangent @ predicted)
 
@@ -77,7 +103,10 @@ class SteadyFrame:
             return Attempt(False, str(error), [], guess, left_domain=True)
 
     def tangent_at(self, xi: np.ndarray) -> np.ndarray:
-        """The unit tangent (n + 1,) at a state ``xi`` (n + 1,), on the side of the frame's own."""
+        """The unit tangent (n + 1,) at a state ``xi`` (n + 1,), on the side of the frame's own.
+
+        Of the null vectors of the derivative the row ``tangent`` chooses the one with tangent . direction = 1.
+        """
         right = np.zeros(len(xi))
         right[-1] = 1
         direction = np.linalg.solve(np.vstack([self.jacobian(xi), self.tangent]), right)
@@ -92,8 +121,13 @@ class SteadyFrame:
 
 
 class SteadyEquations(ABC):
-    """Steady states under a drive that alone makes the ``linear_motion``; unknowns are over the ``clearance``."""
+    """The equations of steady states, for ``Continuation``; a subclass gives the ``linear_motion`` of the drive.
 
+    ``balance`` are the equations of the harmonics, ``clearance`` in m is the unit of these, ``parameter`` says what
+    varies. Newton's method ends at a residual of ``tolerance``, over the clearance, or after ``max_newton`` steps.
+    """
+
+    # Hill's determinant tells the stability, and ``TurningSteps`` judges the turn and the correction of a step alone.
     has_half_traces = False
     guards: frozenset[str] = frozenset()
 
@@ -117,7 +151,7 @@ class SteadyEquations(ABC):
 
     @cached_property
     def newton(self) -> DenseNewton:
-        """Newton's method for states on a plane."""
+        """Newton's method for the equations and one linear row, the plane on which a state is looked for."""
         return DenseNewton(self.balance.size + 1, self.max_newton)
 
     def shift_near(self, xi: np.ndarray) -> np.ndarray:
@@ -173,11 +207,11 @@ class SteadyEquations(ABC):
         return SteadyFrame(self, start.xi, along_parameter).tangent_at(start.xi)
 
     def turn(self, before: Response, after: Response) -> float:
-        """Angle between the tangents of two states in relative units: that of the step, which is judged anyway."""
+        """0: the angle between tangents in a second chart, of which steady states have none."""
         return 0.0
 
     def special_kinds(self, left: Response, right: Response) -> Iterator[SpecialKind[Response]]:
-        """Folds in the parameter."""
+        """Folds: states at which the parameter turns back, where its component of the tangent changes sign."""
         yield SpecialKind("fold", lambda point: float(point.tangent[-1]))
 
     def at(self, guess: np.ndarray, p: float) -> np.ndarray:

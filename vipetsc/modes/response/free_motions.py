@@ -6,9 +6,13 @@ response follows these motions over the frequency, between two points at which t
 loss. Cf. R. J. Kuether et al., J. Sound Vib. 351 (2015) 299, and T. L. Hill et al., Proc. R. Soc. A 471 (2015)
 20140809.
 
-Free motions are followed from each linear mode near the range. At each place Newton's method finds the amplitude of the
-force that keeps such a motion going against the loss that the lattice has, if the force is a quarter of a period ahead.
-From that state the amplitude of the force is varied until it is that of the curve which is being searched for.
+Free motions are followed from each linear mode near the range. At each place, a frequency of the range, Newton's method
+finds the amplitude of the force that keeps such a motion going against the loss that the lattice has, if the force is a
+quarter of a period ahead. From that state the amplitude of the force is varied until it is that of the curve which is
+being searched for.
+
+The method finds an isolated curve only where the loss is small enough for Newton's method to come from the free motion
+to the damped one, and where the force does work on the mode: a mode whose driven masses stand still is not excited.
 """
 
 from collections.abc import Iterator
@@ -29,25 +33,29 @@ from vipetsc.modes.response.equations import FAILURES, SteadyFrame
 from vipetsc.modes.response.isolated import over_amplitude, with_amplitude
 from vipetsc.modes.response.steady import SteadyStates
 
-# Linear modes whose frequencies lie within this factor of the range are followed, with so many motions each at most.
+# Linear modes whose frequencies lie within this factor of the range are followed: contacts shift the frequency of a
+# motion from that of its mode.
 NEAR = 2.0
+# Motions of one branch, at most.
 MOST_MOTIONS = 300
 # Largest relative displacement of the first motion, over the clearance: it touches no stop, and springs that are not
-# linear are nearly so. Arclength of the first step, in the units of the continuation.
+# linear are nearly so.
 FIRST_SIZE = 0.1
+# Arclength of the first step, in the units of ``HarmonicFrame``.
 FIRST_STEP = 0.02
 # Slack of the bounds of frequency: a motion without contact keeps its frequency, but for rounding.
 SLACK = 1e-3
-# Accuracy of motions from which Newton's method begins: what the harmonics leave out, over the motion, and the
-# residual.
+# Free motions are first guesses, and need not be as accurate as steady states: bounds of what their harmonics leave
+# out, over the motion, and of the residual.
 TRUNCATION = 1e-4
 TOLERANCE = 1e-9
 
 
 def states_near_free_motions(states: SteadyStates, places: np.ndarray) -> list[list[np.ndarray]]:
-    """Unknowns of the steady states that free motions lead to at each of ``places``.
+    """Unknowns (n + 1,) of the steady states that free motions lead to: a list for each of ``places``.
 
-    ``states`` are those over the frequency; ``places`` (count,) are frequencies over ``states.parameter.scale``.
+    ``states`` are those over the frequency; ``places`` (count,) are frequencies over ``states.parameter.scale``. A
+    motion from which no steady state is found is left out.
     """
     motions = _conservative(states)
     of_places: list[list[np.ndarray]] = [[] for _ in places]
@@ -75,7 +83,7 @@ def resonance(line: SteadyStates, harmonics: np.ndarray) -> np.ndarray:
     # A free motion may begin at any time. As it is computed, at rest at phase 0, it is in phase with the force; an
     # order k is put k quarter turns behind. Newton's method may not move it in time (``row`` is the motion's derivative
     # by time), and finds the amplitude of the force instead, whose first guess, the one that touches a stop, hardly
-    # counts.
+    # counts, since the equations are linear in it.
     behind = free * np.exp(-0.5j * np.pi * orders)
     row = np.append(unit(line.balance.pack(-1j * orders * behind)), 0.0)
     guess = np.append(line.balance.pack(behind) / line.clearance, 1.0)
@@ -114,12 +122,16 @@ def _conservative(states: SteadyStates) -> ConservativeMotions:
 
 
 def _branches(motions: ConservativeMotions, states: SteadyStates) -> Iterator[list[Point]]:
-    """The free motions that begin at each linear mode near the range of ``states``."""
+    """The free motions that begin at each linear mode near the range of ``states``, branch by branch.
+
+    Bounds of their frequencies are those of the range, extended to the mode itself, from which a branch begins.
+    """
     compliance = motions.compliance
     assert isinstance(compliance, DenseCompliance)
     low, high = states.options.range
     for omega, parts in zip(np.sqrt(compliance.squared), compliance.parts.T, strict=True):
         size = np.abs(parts).max()
+        # A mode in which no contact and no nonlinear spring moves stays linear at any size.
         if not low / NEAR < omega < high * NEAR or size == 0:
             continue
         bounds = [min(low, omega) * (1 - SLACK) / (2 * np.pi), max(high, omega) * (1 + SLACK) / (2 * np.pi)]
@@ -134,7 +146,10 @@ def _branches(motions: ConservativeMotions, states: SteadyStates) -> Iterator[li
 
 
 def _at(motions: ConservativeMotions, points: list[Point], omega: float) -> Iterator[Point]:
-    """The motions of the frequency ``omega`` in rad/s on the branch of ``points``."""
+    """The motions of the frequency ``omega`` in rad/s on the branch of ``points``.
+
+    Where the period of two neighbours encloses that of ``omega``, Newton's method begins at the nearer one.
+    """
     period = 2 * np.pi / omega
     for before, after in pairwise(points):
         if (before.period - period) * (after.period - period) > 0 or before.period == after.period:

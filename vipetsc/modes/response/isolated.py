@@ -1,10 +1,13 @@
 """States of isolated curves, which no curve from the beginning of the range meets: where one can begin.
 
-At one amplitude an isolated curve (an isola) hangs together with the others by states at other amplitudes: with the
-amplitude it grows, and in general merges with its neighbour. From each state found so far at a value p of the parameter
-the states over the amplitude are therefore followed at this p, up and down. Where such a line passes the amplitude of
-the curve again it has found a state of it, a new one or not. Cf. T. Detroux et al., Mech. Syst. Signal Process. 60-61
-(2015) 799, and R. J. Kuether et al., J. Sound Vib. 351 (2015) 299, who continue folds over the amplitude.
+At one amplitude an isolated curve (an isola) is apart from the others, but states at other amplitudes connect them:
+with the amplitude an isola grows, and in general merges with its neighbour. From each state found so far at a value p
+of the parameter the states over the amplitude are therefore followed at this p, up and down. Where such a line passes
+the amplitude of the curve again it has found a state at this amplitude, a known or a new one. An isola is missed if at
+none of the values p tried such a line, within ``nfrc.isola_reach``, leads to it from a known state.
+
+Cf. T. Detroux et al., Mech. Syst. Signal Process. 60-61 (2015) 799, and R. J. Kuether et al., J. Sound Vib. 351 (2015)
+299, who continue folds over the amplitude.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +25,8 @@ from vipetsc.modes.response.steps import TurningSteps
 
 # States of one line over the amplitude, at most.
 MOST_STATES = 1000
-# Difference of unknowns, over their size, above which two states are not the same.
+# Difference of unknowns, over their size, above which two states are not the same. Newton's method leaves a residual of
+# 1e-11 (``nfrc.tolerance``), which near a fold is a much larger error of the unknowns.
 DIFFERENT = 1e-6
 
 Equations = SteadyStates | StatesOverKey
@@ -30,7 +34,7 @@ Curves = Sequence[Sequence[Response]]
 
 
 def places_of(states: Equations, count: int) -> np.ndarray:
-    """Scaled parameters (count,) evenly within the range of a curve, at which unknown states are looked for."""
+    """Scaled parameters (count,) at which unknown states are looked for: the middles of equal parts of the range."""
     low, high = (bound / states.parameter.scale for bound in states.options.range)
     return np.asarray(low + (high - low) * (np.arange(count) + 0.5) / count)
 
@@ -48,10 +52,13 @@ def unknown_states(
 
 
 def over_amplitudes(states: Equations, curves: Curves, p: float) -> list[np.ndarray]:
-    """Unknowns (n + 1,) of states at the scaled parameter ``p`` to which other amplitudes lead from the ``curves``."""
+    """Unknowns (n + 1,) of states at the scaled parameter ``p`` to which other amplitudes lead from the ``curves``.
+
+    They have the curve's amplitude; some may lie on the ``curves`` themselves.
+    """
     states_found: list[np.ndarray] = []
     for begin in states_on(states, curves, p):
-        # A line that has come by this state has followed its line already.
+        # The line through a state that a line has found already is that line.
         if not _is_among(begin, states_found):
             states_found += _states_over_amplitude(states, begin)
     return states_found
@@ -64,6 +71,7 @@ def states_on(states: Equations, curves: Curves, p: float) -> list[np.ndarray]:
         for before, after in pairwise(point.xi for point in points):
             if (before[-1] - p) * (after[-1] - p) > 0 or before[-1] == after[-1]:
                 continue
+            # A line between the two neighbours gives the guess. Where Newton's method fails no state is reported.
             place = (p - before[-1]) / (after[-1] - before[-1])
             with suppress(*FAILURES):
                 xi = states.at(before + place * (after - before), p)
@@ -81,6 +89,7 @@ def _states_over_amplitude(states: Equations, begin: np.ndarray) -> Iterator[np.
     """Unknowns of further states with the curve's amplitude, on the line over the amplitude through ``begin``."""
     line = over_amplitude(states, begin[-1])
     _, amplitude = states.drive(begin[-1])
+    # The two equations may have different clearances as units of displacement.
     unit = states.clearance / line.clearance
     xi = np.append(begin[:-1] * unit, amplitude / line.parameter.scale)
     return with_amplitude(states, line, xi, begin[-1])
@@ -100,7 +109,7 @@ def with_amplitude(states: Equations, line: SteadyStates, begin: np.ndarray, p: 
             start = Response(xi=line.at(begin, float(begin[-1])), next_step=line.options.first_step)
             last = start
             for point in Continuation(line, start, TurningSteps(line, MOST_STATES), direction):
-                # The first step leaves the amplitude itself.
+                # A line that begins at the amplitude itself does not pass it with its first step.
                 is_left = last is start and start.xi[-1] == crossed
                 if not is_left and (last.xi[-1] - crossed) * (point.xi[-1] - crossed) <= 0:
                     place = (crossed - last.xi[-1]) / (point.xi[-1] - last.xi[-1])
@@ -110,7 +119,10 @@ def with_amplitude(states: Equations, line: SteadyStates, begin: np.ndarray, p: 
 
 
 def over_amplitude(states: Equations, p: float) -> SteadyStates:
-    """The equations over the amplitude at the scaled parameter ``p``, from 1/reach to reach times the curve's."""
+    """The equations over the amplitude at the scaled parameter ``p`` of a curve over the frequency or a key.
+
+    Amplitudes range from 1/reach to reach times the curve's own, with reach = ``nfrc.isola_reach``.
+    """
     omega, amplitude = states.drive(p)
     if isinstance(states, SteadyStates):
         lattice = states
@@ -123,7 +135,12 @@ def over_amplitude(states: Equations, p: float) -> SteadyStates:
 
 
 class ClosingSteps(TurningSteps):
-    """Steps of an isolated curve: it ends where it comes back to its ``first`` state, or on the range."""
+    """Steps of an isolated curve: it ends where it comes back to its ``first`` state, or on the range.
+
+    It has come back where t . (xi - xi_first), with the tangent t at the first state, turns positive from one state to
+    the next, at a distance from the first state of one step at most. ``begin`` is the state from which the steps go on:
+    the first one, or a later one of a curve that is resumed.
+    """
 
     def __init__(self, states: Equations, points: int, first: Response, begin: Response) -> None:
         super().__init__(states, points)
@@ -144,7 +161,7 @@ class ClosingSteps(TurningSteps):
         return super().end(point)
 
     def _beyond(self, point: Response) -> float:
-        """How far a state is beyond the first one along its tangent."""
+        """How far a state is beyond the first one along that one's tangent, in units of the unknowns."""
         return float(self.first.tangent @ (point.xi - self.first.xi))
 
 

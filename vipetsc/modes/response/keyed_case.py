@@ -1,4 +1,7 @@
-"""A case whose key varies along a curve: the equations of its lattice at each value."""
+"""A case whose key varies along a curve: the equations of its lattice at each value.
+
+At each value the case is resolved and its lattice built anew; only what the key has not changed is taken over.
+"""
 
 from dataclasses import replace
 
@@ -13,7 +16,8 @@ from vipetsc.modes.response.steady import SteadyStates
 class KeyedCase:
     """The lattices of a ``case`` over its key ``nfrc.over``, with a ``restitution`` and an ``amplitude``.
 
-    Keys of ``[contacts]`` leave the linear lattice as it is: its compliance is then computed once.
+    Keys of ``[contacts]`` leave the linear lattice as it is: its compliance is then computed once. ``amplitude`` is in
+    the unit of the drive (``NfrcTable``).
     """
 
     def __init__(self, case: NfrcCase, restitution: float, amplitude: float) -> None:
@@ -35,13 +39,14 @@ class KeyedCase:
         if key == "contacts.restitution":
             restitution = value
         states = SteadyStates(case, restitution, case.nfrc.fixed[0], self._compliance(case))
+        # With the same compliance Hill's method needs the same values of it at the frequencies of perturbations.
         if self._last is not None:
             states.adopt(self._last)
         self._last = states
         return states
 
     def _compliance(self, case: NfrcCase) -> WaveCompliance | ModalCompliance:
-        """The compliance of the lattice of a ``case``: the last one where only clearances differ, which it has not."""
+        """The compliance of the lattice of a ``case``: the last one if the linear lattice is the same."""
         last = self._last
         if last is not None and _without_clearances(last.case) == _without_clearances(case):
             return last.compliance
@@ -49,5 +54,5 @@ class KeyedCase:
 
 
 def _without_clearances(case: NfrcCase) -> object:
-    """The linear lattice of a ``case``, to compare."""
+    """The chain of a ``case`` without clearances, which do not belong to the linear lattice: two can be compared."""
     return replace(case.model().chain, clearances=())

@@ -1,8 +1,13 @@
 """Outputs of a steady state that ``[output]`` asks for: motion of named masses, forces of contacts and on walls.
 
-The harmonics F_k of the contact forces and of the drive give those of every displacement, U_k = G(k Om) F_k; velocity
-and acceleration follow by factors i k Om. Peaks are those of the sum of all harmonics; those of contact forces are
-taken along each contact episode from the law itself.
+The harmonics F_k in N of the contact forces, which pull back, and the force P of the drive, which acts at Om alone,
+give those of every displacement,
+
+    U_k = H(k Om) (P delta_k1 - F_k),
+
+where H is the response of the linear lattice (its ``field``). An incident wave adds its displacement to U_1. Velocity
+and acceleration follow by factors i k Om. Peaks are those of the sum of all harmonics. The harmonics of a contact force
+converge slowly at its kinks: its peak is taken along each contact episode from the law itself.
 """
 
 import cmath
@@ -18,8 +23,10 @@ from vipetsc.modes.balance.harmonics import Episode
 from vipetsc.modes.balance.stops import Stops
 from vipetsc.spectra.measures import QUANTITIES
 
-# Samples a harmonic of the period in which a largest value is looked for, and those of a contact episode.
+# Samples of the period, per harmonic, among which a largest value is looked for. A sample misses the peak of the last
+# harmonic by a phase of pi/16 at most, so by 2 % of this harmonic.
 SAMPLES_A_HARMONIC = 16
+# Samples of one contact episode.
 SAMPLES_AN_EPISODE = 129
 
 
@@ -44,7 +51,8 @@ class HarmonicMotion(NamedTuple):
 class ResponseOutputs:
     """The outputs that a ``case`` asks for: ``points``, pairs of them (``transmission``), ``forces``.
 
-    ``cells`` are those, from 0, of the named masses and, for the forces on walls, of the two ends.
+    ``cells`` are those, from 0, of the named masses and, for the forces on walls, of the two ends. ``contacts`` are the
+    stops of the sites. Forces on walls exist only where a finite lattice has them: at fixed ends.
     """
 
     def __init__(self, case: NfrcCase, compliance: WaveCompliance | ModalCompliance, contacts: Sequence[Stops]) -> None:
@@ -77,6 +85,7 @@ class ResponseOutputs:
                 "spring_harmonics_imaginary": elongations.imag,
             }
 
+        # Of all displacements only those in the named cells are computed.
         field = np.empty(0)
         if self.cells:
             field = self._field(motion)
@@ -89,6 +98,7 @@ class ResponseOutputs:
                 largest_force(stops, relative, [e for e in motion.episodes if e.pair == pair], motion.omega)
                 for pair, (stops, relative) in enumerate(zip(self.contacts, motion.relative, strict=False))
             ]
+            # The forces of a motion leave out the springs of the linear lattice in the place of pressed contacts.
             springs = np.array([stops.spring for stops in self.contacts])
             first = motion.forces[: len(springs), 1] + springs * motion.relative[: len(springs), 1]
             values |= {"largest_force": np.array(peaks), "first_force": magnitude(first), "force_lag": lag(first)}
@@ -104,7 +114,7 @@ class ResponseOutputs:
             acting = motion.forces[:, order]
             if order == 1:
                 acting = np.append(acting, motion.driving)
-            # Orders that a symmetric motion does not have are not solved for in vain.
+            # Even orders of a symmetric motion have no force, and need no solution.
             if np.any(acting):
                 field[order] = self.compliance.field(order * motion.omega, acting, self.cells)
         field[1] += motion.incident
@@ -121,7 +131,7 @@ class ResponseOutputs:
             values[f"first_{quantity}"] = magnitude(series[:, 1])
         values["lag"] = lag(harmonics[:, 1])
         if self.pairs:
-            # The mean square of a velocity is the sum of those of its harmonics.
+            # The mean square of a velocity is the sum of those of its harmonics. At rest a quotient is 0/0: NaN.
             speed = magnitude(harmonics * rate)
             rms = np.sqrt((speed**2).sum(axis=1) / 2)
             source, receiver = np.array(self.pairs).T
@@ -137,12 +147,14 @@ class ResponseOutputs:
             u = field[:, self.cells.index(wall.cell)][:, wall.masses]
             rate = 1j * motion.omega * np.arange(len(u))[:, None]
             force = (wall.stiffness * u + wall.damping * rate * u).sum(axis=1)
-            # A spring that pulls at the left wall is stretched by u > 0, one at the right wall by u < 0.
+            # Forces are positive towards higher cells at both walls. A nonlinear spring pulls the left wall that way
+            # where u > 0 stretches it, and the right wall the other way where u < 0 stretches it.
             for place, beyond in zip(self._springs, motion.forces[len(self.contacts) :], strict=True):
                 if name == "left" and place.start < 0:
                     force += beyond
                 if name != "left" and place.end < 0:
                     force -= beyond
+            # A wall that moves by w stretches its springs by u - w.
             for moved, ratio in self._moved:
                 if name == moved:
                     force[1] -= wall.stiffness.sum() * ratio * motion.amplitude
@@ -186,7 +198,10 @@ def wall_springs(chain: Chain, wall: str) -> WallSprings:
 
 
 def largest_values(harmonics: np.ndarray) -> np.ndarray:
-    """Largest sample (rows,) in magnitude of the motions with the ``harmonics`` (rows, K + 1) over a period."""
+    """Largest sample (rows,) in magnitude of the motions with the ``harmonics`` (rows, K + 1) over a period.
+
+    The largest value itself, between samples, is ``peaks``.
+    """
     return np.abs(_samples(harmonics)).max(axis=1)
 
 
@@ -208,6 +223,7 @@ def peaks(harmonics: np.ndarray) -> np.ndarray:
 def _samples(harmonics: np.ndarray) -> np.ndarray:
     """Samples (rows, samples) over a period of Re sum Z_k exp(i k Om t) with the ``harmonics`` Z (rows, K + 1)."""
     half = SAMPLES_A_HARMONIC // 2 * harmonics.shape[1]
+    # The inverse transform adds to each order its conjugate, but for the mean: hence the halves.
     padded = np.pad(harmonics, ((0, 0), (0, half - harmonics.shape[1]))) * np.where(np.arange(half), 0.5, 1)
     return np.fft.irfft(padded, axis=1, norm="forward")
 
@@ -215,7 +231,8 @@ def _samples(harmonics: np.ndarray) -> np.ndarray:
 def largest_force(stops: Stops, relative: np.ndarray, episodes: Sequence[Episode], omega: float) -> float:
     """Largest force in N of a contact whose displacement has the harmonics ``relative`` (K + 1,) in m.
 
-    Each of ``episodes`` is sampled at equal phases; ``omega`` in rad/s is the frequency of the motion.
+    It is that of the law, with the static load of a contact that is pressed at rest. Each of ``episodes``, those of
+    this contact, is sampled at equal phases; ``omega`` in rad/s is the frequency of the motion.
     """
     largest = 0.0
     orders = np.arange(len(relative))
@@ -235,7 +252,7 @@ def largest_force(stops: Stops, relative: np.ndarray, episodes: Sequence[Episode
 def magnitude(phasors: np.ndarray) -> np.ndarray:
     """Magnitude (...) of each of ``phasors`` (...), complex.
 
-    Other than of ``np.abs`` its bits do not depend on where the numbers lie in memory.
+    Unlike those of ``np.abs`` its bits do not depend on where the numbers lie in memory.
     """
     return np.hypot(phasors.real, phasors.imag)
 

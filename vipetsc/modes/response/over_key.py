@@ -2,10 +2,10 @@
 
 At each value v of the key the lattice is another one, with equations R(x, v) = 0 of its own (``steady``); amplitude and
 frequency stay the same. Newton's method takes dR/dx from these equations, and dR/dv from differences of R at fixed x,
-with steps of ``SLOPE`` half ranges: central ones, whose error is of second order in the step, and at the two ends of
-the range, beyond which nothing is evaluated, one-sided ones, whose error is of first order. An error of this one column
-makes the convergence linear with a factor of that size, 1e-10 or 1e-5, so that a Newton step more at an end is all that
-is noticed.
+with steps of ``SLOPE`` half ranges. The differences are central, with an error of second order in the step, 1e-10. At
+the two ends of the range, beyond which nothing is evaluated, they are one-sided, with an error of first order, 1e-5.
+An error of this one column makes Newton's method converge linearly, with a factor of that size: it costs one more step
+at an end, and does not change the solution.
 
 A step may pass the end of the range, beyond which the key may have no valid value (a restitution above 1). The
 equations are continued there by their tangent in v, and the rule of the steps replaces such a state by the one at the
@@ -28,8 +28,8 @@ from vipetsc.modes.response.steady import SteadyStates
 
 # Step of a difference in the key, over half its range.
 SLOPE = 1e-5
-# Values whose lattices are kept: those of a step and of its differences. Over a clearance a curve of 24 states builds
-# 71 lattices so, 94 with 4 values and 117 with 2; over a stiffness one of 27 builds 272, 273 and 299. 18 values save
+# Values whose lattices are kept: those of a step and of its differences. With 9, 4 and 2 values a curve of 24 states
+# over a clearance builds 71, 94 and 117 lattices, one of 27 states over a stiffness 272, 273 and 299. 18 values save
 # nothing over the clearance, 9 % over the stiffness.
 KEPT_VALUES = 9
 
@@ -37,8 +37,11 @@ KEPT_VALUES = 9
 class StatesOverKey(SteadyEquations):
     """Steady states over the key of the path ``over``, at one frequency and the ``amplitude`` of the curve.
 
-    ``build`` gives the equations of the lattice whose key has a value. Their own parameter is the amplitude, from that
-    of the curve on, and their frequency is fixed. ``options`` have the range of the key.
+    ``build`` gives the equations of the lattice whose key has a value; they are over the amplitude at the curve's
+    frequency, and are asked at its amplitude alone. ``options`` have the range of the key.
+
+    Unknowns (n + 1,) are over the clearance of the lattice at the lower end of the range, which is the same along the
+    whole curve; those of the lattice at a value of the key ("inner") are over that lattice's own.
     """
 
     def __init__(self, build: Callable[[float], SteadyStates], over: str, amplitude: float, options: NfrcTable) -> None:
@@ -71,12 +74,15 @@ class StatesOverKey(SteadyEquations):
         return states.parameter.fixed, self.parameter.fixed
 
     def shift_near(self, xi: np.ndarray) -> np.ndarray:
-        """The stiffnesses (place,) by which the compliance is shifted for states near the unknowns ``xi`` (n + 1,)."""
+        """The stiffnesses (orders, 1, 1) in N/m by which the compliance is shifted near the state ``xi`` (n + 1,)."""
         states, inner = self._at(xi)
         return states.shift_near(inner)
 
     def residual(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """The residual (n,) of the harmonics, which vanishes at a steady state, over the clearance."""
+        """The residual (n,) of the harmonics, which vanishes at a steady state, over the clearance.
+
+        Beyond the range, at the distance d from its end v, it is R(x, v) + d dR/dv(x, v).
+        """
         residual = self._residual(xi, xi[-1], shift)
         beyond = xi[-1] - self._within(xi[-1])
         if beyond:
@@ -99,20 +105,26 @@ class StatesOverKey(SteadyEquations):
         return min(max(p, low), high)
 
     def _residual(self, xi: np.ndarray, p: float, shift: np.ndarray) -> np.ndarray:
-        """The residual of the motion ``xi`` in the lattice at the parameter ``p``, or the end that is nearest."""
+        """The residual of the motion in ``xi``, whose parameter is not used, in the lattice at the parameter ``p``.
+
+        Beyond the range it is that at the nearest end.
+        """
         states, inner = self._at(np.append(xi[:-1], p))
         return states.residual(inner, shift) * (states.clearance / self.clearance)
 
     def _slope(self, xi: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """The derivative (n,) of the residual by the scaled parameter, from a difference within the range."""
+        """The derivative (n,) of the residual by the scaled parameter, from a difference within the range.
+
+        An end of the range, at which one of the two places is cut off, has a one-sided difference.
+        """
         after = self._within(self._within(xi[-1]) + SLOPE)
         before = self._within(self._within(xi[-1]) - SLOPE)
         difference = self._residual(xi, after, shift) - self._residual(xi, before, shift)
         return np.asarray(difference / (after - before))
 
     def _at(self, xi: np.ndarray) -> tuple[SteadyStates, np.ndarray]:
-        """The equations at the value of the unknowns ``xi``, and these unknowns in their units."""
-        # At the ends of the range the value is the bound itself, whose lattice is valid.
+        """The equations of the lattice at the key's value in ``xi`` (n + 1,), and the unknowns in their units."""
+        # Rounding of p times the scale may leave the range: at its ends the value is the bound itself, which is valid.
         value = min(max(xi[-1] * self.parameter.scale, self._bounds[0]), self._bounds[1])
         states = self.states_at(float(value))
         motion = xi[:-1] * (self.clearance / states.clearance)
@@ -131,7 +143,7 @@ class StatesOverKey(SteadyEquations):
         return measures._replace(outputs={"parameter": np.array(value), **measures.outputs})
 
     def stability(self, xi: np.ndarray) -> Stability:
-        """The stability of a state ``xi`` (n + 1,)."""
+        """The number of growing perturbations of a state ``xi`` (n + 1,), and where multipliers are real."""
         states, inner = self._at(xi)
         return states.stability(inner)
 

@@ -3,8 +3,11 @@
 A perturbation exp(lambda t) begins to grow where its exponent lambda, over Om, passes the line Re lambda = ``least`` of
 Hill's method: a real one at a fold or a branch point, one with Im lambda = 1/2 at a period doubling, a complex pair at
 a Neimark-Sacker bifurcation, behind which the motion is quasi-periodic. On the real axis and on Im lambda = 1/2 Hill's
-determinant is real, and a zero passes the line where its sign there changes. What is left of a change of the number of
-growing perturbations is that of pairs.
+determinant D is real, and a zero passes the line where its sign there changes. What these zeros leave of a change of
+the number of growing perturbations is due to pairs.
+
+Two changes between two neighbouring states that cancel, as of two pairs of which one begins to grow and one to decay,
+are not seen.
 """
 
 from collections.abc import Iterator
@@ -66,11 +69,13 @@ class StabilityChanges:
         states = self.states
         left = states.stability(self.left.xi)
         right = states.stability(self.right.xi)
+        # A state that is unstable on both sides of a point stays so: only "all" asks for such points. -1 is undecided.
         fewer = min(left.unstable, right.unstable)
         if fewer < 0 or (fewer > 0 and states.options.special_points == "stability"):
             return
 
-        # A fold has a multiplier of 1 as well, which passes the line there or in one of the next steps.
+        # A fold has a multiplier of 1 as well, which passes the line there or in one of the next steps. At a branch
+        # point there is no fold, and D changes its sign at lambda = 0 as well as on the line.
         folds = self.left.tangent[-1] * self.right.tangent[-1] < 0
         passes_one = left.at_one * right.at_one < 0
         if passes_one and not folds:
@@ -81,11 +86,12 @@ class StabilityChanges:
         if passes_minus_one:
             yield self._real(PERIOD_DOUBLING, states.least_growth(self.left.xi) + 0.5j, fewer)
 
+        # A real multiplier that passes changes the number by one, a pair by two.
         if abs(right.unstable - left.unstable) - passes_one - passes_minus_one >= 2:
             yield self._pair(left.unstable, fewer)
 
     def _real(self, name: str, exponent: complex, fewer: int) -> SpecialKind[Response]:
-        """The kind where the real multiplier with that ``exponent`` passes; ``fewer`` others grow there."""
+        """The kind where the real multiplier exp(2 pi ``exponent``) passes; ``fewer`` others grow there."""
 
         def determinant(point: Response) -> float:
             return self.states.determinant(point.xi, exponent)
@@ -96,9 +102,10 @@ class StabilityChanges:
         return SpecialKind(name, determinant, finish=finish)
 
     def _pair(self, unstable: int, fewer: int) -> SpecialKind[Response]:
-        """The kind where a complex pair passes the line; the number of perturbations that grow is ``unstable`` before.
+        """The kind where a complex pair passes the line; at the left state ``unstable`` perturbations grow.
 
-        The pair's exponent is followed from the state at which it grows; if that fails, the number decides.
+        The test is the distance of the pair's exponent from the line. The exponent is followed from the state at which
+        the pair grows. If that fails, the test is a step, +-1/2, where the number of growing perturbations changes.
         """
         states = self.states
         exponents: dict[bytes, complex] = {}
@@ -111,6 +118,7 @@ class StabilityChanges:
             return exponents[key].real - states.least_growth(point.xi)
 
         def changed(point: Response) -> float:
+            """1/2 where as many perturbations grow as at the left state, else -1/2."""
             return 0.5 - (states.stability(point.xi).unstable != unstable)
 
         def finish(point: Response, left: Response, right: Response) -> Response:
@@ -125,5 +133,8 @@ class StabilityChanges:
         return SpecialKind(NEIMARK_SACKER, changed, finish=finish)
 
     def _measured(self, point: Response, unstable: int, exponent: complex | None) -> Response:
-        """The ``point`` with its measures: its perturbation of that ``exponent`` neither grows nor decays."""
+        """The ``point`` with its measures, where ``unstable`` perturbations grow.
+
+        The perturbation with that ``exponent`` neither grows nor decays, and is given as the fastest.
+        """
         return replace(point, measures=self.states.measured(point.xi, Perturbations(unstable, exponent)))

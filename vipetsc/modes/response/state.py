@@ -10,12 +10,16 @@ from vipetsc.modes.problem import Solution
 
 
 class Measures(NamedTuple):
-    """Measures of a steady state (``branches.response_layout`` has units and texts).
+    """Measures of a steady state; ``spectra.responses`` has the units and texts of the file.
 
-    ``fractions`` (4,) of the energy that comes in are transmitted, reflected, at higher harmonics, and lost;
-    ``harmonics`` (site, order) complex in m; ``unstable`` perturbations grow, the fastest as exp(lambda t) with
-    lambda = (``growth`` + i ``sideband``) Om.
-    ``outputs`` are what ``[output]`` of the case asks for, by the names in the file (``outputs``).
+    ``frequency`` Om is in rad/s, ``amplitude`` in the unit of the drive. ``largest`` (site,) is the largest relative
+    displacement in m, ``harmonics`` (site, order) are its harmonics, complex, in m, and ``closed`` (site,) is the
+    fraction of the period in contact, in ``episodes`` contact episodes altogether. ``truncation`` is the estimated size
+    of what the harmonics leave out, over the motion.
+
+    ``fractions`` (4,) of the energy that comes in are transmitted, reflected, at higher harmonics, and lost. There are
+    ``unstable`` perturbations that grow (-1: undecided), the fastest as exp(lambda t) with lambda = (``growth`` +
+    i ``sideband``) Om. ``outputs`` are what ``[output]`` of the case asks for, by the names in the file (``outputs``).
     """
 
     frequency: float
@@ -34,7 +38,10 @@ class Measures(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Response(Solution):
-    """A steady state: unknowns ``xi``, the last of which is the parameter, and the unit ``tangent``."""
+    """A steady state: unknowns ``xi`` (n + 1,), the last of which is the parameter, and the unit ``tangent`` (n + 1,).
+
+    ``measures`` are None until the state is accepted.
+    """
 
     xi: np.ndarray
     tangent: np.ndarray = field(default_factory=lambda: np.empty(0))

@@ -1,16 +1,18 @@
 r"""Steady states of a lattice's sites under a harmonic force or an incident Bloch wave, followed over a parameter.
 
-With the contacts condensed (``balance``) the harmonics Z of the relative displacements obey
+With the contacts condensed (``balance``) the harmonics Z_k in m of the relative displacements obey
 
-    Z_k + G(k Om) F_k(Z) = a delta_k1 w(Om),
+    Z_k + G(k Om) F_k(Z) = a delta_k1 w(Om),    k = 0..K,
 
-where w is the motion of the sites by the force (1 N) or the wave (1 clearance of the first site) alone. Unknowns are Z
-over that clearance and the parameter, the amplitude a or the frequency Om over a scale; a curve of solutions is
-followed by pseudo-arclength (``continuation``), folds in the parameter are located on it.
+with the compliance G in m/N of the linear lattice and the harmonics F_k in N of the contact forces. Here w is the
+motion of the sites by the force (1 N), the wall (1 m) or the wave (1 clearance of the first site) alone, and a is the
+amplitude. Unknowns are Z over that clearance and the parameter, the amplitude a or the frequency Om over a scale; a
+curve of solutions is followed by pseudo-arclength (``continuation``), folds in the parameter are located on it.
 
-**Energy.** A wave of the flux P a^2 comes in. What leaves at Om on the side that it goes to is transmitted (T), on the
-other reflected (R); what leaves at k Om, k > 1, is U; contacts lose L. T + R + U + L = 1 for any number of harmonics,
-as the loss is that of the harmonics kept. A force gives what it gives: fractions are over that, T to higher cells.
+**Energy.** A wave of the flux P a^2 in W comes in. What leaves at Om on the side that it goes to is transmitted (T), on
+the other reflected (R); what leaves at k Om, k > 1, on both sides is U; contacts lose L. T + R + U + L = 1 for any
+number of harmonics, as the loss is that of the harmonics kept. A force with the amplitude f puts in the mean power
+Re(i Om f* u)/2 at the displacement u of its mass. Fractions are over this power, and T is what leaves to higher cells.
 """
 
 from collections.abc import Iterator
@@ -30,11 +32,12 @@ from vipetsc.modes.response.outputs import HarmonicMotion, ResponseOutputs, larg
 from vipetsc.modes.response.stability_changes import StabilityChanges
 from vipetsc.modes.response.state import Measures, Response
 
-# A force's work over what it moves, below which nothing but rounding says that something leaves or is lost.
+# A force whose power is below this fraction of amplitude times frequency times displacement, as in a finite lattice
+# without loss, has none but rounding: there are no fractions of it.
 LEAST_WORK = 1e-12
 # States whose stability is kept: the ends of a step, and one between them. Without special points one is enough.
 KEPT_STATES = 3
-# Frequencies of a range at which the linear motion is compared.
+# Frequencies of a range among which the largest linear motion is looked for, as a unit: its size alone matters.
 TRIED = 33
 # Frequencies whose linear motions are kept: those of a step and of its differences. With 2 in place of 9 a curve over
 # the frequency (``nlvib``) computes 7 % more of them; 4 and 18 serve as well.
@@ -42,9 +45,11 @@ KEPT_MOTIONS = 9
 
 
 class SteadyStates(SteadyEquations):
-    """Steady states of the sites of a case with a ``restitution`` and the other parameter ``fixed`` (``NfrcTable``).
+    """Steady states of the sites of a ``case`` over the amplitude or the frequency, with a ``restitution``.
 
-    ``compliance`` is that of the case, if it has been computed already; ``forces`` take the place of the case's.
+    ``fixed`` is the frequency in rad/s of a curve over the amplitude, the amplitude of one over the frequency
+    (``NfrcTable``). ``compliance`` is that of the case, if it has been computed already; ``forces`` take the place of
+    the case's.
     """
 
     def __init__(
@@ -69,7 +74,7 @@ class SteadyStates(SteadyEquations):
         self.compliance = compliance
         self.outputs = ResponseOutputs(case, self.compliance, self.forces.contacts)
 
-        # Latest linear motions by frequency, and the latest determinant: neighbours on a curve over the amplitude.
+        # Along a curve over the amplitude all states have one linear motion and one Hill's determinant.
         self._motions = LatestValues[float, LinearMotion](KEPT_MOTIONS)
         self._hill: Hill | None = None
         self._stabilities = LatestValues[bytes, Stability](KEPT_STATES)
@@ -86,12 +91,16 @@ class SteadyStates(SteadyEquations):
         )
 
     def adopt(self, other: "SteadyStates") -> None:
-        """Take over what ``other`` has computed of perturbations, if it has the same compliance."""
+        """Take over the compliances at frequencies of perturbations from ``other``, if it has the same compliance."""
         if other.compliance is self.compliance:
             self._hill = other._hill
 
     def _unit(self) -> float:
-        """Unit of displacements in m: the first clearance; of contacts without any the linear motion of the range."""
+        """Unit of displacements in m: the first clearance that is positive.
+
+        Without one, as where all contacts are pressed at rest, it is the size of the linear motion: over the amplitude
+        at the upper end of the range, over the frequency at its beginning, or the largest in it if there are springs.
+        """
         for stops in self.forces.contacts:
             for gap in (stops.plus, stops.minus):
                 if 0 < gap < np.inf:
@@ -112,7 +121,10 @@ class SteadyStates(SteadyEquations):
         return float(amplitude * np.abs(self.linear_motion(omega).harmonics).max())
 
     def _scale(self, clearance: float) -> float:
-        """Unit of the parameter: half the range of frequencies, or the amplitude that touches, 1 of a wave."""
+        """Unit of the parameter: half the range of frequencies, or the amplitude with a linear motion of 1 clearance.
+
+        The amplitude of a wave is in clearances already.
+        """
         low, high = self.options.range
         if self.options.over == "frequency":
             return (high - low) / 2
@@ -122,13 +134,17 @@ class SteadyStates(SteadyEquations):
         return float(clearance / np.abs(linear[:, 1]).max())
 
     def linear_motion(self, omega: float) -> LinearMotion:
-        """The motion of the linear lattice for the amplitude 1; FlowError outside a wave's band."""
+        """The motion of the linear lattice for the amplitude 1 at ``omega`` in rad/s.
+
+        Raises FlowError outside a wave's band.
+        """
         return self._motions.get(omega, lambda: self._evaluate_linear(omega))
 
     def _evaluate_linear(self, omega: float) -> LinearMotion:
         pairs = self.forces.pairs
         z = np.zeros((pairs, self.options.harmonics + 1), complex)
         if not self.wave:
+            # Columns beyond the pairs are those of the driven masses.
             z[:, 1] = self.compliance.response(omega)[0, :, pairs:] @ self.weights
             return LinearMotion(z, None)
         assert isinstance(self.compliance, WaveCompliance)
@@ -140,7 +156,10 @@ class SteadyStates(SteadyEquations):
         return LinearMotion(z, wave)
 
     def measured(self, xi: np.ndarray, perturbations: Perturbations | None = None) -> Measures:
-        """The measures of the state ``xi`` (n + 1,) for its file; its ``perturbations`` are counted if not given."""
+        """The measures of the state ``xi`` (n + 1,) for its file.
+
+        Its growing ``perturbations`` are looked for unless they are given.
+        """
         omega, amplitude = self.drive(xi[-1])
         x = xi[:-1] * self.clearance
         z = self.balance.unpack(x)
@@ -168,7 +187,7 @@ class SteadyStates(SteadyEquations):
         )
 
     def _harmonic_motion(self, omega: float, amplitude: float, z: np.ndarray, series: ForceSeries) -> HarmonicMotion:
-        """A state, whose pairs have the harmonics ``z``, as its outputs take it."""
+        """A state, whose pairs have the harmonics ``z`` (pairs, K + 1) in m, as ``ResponseOutputs`` takes it."""
         wave = self.linear_motion(omega).wave
         incident: np.ndarray | float = 0.0
         if wave is not None and self.outputs.cells:
@@ -185,7 +204,10 @@ class SteadyStates(SteadyEquations):
         )
 
     def stability(self, xi: np.ndarray) -> Stability:
-        """The stability of a state ``xi`` (n + 1,); the latest are kept, since neighbours on a curve are compared."""
+        """The number of growing perturbations of a state ``xi`` (n + 1,), and where multipliers are real.
+
+        The latest are kept, since neighbours on a curve are compared.
+        """
         return self._stabilities.get(xi.tobytes(), lambda: self._evaluate_stability(xi))
 
     def _evaluate_stability(self, xi: np.ndarray) -> Stability:
@@ -194,7 +216,7 @@ class SteadyStates(SteadyEquations):
         return self.hill(omega).stability(series)
 
     def _perturbations(self, xi: np.ndarray, series: ForceSeries) -> Perturbations:
-        """The perturbations of a state with these forces that grow."""
+        """How many perturbations of a state ``xi`` grow, and which the fastest; ``series`` are its forces."""
         # The count is cheaper than the zeros themselves, and most states are stable.
         unstable = self.stability(xi).unstable
         if not unstable:
@@ -232,7 +254,10 @@ class SteadyStates(SteadyEquations):
         yield from StabilityChanges(self, left, right).kinds()
 
     def hill(self, omega: float) -> Hill:
-        """Hill's determinant at a frequency; the latest is kept, since it keeps the compliances of perturbations."""
+        """Hill's determinant of motions at ``omega`` in rad/s.
+
+        The latest is kept, since it keeps the compliances at the frequencies of perturbations.
+        """
         if self._hill is None or self._hill.omega != omega:
             options = self.options
             decay = 0.0
@@ -249,7 +274,11 @@ class SteadyStates(SteadyEquations):
         return self._hill
 
     def _fractions(self, omega: float, amplitude: float, forces: np.ndarray, loss: float) -> np.ndarray:
-        """T, R, U, L over what comes in (4,), NaN where a finite lattice lets nothing leave; ``loss`` in J a period."""
+        """T, R, U and L (4,) of the module over what comes in.
+
+        ``forces`` (pairs, K + 1) are the contacts' in N, ``loss`` is theirs in J a period. T, R and U are NaN
+        unless the lattice is infinite; all are where nothing comes in.
+        """
         wave = self.linear_motion(omega).wave
         first = forces[:, 1]
         if wave is not None:
@@ -258,6 +287,7 @@ class SteadyStates(SteadyEquations):
             given = amplitude**2 * wave.flux
         else:
             first = np.append(first, amplitude * self.weights)
+            # The displacement that the force does work on: those of the driven masses, by their weights.
             moved = 0.0
             for (cell, mass), weight in zip(self.points, self.weights.tolist(), strict=True):
                 moved = moved + weight * self.compliance.field(omega, first, [cell])[0, mass]
@@ -270,9 +300,10 @@ class SteadyStates(SteadyEquations):
             outgoing = self.compliance.outgoing(omega, first, wave, amplitude).sum(axis=1)
             powers[:2] = outgoing if self.options.towards > 0 else outgoing[::-1]
             for k in range(2, forces.shape[1]):
-                # Even orders of a symmetric motion have no force, and waves are not solved for in vain.
+                # Even orders of a symmetric motion have no force, and need no solution for their waves.
                 if np.any(forces[:, k]):
                     powers[2] += self.compliance.outgoing(k * omega, forces[:, k]).sum()
+        # From J a period to W.
         powers[3] = loss * (omega / (2 * np.pi))
         if not given > 0:
             return np.full(4, np.nan)

@@ -1,4 +1,10 @@
-"""Steps along a curve of steady states, where it begins, and where it ends."""
+"""Steps along a curve of steady states, where it begins, and where it ends.
+
+A curve begins at the lower end of its range. Where the linear motion touches no contact, it is the state there. Else
+the state is reached by a homotopy from the linear motion: growing amplitudes, or growing weights of the contacts'
+forces. Both are curves themselves, followed by the same continuation; of several states at the lower end only the one
+to which they lead is found.
+"""
 
 from dataclasses import replace
 
@@ -14,19 +20,25 @@ from vipetsc.modes.response.steady import SteadyStates
 # Largest angle in rad between tangents, and correction over the step, of a step that is accepted.
 TURN = 0.25
 CORRECTION = 0.1
-# A step grows by this factor at most, and not where the curve turns by half of what is allowed.
+# The next step is TURN/2 over the turn times the last one, so that the curve turns by half of what is allowed, but at
+# most this factor times it.
 MOST_GROWTH = 1.6
-LEAST_ANGLE = 1e-9  # rad, for the quotient
-# States on growing amplitudes to the beginning of a range (those of examples have 40 to 180), and the arclength that
-# they may need for with short steps.
+# A turn in rad below which the quotient is not formed: the growth is at its bound anyway.
+LEAST_ANGLE = 1e-9
+# States on growing amplitudes to the beginning of a range, at most: those of examples have 40 to 180. Where the case
+# asks for short steps, as many as cover this arclength.
 MOST_RAMP = 300
 LONGEST_RAMP = 30.0
-# States on growing weights of the contacts' forces.
+# States on growing weights of the contacts' forces, at most.
 MOST_WEIGHTS = 10_000
 
 
 class TurningSteps:
-    """Steps of a curve by [nfrc]: as long as it turns by half of what is allowed; the curve ends on its range."""
+    """The step rule of steady states (``StepRule``): steps on which the curve turns by half of what is allowed.
+
+    The curve ends on its range. Lengths of steps are those of [nfrc], in units of the unknowns; ``points`` is the
+    largest number of states.
+    """
 
     points_key = "nfrc.points"
     chart = ""
@@ -43,10 +55,12 @@ class TurningSteps:
         return Verdict(False, step / 2, f"Newton's method ended with {attempt.reason} (residuals {residuals})")
 
     def judge(self, before: Response, after: Response, geometry: Geometry) -> Verdict:
-        """Accept a step on which neither the tangent turns too far nor the correction is too long."""
+        """Accept a step on which neither the tangent turns too far nor the correction is too long; else half of it."""
+        # A comparison with NaN is false, which refuses the step.
         if not (geometry.turn <= TURN and geometry.corrector <= CORRECTION):
             return Verdict(False, after.step / 2, f"the curve turns too sharply ({geometry.turn:.2g} rad)")
         growth = min(MOST_GROWTH, 0.5 * TURN / max(geometry.turn, LEAST_ANGLE))
+        # An accepted turn is at most TURN, so that the quotient is at least 1/2, but for rounding.
         return Verdict(True, min(after.step * max(growth, 0.5), self.states.options.largest_step))
 
     def end(self, point: Response) -> tuple[Response, str] | None:
@@ -60,7 +74,7 @@ class TurningSteps:
         bound = high
         if p < low:
             bound = low
-        # A curve ends on its range, so that curves over the same range end at the same parameter.
+        # The last state is moved back to the end itself: curves over the same range end at the same parameter.
         xi = states.at(point.xi, bound)
         tangent = states.frame(point).tangent_at(xi)
         last = Response(xi=xi, tangent=tangent, index=point.index, step=point.step, next_step=point.next_step)
@@ -85,13 +99,16 @@ class TurningSteps:
 
 
 def first_state(states: SteadyStates | StatesOverKey, is_ramp: bool = False) -> Response:
-    """The state at the beginning of the range, by growing amplitudes from one that touches no contact.
+    """The state at the lower end of the range, with its tangent towards larger parameters.
 
-    Where these do not lead there, and where stops touch at rest, by growing weights of the contacts' forces.
-    ``is_ramp``: it is the beginning of growing amplitudes itself. Raises ContinuationError where neither leads there.
+    It is found by growing amplitudes from one at which no contact is touched. Where these do not lead there, and where
+    stops touch at rest, it is found by growing weights of the contacts' forces. ``is_ramp`` says that it is the
+    beginning of growing amplitudes itself, which the linear motion is near. Raises ContinuationError where neither
+    leads there.
     """
     if isinstance(states, StatesOverKey):
         low, _ = states.options.range
+        # With the key at its first value this is a state over the amplitude.
         guess = states.from_state(low, first_state(states.states_at(low)).xi)
         return _begun(states, guess)
 
@@ -99,6 +116,7 @@ def first_state(states: SteadyStates | StatesOverKey, is_ramp: bool = False) -> 
     omega, amplitude = states.drive(low)
     linear = states.linear_motion(omega).harmonics
     guess = states.balance.pack(amplitude * linear) / states.clearance
+    # A stop that touches at rest acts at every amplitude: no small one is linear.
     if any(0 in (stops.plus, stops.minus) for stops in states.forces.contacts):
         guess = _by_weights(states, omega, amplitude)
     elif _touches(states, amplitude * linear[:, 1]) and not is_ramp:
@@ -109,16 +127,16 @@ def first_state(states: SteadyStates | StatesOverKey, is_ramp: bool = False) -> 
 
 def _begun(states: SteadyStates | StatesOverKey, guess: np.ndarray) -> Response:
     """The state near the unknowns ``guess`` with their parameter, from which the parameter grows."""
-    # Newton's method from the linear motion, or from the state on the ramp, which is one already but for rounding.
+    # The guess is the linear motion, or the end of a homotopy, which is a state already but for rounding.
     start = Response(xi=states.at(guess, guess[-1]), next_step=states.options.first_step)
     tangent = states.first_tangent(start, 1)
     return Response(xi=start.xi, tangent=tangent, next_step=start.next_step)
 
 
 def _touches(states: SteadyStates, linear: np.ndarray) -> bool:
-    """Whether the linear motion (pairs,) in m comes to a stop; a contact that is pressed at rest need not open.
+    """Whether the linear motion (pairs,) in m comes to a stop, or opens a contact that is pressed at rest.
 
-    Springs that are not linear act at every amplitude.
+    Springs that are not linear act at every amplitude: with them it is always so.
     """
     if states.forces.springs:
         return True
@@ -131,16 +149,20 @@ def _touches(states: SteadyStates, linear: np.ndarray) -> bool:
 def _by_weights(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
     """Scaled harmonics of the state at ``omega`` to which growing weights of the contacts' forces lead.
 
-    The forces of all contacts, less those of springs in their place, are multiplied by a weight s^4, each has a
-    parallel dashpot of 1 - s times the impedance of the lattice, and the state is followed from s = 0, where it is the
-    linear one, to s = 1. The curve cannot come back to s = 0, where there is no other state, and the dashpots keep it
-    from resonances. The power gives stiff contacts, which act at small weights already, a long part of the path.
+    The forces of all contacts, less those of springs in their place, are multiplied by a weight s^4. Each contact has a
+    parallel dashpot of (1 - s) d, where d = 1/(Om |G_jj(Om)|) in N s/m is the impedance of the lattice at its pair j.
+    The state is followed from s = 0, where the system is linear, to s = 1. The curve cannot come back to s = 0, where
+    there is no other state, and the dashpots keep it from resonances. The power gives stiff contacts, which act at
+    small weights already, a long part of the path.
+
+    ``omega`` is in rad/s. Raises ContinuationError where the curve does not reach s = 1.
     """
     impedance = 1 / (omega * np.abs(np.diag(states.compliance.at(np.array([omega]))[0])))
     update = {"over": "amplitude", "range": [amplitude, 2 * amplitude], "fixed": [omega]}
     case = states.case.model_copy(update={"nfrc": states.options.model_copy(update=update)})
 
     def weighted(s: float) -> SteadyStates:
+        """The equations with contacts, and the nonlinear parts of springs, of the weight s^4."""
         stops = [
             one._replace(weight=s**4, drag=(1 - s) * drag, spring=s**4 * one.spring)
             for one, drag in zip(states.forces.contacts, impedance.tolist(), strict=False)
@@ -152,6 +174,7 @@ def _by_weights(states: SteadyStates, omega: float, amplitude: float) -> np.ndar
 
     options = case.nfrc.model_copy(update={"range": [0.0, 1.0]})
     weights = StatesOverKey(weighted, "weight of contacts", amplitude, options)
+    # At s = 0 the dashpots change the linear motion, but the equations are linear: one Newton step corrects it.
     linear = amplitude * states.linear_motion(omega).harmonics
     start = _begun(weights, np.append(states.balance.pack(linear) / weights.clearance, 0.0))
     points = list(Continuation(weights, start, TurningSteps(weights, MOST_WEIGHTS)))
@@ -162,7 +185,7 @@ def _by_weights(states: SteadyStates, omega: float, amplitude: float) -> np.ndar
 
 
 def _by_amplitudes(states: SteadyStates, omega: float, amplitude: float) -> np.ndarray:
-    """Scaled harmonics of the state at ``omega`` to which growing amplitudes lead.
+    """Scaled harmonics of the state at ``omega`` in rad/s, reached by amplitudes that grow from 1e-3 of ``amplitude``.
 
     With stiff contacts that have a loss, states over the amplitude may come to motions that close a contact ever more
     slowly, as the damping factor is divided by the speed at which it closes: steps become ever shorter. They may also
