@@ -34,7 +34,7 @@ from vipetsc.studies.run_record import record_of
 from vipetsc.studies.velocity_record import VelocityRecord
 
 FORMAT_VERSION = 3
-SNAPSHOTS = 500  # at most this many samples are transformed by wavelets
+SNAPSHOTS = 500  # at most this many intervals between the samples that are transformed by wavelets
 MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: a window of cells is needed
 
 # Measures of a run whose fields are stored; "maps" are the space-time maps of the other measures.
@@ -49,8 +49,8 @@ WHOLE = {
     "transfer": ("kinetic", "dispersion", "bands", "modal", "maps"),
 }
 
-# Dimensions, units and description of every variable; dimensions of a group are named without it, so none may be
-# called as one outside that the group uses.
+# Dimensions, units and description of every variable. In the file a dimension of a group is named without the group, so
+# that a group must not use both: ``partition/kinetic_energy`` uses ``cell``, and there is no ``partition/cell``.
 LAYOUT = (
     {
         "time": ("time", "s", "time"),
@@ -102,9 +102,9 @@ def analyse(
     paper's t_hat in s, the time of the largest host velocity at the first site in the linear run; by default it is
     estimated from the group velocity: half the burst and the time to the site. ``options`` are the case's where none
     are given. ``case`` is the run's, where the caller has it, and ``opening`` the entropies of the snapshots with which
-    a member of a sweep begins. Measures that the run does not allow (no sites, a single
-    cell) are left out and named in the attribute ``left_out``; those that the stored samples and cells do not resolve
-    are also named in the list ``warnings``.
+    a member of a sweep begins. Measures that the run does not allow (no sites, a single cell) are left out and named in
+    the attribute ``left_out``; those that the stored samples and cells do not resolve are also named in the list
+    ``warnings``.
 
     The ranks of ``comm`` take different measures of the same run; all must call it, and all get all measures.
     """
@@ -243,7 +243,8 @@ def _maps(record: VelocityRecord, measures: Collection[str]) -> dict[str, Any]:
     """Kinetic energy of cells and of wavenumbers over time, from blocks of samples that fit into the memory."""
     nt, cells, dofs = record.velocity.shape
     samples = record.sizes[0]
-    pooled = -(-cells // (2 * record.options.pixels))  # wavenumbers in a bin of the map
+    # Wavenumbers in a bin of the map; there are half as many wavenumbers from 0 to pi as cells.
+    pooled = -(-cells // (2 * record.options.pixels))
     kinetic = []
     contents = []
     total = []
@@ -316,7 +317,7 @@ def _entropies(
         every=options.snapshot_stride,
         first=first,
     )
-    # The result from half of the snapshots and cells estimates the error of the result from all.
+    # The result from every second snapshot and cell estimates the error of the result from all.
     local = entropy.local[start:][::2, ::2]
     weight = entropy.weight[start:]
     coarse = spectra.averages(local, weight[::2, ::2], 0, 2 * options.cell_stride, weight.max())

@@ -1,4 +1,10 @@
-"""Inter-band transfer compared with the slope of frequency-energy branches: ``backbone.h5`` (paper, section IV.C)."""
+"""Inter-band transfer compared with the slope of frequency-energy branches: ``backbone.h5`` (paper, section IV.C).
+
+The frequency f(E) of a nonlinear normal mode, followed as a branch, depends on its energy E once contacts act. The
+paper compares the transfer of a sweep over the amplitude with df/dE of the out-of-phase branch in its region III, the
+vibro-impact regime, and fits a power of the energy to both. ``read_slope`` takes df/dE from a branch, ``initiation_of``
+the drive's work at which contact begins from the linear run, ``align`` scales one to the other and fits.
+"""
 
 import hashlib
 import json
@@ -132,7 +138,7 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     energy = work[valid][order] * (branch.attrs["grazing"] / initiation)
     ibtet = ibtet[valid][order]
     slope = log_slope(energy, *(branch[f"branch/{name}"].values for name in ("energy", "slope", "region")))
-    # Before its peak the transfer still sets in.
+    # Before its peak the transfer still grows as contacts set in.
     fitted = np.isfinite(slope) & (np.arange(len(energy)) >= np.argmax(ibtet))
     values = {"energy": energy, "ibtet": ibtet, "fitted": fitted.astype(np.int8)}
     aligned = xr.merge([xr.Dataset(tabulated(LAYOUT, values)), branch], combine_attrs="override")
@@ -145,7 +151,8 @@ def align(work: np.ndarray, ibtet: np.ndarray, initiation: float, floor: float, 
     def misfit(log_divisor: float) -> float:
         return float(np.sum((np.log(np.exp(slope - log_divisor) + floor) - log_transfer) ** 2))
 
-    # Without a floor the mean of the differences is the answer; the floor only asks for a larger divisor.
+    # Without a floor the mean of the differences is the answer; the floor only asks for a larger divisor. The bracket
+    # grows from its first step, 0.5.
     start = float(np.mean(slope - log_transfer))
     # In ln s, over which the misfit has one minimum, and in which a bracket has no sign to respect.
     best = minimize_scalar(misfit, bracket=(start, start + 0.5), options={"xtol": 1e-10})

@@ -1,4 +1,10 @@
-"""Energies of the pass bands and gaps of one run, by frequency filters, and the inter-band transfer."""
+"""Energies of the pass bands and gaps of one run, by frequency filters, and the inter-band transfer.
+
+The frequency axis is cut at the edges of the pass bands. E_p(t) in J is the kinetic energy of all cells in the velocity
+that is filtered to part p. The inter-band targeted energy transfer (ibtet) is the mean over time of the sum of E_p over
+the bands above the driven one, over the sum of E_p of all parts (``spectra.ibtet``). The mean begins when the wave
+arrives at the first site.
+"""
 
 from collections.abc import Collection
 from typing import Any, NamedTuple

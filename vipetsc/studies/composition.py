@@ -1,16 +1,22 @@
 """Prediction of several sites from the response of one, with waves between them in both directions and no fit.
 
-Between the sites the lattice is linear, so all that sites do to each other goes through G_kj(omega), the response of
-the relative displacement at site k to a pair of forces at site j, ends of the lattice included. With the self response
-g of an infinite lattice, c_k = c0_k + sum_j (G_kj - delta_kj g) f1_j: the linear wave and the waves from the other
-sites and from the ends arrive at a site. f1 = Phi1(|c|/D) c closes the system: GMRES solves it with Phi1 fixed, and
-this is iterated with the Phi1 of the solution until it converges.
+About the drive's frequency Om the wave that arrives at site k is w = Re c_k exp(i Om t), and the force there is
+f = Re f1_k exp(i Om t), with envelopes c in m and f1 in N that vary slowly. Between the sites the lattice is linear, so
+all that sites do to each other goes through G_kj(omega) in m/N, the response of the relative displacement at site k to
+a pair of forces at site j, ends of the lattice included. What a site alone does to itself is the response g of an
+infinite lattice, which the response of one site has in it already. So there arrive at a site the linear wave c0, and
+the waves from the other sites and from the ends,
 
-Third harmonics f3 = Phi3(z) |c| (c/|c|)^3 of the sites add with their phases; a site in contact is stiff to those of
-others: f3 has the term -c3/g too. They press on contacts: z = (|c| + |c3|)/D. The energy that the upper bands carry
-past a site in contact loses the fraction that a driven wave of that amplitude loses. Waves that are not harmonics add
-by energies. G and g are those of the lattice with its dashpots; ``studies.wave_losses`` has what these take until the
-end.
+    c_k = c0_k + sum_j (G_kj - delta_kj g) f1_j,    f1 = Phi1(z) c,    z = |c|/D,
+
+with the clearance D and Phi1 in N/m of ``studies.response``. GMRES solves this with Phi1 fixed, and it is iterated with
+the Phi1 of the solution until it converges.
+
+Third harmonics, about 3 Om, have envelopes c3 and f3. f3 = Phi3(z) |c| (c/|c|)^3 of the sites add with their phases; a
+closed contact does not yield to those of other sites, which adds -c3/g to f3. They press on contacts:
+z = (|c| + |c3|)/D. The energy that the upper bands carry past a site in contact loses the fraction that a driven wave
+of that amplitude loses. Waves that are not harmonics add by energies. G and g are those of the lattice with its
+dashpots; ``studies.wave_losses`` has what these take until the end.
 """
 
 from typing import NamedTuple
@@ -178,6 +184,7 @@ class Network:
         samples = np.arange(int(np.ceil(drive.duration / step)) + 1) * step
         force = drive.force(samples) / abs(drive.amplitude) * np.exp(-self.line.decay * samples)
         transform = step * np.exp(-1j * np.multiply.outer(self.om + self.offset, samples)) @ force
+        # Spectra of the line are sums over its instants, without their distance.
         return np.asarray(2 * transform / self.time[1])
 
     def _responses(self, middle: float) -> tuple[np.ndarray, np.ndarray]:
@@ -248,7 +255,7 @@ class Network:
         return np.asarray(x).reshape(right.shape)
 
     def _over_clearance(self, c: np.ndarray, c3: np.ndarray) -> np.ndarray:
-        """z (site, time)."""
+        """z (site, time), the amplitudes of both harmonics together over the clearance."""
         return np.asarray((np.abs(c) + np.abs(c3)) / self.clearance[:, None])
 
     def _energies(self, waves: Arriving, sites: SiteResponses, change: float, amplitude: float) -> Composed:

@@ -15,9 +15,9 @@ from vipetsc.studies.sampler import Sampler, front, knee
 class Design:
     """A design that was tried: its ``values`` (variable) and its results.
 
-    ``case`` and ``runs`` are None and empty for an impossible one; ``losses`` (objective) are small for a good one, NaN
-    if it failed for a ``reason``. ``constraints`` are the values of what is bounded, ``excess`` is by how much they are
-    out of bounds.
+    ``case`` is None and ``runs`` are empty if the values make no valid case. ``losses`` (objective) are small for a
+    good design, NaN for one that failed, whose ``reason`` says why. ``constraints`` (constraint) are the values of what
+    is bounded, ``excess`` sums by how much they are out of bounds.
     """
 
     values: np.ndarray
@@ -48,6 +48,7 @@ class OptimumSearch:
         self.asked = self.designs
 
     def _design(self, values: np.ndarray, generation: int) -> Design:
+        """The design of ``values`` (variable), with its runs, or with the reason why it is not possible."""
         try:
             case = self.plan.design(values)
             return Design(values, generation, case, [*self.objective.runs(case).values()])
@@ -90,7 +91,8 @@ class OptimumSearch:
         Methods Appl. Mech. Eng. 186, 311); one that failed is worse than all others.
         """
         judged = self.feasible_losses()
-        # Over all designs so far, not those of this generation: losses that the sampler has must stay comparable.
+        # Over all designs so far, not those of this generation: losses that the sampler has must stay comparable. One
+        # more than the worst keeps designs that miss a constraint behind it.
         worst = np.max(judged, axis=0, initial=0.0, where=np.isfinite(judged)) + 1
         most = max(design.excess for design in self.designs)
         losses = []

@@ -1,4 +1,9 @@
-"""Dispersions of a run: of all its cells, and of those before and after the first site."""
+"""Dispersions of a run: of all its cells, and of those before and after the first site.
+
+A dispersion is the kinetic energy of the velocity's transform over time and cells, in bins of wavenumber and frequency
+(``spectra.dispersions``): waves of a linear lattice lie on its Bloch bands. The part before the site has the wave that
+comes and what is sent back, the part after it what passes.
+"""
 
 from typing import Any
 
@@ -9,7 +14,7 @@ from vipetsc import spectra
 from vipetsc.lattice import pass_bands
 from vipetsc.studies.velocity_record import VelocityRecord
 
-HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge
+HEADROOM = 1.5  # dispersion is kept up to this many times the top band's edge, to show what lies above it
 
 
 def dispersions_by_side(record: VelocityRecord) -> dict[str, Any]:
@@ -23,6 +28,7 @@ def dispersions_by_side(record: VelocityRecord) -> dict[str, Any]:
     length = fft.next_fast_len(nt, real=True)
     highest = HEADROOM * pass_bands(record.model.chain.cell)[-1].high
     frequencies = np.count_nonzero(2 * np.pi * fft.rfftfreq(length, record.interval) <= highest)
+    # Wavenumbers and frequencies in a bin of the map. Wavenumbers of both signs are folded to half as many as cells.
     sizes = [-(-n // (2 * record.options.pixels)) for n in (cells, frequencies)]
     windows: dict[str, spectra.CellWindow] = {}
     for name, window in _windows(record).items():

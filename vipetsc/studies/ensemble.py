@@ -63,9 +63,10 @@ class Results:
 
     ``status`` (member): how each ended, an index of ``STATUS``; ``reasons`` of those that failed by number; ``tables``
     (member, or member and a list, padded with NaN) of what was measured by name, for the first of equal members;
-    ``errors`` the largest that is said of each; ``used`` tolerances, engines and options of the analysis; ``linear``
-    runs by name; ``lines`` the places of the records. ``first`` (member) is the number of the first member that is
-    equal. ``warnings`` by number are about the members, ``damaged`` names lines that could not be used.
+    ``errors`` the largest sampling error of each measure; ``used`` tolerances, engines and options of the analysis;
+    ``linear`` runs by name; ``parts`` the names of the parts of the frequency axis, once for each way in which members
+    cut it; ``lines`` the places of the records in their files. ``first`` (member) is the number of the first member
+    that is equal. ``warnings`` by number are about the members, ``damaged`` names lines that could not be used.
     """
 
     def __init__(self, plan: Sweep, folder: Path) -> None:
@@ -266,11 +267,13 @@ def _measured_variables(results: Results) -> Variables:
             table = table.reshape(*plan.shape, *table.shape[1:])
             data[name] = variable((*dims, *further.split()), table, *texts, **error)
 
+    # The times of snapshots may differ between members: the dimension that they have in common is the number.
     if "entropy/history" in data:
         number = np.arange(data["entropy/history"].shape[-1])
         data["snapshot"] = variable("snapshot", number, "1", "number of a snapshot")
         data["entropy/time"] = data.pop("entropy/snapshot")
     for name in [name for name, item in data.items() if PART in item.dims]:
+        # There is one way to cut the axis here: with several no variable of parts has been entered.
         data[name].attrs["parts"] = list(*results.parts)
         if PART not in data:
             number = np.arange(1, data[name].shape[-1] + 1)
@@ -320,7 +323,11 @@ def _fits(data: Variables, along: str) -> Variables:
 
 
 def fit_curve(amplitude: np.ndarray, curve: np.ndarray, normalise: bool) -> dict[str, float]:
-    """The entries of ``FIT`` for one curve (amplitude,) over amplitudes in N, fitted from its peak on; else NaN."""
+    """The entries of ``FIT`` for one ``curve`` (amplitude,) over amplitudes in N; NaN where there is no fit.
+
+    From the curve's peak on y = factor A^exponent, A the amplitude's size, by a straight line of log y over log A and
+    by nonlinear least squares of y; with ``normalise`` y is scaled to [0.01, 1] first.
+    """
     row = dict.fromkeys(FIT, np.nan)
     valid = np.isfinite(curve)
     # The sign of the amplitude is a phase of the drive: the size orders the curve.

@@ -1,5 +1,10 @@
 """Parameters of a case from measured records: the result is ``identified.h5``, with ``identified.toml`` for ``run``.
 
+The parameters minimise the squares of (model - measured)/noise over all samples; ``vipetsc.identification`` has the
+method. A fit has for each parameter a coordinate z, for most its logarithm, and further ones for initial states that
+are estimated. Fits begin at several starts, since the misfit may have several valleys. About the best fit each
+parameter is held at a row of values while all others are fitted: the cost over these values is its profile.
+
 Ranks divide the starts, then the fits of the profiles; with more ranks than starts, the ranks of a team divide the
 records and derivatives of a start. The solution of each window is kept at once, so that an identification that was
 stopped goes on where it was. The same files, to the bit, on any number of ranks.

@@ -1,4 +1,9 @@
-"""Linear modes of a finite lattice near a frequency, with their place, band and shape, in ``modes.h5``."""
+"""Linear modes of a finite lattice near a frequency, with their place, band and shape, in ``modes.h5``.
+
+They solve K x = Om^2 M x, x^T M x = 1; contacts that are pressed at rest count as springs. A mode in a pass band is of
+the "bulk"; one in a gap decays away from where something differs, and is named after the place of its energy: an end
+("edge"), a site or a cell.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -89,6 +94,7 @@ def check_modes(case: Case, count: int, near: float) -> None:
     if gaps and np.any(np.min(gaps, axis=1) == 0):
         remedy = "a contact that touches at rest resists on one side only: no motion about it is linear, however small"
         raise CaseError([Problem("contacts.clearance", 0.0, remedy)])
+    # The comparison is false for NaN too; far below 1e50 squares of frequencies do not overflow.
     if not 0 <= near < 1e50:
         raise CaseError([Problem("--near", near, "give a frequency in rad/s that is not negative")])
     if 8 * count * masses > GATHER_LIMIT:

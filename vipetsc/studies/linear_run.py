@@ -1,8 +1,9 @@
 """Linear runs, which members of a sweep share if they differ only in contacts and amplitude.
 
 Until the first contact a lattice is linear: displacements are proportional to the drive's amplitude, and energies to
-its square. The linear run, under 1 N and without contacts, shows which members have no contact; they are scaled from
-it.
+its square. The linear run, under 1 N and without contacts, shows which members have no contact: those of an amplitude A
+in N with A e < ``MARGIN`` D at every site, where e is the envelope of w at the site in m/N and D the clearance in m.
+They are scaled from it.
 """
 
 import itertools

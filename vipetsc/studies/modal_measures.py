@@ -1,7 +1,9 @@
 """Energies of the linear modes of a run by band, gap and wavenumber, and the energy that contacts transferred.
 
-Contacts that occur between the same two samples form a cluster. Its transfer is the change of the energies between
-these samples, minus the change that the drive would have caused in the lattice without contacts.
+Without contacts and drive the energy |z|^2/2 of a linear mode is constant (``lattice.modes``). E_p is the sum over the
+modes of a part p of the frequency axis. Contacts that occur between the same two samples, at t_b and t_e, form a
+cluster. Its transfer to part p is E_p(t_e) - E_p(t_b), minus the change that the drive would have caused in the lattice
+without contacts.
 """
 
 from collections.abc import Collection

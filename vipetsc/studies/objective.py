@@ -1,4 +1,9 @@
-"""The runs that evaluate a design: simulated by teams of ranks, measured, and recorded as they end."""
+"""The runs that evaluate a design: simulated by teams of ranks, measured, and recorded as they end.
+
+A design has a run for each amplitude that an objective or a constraint names and each sample of disorder, or its
+frequency responses for each sample. A measure at an amplitude, or of a curve, is the mean over the samples. The loss of
+an objective is the mean or the worst of these, with the sign changed if it is to be maximised.
+"""
 
 import itertools
 import json

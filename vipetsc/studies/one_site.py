@@ -189,6 +189,8 @@ class ScatteringRuns:
 
         energy = self.site_waves.energies(force / amplitude)
         sent_out = float((energy - self.reference).sum())
+        # The site gives no energy of its own: what waves have lost there, and the contact has neither dissipated nor
+        # kept, is the dashpots'.
         last = run["velocity"].values[-1]
         return {
             "energy": energy.tolist(),

@@ -1,5 +1,9 @@
 """The best design for an objective, or the Pareto front of two: the result is ``optimum.h5``.
 
+For one objective the sampler is CMA-ES, an evolution strategy that adapts the covariance of the designs that it tries;
+for two it is NSGA-II, a genetic algorithm that keeps designs that no other is better than in both. The search begins
+with the case, or with clearances that the scattering law of one site gives for the linear wave (``start``).
+
 Rank 0 asks the sampler for designs and reports their losses in that order; all ranks simulate the runs. The result of
 a run is recorded at once, so a search that was stopped or killed repeats the same exchange and goes on.
 """
@@ -114,7 +118,7 @@ def _sampler(plan: OptimiseCase, start: np.ndarray) -> Sampler:
         return Nsga2(point, options.step, options.seed, options.population or POPULATION)
 
     variables = plan.variables()
-    # Whole numbers need a least deviation, or the search would stay at one of them.
+    # Variables that are whole numbers have a least deviation, or the search would stay at one of them.
     steps = np.array([variable.step for variable in variables])
     # Of a row of sites, what they have in common is searched first.
     directions = np.eye(len(point))

@@ -1,4 +1,4 @@
-"""The relative motion of contact pairs in a recorded run."""
+"""The relative motion w = u_resonator - u_host of contact pairs in a recorded run, and the largest of it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -76,8 +76,8 @@ def largest_between(
 
     It is that of the cubic through ``w`` (time,) in m with slopes ``rate`` (time,) in m/s.
     """
-    # With the rates that the run has, the cubic is of fourth order in the interval: a sample misses a peak by the
-    # second.
+    # The run has the rates. The error of the cubic through both is of fourth order in the interval between samples; the
+    # largest sample alone misses a peak by an error of second order.
     curve = CubicHermiteSpline(times, w, rate)
     extrema = curve.derivative().roots(extrapolate=False)
     # A piece on which w is constant has NaN for its root.

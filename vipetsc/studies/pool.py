@@ -93,7 +93,8 @@ class TaskPool:
         """Draw ``jobs`` with this team and do them, until none are left or one ends all. Collective."""
         drawn = SharedCounter(self.comm)
         ended = SharedCounter(self.comm)
-        # Of its own: on the communicator of the job, a rank whose job failed would meet the others in the midst of it.
+        # A communicator of its own: on that of the job, a rank whose job failed would meet the others in the midst of
+        # their work.
         meeting = self.team.Dup()
         # Many small jobs are drawn together: a draw and its broadcast may take longer than one of them.
         block = max(len(jobs) * self.team.size // (BLOCKS * self.comm.size), 1)

@@ -2,8 +2,9 @@
 
 Runs: the linear lattice under 1 N (onset, work, energies by band); one site in an infinite lattice (``studies.ring``)
 at ``predict.points`` amplitudes, dense near the onset (``studies.response``); then, to compare, the case itself at
-every amplitude (``studies.prediction_runs``). ``studies.composition`` composes the sites. Energies of bands
-are those of linear modes at the last sample, over the drive's work.
+every amplitude (``studies.prediction_runs``). ``studies.composition`` composes the sites. The onset is the amplitude
+whose linear wave just touches a site: 1 N over the largest of w/D under 1 N, with the clearance D of a site. Energies
+of bands are those of linear modes at the last sample, over the drive's work.
 """
 
 import time

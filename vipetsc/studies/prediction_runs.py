@@ -31,10 +31,11 @@ LINEAR = "linear"
 SITE = "site"
 MEMBER = "member"
 
-# Largest linear relative displacement over clearance, less 1, of the runs near the onset; others are log-spaced above.
+# Runs of one site, by z, the largest linear relative displacement over the clearance: z - 1 of those near the onset,
+# and the z from which on the others are log-spaced.
 NEAR_ONSET = (5e-4, 2e-3, 7e-3, 0.02, 0.05, 0.1, 0.2, 0.35, 0.55, 0.8, 1.2)
 HIGH = 2.8
-BEYOND = 1.01  # the one site's runs reach this many times the largest z of any amplitude
+BEYOND = 1.01  # the bins of z reach this many times the largest z of any amplitude
 
 
 class Job(NamedTuple):
@@ -78,7 +79,7 @@ def amplitudes_of(case: PredictCase, linear: Record) -> np.ndarray:
 
 
 def site_points(case: PredictCase, largest: float) -> list[float]:
-    """z of the runs of one site, up to ``largest``."""
+    """z of the runs of one site, up to the largest that is needed, which ``largest`` is ``BEYOND`` times."""
     # Above the onset the response changes with the logarithm of z.
     high = np.geomspace(HIGH, largest / BEYOND, case.predict.points - len(NEAR_ONSET))
     return [1 + z for z in NEAR_ONSET] + np.unique(high).tolist()
@@ -149,7 +150,8 @@ class PredictionRuns:
         motion = ring.motion(run)
 
         # Without a contact there is no force, whose beginning and end these are.
-        first_contact = last_contact = np.nan
+        first_contact = np.nan
+        last_contact = np.nan
         separation = run["impacts/separation"].values
         if len(separation):
             first_contact = float(run["impacts/onset"].min())
