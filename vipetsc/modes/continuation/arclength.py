@@ -29,19 +29,22 @@ from vipetsc.modes.continuation.guards import GUARDED, OrbitProblem, strain
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError, FlowError, PeriodicProblem, S
 
-# These numbers decide how many points lie on a branch, not its course: each point solves the equations and keeps the
-# guards. None is sharp. On the out-of-phase branch of the paper's reduced model up to 10 kJ (176 points, 21 attempts in
-# vain) each may be changed by a quarter or more, and the Newton steps of all points together change by 13 % at most.
+# The following numbers decide how many points lie on a branch, not its course: each point solves the equations and
+# keeps the guards. None is sharp. On the out-of-phase branch of the paper's reduced model up to 10 kJ (176 points, 21
+# attempts in vain) each may be changed by a quarter or more, and the Newton steps of all points together change by 13 %
+# at most.
 #
-# Strain at which the step after an accepted one aims (at 1, nearly twice as many steps are refused), Newton steps up to
-# which the next step need not be shorter, and its largest growth.
+# Strain at which the step after an accepted one aims. At 1, nearly twice as many steps are refused.
 AIM = 0.7
+# Newton steps up to which the next step need not be shorter.
 EASY = 5
+# Largest growth from one step to the next.
 MOST_GROWTH = 2
 # Factor of a step where Newton's method fails.
 FAILED_FACTOR = 0.4
-# Where a guard refuses a step: the strain at which its repetition aims, and bounds of the factor.
+# Strain at which the repetition of a step aims that a guard has refused.
 AIM_AGAIN = 0.8
+# Bounds of the factor of such a step.
 LEAST_FACTOR = 0.1
 MOST_FACTOR = 0.7
 
@@ -101,10 +104,12 @@ class StepRule(Protocol[S]):
 class GuardedSteps:
     """Steps of a branch of normal modes by [nnm], of such length that the most strained guard comes to ``AIM``.
 
-    Guarded changes are proportional to short steps: angles and half-traces change at a rate along the branch, and a
-    correction, of second order, is taken over the step. (Of those that are not, only being out of bounds counts.) The
-    next step is therefore the last one times ``AIM`` over its strain. It at most doubles, and is shorter than the last
-    one where Newton's method needed more than ``EASY`` steps.
+    Most guarded changes are proportional to the step where it is short: angles and half-traces change at a rate along
+    the branch, and a correction, of second order in the step, is taken over the step. (Of the changes that are not,
+    only being out of bounds counts.) The next step is therefore the last one times ``AIM`` over its strain. It at most
+    doubles, and is shorter than the last one where Newton's method needed more than ``EASY`` steps.
+
+    ``problem`` has the orbits, ``control`` the numbers of [nnm].
     """
 
     points_key = "nnm.points"
@@ -128,10 +133,12 @@ class GuardedSteps:
         """Accept a step that strains no guard beyond its bound."""
         size, guard = strain(self.problem, self.control, before, after, geometry._asdict())
         if size <= 1.0:
+            # The largest of three reasons for a shorter step, each as the factor by which it divides the last one.
             effort = max(size / AIM, after.newton / EASY, 1 / MOST_GROWTH)
             return Verdict(True, min(after.step / effort, self.control.largest_step))
 
-        # A strain that does not fall in proportion to the step must not keep the attempts from ending.
+        # The strain may not be proportional to the step: the least factor keeps one large strain from ending the
+        # branch, and the largest one lets every refusal shorten the step, so that the attempts end.
         factor = min(max(AIM_AGAIN / size, LEAST_FACTOR), MOST_FACTOR)
         return Verdict(False, after.step * factor, *GUARDED[guard])
 
@@ -178,10 +185,11 @@ class GuardedSteps:
 class Continuation(Generic[S]):
     """Iterates over the points of a branch that follow ``start``; the start itself is not among them.
 
-    ``control`` is a step rule, or the section [nnm] of a case: it gives the ``chart`` (``auto``: grazing near a contact
-    at the arc's start, else relative), the steps in units of the chart, the ``guards``, and where the branch ends:
-    outside ``energy`` (J), outside ``frequency`` (Hz) or after ``points`` points. A start without a tangent is left
-    towards growing energy (``direction`` 1) or falling energy (-1); one with a tangent is left along it, and
+    ``control`` is a step rule, or the section [nnm] of a case, by which ``GuardedSteps`` is the rule. That section
+    gives the ``chart`` (``auto``: grazing near a contact at the arc's start, else relative), the steps in units of the
+    chart, the ``guards``, and where the branch ends: outside ``energy`` (J), outside ``frequency`` (Hz) or after
+    ``points`` points. ``step`` is the first arclength, by default the rule's ``first_step``. A start without a tangent
+    is left towards growing energy (``direction`` 1) or falling energy (-1); one with a tangent is left along it, and
     ``direction`` is not used.
 
     Each point is yielded when it has been accepted. ``point`` is the last one; ``passed`` is the same point as it was
@@ -241,8 +249,8 @@ class Continuation(Generic[S]):
                 tangent = frame.tangent_at(attempt.xi)
                 point = replace(frame.measures(attempt, tangent), index=last.index + 1, step=self.step)
 
-                # Of the cosine only rounding above 1 is cut off: the tangent is on the side of the frame's, so it is
-                # not negative.
+                # The cosine is cut off at 1, above which rounding may bring it. It needs no bound below: the tangent is
+                # on the side of the frame's, so that it is positive.
                 correction = attempt.xi - frame.xi - self.step * frame.tangent
                 geometry = Geometry(
                     corrector=float(np.linalg.norm(correction)) / self.step,
@@ -252,7 +260,7 @@ class Continuation(Generic[S]):
             else:
                 verdict = self.rule.not_converged(self.step, attempt)
 
-            # Also the step of a failure is kept: a loop that is asked again does not repeat the attempts.
+            # The step of a failure is kept as well, so that a second iteration does not repeat the attempts.
             self.step = verdict.step
             if verdict.accepted:
                 return replace(point, next_step=self.step)

@@ -1,7 +1,8 @@
 """Guards: bounds on changes from point to point, without which a branch jumps to another arc unseen.
 
-Both arcs satisfy the equations to rounding, so that no residual distinguishes them; neighbouring tongues of internal
-resonances differ in half-traces, contacts and direction.
+Both arcs satisfy the equations to rounding, so that no residual distinguishes them. Neighbouring tongues of internal
+resonances differ in their half-traces c = (mu + 1/mu)/2, mu the Floquet multipliers, in their contacts and in their
+direction. A jump between arcs that differ in none of these beyond the bounds is not seen.
 """
 
 from collections.abc import Sequence
@@ -23,12 +24,12 @@ GUARDED = {
     "turn_relative": ("the branch turns too sharply in the relative chart", "nnm.guards.turn_relative"),
     "truncation": ("the neglected harmonics are too large", "nnm.harmonics or nnm.truncation"),
 }
-# A change of these within its bound is no reason to slow down: they do not shrink with the step.
+# A change of these within its bound is no reason for a shorter step: they do not shrink with it.
 ALL_OR_NOTHING = {"contacts", "turn_relative", "truncation"}
 
 
 class OrbitProblem(PeriodicProblem[Point], Protocol):
-    """Equations whose solutions are orbits with contacts."""
+    """Equations whose solutions are orbits with contacts, as ``strain`` asks them."""
 
     def departures(self, point: Point) -> Sequence[Departure]:
         """The times in the arc of an orbit in which contacts are not what they are at rest; all ranks must call it.
@@ -51,7 +52,11 @@ class Strain(NamedTuple):
 
 
 def strain(problem: OrbitProblem, control: NnmTable, before: Point, after: Point, geometry: dict[str, float]) -> Strain:
-    """The largest strain of a step between two points, whose ``geometry`` has its ``corrector`` and ``turn``."""
+    """The largest strain of a step: of its changes from ``before`` to ``after``, each over its bound in ``control``.
+
+    ``geometry`` has the fields of ``Geometry``: ``corrector`` and ``turn``. Which other changes are guarded
+    ``problem.guards`` says. All ranks must call it: contacts may be looked for on all of them.
+    """
     changes = {"contacts": contact_changes(problem, before, after, control.guards.contacts), **geometry}
     if "half_trace" in problem.guards:
         changes["half_trace"] = half_trace_change(before, after)
@@ -62,9 +67,11 @@ def strain(problem: OrbitProblem, control: NnmTable, before: Point, after: Point
 
     worst = Strain(-np.inf, "")
     for guard, change in changes.items():
-        bound = getattr(control.guards, guard, 1.0) or np.inf  # 0 switches a guard off
+        # The truncation, which is no key of the guards, is over its bound already. 0 switches a guard off.
+        bound = getattr(control.guards, guard, 1.0) or np.inf
         size = change / bound
-        if np.isnan(size):  # a change that cannot be computed counts as beyond any bound
+        # A change that cannot be computed counts as beyond any bound.
+        if np.isnan(size):
             size = np.inf
         if guard in ALL_OR_NOTHING and size <= 1:
             size = 0.0
@@ -74,11 +81,12 @@ def strain(problem: OrbitProblem, control: NnmTable, before: Point, after: Point
 
 
 def contact_changes(problem: OrbitProblem, before: Point, after: Point, allowed: int) -> int:
-    """How many contacts appear or disappear between two points; images of one another count once, if more than allowed.
+    """How many contacts appear or disappear between two points.
 
-    In a lattice that is its own mirror image, or with equal stops on both sides, contacts begin in pairs along the
-    whole branch (``modes.departures``): no shorter step separates them, and to appear together is no jump. To look for
-    images takes the arcs of both orbits again, so it is left out where there is nothing to excuse.
+    If they are more than ``allowed``, images of one another count once. In a lattice that is its own mirror image, or
+    with equal stops on both sides, contacts begin in pairs along the whole branch (``modes.departures``): no shorter
+    step separates them, and to appear together is no jump. To look for images takes the arcs of both orbits again, so
+    it is left out where there is nothing to excuse.
     """
     change = abs(after.episodes - before.episodes)
     if change <= allowed or not allowed:
@@ -87,16 +95,21 @@ def contact_changes(problem: OrbitProblem, before: Point, after: Point, allowed:
 
 
 def half_trace_change(a: Point, b: Point) -> float:
-    """Distance between the sets of asinh(c) of two points: no half-trace is further from the other set.
+    """Hausdorff distance between the sets of asinh(c) of two points, c their half-traces.
 
-    Half-traces may meet and turn into a complex pair, so that they have no lasting order. 0 for one degree of
-    freedom.
+    It is the largest distance of a half-trace of one point from the nearest one of the other. Half-traces may meet and
+    turn into a complex pair, so that they have no lasting order in which to compare them. 0 for one degree of freedom,
+    which has none.
     """
     distance = np.abs(_squashed(a.half_traces)[:, None] - _squashed(b.half_traces)[None, :])
     return float(max(distance.min(axis=axis, initial=np.inf).max(initial=0.0) for axis in (0, 1)))
 
 
 def _squashed(c: np.ndarray) -> np.ndarray:
-    """asinh(|c|) with the phase of c: asinh itself jumps on the imaginary axis."""
+    """asinh(|c|) with the phase of c, for complex c (...).
+
+    It grows as the logarithm of a large |c|, so that relative changes are compared. asinh(c) itself has branch cuts on
+    the imaginary axis, across which it jumps.
+    """
     size = np.maximum(np.abs(c), np.finfo(float).tiny)
     return c * (np.arcsinh(size) / size)

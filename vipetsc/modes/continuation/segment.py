@@ -1,4 +1,9 @@
-"""The branch between two of its points, on which special points are located and not interpolated."""
+"""The branch between two of its points, on which special points are located.
+
+A special point is not interpolated between the two: it is a point of the branch itself. At each arclength s that the
+search for a zero of a test function asks for, Newton's method solves H(xi) = 0 and t . (xi - xi_left) = s, with the
+left point's unknowns and unit tangent t. The first guess is a cubic through neighbouring points.
+"""
 
 import sys
 from collections.abc import Callable
@@ -18,28 +23,31 @@ from vipetsc.modes.problem import PeriodicProblem, S, SpecialKind
 FURTHEST = 0.5
 # Rounding keeps Newton's method from the tolerance near the tips of narrow tongues; so many times of it is enough here.
 ROUNDING = 10
-# Attempts at a point that Newton's method does not reach, each in half of the segment before, and where to halve it.
+# Attempts at a point that Newton's method does not reach, each in a half of the segment before.
 HALVINGS = 5
+# Fractions of its length at which a segment may be cut in two; the first is taken at which Newton's method converges.
 MIDDLES = np.array([0.5, 0.25, 0.75, 0.125, 0.875])
-# Where a test turns back between two points, its extreme is estimated by a parabola. It is looked for if the estimate
-# has crossed zero or is below this fraction of the values at both ends: the parabola may be wrong by about as much.
+# Where a test turns back between two points, its extreme value is estimated by a parabola. Two zeros are looked for if
+# the estimate is beyond zero or below this fraction of the smaller value at the ends: the parabola may be wrong by as
+# much.
 NEAR = 0.5
 # A special point is sought to this fraction of the segment's length: values of its test have errors of 1e-11.
 EXACT = 1e-10
 
 
 class Knot(NamedTuple):
-    """Unknowns ``xi`` of a branch at an arclength, and their ``slope`` there."""
+    """Unknowns ``xi`` (n + 1,) of a branch at an arclength s, and their ``slope`` dxi/ds (n + 1,) there."""
 
     xi: np.ndarray
     slope: np.ndarray
 
 
 class Segment(Generic[S]):
-    """The branch between two points, parametrised by arclength along the left point's tangent.
+    """The branch between two points, parametrised by the arclength s = t . (xi - xi_left), t the left point's tangent.
 
-    ``begin`` is the arclength from the start of the step that the segment is a part of. ``knots`` are the unknowns and
-    their slopes at the arclengths found so far, the ends at first: they give the first guess at others.
+    ``length`` is the arclength of the right point. ``begin`` is the arclength from the start of the step that the
+    segment is a part of. ``knots`` are the unknowns and their slopes at the arclengths found so far, the ends at first:
+    they give the first guess at others.
     """
 
     def __init__(self, problem: PeriodicProblem[S], chart: str, left: S, right: S, begin: float = 0.0) -> None:
@@ -58,15 +66,17 @@ class Segment(Generic[S]):
 
     def _tie(self, arclength: float, xi: np.ndarray, direction: np.ndarray) -> None:
         """Keep unknowns and the branch's ``direction``, of any length, at an arclength."""
+        # s is measured along t, so that t . dxi/ds = 1.
         self.knots[arclength] = Knot(xi, direction / (self.frame.tangent @ direction))
 
     def _guess(self, arclength: float) -> np.ndarray:
-        """The cubic through the nearest knots before and after an arclength."""
+        """The unknowns at an arclength of Hermite's cubic through the nearest knots before and after it."""
         before = max(s for s in self.knots if s <= arclength)
         after = min(s for s in self.knots if s >= arclength)
         a, slope_a = self.knots[before]
         b, slope_b = self.knots[after]
         h = after - before
+        # At a knot itself h is 0, and the cubic is that knot.
         s = (arclength - before) / (h or 1.0)
         bend = 3 * (b - a) - h * (2 * slope_a + slope_b) + s * (2 * (a - b) + h * (slope_a + slope_b))
         return np.asarray(a + s * h * slope_a + s**2 * bend)
@@ -88,17 +98,22 @@ class Segment(Generic[S]):
         return replace(point, index=self.right.index, step=arclength)
 
     def roots(self, kind: SpecialKind[S], before: S | None) -> list[S]:
-        """Points of a kind, where its test vanishes: one between values of two signs, or two at both sides of a turn.
+        """Points of a kind, where its test vanishes and that the kind accepts.
 
-        A turn is seen with the point ``before`` the left one.
+        There is one if the test has two signs at the ends. If it has one sign but turns back between them, as the point
+        ``before`` the left one shows, there may be two, one on each side of the turn. Raises ArithmeticError where a
+        zero between two signs is not found.
         """
         points = self._zeros(kind, before)
-        return points if kind.accept is None else [point for point in points if kind.accept(point)]
+        if kind.accept is None:
+            return points
+        return [point for point in points if kind.accept(point)]
 
     def _zeros(self, kind: SpecialKind[S], before: S | None) -> list[S]:
         """The points where the kind's test vanishes."""
         a = kind.test(self.left)
         b = kind.test(self.right)
+        # A value within the floor of zero has no sign to go by.
         if min(abs(a), abs(b)) <= kind.floor:
             return []
         if a * b < 0:
@@ -110,16 +125,19 @@ class Segment(Generic[S]):
         if turn is None:
             return []
         parts: tuple[Segment[S], ...] = ()
-        with suppress(ArithmeticError):  # there may be no second point, and then none is missed
+        # The parabola only suggests two zeros. Where no point of the branch is found at the turn, none need be missed.
+        with suppress(ArithmeticError):
             parts = self.split(turn)
         return [part.root(kind) for part in parts if kind.test(part.left) * kind.test(part.right) < 0]
 
     def root(self, kind: SpecialKind[S], before: S | None = None, halvings: int = HALVINGS) -> S:
-        """The point where the kind's test vanishes; in the half with it if Newton's method fails before it is found.
+        """The point where the kind's test, of two signs at the ends, vanishes.
 
-        The point ``before`` the left one gives a better first estimate. Raises ArithmeticError if halving does not help
-        ``halvings`` times.
+        The point ``before`` the left one gives a better first estimate. Where Newton's method fails, the search is
+        repeated in the half of the segment that has the zero. Raises ArithmeticError if it fails after ``halvings``
+        halvings as well.
         """
+        # So that the command line can report what a run is doing (``cli.messages``).
         sys.audit("vipetsc.landing", kind.name)
         try:
             point = self._find(kind, before, seek=halvings > 0)
@@ -138,7 +156,8 @@ class Segment(Generic[S]):
 
     def _find(self, kind: SpecialKind[S], before: S | None, seek: bool) -> S:
         """The point where a test vanishes, by the kind's own equations if it has some and ``seek``, or bracketed."""
-        at = cache(self.at)  # the root is one of the arclengths at which a value was asked for
+        # The root is one of the arclengths at which a value was asked for: its point is not computed twice.
+        at = cache(self.at)
         if seek and kind.seek is not None:
             xi = kind.seek(self.frame, self._guess(0.5 * self.length), self.left, self.right)
             arclength = float(self.frame.tangent @ (xi - self.frame.xi))
@@ -160,7 +179,7 @@ class Segment(Generic[S]):
         return {arclength: kind.test(before)}
 
     def _value(self, test: Callable[[S], float], at: Callable[[float], S], arclength: float) -> float:
-        """A test at an arclength; the ends need no correction."""
+        """The value of a test at an arclength; at the ends it is that of their points, which need no correction."""
         if arclength == 0:
             return test(self.left)
         if arclength == self.length:
@@ -180,7 +199,12 @@ class Segment(Generic[S]):
 
 
 def _turn(*values: tuple[float, float]) -> float | None:
-    """Turning point of a value between the last two of three places, by a parabola, if it may cross zero there."""
+    """Place between the last two of three places x0 < x1 = 0 < x2 where a value turns back, if it may cross zero there.
+
+    ``values`` are pairs of a place and the value there. The parabola through them, a + slope x + bend x^2, has its
+    extreme a + slope at/2 at the place at = -slope/(2 bend). None if that lies elsewhere, or the extreme is not near
+    zero.
+    """
     (x0, z), (x1, a), (x2, b) = values
     bend = ((b - a) / (x2 - x1) - (z - a) / (x0 - x1)) / (x2 - x0)
     slope = (b - a) / (x2 - x1) - bend * (x2 - x1)

@@ -16,10 +16,13 @@ def locate(
 ) -> list[S]:
     """Special points between two consecutive points of a branch, in order; their ``index`` is the right one's.
 
-    ``chart`` as for ``Continuation``; with ``grazing`` also every change of the number of contacts (40 corrections or
-    so where it must be bracketed). With the point ``before`` the left one, two special points of a kind are found
-    within a step as well. An energy fold always has a half-trace of 1 and is not reported as a branch point too; it
-    begins or ends the tongue of a ``resonance``. What cannot be located is appended to ``missed`` in a sentence.
+    Their kinds, each with a test function that vanishes there, are those of ``problem.special_kinds``. ``chart`` is as
+    for ``Continuation``. With ``grazing`` every change of the number of contacts is located as well, which costs 40
+    corrections or so where it must be bracketed. With the point ``before`` the left one, two special points of a kind
+    are found within a step as well. What cannot be located is appended to ``missed`` in a sentence.
+
+    An energy fold always has a half-trace of 1, as branch points have, and is not reported as one too; it begins or
+    ends the tongue of a ``resonance``. A branch point in the same step as an energy fold is therefore not reported.
     """
     points: list[S] = []
     segment = Segment(problem, chart, left, right)
@@ -39,9 +42,9 @@ def locate(
 def at_energy(
     problem: PeriodicProblem[Point], left: Point, right: Point, energy: float, chart: str = "relative"
 ) -> Point:
-    """The orbit of an ``energy`` in J between two consecutive points on both sides of it, of the kind regular.
+    """The orbit of an ``energy`` in J between two consecutive points with less and with more of it.
 
-    Raises ArithmeticError if Newton's method fails.
+    It is a point of the kind "regular". Raises ArithmeticError if Newton's method fails.
     """
     kind: SpecialKind[Point] = SpecialKind("regular", lambda p: p.energy / energy - 1)
     return Segment(problem, chart, left, right).root(kind)

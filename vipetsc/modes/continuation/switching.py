@@ -27,7 +27,7 @@ from vipetsc.modes.shooting.maps import MAPS
 from vipetsc.modes.shooting.orbit import repetitions
 from vipetsc.modes.shooting.shooting import DenseFrame, Shooting
 
-# Fractions of the first step s along a crossing branch that are tried.
+# Fractions of ``amplitude`` that are tried, one after the other, as the first step s along a crossing branch.
 FRACTIONS = np.array([1.0, 0.1, 0.01, 0.001])
 # Newton's method may move xi by so many s, since the branch leaves at an angle to r: up to 5 on the paper's branches,
 # beyond 100 where it ends on others.
@@ -46,7 +46,10 @@ ALONG = 1e-6
 
 
 class Crossing(NamedTuple):
-    """A crossing as the map of ``problem`` sees it: the unknowns xi_0 of its ``frame``, and r, the ``row`` (n + 1,)."""
+    """A crossing as the map of ``problem`` sees it (module docstring).
+
+    xi_0 are the unknowns of the ``frame`` at the special point, and the ``row`` (n + 1,) is r.
+    """
 
     problem: Shooting
     frame: DenseFrame
@@ -56,13 +59,13 @@ class Crossing(NamedTuple):
 def switch(old: Shooting, point: Point, amplitude: float = 1e-3) -> tuple[Shooting, Point]:
     """The problem and a first point, with its tangent, on the branch that crosses at a special ``point``.
 
-    The new orbits have less symmetry: they are shot over half a period, from rest to rest or from centre to
-    centre, whichever map has a second null direction at ``point``; over the doubled period at a period doubling.
-    ``amplitude`` is the first step s, relative to the orbit's size; where Newton's method goes astray, parts of it are
-    tried. The tolerance is what the map's rounding at the special point allows, the number of Newton steps is that of
-    ``old``. Raises ContinuationError if no map has a second null direction, or no orbit off the old branch is found.
+    The new orbits have less symmetry: they are shot over half a period, from rest to rest or from centre to centre,
+    whichever map has a second null direction at ``point``; over the doubled period at a period doubling. ``amplitude``
+    is the first step s, relative to the orbit's size; where Newton's method goes astray, parts of it are tried. The new
+    problem has the tolerance that the map's rounding at the special point allows, and as many Newton steps as ``old``.
+    Raises ContinuationError if no map has a second null direction, or no orbit off the old branch is found.
     """
-    # Of the quarter's two symmetries a crossing branch may keep either. A quarter map sees a branch that keeps both.
+    # Of the quarter's two symmetries a crossing branch may keep either; the quarter map sees a branch that keeps both.
     names: tuple[str, ...] = (old.map.name,)
     if old.map.quarter:
         names = ("quarter", "half", "half-centre")
@@ -84,18 +87,22 @@ def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Cr
     problem = Shooting(old.flow, MAPS[name], old.tolerance, old.newton.max_newton)
     x, period = _re_expressed(old, point, problem)
     frame = problem.relative_frame(x, period)
+    # The special point solves the equations of the old map; here they show whether it is an orbit of this map, too.
     rounding = float(np.abs(problem.residual(problem.arc(x, period))).max() / frame.chart.size)
     if rounding > NO_ORBIT:
         return None
 
+    # Of the right singular vectors the last one is the null vector that always exists. The one before belongs to the
+    # smallest singular value, and is the second null vector if that vanishes.
     values, directions = np.linalg.svd(frame.jacobian_of(problem.arc(x, period), frame.xi))[1:]
     singular.append(f"{name} {values[-1] / values[0]:.1e}")
     if values[-1] > SINGULAR * values[0]:
         return None
 
+    # The old branch's direction in the unknowns of this map, by a difference.
     ahead = replace(point, x=point.x + ALONG * point.tangent[:-1], period=point.period + ALONG * point.tangent[-1])
     along = frame.chart.encode(*_re_expressed(old, ahead, problem)) - frame.xi
-    # The null vectors are orthogonal: in their plane t has the coordinates (first, second). Turned by 90 deg it is r.
+    # The null vectors are orthonormal: in their plane t has the coordinates (first, second). Turned by 90 deg it is r.
     plane = directions[-2:]
     first, second = plane @ (plane.T @ plane @ along)
     row = unit(plane.T @ np.array([-second, first]))
@@ -105,7 +112,7 @@ def _crossing(old: Shooting, point: Point, name: str, singular: list[str]) -> Cr
 
 
 def _first_point(crossing: Crossing, point: Point, amplitude: float) -> Point:
-    """The first orbit off the old branch; raises ContinuationError if none is found."""
+    """The first orbit off the old branch, which crosses at ``point``; raises ContinuationError if none is found."""
     problem, frame, row = crossing
     step = np.nan
     attempt = Attempt(False, "not tried", [], frame.xi)
@@ -123,7 +130,7 @@ def _first_point(crossing: Crossing, point: Point, amplitude: float) -> Point:
 
 
 def _re_expressed(old: Shooting, point: Point, new: Shooting) -> tuple[np.ndarray, float]:
-    """Initial values (n,) and period in s of a special point's orbit for another map.
+    """Initial values (n,) and period in s of the orbit of a ``point`` of the ``old`` problem, for the map of ``new``.
 
     The period is doubled at a period doubling.
     """
