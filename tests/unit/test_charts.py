@@ -8,7 +8,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tests.models import CLEARANCE, reduced_model
+from vipetsc.lattice import Contact
 from vipetsc.modes.shooting.charts import Chart, Grazing, Logarithmic, Relative
+from vipetsc.modes.shooting.dop853 import Dop853Flow
+from vipetsc.modes.shooting.graze import Touch, _equations
+from vipetsc.modes.shooting.maps import MAPS
+from vipetsc.modes.shooting.shooting import Shooting
+from vipetsc.modes.system import ContactPair, System
 
 # In clearances, on either side of rest: no mass is at rest, where the logarithmic chart ends.
 displacement = st.floats(0.2, 5).flatmap(lambda value: st.sampled_from([value, -value]))
@@ -52,3 +58,52 @@ def test_the_relative_chart_weighs_gaps_by_the_larger_of_gap_and_clearance(gap, 
     xi = Relative(reduced_model(), x, 0.01).encode(x, 0.01)
 
     assert xi == pytest.approx([x[0] / (5 * CLEARANCE), gap / scale, 1.0], rel=1e-12)
+
+
+def masses_in_contact(*pairs: tuple[int | None, int]) -> System:
+    """Three masses on springs to the ground and to each other, with contacts from hosts to resonators."""
+    law = Contact("bilinear", 5.0)
+    springs = [(None, 0, 1.0), (None, 1, 1.0), (None, 2, 1.0), (0, 1, 0.5), (1, 2, 0.7), (2, 0, 0.9)]
+    contacts = [ContactPair(host, resonator, 0.1 + 0.01 * i, law) for i, (host, resonator) in enumerate(pairs)]
+    return System.assemble([1.0, 1.0, 1.0], springs, contacts)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "unknowns"),
+    [
+        # A ring: its elongations add up to zero.
+        (((0, 1), (1, 2), (2, 0)), {1: 0, 2: 1}),
+        (((1, 0), (0, 1), (1, 2)), {0: 0, 2: 2}),
+        # A chain, and two contacts of one resonator, of which the last has its place.
+        (((0, 1), (1, 2)), {1: 0, 2: 1}),
+        (((None, 1), (0, 1)), {1: 1}),
+    ],
+)
+def test_the_relative_chart_has_as_many_elongations_as_are_independent(pairs, unknowns):
+    system = masses_in_contact(*pairs)
+    x = np.array([0.3, -0.2, 0.1])
+    chart = Relative(system, x, 1.0)
+
+    assert np.linalg.cond(chart.weights) < 10
+    assert chart.decode(chart.encode(x, 1.0))[0] == pytest.approx(x, rel=1e-12)
+    for mass in range(3):
+        row = np.eye(3)[mass]
+        if mass in unknowns:
+            row = system.contact_rows[unknowns[mass]]
+        weights = chart.weights[mass]
+        assert weights / np.abs(weights).max() == pytest.approx(row / np.abs(row).max())
+
+
+@pytest.mark.parametrize("contact", [0, 1])
+def test_the_root_of_a_gap_is_that_of_the_contact_that_grazes(contact):
+    """Of two contacts of one mass the chart has the root of the nearer one; the other's gap is no unknown."""
+    system = masses_in_contact((None, 1), (0, 1))
+    # The first contact stands at its clearance of 0.1 m, the other one does not at its 0.11 m.
+    x = np.array([0.3, 0.1, 0.05])
+    chart = Grazing(system, x, 6.0)
+    assert chart.contact == 0
+    shooting = Shooting(Dop853Flow(system), MAPS["quarter"])
+
+    matrix, _, _ = _equations(shooting, chart, chart.encode(x, 6.0), Touch(0.0, 0.0, contact, side=1))
+    root_alone = np.array_equal(matrix[3], np.eye(5)[chart.index])
+    assert root_alone == (contact == 0)

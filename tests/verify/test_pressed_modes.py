@@ -217,6 +217,35 @@ def test_grains_condensed_onto_their_contacts_move_as_orbits(grains):
     assert orbit.episodes == point.episodes
 
 
+def test_a_ring_of_grains_is_shot_though_its_elongations_add_up_to_zero():
+    """Its highest mode has omega = 2 sqrt(k/m) with k = (3/2) A d^(1/2), and neighbours move against each other."""
+    stiffness = 10.0
+    depth = 0.01
+    table = {
+        "lattice": {"cell": {"masses": [1.0]}, "cells": 4, "ends": "periodic"},
+        "contacts": {
+            "law": "hertz",
+            "stiffness": stiffness,
+            "next_cell": True,
+            "side": "minus",
+            "clearance": 0.0,
+            "precompression": depth,
+            "sites": [1, 2, 3, 4],
+        },
+        "nnm": {"system": "chain", "modes": [4], "shooting": "dense", "points": 3, "locate": False},
+    }
+    method = ShootingMethod(NnmCase.from_table(table), MPI.COMM_SELF)
+    start = method.start(method.shooting, 3)
+    points = [start, *Continuation(method.shooting, start, method.options)]
+
+    omega = 2 * np.sqrt(1.5 * stiffness * np.sqrt(depth))
+    for point in points:
+        assert point.residual < 1e-11
+        assert point.frequency == pytest.approx(omega / (2 * np.pi), rel=1e-3)
+        assert point.x == pytest.approx(point.x[0] * np.array([1, -1, 1, -1]), rel=1e-6)
+    assert len(points) == 4
+
+
 def corrected(problem: Any, u: np.ndarray, period: float) -> Any:
     """The orbit to which a ``problem`` of shooting corrects a motion from rest at ``u``."""
     frame = problem.frame_at("relative", u, period, np.empty(0))

@@ -21,10 +21,11 @@ infinite: tangents turn without bound there. In y the change is of the order y^(
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from vipetsc.modes.system import System
+from vipetsc.modes.system import ContactPair, System
 
 # A largest |w| at the start within this fraction of the clearance is near grazing.
 NEAR_GRAZING = 0.05
@@ -77,6 +78,9 @@ class Relative(DenseChart):
     The scale of w is max(|w_0|, |D|), with the smaller clearance D of the contact, and ``size`` at most. Over ``size``
     itself a large common motion would hide the changes of w that make and break contacts. Without ``rest``, where an
     arc starts at the centre, all initial values are over ``size``: they are velocities, and all w are 0.
+
+    A contact that closes a ring of contacts has no unknown of its own: its w is the sum of the others', by which the
+    chart could not be inverted.
     """
 
     def __init__(self, system: System, x: np.ndarray, period: float, rest: bool = True) -> None:
@@ -84,7 +88,9 @@ class Relative(DenseChart):
         self.period = period
         self.weights = np.eye(len(x)) / self.size
         if rest:
-            for row, pair in zip(system.contact_rows, system.contacts, strict=True):
+            for number in _without_rings(system.contacts):
+                row = system.contact_rows[number]
+                pair = system.contacts[number]
                 scale = min(max(abs(row @ x), abs(pair.stops.clearance)), self.size)
                 self.weights[pair.resonator] = row / scale
         self.inverse = np.linalg.inv(self.weights)
@@ -143,7 +149,7 @@ class Grazing(DenseChart):
     """Initial values over the largest one, with y for the contact that is nearest to its clearance.
 
     Nearest is the contact with the smallest |sigma w/D - 1|, sigma being the side of w. Where it has no stop on that
-    side, the gap is that to the other stop. ``index`` is the place of y.
+    side, the gap is that to the other stop. ``contact`` is its number, ``sign`` the side, ``index`` the place of y.
     """
 
     def __init__(self, system: System, x: np.ndarray, period: float) -> None:
@@ -151,6 +157,7 @@ class Grazing(DenseChart):
         self.period = period
         w = system.contact_rows @ x
         nearest = int(np.abs(system.sides_at(w) * w / system.clearances_at(w) - 1).argmin())
+        self.contact = nearest
         self.row = system.contact_rows[nearest]
         self.index = system.contacts[nearest].resonator
         self.sign = float(system.sides_at(w)[nearest])
@@ -187,6 +194,22 @@ CHARTS: dict[str, type[Relative | Logarithmic | Grazing]] = {
     "logarithmic": Logarithmic,
     "grazing": Grazing,
 }
+
+
+def _without_rings(contacts: Sequence[ContactPair]) -> Iterator[int]:
+    """Numbers of the ``contacts`` whose elongations may be unknowns in the places of their resonators, all at once.
+
+    Left out are contacts that close a ring, each from a host to a resonator that is the host of the next.
+    """
+    # Of several contacts with one resonator the last has its place.
+    host_of: dict[int, int | None] = {}
+    for number, pair in enumerate(contacts):
+        mass = pair.host
+        while mass is not None and mass != pair.resonator:
+            mass = host_of.get(mass)
+        if mass is None:
+            host_of[pair.resonator] = pair.host
+            yield number
 
 
 def near_grazing(system: System, x: np.ndarray) -> bool:

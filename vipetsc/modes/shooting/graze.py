@@ -114,7 +114,7 @@ def _equations(
     matrix[n + 1] = np.append(row @ dv, row @ pull)
     values = np.array([*problem.residual(arc) / end_unit, row @ u - 1, row @ v])
 
-    if touch.time == 0 and isinstance(chart, Grazing) and chart.index == pair.resonator:
+    if touch.time == 0 and isinstance(chart, Grazing) and (chart.contact, chart.sign) == (touch.contact, touch.side):
         # The gap's root is an unknown of this chart, and the gap is stationary in it at the touch.
         matrix[n] = np.eye(n + 2)[chart.index]
         values[n] = xi[chart.index]
