@@ -312,7 +312,10 @@ class WaveCompliance:
         raise ValueError(f"cell {cell + 1} is not one of the lattice's {self.chain.cells}")
 
     def _place(self, cell: int, stretch: Stretch) -> int | None:
-        """Position of a ``cell`` in a ``stretch``, from 1; up to 0 in one without a beginning; None outside."""
+        """Position of a ``cell`` in a ``stretch``, from 1; None outside.
+
+        In a stretch without a beginning the last cell has 0, those before it negative numbers.
+        """
         cells = self.cells
         if stretch.left is None:
             if cell >= cells[0]:

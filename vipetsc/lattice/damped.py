@@ -62,7 +62,7 @@ def damped_bloch(cell: UnitCell, kappa: ArrayLike) -> DampedPoint:
     state[..., d:, d:] = -damping
     rate, vectors = np.linalg.eig(state)
 
-    # Half of the waves, by Im s from above and then by size, and those sorted by Im s from below.
+    # The half of the waves with the largest Im s, of equal ones the slowest; then these with Im s rising.
     order = np.lexsort((np.abs(rate), -rate.imag))[..., :d]
     order = np.take_along_axis(order, np.argsort(np.take_along_axis(rate.imag, order, -1), axis=-1), -1)
     shapes = np.take_along_axis(vectors, order[..., None, :], -1)[..., :d, :]

@@ -177,6 +177,7 @@ def mode_frequency(chain: Chain, number: int) -> float:
         squared = frequencies[number - 1] ** 2
         top = frequencies[-1] ** 2
     else:
+        # Bisection to rounding: of a frequency to its own, of squared frequencies near 0 to that of the largest.
         counter = _spectrum_counter(chain)
         top = counter.top
         low = 0.0

@@ -21,7 +21,10 @@ TERMS = 28
 
 
 class SeriesCompliance:
-    """Compliance of a finite lattice between its sites: by the series where it converges fast, else ``compliance``."""
+    """Compliance of a finite lattice between its sites: by the series where it converges fast, else ``compliance``.
+
+    Cells are equal and without dashpots, and contacts join the pair of their cell.
+    """
 
     def __init__(self, compliance: WaveCompliance) -> None:
         self.compliance = compliance

@@ -122,7 +122,8 @@ class OpenCompliance(ModalCompliance):
 def beyond_end(chain: Chain, end: str, omega: np.ndarray) -> np.ndarray:
     """S (omega, dofs, dofs) in N/m of the half lattice beyond an ``end``, at ``omega`` with negative imaginary parts.
 
-    It is what it adds to the last cell of ``chain``, which has a spring to a wall there unless its ends are free.
+    It adds to the dynamic stiffness of the last cell of ``chain``, which has a spring to a wall there unless the ends
+    are free.
     """
     # Of three reference cells the middle one has its neighbours on both sides.
     d = chain.cell.dofs

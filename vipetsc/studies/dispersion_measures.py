@@ -28,7 +28,8 @@ def dispersions_by_side(record: VelocityRecord) -> dict[str, Any]:
     length = fft.next_fast_len(nt, real=True)
     highest = HEADROOM * pass_bands(record.model.chain.cell)[-1].high
     frequencies = np.count_nonzero(2 * np.pi * fft.rfftfreq(length, record.interval) <= highest)
-    # Wavenumbers and frequencies in a bin of the map. Wavenumbers of both signs are folded to half as many as cells.
+    # Wavenumbers and frequencies in a bin of the map. Wavenumbers of both signs are folded to half as many as cells, so
+    # that the map has at most ``pixels`` of them, and twice as many frequencies.
     sizes = [-(-n // (2 * record.options.pixels)) for n in (cells, frequencies)]
     windows: dict[str, spectra.CellWindow] = {}
     for name, window in _windows(record).items():

@@ -107,6 +107,7 @@ def pressed_contacts(model: Model) -> list[Joint]:
     dofs = chain.cell.dofs
     laws = model.laws or (model.contact,) * len(chain.sites)
     joints: list[Joint] = []
+    # There are no gaps, and no rows, where all contacts have one clearance on both sides: none is pressed then.
     rows = zip(chain.sites, chain.resonator_cells, chain.contact_pairs, laws, model.gaps, strict=False)
     for site, cell, pair, law, stops in rows:
         pressed = -min(stops)
