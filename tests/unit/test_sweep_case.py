@@ -236,7 +236,6 @@ def test_a_member_is_resolved_once():
     assert plan.model_copy(update={"name": "other"}).member(1) is not members[1]
 
 
-@pytest.mark.slow
 def test_fewer_members_of_many_sites_are_tried_before_a_sweep_begins(monkeypatch):
     """The members by which a sweep is checked have a bounded number of sites together, and one is always tried."""
     # A hundredth of the program's bound: to resolve the cases of so many sites takes seconds.

@@ -378,6 +378,7 @@ def marked_points(monkeypatch):
 CROSSING = BOTH | {"locate": True, "switch": ["period-doubling"], "switch_points": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stopped", [False, True])
 def test_crossing_branches_follow_the_numbers_of_special_points_that_a_second_try_adds(
     tmp_path, marked_points, stopped

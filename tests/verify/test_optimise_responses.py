@@ -75,6 +75,7 @@ def measured(case: NfrcCase, **table: Any) -> list[float]:
     return measured_responses(case, [objective], MPI.COMM_SELF, StopRequest())["values"][objective.name]
 
 
+@pytest.mark.slow
 def test_the_peak_is_least_at_the_absorber_of_den_hartog():
     """Frequency 1/(1 + mu), damping (3 mu/(8 (1 + mu)^3))^(1/2): a peak of (1 + 2/mu)^(1/2), larger on all sides."""
     frequency = 1 / (1 + RATIO)
@@ -90,6 +91,7 @@ def test_the_peak_is_least_at_the_absorber_of_den_hartog():
         assert measured(absorber(RATIO * frequency**2, factor**3 * damping))[0] > 1.005 * least
 
 
+@pytest.mark.slow
 def test_peaks_and_gaps_are_those_of_the_equations_of_motion():
     """The largest value, that of a part of the range, and widths below a level, of curves at two forces."""
     case = absorber(0.045, 0.01, fixed=[1.0, 2.0], largest_step=0.05)
@@ -117,6 +119,7 @@ def searched(tmp_path_factory):
     return plan, folder, run_search(plan, folder, MPI.COMM_SELF)
 
 
+@pytest.mark.slow
 def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
     """The verb nfrc of best.toml gives the curve whose largest value the search has found, to the bit."""
     _, folder, summary = searched
@@ -144,6 +147,7 @@ def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
     assert Case.load(folder / "best.toml").lattice.cell.springs[1].damping == found["parameter"][best, 1]
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_goes_on_to_the_same_bits(searched, tmp_path):
     plan, folder, _ = searched
     records = (folder / "optimum-runs.jsonl").read_bytes()
@@ -167,6 +171,7 @@ def test_the_pictures_of_responses_have_a_panel_for_them_alone(searched):
     assert objective.get_ylabel() == "peak_displacement/mass"
 
 
+@pytest.mark.slow
 def test_a_curve_that_ends_early_is_a_design_that_fails(tmp_path):
     """Its reason is the sentence of the curve, and runs of the same search are measured all the same."""
     # Four points reach only a part of the range.

@@ -48,6 +48,7 @@ def clearances(tmp_path_factory):
     return case, folder, curve
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "low", "high"),
     [("contacts.clearance", 0.1, 0.12), ("lattice.cell.masses[1]", 0.98, 1.0), ("lattice.damping.mass", 0.05, 0.06)],
@@ -71,6 +72,7 @@ def test_it_comes_to_the_state_of_the_curve_over_the_frequency(key, low, high, t
     assert ends[0].unstable == ends[1].unstable
 
 
+@pytest.mark.slow
 def test_newtons_method_converges_quadratically():
     """The column by differences costs no order: from a guess off by 1e-2 three steps lead to rounding."""
     for key, low, high in (("contacts.clearance", 0.1, 0.2), ("lattice.cell.masses[1]", 0.9, 1.0)):
@@ -116,6 +118,7 @@ def test_states_come_back_after_a_period_and_are_stable_as_their_multipliers_are
     assert np.sum(np.diff(np.sign(values - folds.mean())) != 0) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("key", "low", "high"), [("contacts.restitution", 0.9, 1.0), ("contacts.clearance", 0.1, 0.2)])
 def test_a_curve_ends_on_its_range_where_no_case_lies_beyond(key, low, high, tmp_path):
     table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
@@ -149,6 +152,7 @@ def test_files_have_the_values_of_the_key_with_its_unit(clearances, tmp_path):
     assert [path.stem for path in draw("branches", [folder])] == [f"branch-{curve.name}"]
 
 
+@pytest.mark.slow
 def test_a_curve_goes_on_to_the_same_bits(tmp_path):
     table = TWO_MASSES | {"contacts": TWO_MASSES["contacts"] | {"clearance": 0.12}}
     whole, parts = tmp_path / "whole", tmp_path / "parts"

@@ -95,6 +95,7 @@ def test_folds_are_no_branch_points(tmp_path):
     assert np.abs(multipliers_at(states, fold) - 1).min() < 5e-3
 
 
+@pytest.mark.slow
 def test_points_between_unstable_states_are_located_if_all_are_asked_for(tmp_path):
     changes = {"contacts": {"clearance": 0.05, "side": "both"}, "nfrc": {"range": [1.6, 1.7]}}
     kinds = {}
@@ -119,6 +120,7 @@ def test_a_pair_is_located_by_its_number_where_it_cannot_be_followed(with_pair, 
     assert np.isnan([point.measured.sideband for point in counted]).all()
 
 
+@pytest.mark.slow
 def test_special_points_are_in_files_and_pictures(tmp_path):
     case = case_of(FLIP, harmonics=15)
     (curve,) = follow_all(case, tmp_path, MPI.COMM_SELF)
