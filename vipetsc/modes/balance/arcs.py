@@ -1,7 +1,9 @@
 """Arcs of contact: the intervals of phase on which a periodic motion is beyond an offset, cut and joined.
 
-Their ends are roots of the quintics that interpolate uniform samples of the motion and its two derivatives, found by
-``vipetsc.contact.search``, which misses no root of a quintic.
+Their ends are roots of the quintics that interpolate uniform samples of the motion z and of its two derivatives z' and
+z'' by phase, found by ``vipetsc.contact.search``, which misses no root of a quintic. A contact so slight
+that the quintic does not reach the offset is missed: quintics differ from motions by 7e-9 of the last harmonic
+(``harmonics.DENSITY``).
 """
 
 import itertools
@@ -12,8 +14,9 @@ import numpy as np
 from vipetsc.compiled import allocating
 from vipetsc.contact.search import bernstein, first_upcrossing, first_upcrossing_after_start
 
-# By Bernstein's inequality, |z''| <= K^2 range/2, a motion exceeds its samples by (2 pi/24)^2/16 = 0.4 % of its range
-# at most; where even this fraction of the range does not lead to the offset, no root need be sought.
+# With K harmonics, and 24 K samples or more, a motion exceeds its samples by (2 pi/24)^2/16 = 0.4 % of its range at
+# most, since |z''| <= K^2 range/2 by Bernstein's inequality. No root need be sought where the offset is above the
+# samples by this fraction of their range, which is taken much larger than the bound.
 OVERSHOOT = 0.1
 
 
@@ -24,6 +27,7 @@ def _crossings(motion: np.ndarray, offset: float, out: np.ndarray) -> int:
     ``motion`` (samples, 3) holds (z, z', z'') over a period. The first crossing is upwards unless the period begins
     above; then they alternate. A value that equals the offset counts as below.
     """
+    # Bernstein coefficients b enclose the quintic: where all have one sign it has no root, and none is sought.
     samples = motion.shape[0]
     h = 2.0 * np.pi / samples
     count = 0
@@ -74,6 +78,7 @@ def arcs(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
     """
     if motion[:, 0].max() + OVERSHOOT * np.ptp(motion[:, 0]) <= offset:
         return []
+    # More roots than any motion of the samples has: one with K harmonics passes an offset 2 K times at most.
     out = np.empty(4 * len(motion))
     roots = out[: _crossings(motion, offset, out)]
     if len(roots) % 2 and motion[0, 0] <= offset:
@@ -85,7 +90,8 @@ def arcs(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
             return [(0.0, 2 * np.pi)]
         return []
 
-    # A period ends as it began: crossings are even in number. If it begins above, the last one, upwards, comes first.
+    # A period ends as it began, so that crossings are even in number. If it begins above, the first crossing is
+    # downwards: the last one, upwards, is moved back by a period and comes first.
     if begins_above:
         roots = np.concatenate([[roots[-1] - 2 * np.pi], roots[:-1]])
     return [(a, b) for a, b in zip(roots[::2].tolist(), roots[1::2].tolist(), strict=True) if b > a]
@@ -94,7 +100,8 @@ def arcs(motion: np.ndarray, offset: float) -> list[tuple[float, float]]:
 def minima(slope: np.ndarray) -> np.ndarray:
     """Phases (minimum,) in rad of the minima of a periodic motion, near enough to cut arcs there.
 
-    ``slope`` (sample,) is its derivative at equal phases of one period; the secant through a change of sign is solved.
+    ``slope`` (sample,) is its derivative at equal phases of one period. A minimum is where the straight line between
+    two samples passes zero upwards.
     """
     after = np.roll(slope, -1)
     before_minimum = np.nonzero((slope < 0) & (after >= 0))[0]
@@ -110,7 +117,7 @@ def cut(a: float, b: float, places: np.ndarray) -> Iterator[tuple[float, float]]
     if b - a >= 2 * np.pi:
         yield a, b
         return
-    # An interval that contains phase 0 begins at a negative phase.
+    # An interval that contains phase 0 begins at a negative phase (``arcs``).
     turns = np.concatenate([places - 2 * np.pi, places])
     inside = np.sort(turns[(turns > a) & (turns < b)]).tolist()
     yield from itertools.pairwise([a, *inside, b])

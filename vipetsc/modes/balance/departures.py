@@ -1,4 +1,8 @@
-"""When contacts of a motion of harmonics are not what they are at rest."""
+"""When contacts in a motion given by its harmonics are not what they are at rest: closed, or open if pressed at rest.
+
+Shooting integrates a part of the period, the arc, after which the motion repeats itself by a symmetry, and counts the
+episodes in it. The same are counted here, so that points of both methods can be compared.
+"""
 
 from collections.abc import Iterable, Sequence
 
@@ -7,8 +11,8 @@ import numpy as np
 from vipetsc.modes.balance.harmonics import Episode, SiteForces
 from vipetsc.modes.departures import Departure
 
-# An episode centred on an end of the arc counts. Rounding may put its middle outside by up to this part of the period,
-# at either end.
+# An episode centred on an end of the arc counts. Rounding may put its middle outside by up to 1e-9 rad at either end,
+# here as a part of the period.
 ROUNDING = 1e-9 / (2 * np.pi)
 
 
@@ -17,7 +21,7 @@ def departures_of(forces: SiteForces, episodes: Iterable[Episode]) -> list[Depar
 
     That is half a period for a motion at rest at phase 0, and a quarter if it is symmetric as well: the arcs that
     shooting integrates, with whose counts these are compared. A contact that is pressed at rest and stays closed for
-    the whole period, or open, has none.
+    the whole period, or open, has none. The middle and the length of a departure are over the period.
     """
     end = 0.5
     if forces.odd:
@@ -33,7 +37,7 @@ def departures_of(forces: SiteForces, episodes: Iterable[Episode]) -> list[Depar
             spans = _between(spans)
         for begin, stop in spans:
             middle = (begin + stop) / (4 * np.pi)
-            # The phase from the arc's beginning on, which is moved back by the rounding, to its end moved on by it.
+            # Whether it lies within the arc that is longer by the rounding at both ends, counted from its beginning.
             if (middle + ROUNDING) % 1 < end + 2 * ROUNDING:
                 departures.append(Departure(middle=middle, length=(stop - begin) / (2 * np.pi)))
     return departures

@@ -1,7 +1,12 @@
 """Describing function: a motion of one pair with a mean and one harmonic, from which a branch in a gap begins.
 
-The force of the pair, a contact or a smooth spring, is replaced by its mean and its first harmonic, the others are
-neglected (N. M. Krylov and N. N. Bogoliubov, Introduction to Non-Linear Mechanics, Princeton 1947).
+The motion of the pair is z = b + a cos theta. Of its force, that of a contact or a smooth spring, the mean F_0(a, b)
+and the first harmonic F_1(a, b) are kept, the others and the motion of all other pairs are neglected (N. M. Krylov and
+N. N. Bogoliubov, Introduction to Non-Linear Mechanics, Princeton 1947). With the compliance G of the pair
+
+    b + G(0) F_0(a, b) = 0,    a + G(Om) F_1(a, b) = 0.
+
+The first equation gives b for every a, the second then a. It is a guess: the balance of all harmonics decides.
 """
 
 import itertools
@@ -16,7 +21,7 @@ from vipetsc.modes.problem import ContinuationError
 # Amplitudes are sought up to this size, in units of ``SiteForces.amplitude_scale`` (of a contact its clearance), and
 # means up to so many amplitudes.
 LARGEST = 1e3
-# Mean over the amplitude that is none but rounding.
+# Mean over the amplitude below which it is rounding, and taken to be 0.
 LEAST_MEAN = 1e-14
 # The force of a contact that is pressed at rest softens as it opens and hardens beyond. Its balance may therefore have
 # the same sign at the smallest and at the largest size, and change it twice between: so many sizes are tried, from this
@@ -42,8 +47,8 @@ class DescribedMotion(NamedTuple):
 def describing_motion(forces: SiteForces, pair: int, g: PairCompliance, omega: float) -> DescribedMotion:
     """The motion z = b + a cos(Om t) of a ``pair`` with one of the ``forces``, of which two harmonics balance.
 
-    b + G(0) F_0(a, b) = 0 gives the mean b for every amplitude a; with it a + G(Om) F_1(a, b) = 0 gives a. Here ``g``
-    are the compliances of the pair at 0 and at ``omega`` (rad/s). Raises ContinuationError where there is none.
+    ``pair`` is its number, ``g`` are the compliances of the pair at 0 and at ``omega`` (rad/s). The equations are those
+    of the module. Raises ContinuationError where they have no solution.
     """
     spring = pair - len(forces.contacts)
     if spring >= 0 and forces.springs[spring].cubic == 0:
@@ -55,18 +60,22 @@ def describing_motion(forces: SiteForces, pair: int, g: PairCompliance, omega: f
     z = np.zeros((forces.pairs, 2), complex)
 
     def force(mean: float, amplitude: float) -> np.ndarray:
+        """F_0, F_1 and F_2 in N: the motion is even in time, so that they are real."""
         z[pair] = mean, amplitude
         return forces.series(z, omega).forces[pair].real
 
     def mean_of(amplitude: float) -> float:
+        """The mean b in m for an amplitude a in m."""
+
         def static_balance(mean: float) -> float:
             return mean + g.static * float(force(mean, amplitude)[0])
 
         without = static_balance(0.0)
         if forces.odd or abs(without) <= LEAST_MEAN * amplitude:
             return 0.0
-        # Of forces that harden the mean lies between 0 and that of the force without it. The force of a contact that is
-        # pressed at rest softens: its mean may be larger.
+        # A force that grows with the elongation opposes the mean: b lies between 0 and -G(0) F_0(a, 0), the mean that
+        # the force at b = 0 would cause. The force of a contact that is pressed at rest softens: its mean may be
+        # larger.
         furthest = -without
         while is_pressed and static_balance(furthest) * without > 0 and abs(furthest) < LARGEST * amplitude:
             furthest *= 2
@@ -76,6 +85,7 @@ def describing_motion(forces: SiteForces, pair: int, g: PairCompliance, omega: f
         return float(brentq(static_balance, furthest, 0.0))
 
     def balance(amplitude: float) -> float:
+        """a + G(Om) F_1 in m."""
         return amplitude + g.dynamic * float(force(mean_of(amplitude), amplitude)[1])
 
     size = forces.amplitude_scale(pair, g.dynamic)

@@ -1,18 +1,25 @@
 r"""Periodic motions condensed onto the places where a system is nonlinear: harmonic balance at contacts and springs.
 
-M u'' + K u + sum_j b_j f_j = p with the elongations z_j = b_j . u has the periodic solutions
+A system M u'' + K u + sum_j b_j f_j = p has the displacements u, the forces f_j at the pairs j, which act along b_j and
+depend on the elongations z_j = b_j . u, and a load p of the frequency Om. Its motions z = Re sum_k Z_k exp(i k Om t)
+obey
 
     Z_k + G(k Om) F_k(Z) = Z_k^linear,    G(omega) = b^T (K - omega^2 M)^-1 b,    k = 0..K,
 
-exact but for the harmonics beyond K, whatever the number of degrees of freedom: ``Compliance`` gives G. The forces and
-their derivatives are ``SiteForces``. What is left out is -G(k Om) F_k for k > K; F_k is computed up to 2K, falls as
-k^-(n + 1) for a contact with the exponent n, and G as k^-2, so that its size is estimated
+with the harmonics F_k of the forces, and those of the elongations under the load alone, Z_k^linear. The equations are
+exact but for the harmonics beyond K, whatever the number of degrees of freedom: ``Compliance`` gives G, also of systems
+with losses. The forces and their derivatives are ``SiteForces``. What is left out is -G(k Om) F_k for k > K; F_k is
+computed up to 2K, falls as k^-(n + 1) for a contact with the exponent n, and G as k^-2, so that its size is estimated
 (``HarmonicBalance.truncation``).
 
-**Shifted compliance.** G has poles at the linear modes, where F_k vanishes. A spring of stiffness s_k is therefore
-added at each place and taken off the force: Z_k + G_s (F_k - s_k Z_k) = A Z_k^linear, G_s = A G, A = (1 + s_k G)^-1,
-which has the same solutions. The sign of s_k is the one that keeps the poles of G_s away from k Om; |s_k| is
-(k Om)^2 times the effective mass.
+**Shifted compliance.** G has poles at the linear modes, where F_k vanishes: their product cannot be computed. A spring
+of stiffness s_k is therefore added at each place and taken off the force:
+
+    Z_k + G_s (F_k - s_k Z_k) = A Z_k^linear,    G_s = A G,    A = (1 + s_k G)^-1.
+
+This is the equation above with s_k G Z_k added and taken off, multiplied by A: it has the same solutions. The sign of
+s_k is the one that keeps the poles of G_s away from k Om; |s_k| is (k Om)^2 times the effective mass of a pair, the
+size of the stiffness that it has by inertia alone.
 
 **Energy** of a conservative motion, which is constant, from its means over a period: with dG/domega = 2 omega
 b^T (K - omega^2 M)^-1 M (K - omega^2 M)^-1 b,
@@ -38,8 +45,8 @@ KEPT_MOTIONS = 3
 class _Columns(NamedTuple):
     """How harmonics follow from the unknowns of one pair, in the order of its unknowns.
 
-    ``orders`` (2 orders,) are those of the harmonics and of their conjugates, ``halves`` (orders, 1) is 1/2 for the
-    mean, which one-sided series have once, and 1 for the others; ``same`` (orders, unknowns) is dZ/dx.
+    ``orders`` (2 orders,) are those of the harmonics and of their conjugates. ``halves`` (orders, 1) is 1/2 for the
+    mean, which one-sided series have once, and 1 for the others. ``same`` (orders, unknowns) is dZ/dx of the pair.
     """
 
     orders: np.ndarray
@@ -55,7 +62,8 @@ class HarmonicBalance:
     k, in m. ``weight`` multiplies the compliances of orders above the first: at 0 a motion has a mean and one harmonic.
 
     Residual, derivative and energy are those of the compliance shifted by stiffnesses that ``shift`` chooses at a
-    frequency: all of them are asked with one choice along a step.
+    frequency: all of them are asked with one choice along a step. ``forces`` without a dependence on velocities, and no
+    load, make a motion conservative.
     """
 
     def __init__(
@@ -124,7 +132,11 @@ class HarmonicBalance:
         return force - shift * elongation
 
     def residual(self, x: np.ndarray, omega: float, shift: np.ndarray, linear: np.ndarray | float = 0.0) -> np.ndarray:
-        """Z + G_s (F - s Z) - A Z^linear as unknowns (size,), in m; ``linear`` (pairs, K + 1) complex."""
+        """Z + G_s (F - s Z) - A Z^linear as unknowns (size,), in m, which vanishes at a solution.
+
+        ``x`` (size,) are the unknowns in m, ``omega`` is in rad/s, ``shift`` (orders, 1, 1) in N/m, and ``linear``
+        (pairs, K + 1) complex in m are the harmonics Z^linear.
+        """
         shifted = self.shifted.at(omega, shift)
         z = self.unpack(x)
         elongation = z.T[self._places, :, None]
@@ -151,7 +163,8 @@ class HarmonicBalance:
         count = len(self.orders)
         pairs = self.forces.pairs
 
-        # The forces' derivative by the harmonics of orders k and -k, which are conjugate to each other.
+        # The forces' derivative by the harmonics of orders k and -k, which are conjugate to each other: by Re Z_k they
+        # change by 1 and 1, by Im Z_k by i and -i.
         two_sided = self.series(x, omega).jacobian(orders=columns.orders, rows=self.orders) * columns.halves
         plus = two_sided[:, :, :count]
         minus = two_sided[:, :, count:]
@@ -167,9 +180,10 @@ class HarmonicBalance:
         return np.concatenate(rows, axis=1).reshape(self.size, self.size)
 
     def rate(self, x: np.ndarray, omega: float, shift: np.ndarray) -> np.ndarray:
-        """dR/domega (size,) of the ``residual`` with no linear motion given.
+        """dR/domega (size,) in m s/rad of the ``residual`` with no linear motion given: dG_s/domega (F - s Z).
 
-        F does not depend on omega, but through a floor of the approach velocity, which is left out.
+        G_s of the order k is taken at k omega, which gives its derivative the factor k. F does not depend on omega, but
+        through a floor of the approach velocity, which is left out.
         """
         out = np.zeros((self.forces.pairs, self.order + 1), complex)
         by_omega = self.shifted.rate(omega, shift) @ self.shifted_force(x, omega, shift)
@@ -189,8 +203,9 @@ class HarmonicBalance:
     def truncation(self, x: np.ndarray, omega: float) -> float:
         """Estimated size of the harmonics left out of ``x`` (n,), over the largest sum of those kept.
 
-        Those from K + 1 to 2K are -G F_k with G continued by its last value as k^-2; the others are estimated from them
-        by the bound k^-3 of their fall.
+        Those from K + 1 to 2K are -G F_k, with G continued from its last value as k^-2, as of inertia. For each pair
+        the sum of |G| over its row stands for G. The others are estimated from them: if all fall as k^-3, those beyond
+        2K are 1/3 of those from K to 2K.
         """
         highest = self.orders[-1]
         forces = np.abs(self.series(x, omega).forces)
@@ -209,5 +224,6 @@ class HarmonicBalance:
         force = self.shifted_force(x, omega, shift)[..., 0]
         quadratic = shifted.compliance + (self.orders * omega)[:, None, None] * self.shifted.rate(omega, shift)
         energies = np.einsum("ki,kij,kj->k", force.conj(), quadratic, force).real
-        energies -= shift[:, 0, 0] * np.sum(np.abs(elongation) ** 2, axis=1)  # what the added springs hold
+        # What the added springs hold.
+        energies -= shift[:, 0, 0] * np.sum(np.abs(elongation) ** 2, axis=1)
         return float(np.where(self.orders == 0, 0.5, 0.25) @ energies + self.series(x, omega).potential.sum())

@@ -12,7 +12,7 @@ onset to the separation.
 
 **Arcs.** Onset and separation are roots of the quintics that interpolate uniform samples of (z, z', z''), found by
 ``vipetsc.contact.search``, which misses no root of a quintic. The quintics differ from the motion by 7e-9 of its last
-harmonic (``DENSITY``). Integrals of an elastic force feel less: an end that is off by d changes them by the order
+harmonic (``DENSITY``). Integrals of an elastic force are less in error: an end off by d changes them by the order
 d^(n+1), n the exponent of the force, which vanishes there.
 
 **Quadrature.** An arc from a to b is integrated by Gauss's rule in phi, theta = a + (b - a) sin^2 phi, in which
@@ -109,7 +109,7 @@ def _transform(theta: np.ndarray, weighted: np.ndarray, out: np.ndarray) -> None
 def _factors(order: int) -> np.ndarray:
     """Factors (4, K + 1) by which harmonics up to an ``order`` become the transforms of z and three derivatives.
 
-    They are those of uniform samples, up to a factor of half their number.
+    They are those of ``irfft`` over half the number of samples: the mean, which has no conjugate, counts twice.
     """
     factors = (1j * np.arange(order + 1)) ** np.arange(4)[:, None]
     factors[0, 0] = 2.0
@@ -190,7 +190,7 @@ class ForceSeries:
         self.potential[pair] += values[2].mean()
 
     def _include(self, pair: int, means: np.ndarray) -> None:
-        """Include the means of f exp(-i k theta) and of df/dz exp(-i k theta), the first rows of ``means``."""
+        """Include the means of f exp(-i k theta) and of df/dz exp(-i k theta), the first two rows of ``means``."""
         # The mean of f exp(-i k theta) is F_k/2, but F_0 for k = 0, since f is a real part.
         self.forces[pair] += 2 * means[0]
         self.forces[pair, 0] -= means[0, 0]
@@ -261,7 +261,7 @@ class ForceSeries:
         rates = np.hstack([self._rates[:, :0:-1].conj(), self._rates])
         matrices += rates[:, lag] * rate[:, None, None, :]
 
-        # The change of z'_minus by d_k, (i k + mu - z''/z') exp((i k + mu) phase), times the force that it causes.
+        # The change of z'_minus by d_k, (i k + mu - z''/z') exp((i k + mu) phase), times the force for a change of 1.
         for pair, phase, bend, theta, weights in self._onsets:
             turns = np.exp(1j * orders * phase)
             decays = weights * np.exp(-exponents[:, None] * (theta - phase))

@@ -1,14 +1,14 @@
 r"""Hill's method for condensed motions: which perturbations of a periodic motion grow, and how fast.
 
-A perturbation exp(lambda t) sum_k d_k exp(i k Om t) of the elongations changes the forces by J d (``ForceSeries``), and
-these the elongations by -G(k Om - i lambda) J d, G of outgoing waves (Im omega < 0 where Re lambda > 0): growing ones
-are the zeros of
+A perturbation exp(lambda t) sum_k d_k exp(i k Om t) of the elongations changes the forces by J d (``ForceSeries``). The
+forces change the elongations by -G(k Om - i lambda) J d, where G is that of outgoing waves (Im omega < 0 where
+Re lambda > 0). A perturbation that keeps itself going has d = -G J d: those that grow are the zeros of
 
     D(lambda) = det(I + G(k Om - i lambda) J(lambda)),   Re lambda > 0,  |Im lambda| <= Om/2.
 
 A perturbation grows in a period by its multiplier exp(2 pi lambda/Om); in the code mu is lambda/Om. D is analytic
-there, tends to 1 for large Re lambda and is real on the real axis. To add i Om to lambda is to number the orders k
-anew: with all orders D has the period i Om and is a function of w = exp(-2 pi lambda/Om), analytic inside the circle of
+there, tends to 1 for large Re lambda and is real on the real axis. To add i Om to lambda only renumbers the orders k:
+with all orders D has the period i Om and is a function of w = exp(-2 pi lambda/Om), analytic inside the circle of
 Re lambda = ``least`` Om, whose zeros there are the inverse multipliers. Their number N is minus the turns of D along
 that line (Cauchy's argument principle). Their sums of powers are Fourier coefficients on a circle |w| = R (Delves and
 Lyness): with w = R exp(-i phi),
@@ -39,28 +39,37 @@ from scipy.integrate import trapezoid
 from vipetsc.modes.balance.harmonics import ForceSeries
 from vipetsc.modes.balance.shifted_compliance import Compliance
 
-# Growth rate over Om up to which a motion counts as stable ...
+# Growth rate over Om up to which a motion counts as stable: 0.06 % a period.
 LEAST = 1e-4
-# ... in a finite system: the least distance of the line from the poles, at Re lambda = -decay Om or below, over which D
-# is smooth. 1 % a period without damping.
+# The same for a finite system without damping, 1 % a period. D has poles at the exponents of the linear modes, which
+# lie at Re lambda = -decay Om or below. The line Re lambda = const on which D is followed keeps this distance from
+# them.
 LEAST_OF_FINITE = 1.6e-3
 # Lines on which the fastest growth is looked for first: far from the poles D has few turns and is cheap to follow.
 LINES = (0.1, 0.02)
-# Intervals of half a strip at first, and halvings at most of one in which D turns by more than TURN rad.
+# Intervals of half a strip, 0 <= Im lambda <= Om/2, at first.
 COARSE = 24
+# Halvings, at most, of an interval in which D turns by more than ``TURN``: the finest is 1e-6 Om long.
 FINEST = 14
+# Largest turn of D in rad from one position to the next: at pi its sense would be ambiguous.
 TURN = 0.7
 # Exponent at which D(0) is taken: at 0 itself a lattice that is free to move has no compliance.
 AT_ZERO = 1e-9
+# Pairs up to which all are taken, whether a force acts on them or not, and products are formed without BLAS.
 FEW_PAIRS = 3
-KEPT = 48  # orders of perturbations that are kept where nothing dissipates
+# Orders of perturbations, to both sides of 0, that are kept where nothing dissipates.
+KEPT = 48
 # Steps, first step and accuracy, over Om, of the secant method.
 MOST_STEPS = 30
 STEP = 1e-4
 ACCURACY = 1e-10
-REAL = 1e-7  # |Im lambda| over Om of what is no complex pair is nearer to 0 or 1/2 than this
-ENTRIES = 1 << 17  # of the matrices whose determinants are taken at once
-LARGEST_LOG = 300.0  # of a determinant, which overflows beyond
+# An exponent is none of a complex pair where |Im lambda| over Om is nearer to 0 or 1/2 than this: rounding leaves an
+# error of 1e-8 in a double zero.
+REAL = 1e-7
+# Entries of the matrices whose determinants are taken at once, 2 MB.
+ENTRIES = 1 << 17
+# Logarithm at which the size of a determinant is cut off. The product of two such determinants does not overflow.
+LARGEST_LOG = 300.0
 
 
 class ContourLine(NamedTuple):
@@ -158,7 +167,7 @@ class Hill:
                 if matrix is None:
                     matrix = _flat(series.jacobians(exponents[part], low)[:, acting])
                 g = _of_pairs(np.array(compliances[part]), acting)
-                # As phase and logarithm: at large exponents the product of so many pivots overflows.
+                # As phase and logarithm, since at large exponents the product of so many pivots overflows.
                 phases, logs = np.linalg.slogdet(_plus_one(g, matrix))
                 # One by one: products of complex arrays are rounded otherwise on some processors.
                 for i, value in enumerate(phases * np.exp(np.minimum(logs, LARGEST_LOG)), begin):
@@ -179,7 +188,8 @@ class Hill:
 
     def _at(self, block: int, orders: np.ndarray, exponents: Sequence[complex]) -> list[np.ndarray]:
         """The compliances (order, pair, pair) of a block's ``orders`` at ``exponents``: new ones all in one call."""
-        # At one frequency a state without contact needs its low orders alone, one with dissipation all of them.
+        # The number of orders is a part of the key: a state without dissipation needs its low orders alone, one with
+        # dissipation all of them.
         keys = [(block, len(orders), mu) for mu in exponents]
         new = [key for key in keys if key not in self._compliances]
         if new:

@@ -1,4 +1,11 @@
-"""The stops of a contact: its law, and where it acts on both sides of the state at rest."""
+"""The stops of a contact: its law, and where it acts on both sides of the state at rest.
+
+With the elastic law f(x), which vanishes for x <= 0, the force at the relative displacement w is
+
+    f(w - plus) - f(-w - minus) - load,    load = f(-plus) - f(-minus),
+
+so that it vanishes at rest. The load is zero unless a clearance is negative: the contact is then pressed at rest.
+"""
 
 from typing import NamedTuple, Self
 
@@ -8,10 +15,11 @@ from vipetsc.lattice import Contact
 class Stops(NamedTuple):
     """The ``law`` of a contact, and where its stops are: clearances in m on the sides ``plus`` and ``minus``.
 
-    inf: there is no stop; negative: it is pressed at rest, where a static load balances its force. In the homotopy to a
-    state with stops that touch at rest the force has a factor ``weight``, and a dashpot of ``drag`` in N s/m parallel
-    to it. A linear system may have a ``spring`` in N/m in the place of a pressed contact: harmonics are then those of
-    the force less the spring's.
+    A clearance of inf says that there is no stop. A negative one says that the contact is pressed at rest by so much,
+    where a static load balances its force. In the homotopy to a state with stops that touch at rest the force has a
+    factor ``weight``, and a dashpot of ``drag`` in N s/m parallel to it. A linear system may have a ``spring`` in N/m
+    in the place of a pressed contact: harmonics are then those of the force less the spring's. ``force`` and ``energy``
+    are those of the contact itself, of the weight 1.
     """
 
     law: Contact
