@@ -63,6 +63,34 @@ def test_energies_align_at_grazing(tmp_path):
     np.testing.assert_allclose(energy / energy[0], amplitude**2, rtol=1e-13)
 
 
+def linear_record(folder, *overrides: str) -> Case:
+    """Record the linear run of a case with ``overrides``, whose envelope is 2e-4 m everywhere; returns the case."""
+    case = Case.load(overrides=["lattice.cells=20", "contacts.sites=[17, 9]", *overrides])
+    linear = LinearRun(np.full(20, 2e-4), np.zeros(20), {"work": 1.5e-3}, {})
+    RecordFile(folder / "members-0.jsonl").append(linear.record(linear_name(case)))
+    return case
+
+
+def test_the_nearer_stop_is_touched_first(tmp_path):
+    """A wave has both signs: of two clearances the lesser one is met."""
+    case = linear_record(tmp_path, "contacts.side='both'", "contacts.clearance=2e-3", "contacts.clearance_minus=1e-3")
+    assert initiation_of(tmp_path, case).onset == pytest.approx(1e-3 / 2e-4, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("override", "reason"),
+    [
+        ("contacts.clearance=0.0", "touches at rest"),
+        ("drive.more=[{waveform='step', amplitude=0.1, ramp=1e-3, cell=3}]", "not proportional"),
+    ],
+)
+def test_contacts_without_a_first_amplitude_have_no_initiation(tmp_path, override, reason):
+    """Contacts that act at any amplitude, and motions that do not grow with it."""
+    case = linear_record(tmp_path, "contacts.side='plus'", override)
+    with pytest.raises(ValueError, match=reason):
+        initiation_of(tmp_path, case)
+
+
 @settings(deadline=None, max_examples=25)
 @given(st.floats(1e2, 1e6), st.floats(1e-3, 1e3), st.floats(-2.0, -0.3), st.integers(0, 99))
 def test_power_laws_are_found(divisor, initiation, exponent, seed):

@@ -26,7 +26,7 @@ from vipetsc.io.folder import FolderError, origin
 from vipetsc.io.netcdf import open_netcdf, tabulated, write_netcdf
 from vipetsc.io.read import curves, open_ensemble
 from vipetsc.spectra import power_law
-from vipetsc.studies.linear_run import leading_cell, read_linear
+from vipetsc.studies.linear_run import factor, is_proportional, leading_cell, read_linear
 
 FORMAT_VERSION = 1
 BRANCH = "branch-out-of-phase.h5"  # the branch that the paper plots
@@ -105,17 +105,24 @@ class Initiation:
 
 
 def initiation_of(folder: Path, case: Case) -> Initiation:
-    """The initiation of the members like ``case`` of the sweep in ``folder``, from their linear run; raises OSError.
+    """The initiation of the members like ``case`` of the sweep in ``folder``, from their linear run.
 
     Until the first contact the lattice is linear, so w grows with the amplitude and the drive's work with its square:
-    the smallest amplitude that touches a site is its clearance over the envelope at 1 N. The envelope is that of
-    w^2 + (w'/Om)^2, so it does not depend on where the samples fall.
+    the smallest amplitude that touches a site is its lesser clearance over the envelope at 1 N. The envelope is that of
+    w^2 + (w'/Om)^2, so it does not depend on where the samples fall. Raises OSError if there is no record of the linear
+    run, ValueError if contacts act at any amplitude, or if the motion before them is not proportional to it.
     """
+    if not is_proportional(case):
+        raise ValueError("the motion before the first contact is not proportional to the drive's amplitude")
     linear = read_linear(folder, case)
     if linear is None:
         raise OSError(f"{folder}: its records contain no linear run of this lattice and drive")
+    with np.errstate(divide="ignore"):
+        touching = factor(case) / linear.reached(case)
+    if not touching.all():
+        raise ValueError("a contact that touches at rest acts at any amplitude")
+
     sites = np.asarray(case.contacts.sites)
-    touching = np.asarray(case.contacts.clearance) / linear.envelope[sites - 1]
     amplitude = float(touching[np.argmax(sites == leading_cell(case))])
     energy = linear.statistics["work"] * amplitude**2
     return Initiation(amplitude, energy, onset=float(touching.min()))
@@ -221,7 +228,10 @@ def _relate_curve(curve: xr.Dataset, case: Case, slopes: Sequence[xr.Dataset], f
 
     # A branch of the same reading if there is one, else any of the law.
     slope = min(same_law, key=lambda slope: slope.attrs["reading"] != case.lattice.reading)
-    initiation = initiation_of(folder, case)
+    try:
+        initiation = initiation_of(folder, case)
+    except ValueError as error:
+        return str(error)
     floor = float(untouched.mean())
     aligned = align(curve["work"].values, curve["ibtet"].values, initiation.energy, floor, slope)
     if "exponent" not in aligned.attrs:
