@@ -86,7 +86,7 @@ def test_the_nearer_stop_is_touched_first(tmp_path):
 )
 def test_contacts_without_a_first_amplitude_have_no_initiation(tmp_path, override, reason):
     """Contacts that act at any amplitude, and motions that do not grow with it."""
-    case = linear_record(tmp_path, "contacts.side='plus'", override)
+    case = linear_record(tmp_path, "contacts.side='plus'", "contacts.restitution=1.0", override)
     with pytest.raises(ValueError, match=reason):
         initiation_of(tmp_path, case)
 
