@@ -103,3 +103,28 @@ def test_growing_weights_lead_to_the_state_of_growing_amplitudes(monkeypatch, by
     monkeypatch.setattr(steps, "LONGEST_RAMP", 0.5)
     assert first_state(states).xi == pytest.approx(expected, abs=1e-9)
     assert by_weights
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("over", ["amplitude", "frequency"])
+def test_growing_amplitudes_have_the_scale_of_the_frequency_that_they_begin_at(monkeypatch, over):
+    """What is fixed of a curve over the frequency is an amplitude, which is no frequency of the ramp."""
+    omega = 1700.0
+    states = states_from(omega, 1.5)
+    if over == "frequency":
+        amplitude = float(states.options.range[0])
+        update = {"over": over, "range": [omega, 1.1 * omega], "fixed": [amplitude]}
+        case = states.case.model_copy(update={"nfrc": states.options.model_copy(update=update)})
+        states = SteadyStates(case, RESTITUTION, amplitude)
+
+    frequencies = []
+
+    class Recorded(SteadyStates):
+        def __init__(self, case: NfrcCase, *others: Any, **named: Any) -> None:
+            super().__init__(case, *others, **named)
+            frequencies.append(case.frequency)
+
+    monkeypatch.setattr(steps, "SteadyStates", Recorded)
+    first_state(states)
+    assert frequencies
+    assert frequencies == pytest.approx([omega] * len(frequencies), rel=1e-12)

@@ -192,7 +192,8 @@ def _by_amplitudes(states: SteadyStates, omega: float, amplitude: float) -> np.n
     end where one contact episode becomes two, of which the second begins without speed. Growing weights may then lead
     to the beginning of the range.
     """
-    below = states.options.model_copy(update={"over": "amplitude", "range": [1e-3 * amplitude, amplitude]})
+    update = {"over": "amplitude", "range": [1e-3 * amplitude, amplitude], "fixed": [omega]}
+    below = states.options.model_copy(update=update)
     ramp = SteadyStates(
         states.case.model_copy(update={"nfrc": below}), states.restitution, omega, compliance=states.compliance
     )
