@@ -13,6 +13,7 @@ from scipy.linalg import eigh
 from tests.breathers import BREATHER_CELLS as CELLS
 from tests.breathers import BREATHER_FREQUENCY, breather_chain
 from tests.models import CLEARANCE, four_band_contact
+from vipetsc.dynamics.engine import StalledError
 from vipetsc.dynamics.propagator.tangent import TangentPropagator
 from vipetsc.lattice import Chain, Contact, four_band
 from vipetsc.lattice.chain import Pair
@@ -187,14 +188,41 @@ def test_an_engine_has_one_orbit_and_moves_variations_only_along_it():
     start = irregular_motion((5,))
     with pytest.raises(RuntimeError, match="call run before move"):
         engine.move(start[None])
+    # Without a state the orbit would be that of the lattice at rest.
+    with pytest.raises(RuntimeError, match="call place before run"):
+        engine.run(1)
 
     engine.place(start, 1.0)
-    engine.run(1)
-    engine.move(start[None])
+    end = engine.run(1)
+    moved = engine.move(start[None])
     with pytest.raises(RuntimeError, match="run another one in another engine"):
         engine.run(2)
     with pytest.raises(RuntimeError, match="place a state before"):
         engine.place(start, 1.0)
+
+    # Of several states that are placed the last one counts.
+    other = engine_of(flow)
+    other.place(irregular_motion((5,), w=4e-3, speed=-2.0), 3.0)
+    other.place(start, 1.0)
+    np.testing.assert_array_equal(other.run(1), end)
+    np.testing.assert_array_equal(other.move(start[None]), moved)
+
+
+@pytest.mark.parametrize(("look", "sample"), [(None, 4), (list, 1)])
+def test_an_orbit_with_more_rows_than_its_tape_is_refused_and_moves_nothing(look, sample):
+    """The message has the rows up to the sample at which they are counted; the part of an orbit is none."""
+    flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
+    engine = TangentPropagator(flow._model(PERIOD, 4), flow.layout, tape_rows=2)
+    start = irregular_motion((5,))
+    engine.place(start, 1.0)
+
+    with pytest.raises(StalledError, match=rf"has 2 rows \(tape_rows\), and \d+ are needed up to sample {sample} of 4"):
+        engine.run(4, look)
+
+    with pytest.raises(RuntimeError, match="has not reached the orbit's end"):
+        engine.move(start[None])
+    with pytest.raises(RuntimeError, match="run another one in another engine"):
+        engine.run(4)
 
 
 def test_no_variations_are_moved_to_none():

@@ -14,10 +14,11 @@ from vipetsc.dynamics.propagator.nodes import NODES, at_end
 
 
 class OrbitContacts(NamedTuple):
-    """Begins and ends (number, 2) in s of times in contact in an orbit.
+    """Intervals of an orbit, (number, 2): the times in s at which they begin and end.
 
-    One contact takes several ``closed_substeps``, which follow each other. ``departures`` are the times in which a site
-    is closed, or open if it is pressed at rest.
+    ``closed_substeps`` are those of substeps in which a site is closed, once for each site: sites that are closed
+    together repeat them, and one contact takes several, which follow each other. ``departures`` are those in which a
+    site is not as at rest, without a break: closed, or open if it is pressed at rest.
     """
 
     closed_substeps: np.ndarray
@@ -62,7 +63,7 @@ class OrbitTape:
         return np.asarray(tape.motion[c, : tape.used[c]])
 
     def contacts(self) -> OrbitContacts:
-        """The times in contact of the sites that this rank logs."""
+        """The substeps in which the sites that this rank logs are closed, and their departures from rest."""
         spans = [np.zeros((0, 2))]
         departures = []
         for c in np.flatnonzero(self._forces.logs).tolist():

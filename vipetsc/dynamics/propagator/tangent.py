@@ -5,44 +5,50 @@ were closed on a tape (``orbit_tape``). From the tape it computes how variations
 end. Shooting for periodic orbits of a whole lattice asks for that: for products of the monodromy matrix with vectors,
 never the matrix.
 
-Sections are those of the derivation in ``vipetsc.dynamics.propagator``. A *DoF* is the relative displacement w of the
-two masses between which a contact acts, the contact being a *site*, or the displacement of a driven mass. A *cluster*
-is a set of DoFs that are solved for together, since they feel one another within a step (sec. 6). The *mode* of a site
-says whether it is free, closed on the side sigma = + or -, or closed with its force clipped to 0. A *substep* is a part
-of a step in which no mode changes (secs. 3, 4).
+Sections are those of the derivation in ``vipetsc.dynamics.propagator``. A *DoF* is the relative displacement w = c u of
+the two masses between which a contact acts, the contact being a *site*, or the displacement of a driven mass; the row c
+has an entry for each of these masses. A *cluster* is a set of DoFs that are solved for together, since they feel one
+another within a step (sec. 6). The *mode* of a site says whether it is free, closed on the side sigma = + or -, or
+closed with its force clipped to 0. A *substep* is a part of a step in which no mode changes (secs. 3, 4).
 
-**A step** goes from t_0 to t_0 + H, with s = (t - t_0)/H. It takes the lattice's state y = (u, u') to
+**A step** goes from t_0 to t_0 + H, with s = (t - t_0)/H. The lattice obeys M u'' + K u = sum of c^T F over the DoFs,
+where F in N is the force of a contact on its w, positive where it raises w. The state y = (u, u') becomes
 
     y+ = P y + L mu,    mu_k = integral of F (1 - s)^k dt over the step.
 
-P y is the free motion (sec. 1). F is the force of a contact on its w, and L mu the motion that all forces leave. To
-find it, variation of constants is expanded in powers of the time 1 - s that remains after each impulse F dt: with
-A = H^2 M^-1 K and the row c of a DoF, w = c u, sec. 5 gives
+P y is the free motion (sec. 1), and L mu the motion that all forces leave. To find it, variation of constants is
+expanded in powers of the time 1 - s that remains after each impulse F dt: with A = H^2 M^-1 K, sec. 5 gives
 
-    L mu = (M^-1 sum_m (c (-A)^m)^T H mu_(2m+1)/(2m+1)!,    M^-1 sum_m (c (-A)^m)^T mu_2m/(2m)!).
+    L mu = (M^-1 sum_m (c (-A)^m)^T H mu_(2m+1)/(2m+1)!,    M^-1 sum_m (c (-A)^m)^T mu_2m/(2m)!),
 
-There are as many moments mu_k as Taylor coefficients in P, 2 ``StepSeries.terms``: what is left out is below the
-truncation of sec. 1.
+summed over the DoFs. There are as many moments mu_k of each as Taylor coefficients in P, 2 ``StepSeries.terms``: what
+is left out is below the truncation of sec. 1. In a lattice with dashpots the rows of sec. 7 replace c (-A)^m.
 
-**Forces** depend on y through few numbers: for each cluster, the Taylor coefficients a of the free motion w(s) =
-sum_k a_k s^k of its DoFs, a = T y with the rows c (-A)^m of sec. 2, and the *approach velocities* q of its sites. The
-approach velocity of a contact is w' at its onset, positive on the side + and negative on the side -. The law scales its
-damping by it:
+**Forces** depend on y through few numbers: for each cluster, the *approach velocities* q of its sites and the Taylor
+coefficients a = T y of the free motion w(s) = sum_k a_k s^k of its DoFs,
 
-    F = -sigma f(x) (1 + c w'/q),    x = sigma w - D >= 0,
+    a_2m = c (-A)^m u/(2m)!,    a_(2m+1) = H c (-A)^m u'/(2m+1)!    (sec. 2).
 
-with the elastic force f of the indentation x, f(0) = 0, the clearance D and the damping c. A law with clipping has
-F = 0 where the bracket is negative. For a contact that is pressed at rest D is negative and c = 0, and the force that
-it has at rest is taken off.
+The approach velocity of a contact is w' at its onset, positive on the side + and negative on the side -. The law scales
+its damping by it:
+
+    F = -sigma f(x) (1 + beta w'/q),    x = sigma w - D >= 0,
+
+with the elastic force f of the indentation x, f(0) = 0, the clearance D and the dimensionless damping beta, which the
+code calls ``damping``. A law with clipping has F = 0 where the bracket is negative. For a contact that is pressed at
+rest D is negative and beta = 0, and the force that it has at rest is taken off.
 
 **Variations.** A variation dy of y moves by the derivative of these lines,
 
     dy+ = P dy + L dmu,    (dmu, dq+) = J (da, dq),    da = T dy.
 
-J is one small matrix for each step and cluster in contact: the product of the linearised collocations of the step's
-substeps, which the tape has, one after the other (``tangent_kernels``). It is computed once for the orbit. After that a
-variation costs as much as a linear step, and the small products. In the code T is ``expand_free_motion`` and L is
-``apply_impulses``.
+J is one small matrix for each step and cluster in contact. In a substep F is the interpolant of its values at the
+nodes. These solve the equation of the law there, in which w is the free motion and what F adds to it. The derivative of
+that equation is a linear system for dF at the nodes, and from dF follow dmu and the variation at the substep's end.
+Unit vectors (da, dq) are carried in this way through the substeps that the tape has of the step, one after the other
+(``tangent_kernels``). Their q stays as it is but at an onset within the step (below). J is computed once for the orbit.
+After that a variation costs as much as a linear step, and the small products. In the code T is ``expand_free_motion``,
+L is ``apply_impulses``, and ``c`` is the number of a cluster.
 
 **Times of onset and separation** vary with y, too. The variation of the state has no term for them, since the force is
 continuous in time at each of these instants: f(0) = 0 at onsets and separations, also where a contact that is pressed
@@ -52,9 +58,10 @@ instant: an onset at the velocity w' and acceleration w'' comes earlier by dw/w'
 the orbit grazes, w' = 0, there is no such derivative; near grazing dq is large, and so are the products with
 variations, if the contact dissipates. Nothing is done about that here.
 
-J treats the ends of substeps as constants. To move such an end changes the integrals by no more than the error of the
-collocation, so that J is the derivative of the exact flow, and not of the program, which chooses its substeps by the
-state.
+J treats the ends of substeps as constants. To move an end by dt changes the integrals by the order of dt^2 where a mode
+changes, since F is continuous there. Elsewhere it divides one smooth integrand in another way, which changes them by no
+more than the error of the collocation. J is therefore the derivative of the exact flow, and not of the program, which
+chooses its substeps by the state.
 
 References
 ----------
@@ -87,8 +94,8 @@ from vipetsc.parallel import on_every_rank
 # Rows of the tape of a cluster unless the caller gives another number. A site that is not free has a row in each
 # substep, of 208 B with the motion at the nodes: 1.7 MB. A contact of the built-in case takes fewer than 30 substeps,
 # so that there is room for hundreds of contacts in one orbit; a contact that is pressed at rest has a row in every
-# substep of the orbit. An orbit that needs more is refused with the number of rows. The system gives memory to rows as
-# they are written: those that are never used cost none.
+# substep of the orbit. An orbit that needs more is refused at the next sample that is looked at, or at its end, with
+# the number of rows up to there. The system gives memory to rows as they are written: those never used cost none.
 MOST_TAPE_ROWS = 8192
 
 
@@ -118,11 +125,13 @@ class _Workspace(NamedTuple):
 class TangentPropagator(Propagator):
     """The engine of a lattice that nothing drives: one orbit from a given state, and the motion of its variations.
 
-    It has one orbit: call ``place`` once, then ``run`` once, then ``move`` any number of times; in another order they
-    raise RuntimeError. States are arrays (2 mass, owned cell) over the masses of a cell, displacements in m before
-    velocities in m/s. The drives of ``model`` are switched off. ``tape_rows``, the same on all ranks, is the length of
-    each cluster's tape, which takes a row for each site that is not free in each substep; with 0 there is no tape, and
-    ``move`` raises ValueError.
+    It has one orbit: call ``place``, then ``run`` once, then ``move`` any number of times. ``run`` without a state that
+    is placed, ``place`` or a second ``run`` after it, and ``move`` without a ``run`` that has reached the orbit's end
+    raise RuntimeError. Of several calls of ``place`` the last one counts. The drives of ``model`` are switched off.
+
+    States are arrays (2 mass, owned cell) over the masses of a cell, displacements in m before velocities in m/s.
+    ``tape_rows``, the same on all ranks, is the length of each cluster's tape, which takes a row for each site that is
+    not free in each substep; with 0 there is no tape, and ``move`` raises ValueError.
 
     Where PETSc fails to exchange cells, RuntimeError is raised on the rank where it does. The others may wait for that
     rank within the exchange, so that they cannot agree on it: the front door ends all ranks then
@@ -138,6 +147,9 @@ class TangentPropagator(Propagator):
         clusters.drives.rows["duration"] = 0.0
         self._forces.clusters = clusters._replace(tape=create_tape(len(clusters.state), tape_rows))
         self._tape = OrbitTape(self._forces, self.series.interval)
+        self._is_placed = False
+        self._has_begun = False
+        self._has_orbit = False
         self._linearisation: _Linearisation | None = None
         self._workspace: _Workspace | None = None
 
@@ -171,7 +183,7 @@ class TangentPropagator(Propagator):
         Raises StalledError, on all ranks, for a closed contact that dissipates, whose force depends on it; RuntimeError
         after ``run``, or where PETSc fails to exchange cells.
         """
-        if self.steps:
+        if self._has_begun:
             raise RuntimeError("the engine has run its orbit: place a state before, or in another engine")
         clusters = self._forces.clusters
         sites = clusters.contacts
@@ -201,19 +213,24 @@ class TangentPropagator(Propagator):
         # its expected duration (``advance``). Contacts that are closed already began long ago, whatever the duration.
         clusters.history["onset"] = -np.inf
         clusters.history["duration"] = 1.0
+        self._is_placed = True
 
     def run(self, samples: int, look: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
-        """Advance to the sample number ``samples``, at least 1, counted from 0 at the start; returns the cells there.
+        """Advance to the sample number ``samples``, at least 1; returns the cells there.
 
-        Cells are states (2 mass, owned cell). ``look``, which some ranks may not have, is called with those of the
-        samples 1 to ``samples``. All ranks must call ``run``. Raises StalledError, on all ranks, where the engine
-        stalls, and where the orbit needs more substeps in contact than the tape has rows; ValueError for fewer samples
-        than 1; RuntimeError for a second orbit.
+        The sample n is the state at the time n ``model.sample_interval``, which is a whole number of steps, with n = 0
+        at the start. Cells are states (2 mass, owned cell). ``look``, which some ranks may not have, is called with
+        those of the samples 1 to ``samples``. All ranks must call ``run``. Raises StalledError, on all ranks, where the
+        engine stalls, and where the orbit needs more rows than the tape has; ValueError for fewer samples than 1;
+        RuntimeError before ``place``, and for a second orbit.
         """
         if samples < 1:
             raise ValueError(f"samples is {samples}: an orbit needs at least 1")
-        if self.steps:
+        if self._has_begun:
             raise RuntimeError("the engine has run its orbit: run another one in another engine")
+        if not self._is_placed:
+            raise RuntimeError("the engine has no state to begin with: call place before run")
+        self._has_begun = True
         tape = self._forces.clusters.tape
         # Where no rank has a state to show the engine goes to the last sample at once.
         numbers = range(samples, samples + 1)
@@ -225,10 +242,16 @@ class TangentPropagator(Propagator):
             # A full tape goes on to count the rows that it lacks; one without rows counts none.
             needed = self._layout.comm.allreduce(int(tape.used.max(initial=0)), max)
             room = tape.rows.shape[1]
-            if result.stalled or needed > room:
-                raise StalledError(result.stalled or f"an orbit needs {needed} substeps in contact, of {room}")
+            if result.stalled:
+                raise StalledError(result.stalled)
+            if needed > room:
+                raise StalledError(
+                    f"the tape of a cluster has {room} rows (tape_rows), and {needed} are needed up to sample {number} "
+                    f"of {samples}: one for each site that is not free in each substep"
+                )
             if look:
                 look(self._present_cells().copy())
+        self._has_orbit = True
         return self._present_cells().copy()
 
     def _present_cells(self) -> np.ndarray:
@@ -238,7 +261,7 @@ class TangentPropagator(Propagator):
         return self._components[self.steps % 2][: rows * owned].reshape(rows, owned)
 
     def contacts(self) -> OrbitContacts:
-        """The times in contact of the sites that this rank logs."""
+        """The substeps in which the sites that this rank logs are closed, and their departures from rest."""
         return self._tape.contacts()
 
     def closed_substeps(self) -> list[ClosedSubsteps]:
@@ -285,12 +308,15 @@ class TangentPropagator(Propagator):
         """Move variations (variation, 2 mass, owned cell) of the beginning to the orbit's end; all ranks must call it.
 
         The map is linear: if displacements are in any unit, velocities are in that unit per s. Raises ValueError for an
-        engine without a tape, and RuntimeError before ``run``, or where PETSc fails to exchange cells.
+        engine without a tape, and RuntimeError before ``run``, after one that has raised an error, or where PETSc fails
+        to exchange cells.
         """
         if self._forces.clusters.tape.rows.shape[1] == 0:
             raise ValueError("tape_rows is 0: an orbit without a tape has no variations; tape_rows must be at least 1")
-        if not self.steps:
+        if not self._has_begun:
             raise RuntimeError("the engine has no orbit yet: call run before move")
+        if not self._has_orbit:
+            raise RuntimeError("run has not reached the orbit's end: variations move along a whole orbit alone")
         layout = self._layout
         count = len(cells)
         if count == 0:
