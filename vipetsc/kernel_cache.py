@@ -49,7 +49,7 @@ class ByContent(UserProvidedCacheLocator):
         self._cache_path = config.CACHE_DIR
 
     def get_source_stamp(self) -> str:
-        """What must not have changed since code was stored: nothing but the name of the folder."""
+        """An empty stamp: the name of the folder alone says of which sources stored code is."""
         return ""
 
 

@@ -1,4 +1,4 @@
-"""What holds the lattice of steady states: walls, contacts that are pressed at rest, and ends that go on for ever."""
+"""Supports of the lattice of steady states: walls, contacts that are pressed at rest, and ends that go on for ever."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any

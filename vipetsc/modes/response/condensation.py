@@ -1,4 +1,4 @@
-"""What a case of ``nfrc`` is condensed to: contacts, nonlinear springs, driven masses and the compliance between them.
+"""The condensed system of a case of ``nfrc``: contacts, nonlinear springs, driven masses, and the compliance between.
 
 Everything else in the lattice is linear. Its response to harmonic forces at these places is the compliance G(omega) in
 m/N, a matrix with a row and a column for each contact, nonlinear spring and driven mass. The equations of steady states

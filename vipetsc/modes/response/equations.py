@@ -47,7 +47,7 @@ class LinearMotion(NamedTuple):
 
 
 class ContinuationParameter(NamedTuple):
-    """What varies along a curve and what does not.
+    """The quantity that varies along a curve, and the one that does not.
 
     ``over`` is "amplitude", "frequency" or the path of a key of the case. ``fixed`` is the frequency in rad/s of a
     curve over the amplitude, else the amplitude. ``scale`` is the unit of the parameter: the last unknown is the value
