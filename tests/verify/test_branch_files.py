@@ -18,6 +18,7 @@ from vipetsc.modes.branches.branch import Branch
 from vipetsc.modes.branches.branch_checks import sampled
 from vipetsc.modes.branches.files import LAYOUTS, read_branch, write_branch
 from vipetsc.modes.branches.follow import follow_all
+from vipetsc.modes.branches.orbits import ShootingMethod
 from vipetsc.modes.branches.regions import regions
 from vipetsc.modes.problem import FlowError
 from vipetsc.parallel import StopRequest
@@ -336,6 +337,60 @@ def test_a_kill_after_the_lower_part_has_ended_leaves_it_as_it_is(tmp_path):
     follow(parts, lambda branch, point: followed.add(branch.name), resume=True, **SHORT)
 
     assert followed == {"out-of-phase"}
+    assert files_of(parts) == files_of(tmp_path / "whole")
+
+
+def test_a_kill_above_a_lower_part_that_failed_costs_no_point_of_it(tmp_path):
+    """The part below goes on from the last point that it had, though it was not due to be written there."""
+    follow(tmp_path / "whole", **BOTH)
+    parts = tmp_path / "parts"
+
+    def fail_below_and_kill_above(branch, point):
+        if branch.name == "out-of-phase-down" and point.index == 3:
+            raise FlowError("the flow ends here")
+        if branch.name == "out-of-phase" and point.index == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        follow(parts, fail_below_and_kill_above, saves_all=True, **BOTH)
+    # The branch has been written with its part below, whose own files are still there.
+    assert {f"{NAME}-down.h5", f"{NAME}.h5"} <= set(files_of(parts))
+    followed = []
+    follow(parts, lambda branch, point: followed.append((branch.name, point.index)), resume=True, **BOTH)
+
+    assert followed[0] == ("out-of-phase-down", 4)
+    assert files_of(parts) == files_of(tmp_path / "whole")
+
+
+def test_a_step_whose_point_cannot_be_assessed_is_repeated_as_a_whole(tmp_path, monkeypatch):
+    """Special points of the step, and what was not located in it, are then there once."""
+    nnm = {"start_energy": 0.029, "energy": [0.0, 0.0291]}
+    assess = ShootingMethod.assess
+
+    def locate(problem, left, right, missed, **options):
+        missed.append(f"nothing is located after point {left.index}")
+        return [replace(right, kind="period-doubling")]
+
+    def fail_at_2(method, problem, point):
+        if point.kind == "regular" and point.index == 2:
+            raise FlowError("the loss is not found")
+        return assess(method, problem, point)
+
+    monkeypatch.setattr("vipetsc.modes.branches.growth.locate", locate)
+    whole = follow(tmp_path / "whole", **nnm)
+    assert len(whole.regular()) > 2
+    parts = tmp_path / "parts"
+    with monkeypatch.context() as patch:
+        patch.setattr(ShootingMethod, "assess", fail_at_2)
+        failed = follow(parts, **nnm)
+    assert failed.ending == "failed: the loss is not found"
+    assert [(point.index, point.kind) for point in failed.points] == [
+        (0, "regular"),
+        (1, "period-doubling"),
+        (1, "regular"),
+    ]
+
+    follow(parts, resume=True, **nnm)
     assert files_of(parts) == files_of(tmp_path / "whole")
 
 

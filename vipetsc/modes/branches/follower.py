@@ -6,13 +6,15 @@ another key of the case. Its *points* are single motions. Those of the continuat
 counts the steps from the start, which has 0; *special* points lie between them, where something changes: a fold of the
 energy or of the frequency, a change of stability, a contact that grazes. A ``Method`` gives the equations of a case's
 branches and their starts, and ``Growth`` continues a branch from one motion to its end. This module says from which
-motions, and keeps the files. Steps, tangents and charts are explained in ``vipetsc.modes.continuation.arclength``.
+motions, and keeps the files. A step of the length s solves H(xi) = 0 with t . (xi - xi_0) = s for the unknowns xi of
+the next point, with those of the last one, xi_0, and the unit tangent t of the branch there; charts, which scale the
+unknowns, are explained with it in ``vipetsc.modes.continuation.arclength``.
 
-**Two parts.** An NNM may be followed from its start both to larger and to smaller energies. The part *below the start*,
-towards smaller energies, is computed first, as a branch of its own with the name ``<name>-down``. Then its points are
-put before the start in reverse order, from the far end on, and the part *above*, towards larger energies, is followed.
-In both parts the index counts the steps from the start: 3, 2, 1, 0, 1, 2. It is not negative, and only the start has 0.
-``nnm.points`` limits both parts together.
+**Two parts.** Where ``Method.has_lower_part`` says so, an NNM is followed from its start both to larger and to smaller
+energies. The part *below the start*, towards smaller energies, is computed first, as a branch of its own with the name
+``<name>-down``. Then its points are put before the start in reverse order, from the far end on, and the part *above*,
+towards larger energies, is followed. In both parts the index counts the steps from the start: 3, 2, 1, 0, 1, 2. It is
+not negative, and only the start has 0. ``nnm.points`` limits both parts together.
 
 **Files.** A branch has the files ``branch-<name>.h5`` and ``.csv``. Every ``SAVE_EVERY`` seconds, where it is stopped
 and where it ends, a growing branch is written whole. What is in the folder, and what a resumed command does:
@@ -20,6 +22,8 @@ and where it ends, a growing branch is written whole. What is in the folder, and
     State                                   -down             <name>                      Resumed
     the part below is followed, or stopped  points so far     none                        the part below goes on
     the part above is followed              the whole part    none, then both parts       the part above goes on
+    the same, after a failure below         its points        none, then both parts,      the part below goes on, then
+                                                              ``failure_below``           the part above
     stopped or out of points above          none              both parts, not complete    the part above goes on
     failed or out of points below           none              both parts, not complete,   the part below goes on, then
                                                               ``failure_below``           the part above
@@ -83,8 +87,9 @@ def method_of(case: BranchCase) -> type[Method[Any]]:
 class Follower:
     """Follows the branches of a case on the ranks ``comm``, into a folder or, without one, in memory alone.
 
-    ``about`` are attributes of the files. ``listener(branch, point)`` is called on rank 0 after each regular point. All
-    ranks call ``follow`` with the same jobs in the same order.
+    ``about`` are attributes of the files. ``listener(branch, point)`` is called after each regular point on rank 0 of
+    ``comm``: of ``follow_all`` that is every rank with its own branches, unless all follow one together. All ranks of
+    ``comm`` call ``follow`` with the same jobs in the same order.
     """
 
     def __init__(
@@ -108,7 +113,10 @@ class Follower:
         self.growth = Growth(self.method, comm, self.write, listener, self.stop)
 
     def follow(self, job: int) -> list[Branch[Any]]:
-        """The branch of a ``job``, one of ``Method.jobs``, then those that cross it, if asked for."""
+        """The branch of a ``job``, then those that cross it, if asked for.
+
+        A job is a number from ``Method.jobs``, counted from 0: that of a mode, of a start frequency, or of a curve.
+        """
         # Members of a sweep have the same audit event: hooks count what a case consists of.
         sys.audit("vipetsc.member", job + 1)
         branch = self._stored_or_new(self.method.name(job))
@@ -201,18 +209,20 @@ class Follower:
             start = below.regular()[-1]
         if below.complete:
             return None
+        failure: FailureBelow | None = None
         try:
-            is_complete = self.growth.run(
-                below, problem, start, self.method.rule, direction=-1, points_elsewhere=points_above
-            )
+            self.growth.run(below, problem, start, self.method.rule, direction=-1, points_elsewhere=points_above)
         except self.method.failures as error:
-            return FailureBelow(why=str(error), next_step=below.next_step)
+            failure = FailureBelow(why=str(error), next_step=below.next_step)
+        else:
+            if not below.complete:
+                failure = FailureBelow(why=below.ending, next_step=below.next_step, failed=False)
 
-        # From now on, until the whole branch is written, a kill does not take the part away.
-        self.write(below)
-        if is_complete:
-            return None
-        return FailureBelow(why=below.ending, next_step=below.next_step, failed=False)
+        # From now on, until the whole branch is written, a kill does not take the part away. After that, until it is
+        # removed, this file has all points of the part that the file of the branch has: ``_resume_below`` relies on it.
+        if below.points:
+            self.write(below)
+        return failure
 
     def _resume_below(self, branch: Branch[Any], problem: PeriodicProblem[Any]) -> None:
         """Continue the part of a branch below its start, which is not complete; raises StoppedError on request."""
@@ -222,7 +232,8 @@ class Follower:
         above = branch.points[first + 1 :]
         points_above = sum(p.kind == "regular" for p in above)
 
-        # There are files of the part only if a command was killed that went on with it.
+        # There are files of the part only if a command was killed before it could remove them. They have all points of
+        # the part that the branch has, or more.
         below = self._stored_or_new(_name_below(branch))
         if not below.points:
             below.points = [_reversed(p) for p in reversed(branch.points[: first + 1])]

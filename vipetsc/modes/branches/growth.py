@@ -79,8 +79,8 @@ class Growth:
 
         try:
             why_ended = self._steps(branch, problem, continuation, rule.chart, monitor)
-        # Also of a branch that fails or is stopped, pairs of neighbouring points are recorded of which one may lie on
-        # another branch. One that is resumed finds the same jumps again.
+        # Jumps are pairs of neighbouring points so unlike that the continuation may have changed to another branch.
+        # They are recorded of a branch that fails or is stopped, too. One that is resumed finds the same jumps again.
         finally:
             jumps = self.method.jumps(problem, branch.regular())
             branch.findings += [jump for jump in jumps if jump not in branch.findings]
@@ -110,8 +110,9 @@ class Growth:
         saved = time.monotonic()
         for point in continuation:
             sys.audit("vipetsc.step")
+            special: list[Any] = []
+            missed: list[str] = []
             if self.method.locates:
-                missed: list[str] = []
                 special = locate(
                     problem,
                     left=last,
@@ -123,12 +124,14 @@ class Growth:
                     before=one_before_last,
                     missed=missed,
                 )
-                branch.findings += missed
-                # As in regular points, ``next_step`` is that of the step after the one that found them.
-                branch.points += [self.method.assess(problem, replace(p, next_step=point.next_step)) for p in special]
 
-            assessed = self.method.assess(problem, point)
-            branch.points.append(assessed)
+            # As in regular points, ``next_step`` is that of the step after the one that found them.
+            special = [replace(p, next_step=point.next_step) for p in special]
+            new_points = [self.method.assess(problem, p) for p in [*special, point]]
+            # A step is taken as a whole, or not at all where an assessment fails: a resumed branch repeats the step.
+            branch.findings += missed
+            branch.points += new_points
+            assessed = new_points[-1]
             branch.next_step = continuation.step
             self._show(branch, assessed)
             why_ended = monitor(assessed)
