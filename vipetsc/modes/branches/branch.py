@@ -26,7 +26,7 @@ class FailureBelow(NamedTuple):
 
     @property
     def finding(self) -> str:
-        """The jump as a sentence among the branch's findings."""
+        """The failure as a sentence among the branch's findings."""
         return f"below the start: {self.why}"
 
 
