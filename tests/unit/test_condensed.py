@@ -1,6 +1,7 @@
 """Harmonics of contact forces, and the balance at the places where a system is nonlinear."""
 
 import itertools
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -307,9 +308,33 @@ def test_a_weight_at_which_the_motion_changes_too_much_is_tried_again_shorter(mo
     tried = record_weights(monkeypatch)
     # No change is small enough: steps of 0.1 times powers of 0.4, until the next one is below the smallest.
     monkeypatch.setattr(conservative, "FURTHEST", 0.0)
-    with pytest.raises(ContinuationError, match=r"no breather at 2\.1 rad/s: with 0 of the harmonics above the first"):
+    reason = r"no breather at 2\.1 rad/s: with 0 of the harmonics above the first, the motion changes by more than"
+    with pytest.raises(ContinuationError, match=reason) as error:
         gap_motions().in_gap(2.1, np.array([1.0]))
     assert tried == pytest.approx(0.1 * 0.4 ** np.arange(8))
+    # Newton's method has converged each time: more steps of it are no remedy.
+    assert "Newton" not in str(error.value)
+
+
+def test_harmonics_with_which_newtons_method_fails_are_told_with_its_reason(monkeypatch):
+    gap = gap_motions()
+    solve = HarmonicFrame.solve
+
+    def fail(frame: HarmonicFrame, guess: np.ndarray, row: np.ndarray, value: float) -> Attempt:
+        attempt = solve(frame, guess, row, value)
+        return replace(attempt, converged=False, reason="the test says so")
+
+    monkeypatch.setattr(HarmonicFrame, "solve", fail)
+    reason = r"Newton's method ends \(the test says so\); change nnm.start_frequency or raise nnm.max_newton"
+    with pytest.raises(ContinuationError, match=reason):
+        gap.in_gap(2.1, np.array([1.0]))
+
+
+def test_a_case_has_the_harmonics_with_which_a_branch_begins():
+    """The guess of a start and the harmonics that are brought in never have more than ``nnm.harmonics``."""
+    NnmTable(harmonics=conservative.FEWEST)
+    with pytest.raises(ValueError, match="harmonics"):
+        NnmTable(harmonics=conservative.FEWEST - 1)
 
 
 def test_a_weight_cut_to_1_in_vain_is_followed_by_a_smaller_one(monkeypatch):

@@ -2,21 +2,24 @@
 
 A sweep over the amplitude A of the drive has a run at its lowest, medium and highest amplitude in each figure. In a
 linear lattice energies grow as A^2 and velocities as A: over these, what differs between the panels is nonlinear. The
-*driven wavenumber* is that of the linear wave at the drive's frequency, in the pass band that is driven; in a gap there
-is none, and its mark is missing. Each figure names what it needs (``from_series``): a sweep without that has no such
-picture.
+*driven wavenumber* is that of the linear wave at the drive's frequency, in the pass band that is driven. In a gap there
+is none: its mark is missing, and figures with ``needs_wave`` are not drawn. Each figure names what it needs
+(``from_series``): a sweep without that has no such picture.
 
 The velocity v(x, t) of the cells' host masses, x being the number of the cell, has the Morlet wavelet transform
 
     X(kappa, x, t) = sqrt(kc/kappa) 1/(2 pi) integral_0^pi V(eta, t) exp[-(kc eta/kappa - kc)^2/2] exp(i eta x) deta,
 
 with V(eta, t) = sum_x v exp(-i eta x): it is the part of the velocity about the wavenumber kappa and the cell x
-(``vipetsc.spectra.wavelet``, with the inverse). Its power S = |X|^2 at the wavenumbers kappa_j gives the local entropy
-in bits
+(``vipetsc.spectra.wavelet``, with the inverse). A wave v = a cos(kappa x - omega t) has |X| = (a/2) sqrt(kc/kappa) at
+its own wavenumber: of waves of equal amplitude the longer ones look stronger. Both directions of travel have the same
+kappa. Near kappa = pi the integral ends within the Gaussian, and at pi half of it is cut off. The power S = |X|^2 at
+the wavenumbers kappa_j = j pi/60, j = 1..60, gives the local entropy in bits
 
     W(x, t) = sum_j S,    H(x, t) = -sum_j (S/W) log2 (S/W),    H(t) = sum_x W H / sum_x W
 
-and the mean H(t) over the cells with the weight W (``vipetsc.spectra.entropies``). "Paper, Fig. n" is a figure of Phys.
+and the mean H(t) over the cells with the weight W (``vipetsc.spectra.entropies``). H lies between 0, for one
+wavenumber, and log2 60 = 5.9; it depends on the number of wavenumbers and on kc. "Paper, Fig. n" is a figure of Phys.
 Rev. E 108, 044214 (2023).
 """
 
@@ -40,10 +43,11 @@ KC = 12.0
 WAVENUMBERS = 120
 # Decades below the largest value that the colours of |X| show, at the three amplitudes.
 WAVELET_DECADES = 2.5
-# Cells whose weight W is below this fraction of the largest one show no entropy.
+# Cells and times whose weight W is below this fraction of the largest W of the run show no entropy.
 LEAST_WEIGHT = 1e-5
-# Fields of the analysis, one a row, by what a pixel of their maps is: the energy of a cell at a time, that of a
-# wavenumber at a time, and that of a bin of wavenumber and frequency in the mean over time.
+# Fields of the analysis, one a row, by what a pixel of their maps is: the kinetic energy of all masses of a cell at a
+# time; that of a wavenumber at a time, both directions of travel together, which add up to that of the lattice; and
+# that of a bin of wavenumber and frequency in the mean over time.
 ROWS = {
     "kinetic_energy": "Energy of a cell",
     "wavenumber_content": "Energy of a wavenumber",
@@ -149,7 +153,7 @@ def entropy_maps(series: AmplitudeSeries) -> Figure:
 
     A dashed line marks the time from which averages of H are taken. The analysis has it, as ``entropy/start``: the
     linear wave's arrival at the first site, by the linear run or by the group velocity. Cells are blank where the
-    weight W is below ``LEAST_WEIGHT`` of the largest: only the wavelets' tails are there.
+    weight W is below ``LEAST_WEIGHT`` of the largest W of the run: only the wavelets' tails are there.
     """
     fields = []
     for member in series.runs:
@@ -164,7 +168,8 @@ def entropy_maps(series: AmplitudeSeries) -> Figure:
         panels.mark_sites(axes, member.run, style.GREY)
         axes.label_outer()
 
-        # The line has the limits of the colours, so that the colour bar is its axis too.
+        # The line has the limits of the colours, so that the colour bar is its axis too. They are percentiles of
+        # H(x, t): where H(t) lies beyond one, the line leaves the panel.
         line_axes = axes.twinx()
         time = member.analysis["entropy/snapshot"].values
         history = member.analysis["entropy/history"].values

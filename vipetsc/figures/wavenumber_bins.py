@@ -5,11 +5,15 @@ highest amplitude in each figure; the *driven wavenumber* is that of the linear 
 
 The *bins* K_1, K_2, ... are equal parts of the wavenumbers from 0 to pi. The velocity v(x) of the masses of one kind,
 one in each cell x, has the Morlet wavelet transform X(kappa, x) of ``vipetsc.figures.scattering``. Of the nodes kappa
-those that lie in a bin b are inverted alone, which gives the bin's part v_b of the velocity. That amounts to a filter
-T_b(eta) over the wavenumbers eta (formulas in ``vipetsc.spectra.wavelet``). Nodes above pi, whose wavelets reach below
-pi, belong to the last bin. All parts together are the velocity, but for its mean and the longest waves. The energies
-of bins are those of all masses of a cell; the picture that explains them shows the velocity of the hosts. "Paper, Fig.
-n" is a figure of Phys. Rev. E 108, 044214 (2023).
+those that lie in a bin b are inverted alone, which gives the bin's part v_b of the velocity. Nodes above pi, whose
+wavelets reach below pi, belong to the last bin. That amounts to a filter over the wavenumbers eta,
+
+    T_b(eta) = (1/C) sum over the nodes kappa of b of (dkappa/kappa) exp[-(kc eta/kappa - kc)^2],
+
+with the constant C by which the sum over all nodes of an endless grid is 1 at every eta > 0
+(``vipetsc.spectra.wavelet``). All parts together are the velocity, but for its mean and the longest waves, which the
+nodes do not reach. The energies of bins are those of all masses of a cell; the picture that explains them shows the
+velocity of the hosts. "Paper, Fig. n" is a figure of Phys. Rev. E 108, 044214 (2023).
 """
 
 from itertools import pairwise
@@ -179,11 +183,12 @@ def reconstruction(series: AmplitudeSeries) -> Figure:
     up to the error of the second row. ``cross_share`` of the analysis is 1 - sum_b KE_b / KE, at each time, the part
     of the products in KE. It is not negative. On the line that goes on at rest beyond the ends of the lattice,
 
-        KE - sum_b KE_b = 1/(2 pi) integral of m/2 [1 - sum_b T_b(eta)^2] |V(eta)|^2 deta,
+        KE - sum_b KE_b = 1/(2 pi) integral of m/2 [1 - sum_b T_b(|eta|)^2] |V(eta)|^2 deta,
 
-    with the spectrum V of the velocity; the filters T_b are not negative and add up to 1 at most (to 1 %), and so do
-    their squares. The analysis sums KE_b over the lattice's own cells alone, which makes them smaller still. In a
-    single cell m v_b v_c has either sign.
+    from -pi to pi, summed over the kinds of masses, with the spectrum V of the velocity of each. The filters T_b are
+    terms of a sum of positive ones that is 1: they add up to 1 at most, and so do their squares. (They add up to 0.99
+    at least where the nodes reach; the second row shows what is missing.) The analysis sums KE_b over the lattice's own
+    cells alone, which makes them smaller still. In a single cell m v_b v_c has either sign.
     """
     figure, grid = series.page(3, 5.0, sharex="col", sharey="row")
     for (energies, errors, crosses), member in zip(grid.T, series.runs, strict=True):

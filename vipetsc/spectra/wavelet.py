@@ -136,8 +136,9 @@ class Bank:
     """Bank of FFT filters to which transform, binning and inverse amount: a mask of bins does not vary along x.
 
     ``transfer`` (bin, k) over the wavenumbers of the padded ``length``:
-    T_b(eta) = (1/C) sum over the nodes of bin b of (dkappa/kappa) |Psi(kc eta/kappa)|^2. The sum over b is 1
-    within 1 % from 1.3 pi/60 to pi, 0.56 at pi/60 and 0 at eta = 0 (kc = 6).
+    T_b(eta) = (1/C) sum over the nodes of bin b of (dkappa/kappa) |Psi(kc eta/kappa)|^2. The sum over b is at most 1:
+    over the nodes of an endless grid it would be 1. It is 0.99 at least from 1.3 pi/60 to pi, 0.56 at pi/60 and 0 at
+    eta = 0 (kc = 6).
     """
 
     transfer: np.ndarray

@@ -6,19 +6,21 @@ motion of frequency Om that is at rest at phase 0 each elongation is a sum of co
 
     z(theta) = sum_k Z_k cos(k theta),    theta = Om t,    k = 0..K,
 
-with real Z_k. Where all forces are odd, the Z_k of odd k are enough: such motions are symmetric, z(theta + pi) =
--z(theta). K is the *order* of the motion.
+with real Z_k. K is the *order* of the motion. Motions without an instant of rest, such as travelling waves, are not
+among them. Where all forces are odd, symmetric motions alone are sought, z(theta + pi) = -z(theta), which have odd k:
+branches of motions that break this symmetry are not found.
 
 **Equations.** The linear part of the system has the compliance G(omega) (pairs, pairs) in m/N: forces f cos(omega t)
-that the pairs exert against their elongation give them the elongations -G f cos(omega t). With the harmonics F_k(Z) of
-the forces in N a motion solves
+that the pairs exert against their elongation give them the elongations -G f cos(omega t). Along z(theta) the pairs
+exert against it the force sum_k F_k(Z) cos(k theta) in N (``vipetsc.modes.balance.harmonics``). A motion solves
 
     Z_k + G_s(k Om) (F_k - s_k Z_k) = 0,    G_s = (1 + s_k G)^-1 G,
 
 which ``vipetsc.modes.balance.harmonic_balance`` derives, with G from masses and stiffnesses. The *shift* s_k in N/m,
 one number for each k, is the stiffness of a spring that is added at each pair to the linear part and taken off the
-pair's force. G_s has other poles than G. The solutions do not depend on s_k, the residuals do: a ``HarmonicFrame``
-keeps one shift through a step of the continuation. It is
+pair's force. Near an eigenfrequency of the linear part G has no bound and F_k vanishes, so that their product cannot
+be computed; G_s stays near 1/s_k there. The solutions do not depend on s_k, the residuals do: a ``HarmonicFrame`` keeps
+one shift through a step of the continuation. It is
 
     s_k = +-(k Om)^2 m    (Om^2 m for k = 0),    1/m = (K Om)^2 |trace G(K Om)|/pairs,
 
@@ -31,18 +33,30 @@ it has:
 
     max_i [4/3 sum_{k=K+1..2K} g_i (K/k)^2 |F_ik|] / max_i [sum_{k<=K} |Z_ik|],    g_i = sum_j |G_ij(K Om)|,
 
-for the pairs i. The harmonic -G F_k that is left out has G at k Om, which falls as k^-2 from its value at K Om. The
-factor 4/3 stands for the harmonics beyond 2K: where |G F_k| falls as k^-3, their sum is a third of that from K to 2K.
-From the truncation at each point the order of the next one is chosen.
+for the pairs i. The harmonic k that is left out has the elongations sum_j G_ij F_jk at k Om, where G falls as k^-2 from
+its value at K Om. Since G is symmetric, g_i |F_ik| is a bound on the sum of the elongations of all pairs that the force
+of the pair i alone causes, and the pair with the largest of these stands for all. The factor 4/3 stands for the
+harmonics beyond 2K: where all fall as k^-3, their sum is a third of that from K to 2K. Those of a contact fall as k^-4
+(``DECAY``), which would give 8/7. From the truncation at each point the order of the next one is chosen.
 
-**Starts.** A branch begins at a linear mode, or at a frequency in a gap between or beyond the lattice's pass bands. The
-start in a gap is found in three stages.
+**Starts.** A branch begins at a linear mode, or at a frequency in a gap between or beyond the lattice's pass bands. A
+motion in a gap, which falls off with the distance from the pairs in contact, is a *breather*. It is found in three
+stages.
 
 1. *Each pair alone.* A describing function gives the motion z_p = b_p + a_p cos(Om t) of each pair p that is to have
-   contact, with a_p from a_p + G_pp(Om) F_p1 = 0 and b_p from b_p + G_pp(0) F_p0 = 0.
-2. *All pairs together.* From there Newton's method solves the equations of the mean and the first harmonic, K = 1.
-3. *All harmonics.* The compliances G(k Om) of the harmonics k > 1 are multiplied by a weight that grows from 0, at
-   which the motion of the second stage is a solution, to 1.
+   contact. With the mean F_p0 and the first harmonic F_p1 of the force along this motion, a_p and b_p solve
+
+       b_p + G_pp(0) F_p0(a_p, b_p) = 0,    a_p + G_pp(Om) F_p1(a_p, b_p) = 0.
+
+   The first equation gives b_p for every a_p, and a_p is a root above the amplitude at which the pair begins to feel
+   its force, of a contact the clearance. Of several roots any one may be found; of a contact that is pressed at rest it
+   is one in the lowest of the brackets that are tried (``vipetsc.modes.balance.describing_function``).
+2. *All pairs together.* From there Newton's method solves the equations of the mean and the first harmonic, K = 1. A
+   solution in which a pair moves with another sign than it is to have is not taken: the third stage then tries from
+   the motions of the first.
+3. *All harmonics.* Z_k + w G(k Om) F_k = 0 for k > 1, with K = ``FEWEST`` and Om fixed, has the motion of the second
+   stage as its solution at w = 0. The weight w grows to 1 in steps in which the motion changes by less than
+   ``FURTHEST``. The signs are not looked at again.
 """
 
 from collections.abc import Iterator
@@ -61,7 +75,8 @@ from vipetsc.modes.newton import DenseNewton
 from vipetsc.modes.point import Point
 from vipetsc.modes.problem import Attempt, ContinuationError, SpecialKind, unit
 
-# Order of the motions with which a branch begins. No motion has fewer harmonics, unless ``nnm.harmonics`` is smaller.
+# Order of the motions with which a branch begins. No point of a branch has a lower one: a case with ``nnm.harmonics``
+# below it is refused.
 FEWEST = 15
 # The number of harmonics changes where the truncation is outside these fractions of the one allowed, and then so that
 # it becomes the fraction AIM: far enough from both ends that the number does not change at every point.
@@ -69,7 +84,8 @@ FEWER = 0.02
 MORE = 0.5
 AIM = 0.2
 # The truncation falls as the inverse cube of the order K at least: the harmonics of a force with a kink fall as k^-2,
-# and so does G, hence Z_k as k^-4, and the sum of those beyond K as K^-3.
+# and so does G, hence Z_k as k^-4, and the sum of those beyond K as K^-3. With a smaller power the order would grow by
+# more than is needed; the truncation itself takes k^-3 for Z_k, so that its estimate is not too small.
 DECAY = 3
 # In one step the order grows by this factor at most (and to the next odd number), since the estimate of a motion with
 # few harmonics may be far off.
@@ -181,7 +197,8 @@ class ConservativeMotions:
         _, _, right_vectors = np.linalg.svd(frame.jacobian(frame.xi))
         null_vector = right_vectors[-1]
         point = frame.measures(_solution(frame.xi), null_vector)
-        # Where the energy does not change along the tangent, either sign is towards growing energy.
+        # Where the energy does not change along the tangent, neither sign is towards growing energy: ``direction`` then
+        # multiplies the null vector as it is.
         sign = np.sign(point.energy_tangent) * direction or direction
         harmonics = self.balance(start.order).resized(point.tangent[:-1])
         return np.append(harmonics, point.tangent[-1]) * sign
@@ -189,8 +206,8 @@ class ConservativeMotions:
     def turn(self, before: Point, after: Point) -> float:
         """0: no angle is guarded beyond that between the tangents in the unknowns of a step's frame.
 
-        ``PeriodicProblem.turn`` is the angle in relative units. These equations have no other units, and the step's own
-        angle is guarded in any case.
+        Other problems give the angle in units that do not depend on the chart. There is one chart here, whose unknowns
+        are relative already, and each step guards the angle in these.
         """
         return 0.0
 
@@ -288,7 +305,7 @@ class ConservativeMotions:
     def _bring_in_harmonics(self, x: np.ndarray, omega: float) -> np.ndarray:
         """The third stage: the solution (n,) with ``FEWEST`` harmonics, from that with a mean and one harmonic, ``x``.
 
-        Raises ContinuationError where Newton's method fails or the motion changes too much however small the step.
+        Raises ContinuationError where Newton's method fails, or the motion changes too much, however small the step.
         """
         size = float(np.abs(x).max())
         weight = 0.0
@@ -310,9 +327,11 @@ class ConservativeMotions:
             # Of the step that was tried: the weight 1 may have cut it.
             step = SHORTER * min(step, 1.0 - weight)
             if step < SMALLEST_WEIGHT:
+                why = f"Newton's method ends ({attempt.reason}); change nnm.start_frequency or raise nnm.max_newton"
+                if attempt.converged:
+                    why = f"the motion changes by more than {FURTHEST:g} of its size; change nnm.start_frequency"
                 raise ContinuationError(
-                    f"no breather at {omega:g} rad/s: with {weight:.3g} of the harmonics above the first, Newton's "
-                    f"method ends ({attempt.reason}); change nnm.start_frequency or raise nnm.max_newton"
+                    f"no breather at {omega:g} rad/s: with {weight:.3g} of the harmonics above the first, {why}"
                 )
         return x
 
