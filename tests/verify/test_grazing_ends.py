@@ -13,54 +13,45 @@ from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.grazing import grazing_contacts
 from vipetsc.modes.system import ContactPair, System
 
+
+def third_mode_of(own: dict[str, Any], **contacts: Any) -> dict[str, Any]:
+    """The table of the third mode of an ``own`` lattice with stiff bilinear ``contacts``."""
+    nnm = {"system": "own", "modes": [3], "points": 130, "locate": False, "own": own}
+    return {"name": "stiff", "contacts": {"law": "bilinear"} | contacts, "nnm": nnm}
+
+
 # Four masses whose third mode closes the second of three contacts first, at the start of the orbit; three masses whose
 # third mode does so at its end.
-AT_START: dict[str, Any] = {
-    "name": "stiff",
-    "contacts": {"law": "bilinear", "stiffness": 5e8},
-    "nnm": {
-        "system": "own",
-        "modes": [3],
-        "points": 130,
-        "locate": False,
-        "own": {
-            "masses": [0.509, 0.8, 1.936, 1.48],
-            "springs": [
-                {"start": 0, "end": 1, "stiffness": 1707.1},
-                {"start": 1, "end": 2, "stiffness": 1207.5},
-                {"start": 2, "end": 3, "stiffness": 370.1},
-                {"start": 3, "end": 4, "stiffness": 1211.6},
-            ],
-            "contacts": [
-                {"host": 0, "resonator": 1, "clearance": 0.001},
-                {"host": 2, "resonator": 3, "clearance": 0.001},
-                {"host": 0, "resonator": 2, "clearance": 0.000734},
-            ],
-        },
+AT_START = third_mode_of(
+    {
+        "masses": [0.509, 0.8, 1.936, 1.48],
+        "springs": [
+            {"start": 0, "end": 1, "stiffness": 1707.1},
+            {"start": 1, "end": 2, "stiffness": 1207.5},
+            {"start": 2, "end": 3, "stiffness": 370.1},
+            {"start": 3, "end": 4, "stiffness": 1211.6},
+        ],
+        "contacts": [
+            {"host": 0, "resonator": 1, "clearance": 0.001},
+            {"host": 2, "resonator": 3, "clearance": 0.001},
+            {"host": 0, "resonator": 2, "clearance": 0.000734},
+        ],
     },
-}
-AT_END: dict[str, Any] = {
-    "name": "stiff",
-    "contacts": {"law": "bilinear", "stiffness": 5e9, "side": "plus"},
-    "nnm": {
-        "system": "own",
-        "modes": [3],
-        "points": 130,
-        "locate": False,
-        "own": {
-            "masses": [1.06, 1.042, 0.59],
-            "springs": [
-                {"start": 0, "end": 1, "stiffness": 771.4},
-                {"start": 1, "end": 2, "stiffness": 690.1},
-                {"start": 2, "end": 3, "stiffness": 406.0},
-            ],
-            "contacts": [
-                {"host": 0, "resonator": 3, "clearance": 5e-5},
-                {"host": 1, "resonator": 2, "clearance": 5e-5},
-            ],
-        },
+    stiffness=5e8,
+)
+AT_END = third_mode_of(
+    {
+        "masses": [1.06, 1.042, 0.59],
+        "springs": [
+            {"start": 0, "end": 1, "stiffness": 771.4},
+            {"start": 1, "end": 2, "stiffness": 690.1},
+            {"start": 2, "end": 3, "stiffness": 406.0},
+        ],
+        "contacts": [{"host": 0, "resonator": 3, "clearance": 5e-5}, {"host": 1, "resonator": 2, "clearance": 5e-5}],
     },
-}
+    stiffness=5e9,
+    side="plus",
+)
 
 
 def ending(table: dict[str, Any], **nnm: Any) -> str:
