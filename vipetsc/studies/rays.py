@@ -1,13 +1,17 @@
-r"""Energy that a site sends out and that dashpots and absorbing ends leave, along the rays of its waves.
+r"""Energy of the waves that a site sends out, and what dashpots and absorbing ends take of it along the waves' rays.
 
-A wave of a band at the wavenumber kappa travels with its group velocity v, is reflected by ends that do not absorb, and
-goes round a ring. Dashpots of the cell take its energy at the rate 2 gamma = -2 Re s, exactly (``damped_bloch``); those
-that a cell n has beyond them, of an absorbing end, at phi* C_n phi in addition, with the mass-normalised vector phi of
-the wave without dashpots: their first order, which is enough for ends that absorb without reflection. With the depth
+A wave of a band with the wavenumber kappa travels at its group velocity v. An end that does not absorb reflects it, and
+it goes round a ring. Two rates in 1/s say how fast its energy fades:
 
-    d(tau) = integral of both rates over the ray's cells until tau after it was sent, exp(-d) of the energy is left,
+- The dashpots of the reference cell take 2 gamma = -2 Re s, with the complex rate s of the damped wave
+  (``damped_bloch``). This is exact.
+- A cell n of an absorbing end has more dashpots than the reference cell. These, C_n in N s/m, take phi* C_n phi, with
+  the mass-normalised vector phi of the wave without dashpots. This is of first order in C_n, which is enough for ends
+  that absorb without reflection.
 
-and what the ends have taken is the integral of their rate times exp(-d). Half of the energy goes to either side.
+The depth d(tau) is the integral of both rates along the ray, from the time at which the energy was sent to tau later.
+Then exp(-d) of the energy is left, and the ends have taken the integral of their rate times exp(-d). Half of the energy
+of a site goes to either side.
 """
 
 from typing import NamedTuple
@@ -18,18 +22,20 @@ from vipetsc.case import Model
 from vipetsc.lattice import bloch
 from vipetsc.lattice.damped import damped_bloch
 
-# Bins of the wavenumber in a band, in each of which waves are one ray. With half as many energies change by 0.003
-# decades, a hundredth of the prediction's own error, with twice as many by 0.001, and in twice the CPU time.
+# Bins of the wavenumber in a band; the waves of a bin share one ray. With half as many bins predicted energies change
+# by 0.003 decades, a hundredth of the prediction's own error. Twice as many change them by 0.001 decades and take twice
+# the CPU time.
 BINS = 48
-# Steps of a ray over the whole run. With half as many energies change by 1e-4 decades and the CPU time by a fifth, with
-# twice as many by less than 1e-4 decades and by a half.
+# Steps of a ray over the whole run. Half as many change energies by 1e-4 decades and save a fifth of the CPU time.
+# Twice as many change them by less than 1e-4 decades and take half as much CPU time again.
 STEPS = 1024
 
 
-class Left(NamedTuple):
-    """Fractions of the energy of waves that are left, and that absorbing ends have taken, at the end of the run.
+class RayFractions(NamedTuple):
+    """Fractions of the energy that was sent: ``remaining`` in waves at the end of the run, ``absorbed`` by its ends.
 
-    Both are over the instants at which the energy was sent, ``remaining`` as the last axis.
+    The last axis of both is the instant at which the energy was sent. What is missing from 1 was taken by the dashpots
+    of the reference cells.
     """
 
     remaining: np.ndarray
@@ -39,7 +45,9 @@ class Left(NamedTuple):
 class Rays:
     """The rays in the lattice of a ``model`` with dashpots; ``time`` (t,) in s are instants at which energy is sent.
 
-    After ``model.end`` nothing is sent.
+    The run ends at ``model.end``; energy sent later counts as sent at the end, so that all of it remains. ``since``
+    (t,) in s is the time from each instant to the end of the run. ``extra`` (cell, dof) in N s/m are the dashpots to
+    ground beyond those of the reference cell.
     """
 
     def __init__(self, model: Model, time: np.ndarray) -> None:
@@ -47,30 +55,32 @@ class Rays:
         chain = model.chain
         self.age = np.linspace(0.0, model.end, STEPS)
         self.since = np.clip(model.end - time, 0.0, model.end)
-        # Dashpots to ground that cells have beyond those of the reference cell.
         grounding = chain.coefficients(0, chain.cells).grounding
         self.extra = grounding - np.array(chain.cell.grounding or np.zeros(chain.cell.dofs))
+        # The middles of the bins.
         self.bins = np.pi * (np.arange(BINS) + 0.5) / BINS
 
-    def of_bands(self, site: int, spectrum: np.ndarray) -> Left:
-        """Fractions (band, time) that are left of the energy that a ``site`` (cell) sends into the bands.
+    def of_bands(self, site: int, spectrum: np.ndarray) -> RayFractions:
+        """Fractions (band, time) of the energy that a ``site`` (cell, from 0) sends into the bands.
 
-        Of that in a band the fraction ``spectrum`` (band, bin) is in each bin of the wavenumber.
+        ``spectrum`` (band, bin) is how the energy of a band is divided between the ``BINS`` of the wavenumber.
         """
         remaining, absorbed = self._fractions(site, self.bins)
-        return Left(np.einsum("bk,bkt->bt", spectrum, remaining), np.einsum("bk,bkt->bt", spectrum, absorbed))
+        return RayFractions(
+            remaining=np.einsum("bk,bkt->bt", spectrum, remaining), absorbed=np.einsum("bk,bkt->bt", spectrum, absorbed)
+        )
 
-    def of_wave(self, site: int, band: int, kappa: float) -> Left:
-        """Fractions (time,) that are left of the energy that a ``site`` (cell) sends into one wave."""
+    def of_wave(self, site: int, band: int, kappa: float) -> RayFractions:
+        """Fractions (time,) of the energy that a ``site`` (cell, from 0) sends into one wave of a ``band`` (from 0)."""
         remaining, absorbed = self._fractions(site, np.array([kappa]))
-        return Left(remaining[band, 0], absorbed[band, 0])
+        return RayFractions(remaining=remaining[band, 0], absorbed=absorbed[band, 0])
 
     def rate(self, band: int, kappa: float) -> float:
-        """Rate in 1/s at which dashpots of the cell take the energy of a wave."""
+        """Rate in 1/s at which dashpots of the reference cell take the energy of a wave of a ``band`` (from 0)."""
         return float(-2 * damped_bloch(self.model.chain.cell, kappa).rate.real[band])
 
-    def _fractions(self, site: int, kappas: np.ndarray) -> Left:
-        """Fractions (band, kappa, time) that are left of the energy that a ``site`` (cell) sends into each wave."""
+    def _fractions(self, site: int, kappas: np.ndarray) -> RayFractions:
+        """Fractions (band, kappa, time) of the energy that a ``site`` (cell, from 0) sends into each wave."""
         chain = self.model.chain
         point = bloch(chain.cell, kappas)
         speed = np.abs(point.group_velocity).T
@@ -91,14 +101,15 @@ class Rays:
             # Of what is lost in a step the ends get their part of the depth.
             part = np.divide(in_step, all_in_step, out=np.zeros_like(in_step), where=all_in_step > 0)
             absorbed += _from_first(np.cumsum(-np.diff(left, axis=-1) * part, axis=-1)) / 2
-        return Left(self._sent_at(remaining), self._sent_at(absorbed))
+        return RayFractions(remaining=self._sent_at(remaining), absorbed=self._sent_at(absorbed))
 
     def _cells(self, position: np.ndarray) -> np.ndarray:
-        """The cell at each ``position`` along a line that goes on: through a ring again, or back from an end."""
+        """The cell at each ``position`` of a ray, in cells along a straight line without end."""
         count = self.model.chain.cells
         cells = np.rint(position).astype(int)
         if self.model.chain.ends == "periodic":
             return cells % count
+        # Between two ends the ray repeats itself after the way there and back.
         there_and_back = cells % (2 * count)
         return np.minimum(there_and_back, 2 * count - 1 - there_and_back)
 
@@ -112,5 +123,5 @@ class Rays:
 
 
 def _from_first(values: np.ndarray) -> np.ndarray:
-    """The ``values`` (..., step) at the ends of steps, with 0 at the begin of the first: (..., age)."""
+    """The ``values`` (..., step) at the ends of steps, after a 0 for the beginning of the first one: (..., age)."""
     return np.concatenate([np.zeros_like(values[..., :1]), values], axis=-1)

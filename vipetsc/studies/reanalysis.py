@@ -29,7 +29,10 @@ from vipetsc.studies.sweep_runs import keeps_all, measures_of
 
 
 class MeasurableRun(NamedTuple):
-    """A run in ``folder``, the ``sweep`` (folder) that it may be a member of, and the ``measures`` to take."""
+    """A run in ``folder``, the folder ``sweep`` of the sweep that it may be a member of, and the ``measures`` to take.
+
+    The measures are named as ``studies.analysis.analyse`` names them.
+    """
 
     folder: Path
     sweep: Path
@@ -37,14 +40,15 @@ class MeasurableRun(NamedTuple):
 
 
 def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str] = ()) -> list[Path]:
-    """Measure the runs in ``paths`` (folders of runs or sweeps, or ``run.h5``); returns the files written.
+    """Measure the runs in ``paths`` again (folders of runs or sweeps, or ``run.h5``); returns the files written.
 
-    ``overrides`` change keys of ``[analysis]``, for single runs only: members without stored fields could not follow.
+    Of a sweep the members whose fields are stored are measured, the others keep their measures, and the ensemble is
+    assembled again. ``overrides`` ("analysis.key=value") change keys of ``[analysis]``. They are for single runs alone:
+    members without stored fields cannot be measured with other options, and all members of a sweep have the same.
 
-    The ranks of ``comm`` measure different runs. Members without stored fields stay as they are; the ensemble of the
-    sweep is assembled again.
-
-    Raises FolderError, and writes nothing, if a path contains neither runs nor a sweep.
+    The ranks of ``comm`` measure different runs; all must call it. Raises FolderError on all ranks for a path that
+    contains neither runs nor a sweep, and for an override that does not apply, before anything is written; also for a
+    sweep that is not finished, whose members were measured by then.
     """
 
     def look() -> tuple[list[MeasurableRun], list[Path]]:
@@ -72,7 +76,7 @@ def _reassemble(folder: Path) -> Path:
     if (results.status == MISSING).any():
         raise FolderError(f"{folder}: the sweep is not finished; continue it with the verb sweep")
 
-    # New records behind the old ones: the latest of a member counts.
+    # New records come behind the old ones: of several records of a member the latest counts.
     file = RecordFile(results.paths.for_rank(0))
     for name in results.ids:
         path = folder / name / "analysis.h5"
@@ -118,11 +122,11 @@ def measure_run(
     overrides: Sequence[str] = (),
     comm: MPI.Comm = MPI.COMM_SELF,
 ) -> Path:
-    """Write ``folder/analysis.h5`` and return its path; raises as ``open_run``.
+    """Measure the run in ``folder`` and write its ``analysis.h5``; returns that file. Raises as ``open_run``.
 
-    The time at which the wave arrives is taken from the ``sweep`` of which the run is a member, by default the folder
-    that its own is in. ``overrides`` are of ``[analysis]``. The ranks of ``comm`` take different measures, and all must
-    call it.
+    ``sweep`` is the folder of the sweep that the run may be a member of, by default the one in which ``folder`` lies:
+    its linear run says when the wave arrives at the first site. ``overrides`` change keys of ``[analysis]``. The ranks
+    of ``comm`` take different ones of the ``measures``, and all must call it.
     """
 
     def begin(stack: ExitStack) -> tuple[xr.Dataset, float | None, AnalysisTable]:
@@ -147,7 +151,7 @@ def measure_run(
 
 
 def _put_into_summary(path: Path, numbers: Mapping[str, float | list[float]]) -> None:
-    """Write the ``numbers`` of a run into its summary, if it has one; what is not finite is null there."""
+    """Write the ``numbers`` of a run into the JSON file ``path``, its summary, if it is there; NaN becomes null."""
     if not path.exists():
         return
     summary = json.loads(path.read_text(encoding="utf-8"))
@@ -160,7 +164,10 @@ def _put_into_summary(path: Path, numbers: Mapping[str, float | list[float]]) ->
 
 
 def numbers_of(analysis: xr.Dataset) -> dict[str, float | list[float]]:
-    """The measures of the registry that an ``analysis`` has, by name; lists over the parts of the frequency axis."""
+    """The numbers in an ``analysis``, by the names that ``spectra.measures`` has for them, without histories and maps.
+
+    A measure of the parts of the frequency axis (bands and gaps) is a list over them.
+    """
     numbers = {}
     for name in map(str, analysis.data_vars):
         is_number = not analysis[name].dims or "parts" in analysis[name].attrs

@@ -24,13 +24,13 @@ from vipetsc.progress import Progress
 from vipetsc.studies.pool import TaskPool
 
 Key = str | float | tuple[str, float] | tuple[str, float, int]
-# Failures of a single run. Too little memory (also as CaseError) or disk is not among them: another attempt
-# with more of it may succeed.
+# Exceptions that say that a run itself has failed, and would fail again. Too little memory (MemoryError, or CaseError
+# from a check before the run) and a full disk (OSError) are not among them: the next attempt may have more.
 FAILURES = (RuntimeError, ArithmeticError)
 
 
 class RecordPaths:
-    """Files of the records called ``name`` in ``folder``: one for each rank, until all are merged into one."""
+    """Files of the records called ``name`` in ``folder``: one for each rank, merged into one when a study has ended."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self.folder = folder
@@ -50,17 +50,21 @@ class RecordPaths:
         return sorted(self.folder.glob(f"{self.name}-*.jsonl"))
 
     def existing(self) -> list[Path]:
-        """Existing files; of two records of one run the later in this order counts."""
-        merged = [self.merged] if self.merged.exists() else []
-        return merged + self.by_rank()
+        """Existing files, the merged one first; of two records of one run the later in this order counts."""
+        files = self.by_rank()
+        # What ranks appended after the last merger is newer than all that is in the merged file.
+        if self.merged.exists():
+            files.insert(0, self.merged)
+        return files
 
 
 class RecordedRuns:
     """Runs simulated by teams of ``ranks`` of ``comm``, and their records called ``name`` in ``folder``.
 
-    ``team`` are the ranks that work on a run together with this one; the first of them appends its record. ``records``
-    are the records by key, on all ranks: those in the files, once they are ``read``, and those added after
-    that. ``failures`` are the exceptions that a single run may end in.
+    ``team`` is the communicator of the ranks that work on a run together with this one; the first of them appends its
+    record. ``records`` are the records by key, the same on all ranks: those that ``read`` found in the files, and those
+    that ``make`` added. ``failures`` are the exceptions that count as a failure of a single run; any other ends the
+    study.
     """
 
     def __init__(
@@ -81,7 +85,7 @@ class RecordedRuns:
         self.records: dict[Key, Record] = {}
 
     def read(self) -> "RecordedRuns":
-        """Take the records that are there as ``records``, on all ranks; returns itself. Collective."""
+        """Read the records in the files into ``records``, on all ranks; returns itself. Collective."""
         # Rank 0 reads for all ranks, which must agree on the runs that are missing.
         self.records = on_root(self.comm, lambda: {key: record for key, (record, _) in self._read().items()})
         return self
@@ -95,11 +99,13 @@ class RecordedRuns:
         progress: bool = False,
         failures: bool = False,
     ) -> None:
-        """Compute the records of those ``keys`` that have none by ``work``, which all ranks of a team call. Collective.
+        """Compute the missing records of ``keys``; ``work`` returns that of a key. Collective.
 
-        The record of a run that fails is its ``reason`` if ``failures`` may be; else RuntimeError is raised on all
-        ranks. Raises OSError on all, and there is no record, if memory or disk is short or if it was no failure
-        of the run itself: it may succeed the next time. Raises StoppedError on all if some rank got a request to stop.
+        All ranks of a team call ``work`` for the same key. A run that fails is recorded with its ``reason`` if
+        ``failures`` are allowed, and otherwise raises RuntimeError on all ranks once the others have ended. Raises
+        OSError on all ranks, without a record, if memory or disk is short or an error is none of the run itself: the
+        next call may succeed. Raises StoppedError on all ranks after a request to stop; what has ended by then is
+        recorded. ``what`` names the runs in messages and in the bar that ``progress`` shows.
         """
         # A key that is given twice is computed once; the order stays, the same on all ranks.
         missing = [key for key in dict.fromkeys(keys) if key not in self.records]
@@ -139,7 +145,7 @@ class RecordedRuns:
         on_root(self.comm, check)
 
     def keep_part(self, key: Key, record: Record) -> None:
-        """Append the ``record`` of a part of the team's run at once; another attempt finds it in ``records``.
+        """Append the ``record`` of a part of the team's run; after an interruption, ``read`` finds it.
 
         All ranks of the team must call it. Raises OSError on all if the disk is full.
         """
@@ -164,9 +170,9 @@ class RecordedRuns:
         return run_in_memory(case, self.team, self.stop)
 
     def finish(self) -> None:
-        """Put the records of all ranks into one file and let go of the team. Collective.
+        """Merge the records of all ranks into one file and free the team's communicator. Collective.
 
-        To be called before the result is written: a study that has one is complete.
+        It is called before the result of a study is written: a study whose result is there has nothing left to do.
         """
 
         def merge() -> None:
@@ -178,14 +184,17 @@ class RecordedRuns:
         self.team.Free()
 
     def _read(self) -> dict[Key, tuple[Record, Line]]:
-        """Records of this version and their lines by key; a damaged line is as if it had never been."""
+        """Records of this version and their lines by key, without damaged lines, whose runs are simulated again."""
         records: dict[Key, tuple[Record, Line]] = {}
         for path in self.paths.existing():
             for record, line in read_records(path, damaged=lambda text: None):
                 if record["vipetsc_version"] != vipetsc.__version__:
                     continue
                 key = record["key"]
-                records[tuple(key) if isinstance(key, list) else key] = record, line  # JSON has no tuples
+                # JSON has no tuples.
+                if isinstance(key, list):
+                    key = tuple(key)
+                records[key] = record, line
         return records
 
 

@@ -1,13 +1,15 @@
 """Response of one site to a wave: contact force and energies, as functions of the wave's instantaneous amplitude.
 
 A burst meets a site in a lattice so long that nothing returns. With w the relative displacement of the contact pair,
-w_0 that of the lattice without contacts and g(omega) the response of w to a pair of opposite forces at the infinite
+w_0 that of the lattice without contacts and g(omega) the response of w to a pair of opposite forces in the infinite
 lattice, the contact's force is f = (w - w_0)/g at every frequency. Near the drive's frequency Om,
-w_0 = Re c exp(i Om t) and f = Re f1 exp(i Om t), near 3 Om f = Re f3 exp(3 i Om t). Once |c| exceeds the clearance D,
-contact goes on until the last one ends, at the z = |c|/D that the run shows (``release``). Meanwhile all of it is taken
-for a function of z, averaged over bins of log z, over the burst's rise and fall and over runs of several amplitudes.
-A factor corrects the loss and the transfer of a whole burst. Both the factor and the release are those of bursts with
-the same largest z.
+w_0 = Re c exp(i Om t) and f = Re f1 exp(i Om t), near 3 Om f = Re f3 exp(3 i Om t).
+
+A site counts as in contact from the instant at which z = |c|/D, D being the clearance, exceeds 1 until the last contact
+of the burst ends. The z at that instant, the ``release``, is read from the run. While a site is in contact, force, loss
+and transfer are taken as functions of z alone: they are averaged over bins of log z, over the burst's rise and its
+fall, and over runs of several amplitudes. A burst whose own sums differ from these averages has a correction factor for
+its loss and for each band. Factor and release are looked up by the largest z of a burst.
 """
 
 from dataclasses import dataclass
@@ -19,15 +21,15 @@ from vipetsc.io.records import Record
 from vipetsc.lattice import Band, Chain, OpenCompliance, UnitCell, WaveCompliance, bloch, pass_bands, waves_at
 from vipetsc.lattice.chain import Pair
 
-# The z of the first of the bins, below which no contact goes on. Half and twice of it change predicted energies by 0.02
-# decades, a fifth of the prediction's error.
+# The z of the first bin; smaller ones count to it. Half and twice of it change predicted energies by 0.02 decades, a
+# fifth of the prediction's error.
 LOWEST = 0.15
 # Bins of log z. With half as many energies change by 0.02 decades, with twice as many by 0.03, where the
 # prediction's error is 0.1.
 BINS = 40
 DECAY = 4.0  # windows fall by e^-4 over the transformed time, so that no response is folded back
 TINY = 1e-300  # in place of zero in a divisor
-# The quantities that are summed over the samples of a run, in the order of the rows of ``Burst.sums``.
+# Rows of ``Burst.sums``; from ``INTO`` on there is one a band.
 SQUARE, FUNDAMENTAL_REAL, FUNDAMENTAL_IMAGINARY, THIRD_REAL, THIRD_IMAGINARY, GIVEN, DISSIPATED = range(7)
 INTO = slice(7, None)
 # Half-widths of the lines at Om and 3 Om, over Om: frequencies outside the signal's own line are cut off.
@@ -38,18 +40,23 @@ TOP = 1.02
 
 
 def self_response(cell: UnitCell, omega: np.ndarray, pair: Pair) -> np.ndarray:
-    """g (omega) in m/N of a ``pair`` in an infinite lattice at frequencies ``omega`` in rad/s, below the real axis."""
+    """Compliance g (omega,) in m/N of a ``pair`` in an infinite lattice of ``cell``.
+
+    It is the relative displacement of the pair by opposite unit forces on its masses. ``omega`` (omega,) in rad/s lie
+    below the real axis, where the waves that decay away from the pair are those that leave it.
+    """
     if cell.is_damped:
-        # Two cells, for a contact that joins them, which go on in both directions.
+        # A segment of two cells, since a contact may join neighbours, with the lattice going on at both ends.
         chain = Chain(cell, 2, sites=(0,), pairs=(pair,))
         return OpenCompliance(chain, open_ends=("left", "right")).at(omega)[:, 0, 0]
     return WaveCompliance(Chain(cell, 1, sites=(0,), pairs=(pair,)), infinite=True).at(omega)[:, 0, 0]
 
 
 class TravellingWave(NamedTuple):
-    """The fastest wave at a frequency: its ``band`` from 0, |v_g| ``speed`` in cells/s, power over |w|^2 in W/m^2.
+    """The fastest wave at a frequency: its ``band`` from 0, ``wavenumber`` in rad per cell, ``speed`` |v_g| in cells/s.
 
-    w is the relative displacement of a pair of masses; ``wavenumber`` is in rad per cell.
+    ``power_per_area`` in W/m^2 is the power that it carries over |w|^2, w being the complex amplitude of the relative
+    displacement of a pair of masses in it.
     """
 
     band: int
@@ -64,6 +71,7 @@ def fastest_wave(cell: UnitCell, omega: float, pair: Pair) -> TravellingWave | N
     if not waves:
         return None
 
+    # The vectors have M-norm 1: a mode of amplitude q has the energy omega^2 |q|^2/2, and w = relative * q.
     number, kappa, speed = max(waves, key=lambda wave: wave[2])
     vector = bloch(cell, kappa).vectors[:, number - 1]
     w = vector[pair.resonator]
@@ -97,10 +105,11 @@ def unit_phase(c: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SiteRun:
-    """A run with one site in contact, at the samples of its burst.
+    """A run with one site, at the samples of its ``Burst``.
 
-    ``amplitude`` of the drive in N, ``clearance`` in m, w (time) in m as ``displacement``, ``dissipated`` (time) in J
-    since the begin, ``last_contact``: the time in s at which the last contact ends, NaN without any.
+    ``amplitude`` of the drive in N; ``clearance`` in m; ``displacement`` (time) is w in m; ``dissipated`` (time) is the
+    energy in J that the contact has dissipated since the beginning; ``last_contact`` is the time in s at which the last
+    contact ends, NaN if there is none.
     """
 
     amplitude: float
@@ -111,10 +120,11 @@ class SiteRun:
 
 
 class Burst:
-    """The linear wave at a site: ``time`` in s (uniform), relative displacement ``w`` in m and what follows from it.
+    """The linear wave at a site under 1 N, and the transforms by which runs with a contact are compared with it.
 
-    The response ``g`` in m/N and the ``linear`` spectrum are over the frequencies ``omega`` in rad/s; ``c`` (time) is
-    the envelope at the frequency ``drive``.
+    ``time`` (time,) in s is uniform, ``w`` (time,) in m the relative displacement of the ``pair``, ``drive`` the
+    frequency in rad/s of the burst. Over the frequencies ``omega`` (omega,) in rad/s, shifted by -i ``decay``, are the
+    compliance ``g`` in m/N and the spectrum ``linear`` of w; ``c`` (time,) in m is the envelope of w about ``drive``.
     """
 
     def __init__(self, cell: UnitCell, drive: float, time: np.ndarray, w: np.ndarray, pair: Pair) -> None:
@@ -136,20 +146,23 @@ class Burst:
         return np.asarray(np.fft.rfft(w * np.exp(-self.decay * self.time), self.padded))
 
     def envelope(self, spectrum: np.ndarray, middle: float, half: float) -> np.ndarray:
-        """a(t) (time,) of the part Re a exp(i middle t) of a signal within ``half`` of ``middle``, both in rad/s.
+        """Envelope a (time,) of a signal's part Re a exp(i middle t), from its ``spectrum`` (omega,).
 
-        ``spectrum`` (omega,) is the signal's.
+        The part has the frequencies that are less than ``half`` from ``middle``, both in rad/s.
         """
+        # A real signal has half of Re a exp(i middle t) at positive frequencies, hence twice the spectrum.
         part = np.zeros(self.padded, complex)
         part[: len(self.omega)] = np.where(np.abs(self.omega - middle) < half, 2 * spectrum, 0)
         return np.asarray(np.fft.ifft(part)[: len(self.time)] * np.exp((self.decay - 1j * middle) * self.time))
 
     def sums(self, run: SiteRun, largest: float) -> Record:
-        """``sums`` (quantity, bin) over a ``run``'s samples in contact, ``totals``, and the z of the ``release``.
+        """Sums over the samples of a ``run`` in contact, as its record holds them.
 
-        The bins of log z go from ``LOWEST`` to ``largest``. Quantities: |c|^2 (``SQUARE``), Re and Im of f1 c*, Re and
-        Im of f3 (c*/|c|)^3 |c|, power that the driven wave gives (``GIVEN``), power dissipated, power into each band
-        (``INTO``). The totals are those of the last two over all samples.
+        ``sums`` (quantity, bin) are over bins of log z, the first of ``LOWEST``, the last of ``largest``. The
+        quantities are |c|^2 in m^2 (``SQUARE``), Re and Im of f1 c*, Re and Im of f3 (c*/|c|)^3 |c| in N m, the power
+        in W that the driven wave gives (``GIVEN``), the power dissipated (``DISSIPATED``), and the power into each band
+        (``INTO``). ``totals`` are the sums of the last two over all samples, in contact or not. ``release`` is the z at
+        which the last contact ends, at most 1; 1 without any contact.
         """
         c = run.amplitude * self.c
         incident = run.amplitude * self.linear
@@ -162,6 +175,7 @@ class Burst:
         touched = np.isfinite(run.last_contact)
         release = 1.0
         if touched:
+            # At most 1, where contact begins: a higher release would end it in the same instant.
             release = min(float(np.interp(run.last_contact, self.time, z)), 1.0)
         on = in_contact(z[None], np.array([release]))[0] & touched
 
@@ -176,7 +190,7 @@ class Burst:
         }
 
     def _force_rows(self, c: np.ndarray, force: np.ndarray, incident: np.ndarray) -> list[np.ndarray]:
-        """The quantities from ``SQUARE`` to ``GIVEN`` over time."""
+        """The quantities of ``sums`` from ``SQUARE`` to ``GIVEN``, each over time."""
         drive = self.drive
         f1 = self.envelope(force, drive, FIRST_LINE * drive)
         f3 = self.envelope(force, 3 * drive, THIRD_LINE * drive)
@@ -209,7 +223,10 @@ class Burst:
 
 
 class ContactState(NamedTuple):
-    """State of a site in contact, over the shape of z; ``into`` has the bands as first axis. See ``SiteResponse``."""
+    """What a site in contact does at the amplitudes z (...): the quantities of ``SiteResponse``, interpolated.
+
+    ``fundamental``, ``third`` and ``lost`` are (...), ``into`` is (band, ...).
+    """
 
     fundamental: np.ndarray
     third: np.ndarray
@@ -218,9 +235,11 @@ class ContactState(NamedTuple):
 
 
 class BurstState(NamedTuple):
-    """Values for a whole burst, over its largest z: factors of loss and of bands (band, ...), and release.
+    """Values for whole bursts of given largest z (...): the correction factors, the release and the spectra.
 
-    ``spectrum`` (..., band, bin) are the fractions of the energy in a band that each bin of the wavenumber gets.
+    ``lost`` (...) and ``into`` (band, ...) are the factors of the loss and of the power into each band, ``release``
+    (...) the z at which contact ends, ``spectrum`` (..., band, bin) the fractions of the energy in a band that each bin
+    of the wavenumber gets.
     """
 
     lost: np.ndarray
@@ -230,13 +249,16 @@ class BurstState(NamedTuple):
 
 
 class SiteResponse(NamedTuple):
-    """Response of a site in contact at z = exp(``x``): all arrays over ``x``.
+    """Response of a site in contact as a function of z = exp(x), at the bins ``x`` (x,) of ``Burst.sums``.
 
-    ``fundamental`` is f1/c and ``third`` f3 (c*/|c|)^3/|c| in N/m (complex). ``lost`` and ``into`` (band, x) are powers
-    over that of a travelling wave of the same |c|: what is dissipated, and what goes to every band but its own, scaled
-    to sum to what the driven wave loses. Of bursts whose largest z is exp(``peaks``): ``factor`` (loss and bands, run),
-    by which the sum over a burst is that of the run, ``release`` (run), z at which contact ends, and ``spectrum``
-    (band, bin, run): see ``BurstState``; of lattices without dashpots it has no bin.
+    ``fundamental`` (x,) is f1/c and ``third`` (x,) is f3 (c*/|c|)^3/|c|, both complex, in N/m. ``lost`` (x,) and
+    ``into`` (band, x) are powers over the power of a travelling wave of the same |c|: what the contact dissipates, and
+    what it sends into every band. The driven band has 0 there, and the others are scaled such that with ``lost`` they
+    add up to what the driven wave gives.
+
+    The rest is over the runs, whose bursts have the largest z exp(``peaks``) (run,), see ``BurstState``: ``factor``
+    (1 + band, run), of the loss and of each band, is a run's own energy over that by the averages; ``release`` (run,);
+    ``spectrum`` (band, bin, run), without bins if the lattice has no dashpots.
     """
 
     x: np.ndarray
@@ -251,8 +273,12 @@ class SiteResponse(NamedTuple):
 
     @classmethod
     def of(cls, records: list[Record], cell: UnitCell, drive: float, largest: float, pair: Pair) -> Self:
-        """The response of a ``pair`` from the sums of all runs, in any order; zero if there was no contact."""
-        # Rising peaks, which interpolation needs; and the same sums whatever the order in which runs ended.
+        """The response of a ``pair`` from the ``records`` of all runs, in any order; zero if none had a contact.
+
+        ``drive`` is the frequency in rad/s, ``largest`` the z of the last bin, as ``Burst.sums`` was given them.
+        """
+        # By z, since interpolation needs rising peaks. It also fixes the order of the sum over runs, whose rounding
+        # would otherwise depend on which run ended first.
         records = sorted(records, key=lambda record: record["z"])
         x = np.linspace(np.log(LOWEST), np.log(largest), BINS)
         sums = np.array([record["sums"] for record in records])
@@ -276,15 +302,16 @@ class SiteResponse(NamedTuple):
                 spectrum=spectrum,
             )
 
-        # Bins that no sample fell into lie between others that have some.
+        # Means over samples, weighted by |c|^2. A bin without samples takes the line between its neighbours that have
+        # some, or the nearest value where it has them on one side alone.
         mean = np.array([np.interp(x, x[seen], row[seen] / total[SQUARE][seen]) for row in total])
         given = mean[GIVEN] / wave.power_per_area
         lost = np.maximum(mean[DISSIPATED], 0)
         into = mean[INTO].copy()
         into[wave.band] = 0
         into = np.maximum(into, 0)
-        # Powers by band overlap in time and need not sum to what is given: their ratios are kept, and their sum is
-        # set.
+        # The filter of a band spreads its power over the inverse of the band's width in time: in a bin the powers need
+        # not sum to what is given. Their ratios are kept, and their sum is set.
         scale = np.maximum(given, 0) / np.maximum(into.sum(axis=0) + lost, TINY)
         table = np.array([lost * scale, *(into * scale)])
 
@@ -306,7 +333,7 @@ class SiteResponse(NamedTuple):
         )
 
     def at(self, z: np.ndarray) -> ContactState:
-        """State of a site in contact at the amplitudes ``z`` (...), over the clearance."""
+        """The response at the amplitudes ``z`` (...), in clearances; beyond the bins that of the first or last one."""
         x = np.log(np.maximum(z, LOWEST))
         return ContactState(
             fundamental=self._interpolated(x, self.fundamental),
@@ -316,12 +343,12 @@ class SiteResponse(NamedTuple):
         )
 
     def _interpolated(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Complex ``values`` at ``x``."""
+        """Complex ``values`` (bin,) of the response, interpolated at ``x`` (...)."""
         return np.asarray(np.interp(x, self.x, values.real) + 1j * np.interp(x, self.x, values.imag))
 
     def over_bursts(self, largest: np.ndarray) -> BurstState:
-        """Factors and release of bursts with these ``largest`` z (site)."""
-        x = np.log(np.maximum(largest, 1e-9))
+        """Factors, release and spectra of bursts with these ``largest`` z (...), at most those of the last run."""
+        x = np.log(np.maximum(largest, TINY))
         factors = np.array([np.interp(x, self.peaks, row) for row in self.factor])
         spectrum = np.zeros((*np.shape(x), *self.spectrum.shape[:-1]))
         for band, of_bin in np.ndindex(self.spectrum.shape[:-1]):
@@ -332,7 +359,7 @@ class SiteResponse(NamedTuple):
 
 
 class SiteResponses(NamedTuple):
-    """The response of every site: ``of_kind`` are those of the kinds of sites, ``kind`` (site,) the number of each."""
+    """The responses of all sites: ``of_kind`` holds that of each kind, ``kind`` (site,) the number of a site's kind."""
 
     of_kind: tuple[SiteResponse, ...]
     kind: np.ndarray
@@ -342,7 +369,7 @@ class SiteResponses(NamedTuple):
         return self.of_kind[self.kind[site]]
 
     def at(self, z: np.ndarray) -> ContactState:
-        """State of the sites in contact at ``z`` (site, time)."""
+        """What sites in contact do at the amplitudes ``z`` (site, time), in clearances."""
         if len(self.of_kind) == 1:
             return self.of_kind[0].at(z)
         states = [self.of_site(site).at(row) for site, row in enumerate(z)]
@@ -354,7 +381,7 @@ class SiteResponses(NamedTuple):
         )
 
     def over_bursts(self, largest: np.ndarray) -> BurstState:
-        """Factors and release of bursts with these ``largest`` z (site)."""
+        """Factors, release and spectra of bursts with these ``largest`` z (site,)."""
         if len(self.of_kind) == 1:
             return self.of_kind[0].over_bursts(largest)
         states = [self.of_site(site).over_bursts(np.asarray(z)) for site, z in enumerate(largest)]
@@ -367,7 +394,7 @@ class SiteResponses(NamedTuple):
 
 
 def _fractions(energies: list[list[float]]) -> np.ndarray:
-    """The ``energies`` (band, bin) over their sums, of bands that have any."""
+    """The ``energies`` (band, bin) over their sums in each band; 0 in a band without energy."""
     values = np.array(energies)
     sums = values.sum(axis=1, keepdims=True)
     return np.divide(values, sums, out=np.zeros_like(values), where=sums > 0)

@@ -17,24 +17,27 @@ from vipetsc.modes.branches.responses import ISOLA
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.spectra.responses import CurvePart, largest_response, widest_gap
 
-ROUNDING = 1e-9  # relative, of the parameter at the end of a range, where a curve is corrected to its tolerance
+# Relative. The last point of a complete curve lies on the upper end of its range, but for the tolerance of Newton's
+# method.
+ROUNDING = 1e-9
 
 
 def measured_responses(
     case: NfrcCase, tables: Sequence[MeasuredTable], comm: MPI.Comm, stop: StopRequest
 ) -> dict[str, Any]:
-    """The record of the curves of ``case``, each of which one rank of ``comm`` follows. Collective.
+    """Follow the curves of ``case`` on the ranks of ``comm``, each on one, and measure them; returns a record.
 
-    ``values`` are lists over the curves of what the ``tables`` ask for, by their names; ``curves`` are the curves with
-    their isolated parts: ``name``, ``parameter``, ``unstable`` and ``values`` by point. Raises on all ranks
-    StoppedError if a curve was stopped, RuntimeError if one ended early.
+    ``values`` holds what each of the ``tables`` asks for, by its name, as a list over the curves. ``curves`` is a list
+    of the curves and their isolated parts, each with its ``name`` and with lists over its points: ``parameter``,
+    ``unstable`` (number of perturbations that grow) and ``values`` by the tables' names. Collective. Raises on all
+    ranks StoppedError if a curve was stopped, RuntimeError if one does not reach the end of its range.
     """
     branches = follow_all(case, None, comm, stop=stop)
     return on_root(comm, lambda: _record(case, branches, tables))
 
 
 def _record(case: NfrcCase, branches: Sequence[Branch[Any]], tables: Sequence[MeasuredTable]) -> dict[str, Any]:
-    """The record of the ``branches`` of a case."""
+    """The record of ``measured_responses`` from the ``branches`` of a case; raises as it does."""
     for branch in branches:
         if branch.ending.startswith("stopped"):
             raise StoppedError(branch.ending)
@@ -45,23 +48,26 @@ def _record(case: NfrcCase, branches: Sequence[Branch[Any]], tables: Sequence[Me
     measures = response_measures(case)
     values: dict[str, list[float]] = {}
     for table in tables:
-        of = measures[str(table.measure)]
+        response = measures[str(table.measure)]
         low, high = table.part or case.nfrc.range
-        of_curves: list[float] = []
+        over_curves: list[float] = []
         for curve in case.every_curve():
             # Isolated states are as possible as those of the curve near which they lie.
-            parts = [_part(b, of) for b in branches if b.name.partition(ISOLA)[0] == curve.name]
+            parts = [_part(b, response) for b in branches if b.name.partition(ISOLA)[0] == curve.name]
             if table.below:
-                of_curves.append(widest_gap(parts, table.below, low, high))
+                over_curves.append(widest_gap(parts, table.below, low, high))
             else:
-                of_curves.append(largest_response(parts, low, high))
-        values[table.name] = of_curves
+                over_curves.append(largest_response(parts, low, high))
+        values[table.name] = over_curves
 
     curves: list[dict[str, Any]] = []
     for branch in branches:
-        of_points = {table.name: _values(branch, measures[str(table.measure)]).tolist() for table in tables}
-        about = {"name": branch.name, "unstable": measure(branch, "unstable").tolist(), "values": of_points}
-        curves.append(about | {"parameter": parameter_values(branch).tolist()})
+        curves.append({
+            "name": branch.name,
+            "unstable": measure(branch, "unstable").tolist(),
+            "values": {table.name: _values(branch, measures[str(table.measure)]).tolist() for table in tables},
+            "parameter": parameter_values(branch).tolist(),
+        })  # fmt: skip
     return {"values": values, "curves": curves}
 
 
@@ -69,6 +75,7 @@ def _why_incomplete(case: NfrcCase, branch: Branch[Any]) -> str:
     """Why a curve has no states in a part of its range; empty if it has."""
     if not branch.complete:
         return branch.ending
+    # An isolated part covers what it covers.
     if ISOLA in branch.name:
         return ""
     high = case.nfrc.range[1]
@@ -78,19 +85,21 @@ def _why_incomplete(case: NfrcCase, branch: Branch[Any]) -> str:
     return ""
 
 
-def _values(branch: Branch[Any], of: ResponseMeasure) -> np.ndarray:
-    """The measured values (point,) of the states of a curve."""
-    values = measure(branch, of.quantity).reshape(len(branch.points), -1)
-    return np.asarray(values.max(axis=1) if of.member is None else values[:, of.member])
+def _values(branch: Branch[Any], response: ResponseMeasure) -> np.ndarray:
+    """The values (point,) of a ``response`` in the states of a curve: of its member, or the largest of all members."""
+    values = measure(branch, response.quantity).reshape(len(branch.points), -1)
+    if response.member is None:
+        return np.asarray(values.max(axis=1))
+    return np.asarray(values[:, response.member])
 
 
-def _part(branch: Branch[Any], of: ResponseMeasure) -> CurvePart:
-    """The measured values along a curve, over the parameter."""
-    # Over the length along the curve, which the parameter need not follow: it turns back at folds.
+def _part(branch: Branch[Any], response: ResponseMeasure) -> CurvePart:
+    """The values of a ``response`` along a curve, by which they are interpolated."""
+    # With the length along the curve, which rises, while the parameter turns back at folds.
     steps = np.linalg.norm(np.diff(branch.column("xi"), axis=0), axis=1)
     return CurvePart(
         parameter=parameter_values(branch),
-        values=_values(branch, of),
+        values=_values(branch, response),
         length=np.append(0.0, np.cumsum(steps)),
         is_regular=branch.is_kind("regular"),
     )

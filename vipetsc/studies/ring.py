@@ -1,14 +1,19 @@
-"""The ring, which acts as an infinite lattice with one site during a run: the geometry of the law and the prediction.
+"""Runs on a ring that acts as an infinite lattice with one site: the geometry of the law and of the prediction.
 
-The lattice is a ring of N cells, driven at one, with the site d cells on. The burst lasts T_b; v is the speed of its
-slow waves (all but 1e-3 of the energy in its band is faster), V the largest group velocity of any band. A run ends at
-t_e = d/v + s T_b (s = ``law.settle``): at d/v + T_b the slow waves' end has passed, what is left of the time is for
-contacts to die away. No wave returns along the ring: what the drive sends in the other direction reaches the site from
-behind after (N - d)/V, what leaves the site is back N/V after the wave's arrival there, so N >= d + V t_e makes the
-ring infinite. The drive works as without a site if the burst is over before a wave is back from it (d >= V T_b/2). The
-drive is in the midst of the lattice, not at a wall: where the case moves one, a force on the mass next to it sends the
-wave, which has the same form at a site as that of the wall if it is narrow in frequency. How far the wall moves for it
-follows from a run in which it does. ``LawCase.one_site`` chooses N, d and t_e.
+The lattice is a ring of N cells, driven at one, with the site d cells on. The burst lasts T_b. The speed v is that of
+its slow waves, than which all but 1e-3 of the energy in its band is faster; V is the largest group velocity of all
+bands. ``LawCase.one_site`` chooses N, d and the end t_e of a run by three conditions:
+
+- t_e = d/v + s T_b with s = ``law.settle``: at d/v + T_b the last slow waves have passed the site, and contacts die
+  away in the time that is left.
+- N >= d + V t_e: no wave comes round the ring. What the drive sends in the other direction would reach the site from
+  behind after (N - d)/V; what leaves the site would be back N/V after the wave has arrived there.
+- d >= V T_b/2: the burst is over before a wave is back at the drive from the site, so that the drive does the work that
+  it does without a site.
+
+A ring has no wall. Where the case moves one, a force on the mass next to it sends the wave instead; at a site this has
+the form of the wall's wave if the burst is narrow in frequency. By how much the wall has to move for it follows from a
+run of a lattice with that wall (``Ring.wall_peak``).
 """
 
 from collections.abc import Mapping
@@ -26,7 +31,7 @@ from vipetsc.studies.recorded_runs import RecordedRuns
 class Ring:
     """Runs of ``case`` on the ring, simulated by the teams of ``recorded``; ``setting`` holds its sizes and times.
 
-    The site is of the ``kind`` of that number, by default that of ``law.site``.
+    The argument ``kind`` is the number of the kind of site (``case.kinds``), by default that of the site ``law.site``.
     """
 
     def __init__(self, case: LawCase, recorded: RecordedRuns, kind: int | None = None) -> None:
@@ -36,14 +41,17 @@ class Ring:
         self.recorded = recorded
 
     def amplitude(self, z: float, peak: float) -> float:
-        """Amplitude in N at which the linear wave reaches ``z`` clearances at the site; ``peak`` is that of 1 N in m.
+        """Amplitude in N at which the linear wave reaches ``z`` clearances at the site.
 
-        Of sides that differ the peak is that of the side whose stop the wave reaches first, as ``peak_of`` has it.
+        ``peak`` in m is what the wave of 1 N reaches there, as ``peak_of`` measures it.
         """
         return z * self.setting.clearance / peak
 
     def peak_of(self, motion: PairMotion) -> float:
-        """Largest w in m of a ``motion``, each side's over that side's clearance in lesser clearances."""
+        """Largest w in m of a ``motion``; on a side whose clearance is r times the lesser one, w counts as w/r.
+
+        The motion touches a stop if this exceeds the lesser clearance.
+        """
         return motion.reached([self.kind.sides])[0]
 
     def motion(self, run: xr.Dataset) -> PairMotion:
@@ -52,13 +60,13 @@ class Ring:
         return PairMotion.between(run, [int(column)], [self.kind.pair])
 
     def run_to_end(self, amplitude: float, *, with_site: bool) -> xr.Dataset:
-        """A run under ``amplitude`` in N of which all cells are kept at the first and the last sample."""
+        """Run under ``amplitude`` in N; the dataset has all cells at the first and the last sample."""
         return self._run(amplitude, with_site, {"stride": self.setting.samples})
 
     def run_at_site(self, amplitude: float, *, with_site: bool, neighbours: int = 0) -> xr.Dataset:
-        """A run under ``amplitude`` in N of which all samples of the site's cells are kept.
+        """Run under ``amplitude`` in N; the dataset has all samples of the site's cells.
 
-        So are those of as many ``neighbours`` of it on either side.
+        These are the site's cell, the next one if the contact joins both, and ``neighbours`` cells on either side.
         """
         cell = self.setting.site + 1
         first = max(cell - neighbours, 1)
@@ -68,7 +76,7 @@ class Ring:
     def wall_peak(self) -> float:
         """Largest w in m of the linear wave at the site's distance from the case's wall, which moves by 1 m."""
         setting = self.setting
-        # A ring has no wall: the waves come from the one of the case's lattice, here as long as the ring.
+        # The lattice has the case's ends, and the length of the ring, within which no wave returns before the end.
         cell = setting.distance + 1
         if self.case.drive.end == "right":
             cell = setting.cells - setting.distance
@@ -91,6 +99,7 @@ class Ring:
         return contacts_of_one(self.case.contacts, sites[0], self.kind, cell, self.setting.clearance)
 
     def _run(self, amplitude: float, with_site: bool, output: Mapping[str, object]) -> xr.Dataset:
+        """Run the ring under ``amplitude`` in N, and return what the section ``output`` keeps of it."""
         setting = self.setting
         contacts = self._contacts() if with_site else NO_SITES
         case = self.case.varied(

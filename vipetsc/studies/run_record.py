@@ -12,11 +12,13 @@ from vipetsc.spectra.measures import PERIODS, QUANTITIES, TOLERANCE, RunRecord
 
 
 def record_of(run: xr.Dataset, case: Case, options: AnalysisTable) -> RunRecord:
-    """The record of a ``run`` of ``case``, open or in memory, measured with ``options``."""
+    """The record of a ``run`` of ``case``, open or in memory; ``options`` say how its steady state is found."""
     output = case.output
     cell = case.lattice.unit_cell()
-    # Masses without springs have no bands.
-    parts = Parts.of(pass_bands(cell)) if cell.springs else Parts(np.array([0.0, np.inf]), ("above",), ((),))
+    # Masses that no spring joins have no bands: the whole frequency axis is one part.
+    parts = Parts(np.array([0.0, np.inf]), ("above",), ((),))
+    if cell.springs:
+        parts = Parts.of(pass_bands(cell))
 
     points: dict[str, History] = {}
     if "points/velocity" in run:
@@ -28,6 +30,7 @@ def record_of(run: xr.Dataset, case: Case, options: AnalysisTable) -> RunRecord:
     return RunRecord(
         run=run,
         points=points,
+        # Without the points' motion nothing is transmitted between them.
         pairs=(output.transmission or []) if points else [],
         edges=np.asarray(parts.edges),
         parts=parts.names,
@@ -38,7 +41,7 @@ def record_of(run: xr.Dataset, case: Case, options: AnalysisTable) -> RunRecord:
 
 
 def steady_drive(case: Case) -> SteadyDrive | None:
-    """The steady part of the first drive of ``case``: between its ramps; None for one that is no harmonic drive."""
+    """The harmonic part of the first drive of ``case``, between its ramps; None without a harmonic drive."""
     drive = case.drive
     if drive.kind != "harmonic" or not drive.amplitude or not drive.frequency:
         return None

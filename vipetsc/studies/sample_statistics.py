@@ -1,4 +1,4 @@
-"""Statistics over the samples of a sweep: the members along the axis of ``disorder.seed`` alone."""
+"""Statistics over the samples of a sweep, which are its members along the axis of ``disorder.seed``."""
 
 import warnings
 from collections.abc import Iterable
@@ -12,10 +12,12 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 def over_samples(data: Variables, seed: str, names: Iterable[str]) -> Variables:
-    """``statistics/<name>/mean``, ``deviation`` and ``quantiles`` of the ``names`` over the dimension ``seed``.
+    """Mean, standard deviation and ``QUANTILES`` of the variables ``names`` in ``data`` over the dimension ``seed``.
 
-    They refer to the successful samples, whose number is ``statistics/samples``. The variance is divided by n - 1.
+    They are called ``statistics/<name>/mean``, ``deviation`` and ``quantiles``, and are of the samples that did not
+    fail, whose number is ``statistics/samples``. The variance of n samples is divided by n - 1.
     """
+    # A failed member has NaN in every measure; the number of contact episodes is one that all others have.
     episodes = data["contact_episodes"]
     valid = np.isfinite(episodes.values).sum(axis=episodes.dims.index(seed))
     other_dims = [str(dim) for dim in episodes.dims if dim != seed]
@@ -33,7 +35,8 @@ def _statistics(prefix: str, item: xr.Variable) -> Variables:
     dims = tuple(map(str, item.dims[1:]))
     units = item.attrs["units"]
     text = item.attrs["long_name"]
-    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # NaN where no sample came out
+    # NumPy warns where all samples have failed, or one is left, of which there is no deviation: NaN says so.
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         mean = np.nanmean(item.values, axis=0)
         deviation = np.nanstd(item.values, axis=0, ddof=1)
         quantiles = np.nanquantile(item.values, QUANTILES, axis=0)

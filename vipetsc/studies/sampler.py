@@ -1,7 +1,7 @@
 """Samplers of designs: CMA-ES for one objective, NSGA-II for two; the same designs from the same seed.
 
-Either is asked for points (design, variable) of the unit cube and then given the losses (design, objective), which are
-to become small, of all of them in that order. Neither draws from numpy's global state.
+A sampler is asked for a generation of points (design, variable) in the unit cube, and is then told their losses
+(design, objective) in the same order, which it makes small. Neither draws from numpy's global state.
 """
 
 from typing import Any
@@ -9,16 +9,21 @@ from typing import Any
 import numpy as np
 
 RESOLVED = 1e-4  # of the range between the bounds: impacts turn a finer change into noise
-LARGEST = 8  # times the first population: three restarts, each of which looks at a larger part of the range
-WHOLE = 0.3  # least standard deviation of a whole number: a tenth of the designs then have a neighbouring one
+LARGEST = 8  # times the first population: reached after three restarts, each of which looks at a larger part
+# Least standard deviation of a whole number, in steps of it: a normal deviate exceeds half a step in one design of ten,
+# which then has a neighbouring number.
+WHOLE = 0.3
 
 
 class CmaEs:
     """Covariance matrix adaptation (Hansen 2016, arXiv:1604.00772), by ``cma``.
 
-    A search that has contracted begins again at the best point, with twice the population, up to ``LARGEST`` times the
-    first. ``steps`` (variable) are those of whole numbers in the unit cube, 0 for others. It begins with the deviation
-    ``step`` along each of the ``directions`` (variable, direction); points beyond the cube are mirrored into it.
+    The search begins at the point ``start`` (variable,) of the unit cube, with the standard deviation ``step`` along
+    each of the ``directions`` (variable, direction); points beyond the cube are mirrored into it. When it has
+    contracted it begins again at the best point, with twice the population, up to ``LARGEST`` times the first.
+    ``steps`` (variable,) are the distances of neighbouring whole numbers in the cube, 0 for real variables; the
+    direction of a whole number must be its own axis. ``population`` is the size of the first generation, by default
+    what ``cma`` takes for the number of variables.
     """
 
     def __init__(
@@ -35,44 +40,49 @@ class CmaEs:
         self._steps = steps
         self._directions = directions
         self._best: tuple[float, np.ndarray] = np.inf, start
-        self._begin({"popsize": population} if population else {})
-        # The package chooses a population by the number of variables where none is given.
+        self._begin(population)
         self._first = int(self._search.popsize)
 
-    def _begin(self, options: dict[str, Any]) -> None:
+    def _begin(self, population: int | None) -> None:
+        """Begin at the best point so far; without a ``population`` the package chooses one."""
         from cma.evolution_strategy import CMAEvolutionStrategy
 
-        options |= {
+        options: dict[str, Any] = {
             "minstd": (WHOLE * self._steps).tolist(),
             "tolx": RESOLVED,
             "randn": lambda *shape: self._random.standard_normal(shape),
-            "seed": np.nan,  # cma would seed numpy's global state
-            "verbose": -10,  # nor does it read options from a file cma_signals.in
+            "seed": np.nan,  # with a number cma would seed numpy's global state
+            "verbose": -10,  # from -9 on cma would read options from a file cma_signals.in
         }
+        if population:
+            options["popsize"] = population
+        # The search runs in coordinates along the directions, with the best point as their origin.
         self._centre = self._best[1]
         self._search = CMAEvolutionStrategy([0.0] * len(self._centre), self._step, options)
 
     def ask(self) -> np.ndarray:
-        """The next generation (design, dimension), each coordinate in [0, 1]."""
+        """The next generation (design, variable), each coordinate in [0, 1]."""
         self._asked = self._search.ask()
         unbounded = self._centre + np.array(self._asked) @ self._directions.T
-        self._points = 1 - np.abs(1 - unbounded % 2)  # mirrored at 0 and 1
+        # Mirrored at 0 and 1, again and again: the triangle wave of period 2.
+        self._points = 1 - np.abs(1 - unbounded % 2)
         return self._points
 
     def tell(self, losses: np.ndarray) -> None:
-        """Report the losses (design, 1) of the generation that was asked for."""
+        """Take the losses (design, 1) of the generation that was asked for, and begin again if it has contracted."""
         least = int(np.argmin(losses[:, 0]))
         if losses[least, 0] < self._best[0]:
             self._best = float(losses[least, 0]), self._points[least]
         self._search.tell(self._asked, losses[:, 0].tolist())
         if self._search.stop():
-            self._begin({"popsize": min(2 * len(self._asked), LARGEST * self._first)})
+            self._begin(min(2 * len(self._asked), LARGEST * self._first))
 
 
 class Nsga2:
     """Nondominated sorting genetic algorithm (Deb et al. 2002, IEEE Trans. Evol. Comput. 6, 182), by ``pymoo``.
 
-    The first generation is normal about the ``start``, with the standard deviation ``step``.
+    The first generation, of ``population`` points, is normal about the ``start`` (variable,), with the standard
+    deviation ``step``, and clipped to the unit cube.
     """
 
     def __init__(self, start: np.ndarray, step: float, seed: int, population: int, objectives: int = 2) -> None:
@@ -88,12 +98,12 @@ class Nsga2:
         self._search.setup(self._problem, termination=NoTermination(), seed=seed)
 
     def ask(self) -> np.ndarray:
-        """The next generation (design, dimension), each coordinate in [0, 1]."""
+        """The next generation (design, variable), each coordinate in [0, 1]."""
         self._asked = self._search.ask()
         return np.array(self._asked.get("X"), float)
 
     def tell(self, losses: np.ndarray) -> None:
-        """Report the losses (design, objective) of the generation that was asked for."""
+        """Take the losses (design, objective) of the generation that was asked for."""
         from pymoo.core.evaluator import Evaluator
         from pymoo.problems.static import StaticProblem
 
@@ -105,9 +115,10 @@ Sampler = CmaEs | Nsga2
 
 
 def smooth(count: int) -> np.ndarray:
-    """Directions (variable, direction) in which like variables in a row change together first, one by one last.
+    """Directions (variable, direction) of ``count`` variables in a row, such as clearances of neighbouring sites.
 
-    Cosines over the row: the mean by 1, the slope by 1/2, the bend by 1/3 (root mean square over the row), and so on.
+    They are cosines over the row, the k-th from 0 with k half waves and the root mean square 1/(1 + k): a step changes
+    the mean most, the slope half as much, the bend a third as much, and differences of neighbours least.
     """
     order = np.arange(count)
     normalisation = np.where(order, np.sqrt(2), 1)
@@ -116,9 +127,10 @@ def smooth(count: int) -> np.ndarray:
 
 
 def front(losses: np.ndarray) -> np.ndarray:
-    """The designs whose ``losses`` (design, objective) no other betters: all finite, sorted by the first objective.
+    """Numbers of the designs in the Pareto front of ``losses`` (design, objective), sorted by the first objective.
 
-    Of equal ones the first is taken; for one objective it is the best.
+    No other design is as good in every objective; of equal designs the first is taken. Designs with a loss that is not
+    finite are left out. For one objective the front is the best design.
     """
     finite = np.flatnonzero(np.isfinite(losses).all(axis=1))
     # Sorted by the first objective, then by the second: a design can only be dominated by one before it.
@@ -131,7 +143,8 @@ def front(losses: np.ndarray) -> np.ndarray:
 
 
 def knee(losses: np.ndarray) -> int:
-    """The design of a front whose ``losses`` (design, objective) are farthest below the line between its ends."""
+    """Number of the design of a front whose ``losses`` (design, objective) are farthest below the line of its ends."""
+    # Over its span the front has the ends (0, 1) and (1, 0), and a design is below their line by what its sum is less.
     span = np.ptp(losses, axis=0)
     scaled = (losses - losses.min(axis=0)) / np.where(span > 0, span, 1.0)
     return int(np.argmin(scaled.sum(axis=1)))

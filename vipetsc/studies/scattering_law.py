@@ -1,4 +1,4 @@
-"""The scattering law of one site: the fractions of a wave's energy over its amplitude at the site."""
+"""The scattering law of one site: the fractions into which it divides a wave's energy, over the wave's amplitude."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,10 +13,11 @@ from vipetsc.io.netcdf import open_netcdf
 from vipetsc.studies.linear_run import LinearRun
 
 FORWARD, BACKWARD = 0, 1  # directions: from the drive to the site and on, and the other
-LEAST = 0.02  # of the energy that must leave the drive's wave where the transfer's efficiency U/(1-T) is judged
+LEAST = 0.02  # least loss 1-T of the driven wave at which the efficiency U/(1-T) is judged: below, it is 0 over 0
 NEAR = 5  # cells from the site within which energy counts as near it: evanescent waves have decayed beyond
-FLAT = 0.1  # of the efficiency: smaller differences are within its scatter
-BROAD = 0.05  # half the width in log z over which it is averaged: a design has to bear as much
+FLAT = 0.1  # relative differences of the efficiency that are within its scatter
+# Half the width in log z over which the efficiency is averaged: a design has to bear such an error of a clearance.
+BROAD = 0.05
 LISTED = (1.01, 1.1, 1.5, 3.0, 10.0, 30.0, 100.0)  # values of z in the printed table
 
 POINT_LAYOUT = {
@@ -57,13 +58,15 @@ LAYOUT = {
 
 
 class ScatteringOutcome(NamedTuple):
-    """Outcome of a wave at one site, arrays over z; fractions of the energy that arrives in the drive's band.
+    """Outcome of a wave at one site, as arrays (...) over z.
 
-    ``share`` (..., band, direction) is what leaves by band, forward (0) and backward (1): in the drive's band these are
-    ``transmitted`` and ``reflected``; ``upper`` is all of the bands above. ``dissipated`` in the contact, ``contact``,
-    held by a closed contact at the end, and ``dashpots``, taken by those at the site, make the sum 1. ``onset`` and
-    ``separation`` are the times in s of the first and the last contact, NaN without any; ``release`` is the linear
-    envelope over the clearance at the latter.
+    Energies are fractions of what arrives in the drive's band. ``share`` (..., band, direction) is what leaves the site
+    in each band, forward (0) and backward (1); in the drive's band these are ``transmitted`` and ``reflected``, and
+    ``upper`` is the sum over the bands above it. With what is ``dissipated`` in the contact, what a ``contact`` that is
+    still closed holds at the end, and what the ``dashpots`` at the site take, the whole ``share`` adds up to 1.
+
+    ``onset`` and ``separation`` are the times in s at which the first contact begins and the last one ends, NaN without
+    any. ``release`` is the linear envelope over the clearance at ``separation``.
     """
 
     share: np.ndarray
@@ -80,12 +83,12 @@ class ScatteringOutcome(NamedTuple):
 
 @dataclass(frozen=True)
 class ScatteringLaw:
-    """The law at points ``z``: largest relative displacement of the linear wave at the site, over the clearance.
+    """The law at points ``z`` (z,): largest relative displacement of the linear wave at the site, over the clearance.
 
-    ``mean`` and ``scatter`` (standard deviation of runs with amplitudes a little apart) hold arrays over the points.
-    ``drive_band`` counts from 0; ``clearance`` in m. ``peak`` is the largest |w| of the linear wave at the site in m
-    under 1 N, ``linear_envelope`` (time) its sqrt(w^2 + (w'/Om)^2) at ``linear_time`` in s; ``about``: the attributes
-    of ``law.h5``.
+    ``mean`` and ``scatter`` hold arrays over the points: mean and standard deviation over runs with amplitudes a little
+    apart. ``drive_band`` counts from 0; ``clearance`` is in m. Under 1 N the linear wave at the site reaches ``peak``
+    in m, and has the envelope ``linear_envelope`` (time,), sqrt(w^2 + (w'/Om)^2) in m, at ``linear_time`` (time,) in s.
+    ``about`` are the attributes of ``law.h5``.
     """
 
     z: np.ndarray
@@ -106,7 +109,8 @@ class ScatteringLaw:
 
     @classmethod
     def of(cls, data: xr.Dataset) -> Self:
-        """The law in the content of ``law.h5``."""
+        """The law in the content ``data`` of ``law.h5``."""
+        # Fractions that a lattice does not have (``DAMPED``) are not in its file.
         none = xr.zeros_like(data["dissipated"])
         mean = {name: data.get(name, none).values for name in ScatteringOutcome._fields}
         scatter = {name: data.get(f"{name}_scatter", none).values for name in ScatteringOutcome._fields}
@@ -123,9 +127,9 @@ class ScatteringLaw:
         )
 
     def at(self, z: ArrayLike) -> ScatteringOutcome:
-        """Outcome of a wave at ``z`` (any shape): linear in log z between the points, T = 1 below the first.
+        """Outcome of a wave at ``z`` (any shape), interpolated linearly in log z.
 
-        Above the last point the last one holds.
+        Below the first point, at which nothing is touched yet, and above the last one the outcome is that of the point.
         """
         return self._interpolated(self.mean, z)
 
@@ -134,6 +138,7 @@ class ScatteringLaw:
         return self._interpolated(self.scatter, z)
 
     def _interpolated(self, values: ScatteringOutcome, z: ArrayLike) -> ScatteringOutcome:
+        """The ``values`` of the points at ``z`` (any shape), as ``at`` has them."""
         x = np.log(np.clip(np.asarray(z, float), self.z[0], self.z[-1]))
         grid = np.log(self.z)
         right = np.clip(np.searchsorted(grid, x), 1, len(grid) - 1)
@@ -148,7 +153,10 @@ class ScatteringLaw:
         return ScatteringOutcome(*map(between, values))
 
     def efficiency(self) -> np.ndarray:
-        """U/(1-T) (point), both averaged over 5 % of z on both sides; 0 where 1-T is below 2 % somewhere there."""
+        """Efficiency of the transfer (z,): U/(1-T), both averaged over 5 % of z on either side.
+
+        It is 0 where the driven wave loses less than ``LEAST`` at any z of that range.
+        """
         neighbourhood = np.exp(np.linspace(-BROAD, BROAD, 41))[:, None] * self.z
         outcome = self.at(neighbourhood)
         lost = 1 - outcome.transmitted
@@ -156,10 +164,10 @@ class ScatteringLaw:
         return np.where(lost.min(axis=0) > LEAST, mean_efficiency, 0.0)
 
     def matched(self) -> tuple[float, float]:
-        """Point z* at which the upper bands receive the largest part of the driven wave's loss, and T there.
+        """Best amplitude z* for the transfer to upper bands, and the transmitted fraction T there.
 
-        The efficiency U/(1-T) is flat: of the points within 10 % of its best the one with the largest T, which leaves
-        most for further sites. Raises ValueError if no upper band gets anything.
+        The efficiency U/(1-T) is flat about its maximum. Of the points within 10 % of it, z* is the one with the
+        largest T, which leaves most for further sites. Raises ValueError if no energy is transferred.
         """
         efficiency = self.efficiency()
         if not efficiency.any():
@@ -170,7 +178,7 @@ class ScatteringLaw:
         return float(self.z[best]), float(self.at(self.z[best]).transmitted)
 
     def summary(self) -> list[tuple[str, str]]:
-        """Rows of a table that describe the law: its ring, the packet, its points and a few of its values."""
+        """Rows (name, text) of a table that describes the law: its ring, the packet, its points, some of its values."""
         about = self.about
         mean = self.mean
         sums = mean.share.sum(axis=(1, 2)) + mean.dissipated + mean.contact + mean.dashpots
@@ -194,7 +202,7 @@ class ScatteringLaw:
         return [*rows, ("matched", best)]
 
     def _fractions_at(self, z: float) -> str:
-        """T, R, U and the dissipated fraction L at ``z``, of dashpots D, with their scatter."""
+        """The fractions at ``z`` with their scatter, as text: T, R and U, L dissipated, D taken by dashpots."""
         mean = self.at(z)
         scatter = self.deviation(z)
         symbols = {"T": "transmitted", "R": "reflected", "U": "upper", "L": "dissipated"}
@@ -206,10 +214,10 @@ class ScatteringLaw:
 
 
 def matched_clearances(law: ScatteringLaw, linear: LinearRun, sites: Sequence[int], amplitude: float) -> np.ndarray:
-    """Clearances in m with which each of the ``sites`` (cells from 1, in the order of the wave) operates at z*.
+    """Clearances (site,) in m with which all ``sites`` (cells from 1, in the order of the wave) operate at z*.
 
-    D_k = A env(s_k) sqrt(T^k)/z*, with the envelope of the ``linear`` run under 1 N and the ``amplitude`` A in N: what
-    the sites before leave of the drive's wave.
+    D_k = A env(s_k) sqrt(T^k)/z* for the site k = 0, 1, ...: the envelope env of the ``linear`` run under 1 N, times
+    the ``amplitude`` A in N, times what the k sites before leave of the wave. Raises ValueError as ``matched``.
     """
     z, transmitted = law.matched()
     left = np.sqrt(transmitted ** np.arange(len(sites)))

@@ -1,4 +1,4 @@
-"""Envelopes over a run of signals about a frequency, and their spectra."""
+"""Envelopes of signals about a frequency over the time of a run, and the spectra of these envelopes."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,9 +10,11 @@ from vipetsc.studies.response import DECAY
 
 @dataclass(frozen=True)
 class SpectralLine:
-    """Frequencies within ``half`` rad/s of the middle of a line; ``length`` in s is twice that of the run.
+    """A grid of the frequencies within ``half`` rad/s of a middle, and of the instants of envelopes about it.
 
-    The second half of the time is padding for what the transform would fold back.
+    A signal about the frequency middle in rad/s is Re a exp(i middle t) with the envelope a. ``length`` in s is twice
+    the time of the run: in its second half responses die away that the transform, which is periodic, would otherwise
+    fold back into the run.
     """
 
     half: float
@@ -20,7 +22,7 @@ class SpectralLine:
 
     @cached_property
     def most(self) -> int:
-        """Number of frequencies above the middle, which is the same below."""
+        """Number of frequencies above the middle, and of those below it."""
         return int(np.ceil(self.half * self.length / (2 * np.pi)))
 
     @cached_property
@@ -30,16 +32,16 @@ class SpectralLine:
 
     @cached_property
     def time(self) -> np.ndarray:
-        """The instants (time,) in s of envelopes."""
+        """The instants (time,) in s of envelopes, as many as there are frequencies."""
         return np.arange(len(self.offset)) * self.length / len(self.offset)
 
     @property
     def decay(self) -> float:
-        """Rate in 1/s of the envelopes' decay: less the imaginary part of all frequencies."""
+        """Rate in 1/s of the window exp(-decay t) of envelopes: spectra are at the frequencies offset - i decay."""
         return DECAY / self.length
 
     def forward(self, a: np.ndarray) -> np.ndarray:
-        """Spectrum (..., offset) of an envelope (..., time)."""
+        """Spectrum (..., offset) of an envelope ``a`` (..., time): a sum over instants, without their distance in s."""
         return np.asarray(np.fft.fftshift(np.fft.fft(a * np.exp(-self.decay * self.time)), axes=-1))
 
     def backward(self, spectrum: np.ndarray) -> np.ndarray:

@@ -1,4 +1,8 @@
-"""Sweeps on all ranks: linear runs first, then the longest members; can be resumed, and continues after failures."""
+"""Sweeps: all members are simulated on all ranks, and their measures are collected in ``ensemble.h5``.
+
+The linear runs come first, which members without contact are scaled from, then the members, those that take longest
+first. A sweep goes on after members that fail, and can be resumed after an interruption.
+"""
 
 import json
 import re
@@ -37,11 +41,12 @@ MOST_SURVEYED = 10_000  # members whose cases are resolved beforehand, for their
 
 @dataclass(frozen=True)
 class SweepResult:
-    """Outcome of a sweep: ``status`` (member), an index of ``studies.ensemble.STATUS``.
+    """Outcome of a sweep, the same on all ranks but for ``held``.
 
-    ``computed`` counts the members simulated or scaled now; ``busy`` (rank) is the fraction of the time in which each
-    rank worked on members. ``warnings`` are sentences about lost results and about the members. Rank 0 has what is
-    ``held`` of a sweep without a folder.
+    ``status`` (member,) says how each member ended, as an index of ``studies.ensemble.STATUS``. ``computed`` is the
+    number of members that this call simulated or scaled, ``seconds`` its wall time, ``busy`` (rank) the fraction of it
+    in which each rank worked on members. ``warnings`` are sentences about lost results and about the members. A sweep
+    without a ``folder`` has its ensemble in memory, ``held`` by rank 0.
     """
 
     status: np.ndarray
@@ -54,13 +59,13 @@ class SweepResult:
 
     @cached_property
     def dataset(self) -> "xr.Dataset | None":
-        """The ensemble: read from its folder, or the one in memory, which only rank 0 has; None while members miss."""
+        """The ensemble, from its folder or from memory; None while members are missing, and in memory beyond rank 0."""
         if self.folder is None or self.resumable:
             return self.held
         return open_ensemble(self.folder)
 
     def _repr_html_(self) -> str:
-        """The numbers of members by their ending, and warnings, as a notebook shows them."""
+        """The numbers of members by how they ended, and the warnings, as a notebook shows them."""
         rows: list[tuple[str, object]] = [(name, self.count(code) or None) for code, name in enumerate(STATUS)]
         rows += [("time in s", round(self.seconds, 1)), ("ensemble", self.folder or "in memory, as `dataset`")]
         rows += [("warning", warning) for warning in self.warnings]
@@ -68,7 +73,7 @@ class SweepResult:
 
     @property
     def complete(self) -> bool:
-        """Whether every member is there."""
+        """Whether every member has measures: none has failed, and none is missing."""
         return not self.count(FAILED) and not self.count(MISSING)
 
     @property
@@ -93,19 +98,20 @@ def run_sweep(
 ) -> SweepResult:
     """Simulate every member of ``plan`` in ``folder``, then write ``ensemble.h5`` and ``index.json``.
 
-    ``result.dataset`` is the ensemble, an xarray dataset. Without a folder it is held in memory; a sweep that is
+    The ensemble is ``result.dataset``, an xarray dataset. Without a folder it is held in memory; a sweep that is
     stopped then stays in a temporary folder, which ``result.folder`` names.
 
-    Complete members of this version are not simulated again, so that an interrupted sweep continues; ``force`` starts
-    again and replaces the sweep in the folder at the end, ``resume`` requires an existing sweep. A member that fails is
-    recorded with its reason, and the others continue. All ranks of
-    ``comm`` work, ``[sweep] ranks`` of them together on each member.
+    Members that this version has completed are not simulated again, so that an interrupted sweep continues. ``force``
+    starts again, and replaces the sweep in the folder at the end; ``resume`` requires an existing sweep. A member that
+    fails is recorded with its reason, and the others continue. All ranks of ``comm`` work, ``[sweep] ranks`` of them
+    together on each member.
 
     Raises CaseError if no member is a valid case (of a sample, if there are many), or if fields of members are to be
     stored without a folder; FolderError if the folder contains anything else; ValueError without a folder if the ranks
     are on several machines.
     """
-    on_root(comm, lambda: plan.tried()[:0])  # raises; the cases are not sent
+    # For its errors alone: an empty list is sent to the other ranks, not all cases.
+    on_root(comm, lambda: plan.tried()[:0])
     if folder is None:
         return _in_memory(plan, comm, stop, progress)
     with claimed(comm, folder, SWEEP, plan.to_toml(), force=force, resume=resume) as claim:
@@ -120,7 +126,10 @@ def run_sweep(
 
 
 def _in_memory(plan: Sweep, comm: MPI.Comm, stop: StopRequest | None, progress: bool) -> SweepResult:
-    """The sweep in a temporary folder, which is removed after rank 0 has read the ensemble."""
+    """Run the sweep in a temporary folder, which rank 0 removes after it has read the ensemble; raises as `run_sweep`.
+
+    A sweep that was stopped, or that an error ended, keeps the folder.
+    """
     if plan.options.fields:
         remedy = "stores files of every member: give a folder for them, as in sweep(plan, 'my-sweep')"
         raise CaseError([Problem("sweep.fields", True, remedy)], plan.name)
@@ -139,7 +148,7 @@ def _in_memory(plan: Sweep, comm: MPI.Comm, stop: StopRequest | None, progress: 
     def read() -> "xr.Dataset":
         index = json.loads((folder / "index.json").read_text(encoding="utf-8"))
         ensemble = open_ensemble(folder).assign_attrs(failed=json.dumps(index["failed"]))
-        # No folder has the members.
+        # The folder is removed below.
         del ensemble.attrs["folder"]
         discard(folder)
         return ensemble
@@ -159,19 +168,20 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
     runs = SweepRuns(plan, folder, comm, stop)
     pool = runs.recorded.pool
 
-    # What there is and what comes first is decided on one rank: another may not see the files of the others yet.
+    # One rank looks at what there is and decides on the order: on a network file system another rank may not see the
+    # files yet. The survey stays there, in this list; the others get the parts of it that they need.
     surveys: list[_Survey] = []
 
     def look() -> tuple[dict[str, NeededRun], dict[str, LinearRun | str]]:
         survey = _survey(plan, folder)
         surveys.append(survey)
+        # Where no member is missing, no rank needs the linear runs, which may be large to send.
         linear: dict[str, LinearRun | str] = {}
-        # Of a whole sweep nobody needs the linear runs, which other ranks would get in a message.
         if len(survey.missing):
             linear |= survey.results.linear
         return survey.needed, linear
 
-    # Linear runs first: members that nothing touches are scaled from them, and they show what the others cost.
+    # Linear runs first: members without contact are scaled from them, and they show what the others will cost.
     needed, runs.linear = on_root(comm, look)
     pool.run(list(needed), lambda name: runs.make_linear(*needed[name]))
     _join_linear_runs(runs, comm)
@@ -199,17 +209,17 @@ def _make_all(plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest, prog
 
 
 def _join_linear_runs(runs: SweepRuns, comm: MPI.Comm) -> None:
-    """Give every rank the linear runs of all, each with all measures that any rank took of it."""
+    """Give every rank the linear runs of all ranks, each with all measures that any rank took of it. Collective."""
     for from_rank in comm.allgather(runs.linear):
         for name, run in from_rank.items():
-            # A text is the reason why it did not come out.
+            # A text is the reason why the run failed.
             if not isinstance(run, str):
                 run = run.joined(runs.linear.get(name))
             runs.linear[name] = run
 
 
 class NeededRun(NamedTuple):
-    """A linear run that is missing: a ``case`` that needs it, and the first ``sites`` to measure it for (cells)."""
+    """A linear run that is missing: a ``case`` that needs it, and the leading ``sites`` (cells) to measure it for."""
 
     case: Case
     sites: list[int]
@@ -224,10 +234,11 @@ class DrawnMember(NamedTuple):
 
 
 class _Survey(NamedTuple):
-    """State of a sweep: its results, the numbers of the ``missing`` members, and sentences about what is ``lost``.
+    """State of a sweep before members are simulated.
 
-    Of the missing members, if they are many, as many are ``drawn`` as can represent the others. They show what a member
-    costs, and the linear runs that are ``needed``, by name.
+    ``results`` are those that are there, ``missing`` (member,) the numbers of the members that are not, ``lost``
+    sentences about files that cannot be read. The cases of the ``drawn`` members are resolved: of all missing ones, or
+    of a sample if they are many. They show what members will cost, and which linear runs are ``needed``, by name.
     """
 
     results: Results
@@ -237,10 +248,13 @@ class _Survey(NamedTuple):
     lost: list[str]
 
     def order(self, linear: dict[str, LinearRun | str]) -> list[int]:
-        """The missing members: linear run by linear run, since ranks keep few of them, and the longest first.
+        """The numbers of the missing members in the order in which they are simulated.
 
-        Contacts at every site that the linear wave would reach cost most.
+        Members of one linear run follow each other, since ranks keep few of these runs. The longest come first, so that
+        no rank ends with a long one while the others wait. What a member will cost is judged by its contacts, which
+        cost most: the sum over sites of the linear wave over the clearance, out of ``linear``, the linear runs by name.
         """
+        # Each list begins with an entry for the missing members before the first one that was drawn.
         numbers = [-1]
         costs = [0.0]
         runs = [""]
@@ -256,15 +270,18 @@ class _Survey(NamedTuple):
         for name, cost in zip(runs, costs, strict=True):
             dearest[name] = max(cost, dearest.get(name, 0.0))
         ranking = {name: rank for rank, name in enumerate(sorted(dearest, key=lambda name: (-dearest[name], name)))}
-        # One that was not drawn costs what the last one before it does that was: its neighbour in the sweep.
+        # A member that was not drawn has the cost and the linear run of the last one before it that was.
         nearest = np.searchsorted(numbers, self.missing, "right") - 1
-        # Stable, so that equal ones stay in their order, the same in every call.
+        # By linear run, then by falling cost. The sort is stable: equal members stay in order, the same in every call.
         order = np.lexsort((-np.array(costs)[nearest], np.array([ranking[name] for name in runs])[nearest]))
         return list(self.missing[order].tolist())
 
 
 def _survey(plan: Sweep, folder: Path) -> _Survey:
-    """Look through ``folder``: members that have failed are missing, and those whose fields cannot be read."""
+    """Survey the sweep ``plan`` in ``folder``.
+
+    Members that have failed count as missing, since they may succeed now, and so do those whose fields cannot be read.
+    """
     results = Results(plan, folder)
     lost: list[str] = []
     absent = (results.status != COMPLETE) & (results.status != SCALED)
@@ -273,7 +290,7 @@ def _survey(plan: Sweep, folder: Path) -> _Survey:
             whole = is_whole(folder / name / "run.h5", lost) and is_whole(folder / name / "analysis.h5", lost)
             absent[number] |= not whole
 
-    # Equal members are one run.
+    # Equal members are simulated once, as the first of them.
     missing = np.unique(results.first[absent])
     tried = missing
     if len(missing) > MOST_SURVEYED:
@@ -287,21 +304,24 @@ def _survey(plan: Sweep, folder: Path) -> _Survey:
 
 
 def _needed_runs(plan: Sweep, results: Results, drawn: Sequence[DrawnMember]) -> dict[str, NeededRun]:
-    """The linear runs of the ``drawn`` members, by name, that are not there or not measured for all first sites."""
+    """The linear runs of the ``drawn`` members, by name, that are not there or not measured for all leading sites."""
     runs: dict[str, NeededRun] = {}
     for member in drawn:
         run = runs.setdefault(member.linear, NeededRun(member.case, []))
         site = leading_cell(member.case)
         measured_run = results.linear.get(member.linear)
         measured = measured_run is not None and site in measured_run.measures
-        # Members whose fields are kept are measured themselves.
+        # Where fields are kept members are measured, not scaled, and nobody needs measures of the linear run.
         if not plan.options.fields and not measured and site not in run.sites:
             run.sites.append(site)
     return {name: run for name, run in runs.items() if run.sites or name not in results.linear}
 
 
 def is_whole(path: Path, lost: list[str]) -> bool:
-    """Whether an HDF5 file is there and was not cut off, which HDF5 sees; if it was, ``lost`` gets a sentence."""
+    """Whether an HDF5 file is there and can be opened; if it is there and cannot, ``lost`` gets a sentence.
+
+    HDF5 does not open a file that is shorter than it says itself.
+    """
     try:
         h5py.File(path).close()
     except OSError as error:
@@ -312,9 +332,9 @@ def is_whole(path: Path, lost: list[str]) -> bool:
 
 
 def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[str]]:
-    """Write ``ensemble.h5``, once no member is missing, and ``index.json``; how the members ended, and warnings.
+    """Write ``index.json`` and, once no member is missing, ``ensemble.h5``; returns ``status`` (member,) and warnings.
 
-    The endings are (member,). A file that is there stays unless it is of other results, or ``afresh``.
+    Files that are there stay where they are of the same results, unless ``afresh``.
     """
     plan = results.plan
     folder = results.folder
@@ -334,7 +354,8 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
     path = folder / "index.json"
     text = json.dumps(index, indent=1, default=int) + "\n"
     current = path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
-    # The index comes last: with it and no member simulated since, the ensemble is that of these members.
+    # The index is written after the ensemble: where it is the current one, and no member was simulated since, the
+    # ensemble is complete and of these members.
     if not count[STATUS[MISSING]]:
         lost: list[str] = []
         if afresh or not current or not is_whole(folder / "ensemble.h5", lost):
@@ -347,7 +368,7 @@ def conclude(results: Results, afresh: bool = False) -> tuple[np.ndarray, list[s
 
 
 def _failed_member(results: Results, number: int) -> dict[str, Any]:
-    """Place in the sweep of a member that failed, its name and the reason."""
+    """The entry of the index for a member that failed: its ``place`` over the axes, its name ``id`` and the reason."""
     return {
         "place": np.unravel_index(number, results.plan.shape),
         "id": results.ids[number],
@@ -356,9 +377,9 @@ def _failed_member(results: Results, number: int) -> dict[str, Any]:
 
 
 def summarise(sentences: Sequence[str]) -> list[str]:
-    """Shorten the warnings of members: of those that differ in numbers alone one, with how many there are.
+    """Warnings of members in short: of ``sentences`` that differ in numbers alone one, after how many there are.
 
-    The one is the last in the alphabet, which does not depend on the order of the members.
+    It is the last one in the alphabet, so that the choice does not depend on the order of the members.
     """
     kinds: dict[str, list[str]] = {}
     for sentence in sentences:

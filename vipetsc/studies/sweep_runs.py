@@ -1,4 +1,4 @@
-"""The runs of a sweep, each of which ends as a record: simulated and measured, or scaled from a linear run."""
+"""The runs of a sweep: members are simulated and measured, or scaled from a linear run, and each leaves a record."""
 
 import json
 import time
@@ -37,9 +37,9 @@ ANALYSED = {"entropy": ("entropy",), "transfer": ("bands", "modal")}
 class SweepRuns:
     """The members of the sweep ``plan`` and its linear runs, ``recorded`` in ``folder``.
 
-    All ranks of ``comm`` must construct one; all ranks of a team work on each run together. Members whose fields are
-    kept have folders ``<id>/`` with ``run.h5`` and ``analysis.h5`` too. ``linear`` are the linear runs this rank
-    has so far by name, or why one did not come out.
+    All ranks of ``comm`` must construct one; the ranks of a team work together on each run, and call every method that
+    simulates. If the sweep keeps fields, each member also has a folder ``<id>/`` with ``run.h5`` and ``analysis.h5``.
+    ``linear`` holds the linear runs that this rank has so far, by name; of one that failed, the reason.
     """
 
     def __init__(self, plan: Sweep, folder: Path, comm: MPI.Comm, stop: StopRequest) -> None:
@@ -47,17 +47,17 @@ class SweepRuns:
         self.folder = folder
         self.ids = plan.ids()
         self.measures = measures_of(plan)
-        # Any exception is the member's own, but a full disk: a sweep goes on past failures.
+        # Any exception counts as a failure of the member, but for a full disk: a sweep goes on past failures.
         self.recorded = RecordedRuns(MEMBERS, folder, comm, stop, plan.options.ranks, failures=(Exception,))
         self.linear: dict[str, LinearRun | str] = {}
         self._histories = LinearHistories()
-        # A member's fields are gone when it is measured.
+        # Members use one block of memory for their fields, one after the other: none is needed once it is measured.
         self._fields = FieldMemory()
 
     def make_linear(self, case: Case, sites: Collection[int]) -> None:
-        """Simulate the linear run of ``case``, and measure it for members with each of the first ``sites`` (cells).
+        """Simulate the linear run of ``case``, and measure it for members with a leading site among ``sites`` (cells).
 
-        Raises StoppedError, or RuntimeError if it does not come out, and again whenever it is asked for.
+        Raises StoppedError, or RuntimeError if the run fails; then it is not tried again, and every later call raises.
         """
         name = linear_name(case)
         earlier = self.linear.get(name)
@@ -81,7 +81,7 @@ class SweepRuns:
             raise
 
     def _make_history(self, case: Case) -> LinearHistory:
-        """Simulate the linear run of ``case``; raises StoppedError, or RuntimeError if it does not come out."""
+        """Simulate the linear run of ``case``; raises StoppedError, or RuntimeError if the run fails."""
         return LinearHistory.of(case, self.recorded.team, self.recorded.stop)
 
     def _keep(self, name: str, history: LinearHistory, case: Case) -> None:
@@ -108,7 +108,10 @@ class SweepRuns:
         return history.opening(case)
 
     def make(self, number: int) -> None:
-        """Simulate the member ``number``, or scale it; raises as ``make_linear``, for an impossible case too."""
+        """Simulate the member ``number``, or scale it, and record it.
+
+        Raises as ``make_linear``, and RuntimeError if its case is impossible or its run fails.
+        """
         begin = time.process_time()
         member = self.plan.member(number)
         if member.case is None:
@@ -132,11 +135,12 @@ class SweepRuns:
         on_root(self.recorded.team, lambda: self._append(number, status, record))
 
     def _linear_of(self, case: Case, name: str, site: int) -> LinearRun:
-        """The linear run ``name`` of ``case``, simulated if it is missing, with measures for the first ``site``.
+        """The linear run ``name`` of ``case``, with measures for the leading ``site`` (cell); simulated if missing.
 
-        It has none where members keep their fields: they are measured themselves.
+        Raises as ``make_linear``.
         """
         linear = self.linear.get(name)
+        # Where fields are kept members are measured, not scaled, and need no measures of the linear run.
         sites = [site]
         if self.plan.options.fields:
             sites = []
@@ -151,6 +155,7 @@ class SweepRuns:
         self._append(number, FAILED, {"reason": reason})
 
     def _append(self, number: int, status: int, record: Record) -> None:
+        """Append the ``record`` of a member with its name, its place in the sweep and its ``status``."""
         about = {
             "id": self.ids[number],
             "place": [*map(int, np.unravel_index(number, self.plan.shape))],
@@ -160,15 +165,17 @@ class SweepRuns:
         self.recorded.file.append(about | record)
 
     def _simulate(self, case: Case, folder: Path, arrival: float | None, name: str) -> Record:
-        """Simulate and measure a member with all its samples and cells; what is kept of them is cut out after that.
+        """Simulate and measure a member of which all samples and cells are recorded; returns its record.
 
-        ``name`` is that of its linear run.
+        If the sweep keeps fields, its run is written to ``folder``, cut down to what the case keeps. ``arrival`` is the
+        time in s at which the linear wave arrives at the leading site, ``name`` the name of the linear run. Raises
+        StoppedError, or RuntimeError if the run fails.
         """
         fields = self.plan.options.fields
         all_kept = keeps_all(case) and "displacement" in case.output.fields
 
         def begin() -> None:
-            """Keep what is there of a run that was cut off, if it is of the same case."""
+            """Prepare the member's folder, and empty it unless it holds the beginning of a run of the same case."""
             marker = folder / "case.toml"
             text = case.to_toml()
             if fields and not (marker.exists() and marker.read_bytes() == text.encode()):
@@ -186,7 +193,7 @@ class SweepRuns:
             simulated = _with_everything(case, [*FIELDS])
             if all_kept:
                 simulated = case
-        # A run that is resumed needs none; its measures do, which have the same bits as without a stop.
+        # Also for a run that is resumed behind its opening: its measures use it, and have the bits of a run in one go.
         opening = self._opening(case, name)
         result = self.recorded.simulate(simulated, output, lambda: opening)
 
@@ -205,7 +212,8 @@ class SweepRuns:
             if fields:
                 about = origin() | analysis.attrs
                 write_netcdf(folder / "analysis.h5", analysis.assign_attrs(about, case=case.to_toml()))
-                for file in ("summary.json", "case.toml"):  # their content is in the record and in the run
+                # Their content is in the record and in the run.
+                for file in ("summary.json", "case.toml"):
                     (folder / file).unlink(missing_ok=True)
             return {
                 "reason": result.sentence,
@@ -218,7 +226,10 @@ class SweepRuns:
 
 
 def _scaled(case: Case, linear: LinearRun, name: str, site: int) -> Record:
-    """The record of a member that nothing touches: its ``linear`` run ``name``, scaled to the amplitude of ``case``."""
+    """The record of a member without contact: its ``linear`` run ``name``, scaled to the amplitude of ``case``.
+
+    ``site`` is the member's leading site (cell), for which the linear run was measured.
+    """
     return {
         "reason": "complete: scaled from the linear run",
         "linear": name,
@@ -236,13 +247,13 @@ def _scaled(case: Case, linear: LinearRun, name: str, site: int) -> Record:
 
 
 def _with_everything(case: Case, fields: list[str]) -> Case:
-    """The ``case`` with all samples and cells of its ``fields``."""
+    """The ``case`` of which all samples and cells of the ``fields`` are recorded."""
     output = {"fields": fields, "window": None, "every": 1, "stride": 1, "writer": "gather"}
     return case.model_copy(update={"output": case.output.model_copy(update=output)})
 
 
 def measures_of(plan: Sweep) -> set[str]:
-    """Measures that ``analyse`` takes of a member: those that its pictures show if its fields are kept."""
+    """Measures that ``analyse`` takes of a member: those asked for, and those of its pictures if fields are kept."""
     asked: Mapping[str, Sequence[str]] = ANALYSED
     if plan.options.fields:
         asked = WHOLE
@@ -262,13 +273,13 @@ def thinned(run: xr.Dataset, case: Case) -> xr.Dataset:
     """Cut a ``run`` with all its fields down to what the section ``[output]`` of ``case`` keeps of them."""
     output = case.output
     if "displacement" not in output.fields:
-        # The last state stays: energies of the linear modes are measured from it.
+        # The last displacement stays: a later analysis takes the energies of the linear modes from it.
         run = run.assign({"end/displacement": run["displacement"].variable[-1]})
     run = run.drop_vars([name for name in FIELDS if name in run and name not in output.fields])
     run = run.isel(cell=list(recorded_cells(output, case.lattice.cells)))
 
     if "point" in run.coords:
-        # Names stand in the case; files count points, as those of single runs do.
+        # A dataset in memory names the points, a file numbers them, as those of single runs do: the case has the names.
         run = run.assign_coords(point=("point", np.arange(1, run.sizes["point"] + 1), run["point"].attrs))
 
     fields = {}

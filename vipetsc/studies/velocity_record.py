@@ -1,4 +1,4 @@
-"""Input of the measures: the velocity that a run kept, in memory or in its file, and numbers of its case."""
+"""The velocity that a run kept, in memory or in its file, with the numbers of its case that measures need."""
 
 from copy import copy
 from typing import Any, Self
@@ -15,13 +15,16 @@ from vipetsc.lattice import pass_bands
 
 
 class VelocityRecord:
-    """Velocity, axes and masses of a run of ``case`` for its measures, which add attributes and what is left out.
+    """Velocity, axes and masses of a ``run`` of ``case``, measured with ``options``.
 
-    ``masses`` (dof) of the reference cell in kg, ``velocity`` (t, cell, dof) in m/s and ``weighted`` the same times
-    sqrt(m/m_reference) of each mass, so that its energies by the reference cell's masses are those of the masses there
-    are; ``time`` (t) and ``interval`` in s, ``cells`` (cell) and ``site``, the leading one's cell, as numbers from 1.
-    ``sizes`` are the blocks (samples, cells) of which maps hold the means, at ``mean_time`` and ``mean_cells``;
-    ``memory`` in bytes. ``attributes`` are those of variables, of groups under "".
+    ``velocity`` (t, cell, dof) is in m/s and ``masses`` (dof,) of the reference cell in kg. ``weighted`` is the
+    velocity times sqrt(m/m_reference) of each mass: with the reference cell's masses it has the energies of the actual
+    masses. ``time`` (t,) and ``interval`` are in s; ``cells`` (cell,) and ``site``, the cell of the site that the wave
+    meets first (None without sites), are numbers from 1.
+
+    Maps hold means over blocks of ``sizes`` (samples, cells), at ``mean_time`` and ``mean_cells``. Fields larger than
+    ``memory`` in bytes stay in their file. Measures enter the ``attributes`` of their variables, by name (those of the
+    analysis under ""), and sentences about what is ``left_out``, and ``warnings``.
     """
 
     def __init__(self, run: xr.Dataset, case: Case, options: AnalysisTable) -> None:
@@ -52,7 +55,7 @@ class VelocityRecord:
         self.warnings: list[str] = []
 
     def blank(self) -> Self:
-        """The same record, of which nothing has been measured: no attributes, nothing left out, no warnings."""
+        """A copy of the record of which nothing has been measured: no attributes, nothing left out, no warnings."""
         record = copy(self)
         record.attributes = {}
         record.left_out = []
@@ -60,13 +63,19 @@ class VelocityRecord:
         return record
 
     def field(self, field: xr.DataArray, factor: ArrayLike = 1.0) -> Any:
-        """A recorded ``field`` times a ``factor`` (cell, dof); read as a whole if it fits into the memory."""
+        """A recorded ``field`` (t, cell, dof) times a ``factor``, a number 1 or (cell, dof).
+
+        It is an array if it fits into the memory, else an object that reads slices from the file.
+        """
         if field.nbytes > self.memory:
             return _StoredField(field, factor)
         return field.values * factor if np.ndim(factor) else field.values
 
     def unresolved(self) -> set[str]:
-        """Measures that would take waves for longer or slower ones in what was kept; warns of them."""
+        """Names of the groups of measures that what was kept does not resolve, with a warning for each.
+
+        Fields that are stored at too few samples, or of too few cells, show waves as slower or longer ones (aliasing).
+        """
         top = pass_bands(self.model.chain.cell)[-1].high
         every = int(np.diff(self.cells).max(initial=1))
         names: set[str] = set()
@@ -85,14 +94,14 @@ class VelocityRecord:
         return names
 
     def mean(self, energy: np.ndarray) -> np.ndarray:
-        """Means of ``energy`` (t, cell) over the blocks of a map."""
+        """Means of an ``energy`` (t, cell) over the blocks of a map, in single precision."""
         over_time = spectra.block_means(energy, self.sizes[0], 0)
         # Single precision halves the file, and is finer than any colour scale.
         return spectra.block_means(over_time, self.sizes[1], 1).astype(np.float32)
 
 
 class _StoredField:
-    """A field (t, cell, dof) that stays in its file; what is sliced is read, and multiplied by the ``factor``."""
+    """A field (t, cell, dof) that stays in its file: a slice of it is read, and multiplied by the ``factor``."""
 
     def __init__(self, field: xr.DataArray, factor: ArrayLike) -> None:
         self.shape = field.shape

@@ -1,13 +1,15 @@
 """Losses of the waves between sites in dashpots and absorbing ends, until the end of the run.
 
-Waves in other bands than the drive's fade along rays (``studies.rays``). The driven wave is one of interference: its
-energy at the end is that of the run without contacts less all that it gives to contacts, to other bands and to the
-ends in the meantime, each faded by the dashpots of the cells since then,
+Waves in other bands than the drive's fade along rays (``studies.rays``). In the drive's band the waves of the drive and
+of the sites interfere, so that their energies do not add. There the energy E at the end follows from the balance of the
+driven wave: it is E_0, that of the run without contacts, less all that the wave has given since, each part faded by the
+dashpots of the cells from then on,
 
-    E = E_0 - integral (P_given + P_ends - P_ends,0) exp(-2 gamma (t_end - t)) dt,
+    E = E_0 - integral (P_given + P_ends - P_ends,0) exp(-2 gamma (t_end - t)) dt.
 
-with the rate 2 gamma of the wave of the drive's frequency. The power P_ends that absorbing ends take follows from the
-forces of contacts and drive and the compliance of the lattice, with and without (0) contacts.
+P_given is the power that goes to contacts, to other bands and to harmonics. P_ends is the power that absorbing ends
+take, which follows from the forces of contacts and drive by the compliance of the lattice; E_0 has lost P_ends,0, the
+same without contacts. 2 gamma is the rate of the wave at the drive's frequency.
 """
 
 from typing import NamedTuple
@@ -22,11 +24,13 @@ from vipetsc.studies.spectral_line import SpectralLine
 
 
 class SentPowers(NamedTuple):
-    """Powers in W (site, time) that contacts send out and take in a lattice with dashpots.
+    """Powers that the contacts send out in a lattice with dashpots, and their forces.
 
-    ``bands`` (band, site, time) is what goes to bands other than the drive's, and ``spectrum`` (site, band, bin) the
-    fractions of it in bins of the wavenumber; ``third`` is the gain of third harmonics together, ``given`` all that the
-    driven wave loses. ``force`` (site, time) in N is the envelope of the contacts' forces about the drive's frequency.
+    ``bands`` (band, site, time) in W is what goes to bands other than the drive's; ``spectrum`` (site, band, bin) are
+    the fractions of a band's energy in bins of the wavenumber. ``third`` (site, time) in W is what the third harmonics
+    of all sites carry beyond those of each site alone, which are in ``bands``. ``given`` (site, time) in W is all that
+    the driven wave gives. ``force`` (site, time) in N is the envelope of the contact's force about the drive's
+    frequency.
     """
 
     bands: np.ndarray
@@ -36,17 +40,23 @@ class SentPowers(NamedTuple):
     force: np.ndarray
 
 
-class AtEnd(NamedTuple):
-    """Energies in J at the end: ``remaining`` (band,), in the drive's band its change, and ``absorbed`` by ends."""
+class EndEnergies(NamedTuple):
+    """Energies in J at the end of the run, as the contacts have changed them.
+
+    ``remaining`` (band,) are the energies of the bands, in the drive's band its change by the contacts; ``absorbed`` is
+    the change of what absorbing ends have taken.
+    """
 
     remaining: np.ndarray
     absorbed: float
 
 
 class WaveLosses:
-    """The dashpots of a ``model``, for waves of the frequency ``middle`` in rad/s and of its third harmonic.
+    """What the dashpots of a ``model`` take of waves about the frequency ``middle`` in rad/s and of their harmonics.
 
-    ``driving`` (drive, offset) are spectra about it of the drives in N, under a drive of 1 N (1 m of a wall).
+    ``line`` is the grid of frequencies about ``middle``, ``compliance`` that of the lattice with its dashpots.
+    ``driving`` (drive, offset) are the spectra of the drives' forces in N, under a drive of 1 N (or 1 m of a wall).
+    ``driven`` is the wave of the drive's frequency, ``third`` that of its triple, None where there is none.
     """
 
     def __init__(
@@ -67,12 +77,15 @@ class WaveLosses:
         self.rays = Rays(model, line.time)
         self.during = line.time <= model.end
 
-        # The motions of masses with dashpots that the reference cell has not.
+        # The masses of absorbing ends, which have dashpots that the reference cell has not, and a column of ones and
+        # zeros for each that takes its displacement out of all.
         (masses,) = np.nonzero(self.rays.extra.ravel())
         self.dashpots = self.rays.extra.ravel()[masses]
         rows = np.zeros((self.rays.extra.size, len(masses)))
         rows[masses, np.arange(len(masses))] = 1.0
-        # Damped, so that the transform's period does not fold the response back.
+
+        # Velocities (offset, mass, force) of these by unit forces at the sites and of the drives, at the frequencies of
+        # ``line``.
         omega = middle + line.offset - 1j * line.decay
         motions = compliance.motion(omega, rows) if len(masses) else np.zeros((len(omega), 0, 0))
         self.velocities = 1j * omega[:, None, None] * motions
@@ -86,8 +99,8 @@ class WaveLosses:
         """Rate in 1/s at which the dashpots of the cells take the energy of a ``wave``."""
         return self.rays.rate(wave.band, wave.wavenumber)
 
-    def at_end(self, sent: SentPowers, amplitude: float) -> AtEnd:
-        """The energies at the end of a run under ``amplitude`` in N (of a wall m)."""
+    def at_end(self, sent: SentPowers, amplitude: float) -> EndEnergies:
+        """The energies at the end of a run under ``amplitude`` in N (in m of a wall) whose contacts have ``sent``."""
         step = float(self.line.time[1])
         remaining = np.zeros(len(sent.bands))
         absorbed = 0.0
@@ -102,20 +115,20 @@ class WaveLosses:
         # Rounding may leave a negative energy where nothing is sent.
         remaining = np.maximum(remaining, 0.0)
 
-        # The difference: what ends take without contacts is in the energy of the run without them already.
+        # What the ends take without contacts is missing from the energy of the run without them already.
         in_ends = self._power_in_ends(amplitude, sent.force) - self._power_in_ends(amplitude)
         since = np.exp(-self.rate(self.driven) * self.rays.since)
         remaining[self.driven.band] = -float((sent.given.sum(axis=0) + in_ends) @ since) * step
-        return AtEnd(remaining, absorbed + float(in_ends.sum()) * step)
+        return EndEnergies(remaining=remaining, absorbed=absorbed + float(in_ends.sum()) * step)
 
     def absorbed_without_contacts(self) -> float:
         """Energy in J that absorbing ends take in the run without contacts, under a drive of 1 N (1 m of a wall)."""
         return float(self._power_in_ends(1.0).sum()) * float(self.line.time[1])
 
     def _power_in_ends(self, amplitude: float, force: np.ndarray | None = None) -> np.ndarray:
-        """Power (time,) in W that absorbing ends take from the driven wave, averaged over a period.
+        """Power (time,) in W that absorbing ends take from the driven wave, averaged over a period of the drive.
 
-        ``force`` (site, time) in N are the envelopes of contacts' forces, without any if there are none.
+        ``force`` (site, time) in N are the envelopes of the contacts' forces; None for the run without contacts.
         """
         if not self.has_ends:
             return np.zeros(len(self.line.time))
@@ -124,5 +137,5 @@ class WaveLosses:
             of_sites = self.line.forward(force)
         forces = np.vstack([of_sites, abs(amplitude) * self.driving])
         velocity = self.line.backward(np.einsum("wms,sw->mw", self.velocities, forces))
-        # Half, the mean of a squared cosine. The line's time goes on beyond the run.
+        # Half is the mean of a squared cosine. The second half of the line's time is no part of the run.
         return np.where(self.during, 0.5 * self.dashpots @ np.abs(velocity) ** 2, 0.0)
