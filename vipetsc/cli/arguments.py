@@ -17,7 +17,7 @@ def argument(flag: str, **keywords: Any) -> Argument:
 
 
 def case_with(section: str) -> Argument:
-    """A required case file, because its ``section`` has no default."""
+    """The argument CASE of a verb whose case must have a ``section``, so that there is no built-in one."""
     return argument("case", metavar="CASE", help=f"case file (TOML) with a section [{section}]")
 
 
@@ -35,5 +35,5 @@ QUIET = argument("--quiet", action="store_true", help="print only warnings and e
 VERBOSE = argument("--verbose", action="store_true", help="print every phase and all statistics")
 LOG = argument("--log", type=Path, metavar="FILE", help="append all messages to FILE, with the time")
 
-OF_STUDIES = SET, OUT, FORCE, RESUME  # besides the case
+OF_STUDIES = SET, OUT, FORCE, RESUME  # of all verbs that compute results of a case, besides the case
 OF_EVERY_VERB = QUIET, VERBOSE, LOG

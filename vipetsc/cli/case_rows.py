@@ -1,4 +1,4 @@
-"""Description of a case as text: the lattice with its ends, losses, contacts, sites and initial motion."""
+"""Description of a case as text: the lattice with its ends, bands and losses, and the contacts with their sites."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from vipetsc.wording import MOST_SHOWN
 
 
 def lattice_rows(case: Case) -> list[tuple[str, str]]:
-    """Name, lattice, bands and contacts of a case, as rows of a table."""
+    """Rows of a table, name and text, that describe the lattice, the bands and the contacts of a case."""
     model = case.model()
     chain = model.chain
     cell = chain.cell
@@ -45,7 +45,10 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
 
 
 def describe_ends(case: Case) -> str:
-    """Description of the ends; for an absorbing end, with the energy reflected at each drive and in total."""
+    """Description of the ends; for absorbing ones with the fractions of the energy that they reflect.
+
+    For each drive these are the fraction at its frequency, and that of all waves that it sends.
+    """
     lattice = case.lattice
     absorbing = lattice.absorbing
     if absorbing is None or not (absorbing.cells and absorbing.strength):
@@ -70,7 +73,10 @@ def describe_ends(case: Case) -> str:
 
 
 def describe_losses(case: Case) -> str:
-    """The smallest, largest and mean loss ratio of each band over its wavenumbers; empty if no loss is prescribed."""
+    """The least, largest and mean loss of each band over its wavenumbers, as text; empty if no loss is prescribed.
+
+    The loss is twice the damping ratio; that which the case asks for stands behind.
+    """
     sentences = []
     for band, (asked, least, mean, most) in enumerate(losses(case.lattice), 1):
         sentence = f"band {band} {least:.3g}-{most:.3g}, mean {mean:.3g}"

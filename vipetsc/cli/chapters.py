@@ -1,4 +1,4 @@
-"""Chapters of the manual: which there are, part by part, and their Markdown as text for a terminal."""
+"""Chapters of the manual: their names, part by part, and their Markdown as text for a terminal."""
 
 import itertools
 import re
@@ -8,15 +8,17 @@ from textwrap import indent
 
 from vipetsc.cli.formulas import FormulaError, formula_text
 
-WIDEST = 40  # characters of a column, on average over all but the last; wider ones hold sentences
+# Characters of a column, on average over all columns but the last. A table with wider ones holds sentences, and is
+# printed as a list.
+WIDEST = 40
 # Chapters that no file holds, and the modules that write them.
 WRITTEN = {"case-keys": "vipetsc.case.keys", "features": "vipetsc.cli.feature_table"}
-# What no formula is in: blocks of code, and code in a paragraph.
+# Blocks of code, and code in a paragraph, in which $ begins no formula.
 CODE = re.compile(r"(^```.*?^```$|`(?:[^`\n]|\n(?!\n))+`)", flags=re.M | re.S)
 
 
 def parts() -> dict[str, list[str]]:
-    """Names of the manual's chapters by part, as the headings and tables of its index list them."""
+    """Names of the manual's chapters by the title of their part, as the headings and tables of its index list them."""
     sections = re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", chapter("index"), flags=re.M | re.S)
     listed = {title: re.findall(r"^\| \[[^]]*\]\(([\w-]+)\.md\)", text, flags=re.M) for title, text in sections}
     # No file holds these chapters, and no index links to them.
@@ -30,21 +32,21 @@ def studies() -> list[str]:
 
 
 def chapter(name: str) -> str:
-    """The text of a chapter, which a module may write."""
+    """The Markdown of the chapter ``name``, from its file or from the module that writes it."""
     if name in WRITTEN:
         return str(import_module(WRITTEN[name]).chapter())
     return (files("vipetsc") / "manual" / f"{name}.md").read_text(encoding="utf-8")
 
 
 def title(name: str) -> str:
-    """The title of a chapter."""
+    """The title of the chapter ``name``."""
     if name in WRITTEN:
         return str(import_module(WRITTEN[name]).TITLE)
     return chapter(name).partition("\n")[0].removeprefix("# ")
 
 
 def contents() -> str:
-    """Names and titles of the chapters, part by part."""
+    """Names and titles of the chapters, part by part, as lines of text."""
     listed = parts()
     width = max(map(len, itertools.chain(*listed.values())))
     lines = []
@@ -56,7 +58,7 @@ def contents() -> str:
 
 
 def plain(text: str) -> str:
-    """Markdown for a terminal: links and pictures by their words, formulas in Unicode, tables in columns."""
+    """Markdown as text for a terminal: links and pictures by their words, formulas in Unicode, tables in columns."""
     # Pictures before links, whose pattern matches those too.
     text = re.sub(r"!\[([^\]]*)\]\([^)]*\)", r"[picture: \1]", text)
     text = re.sub(r"\[([^\]]+)\]\((?!http)(?:\.\./)?(\w[\w/-]*)\.md(?:#[^)]*)?\)", r"\1 (manual \2)", text)
@@ -64,6 +66,7 @@ def plain(text: str) -> str:
 
     # The fences of a directive go; what they hold is text.
     text = re.sub(r"(?ms)^```\{\w+\}.*?\n(.*?)^```$", r"\1", text)
+    # Every second piece is what the pattern matched, and is code.
     pieces = CODE.split(text)
     for i in range(0, len(pieces), 2):
         pieces[i] = _without_latex(pieces[i])
@@ -71,13 +74,13 @@ def plain(text: str) -> str:
 
 
 def _without_latex(text: str) -> str:
-    """Text without code, its formulas in Unicode; displayed ones are indented."""
+    """A ``text`` that holds no code, with its formulas in Unicode; displayed ones are indented."""
     text = re.sub(r"(?s)\$\$(.+?)\$\$", lambda shown: indent(_formula(shown[1]), " " * 4), text)
     return re.sub(r"(?s)\$([^$]+?)\$", lambda inline: _formula(inline[1]), text)
 
 
 def _formula(latex: str) -> str:
-    """A formula in Unicode, or as it stands where that cannot be."""
+    """A formula in Unicode; as it stands if it has LaTeX that no table translates."""
     try:
         return formula_text(latex)
     except FormulaError:
@@ -85,9 +88,10 @@ def _formula(latex: str) -> str:
 
 
 def _columns(rows: str) -> str:
-    """The rows of a table in columns of equal width, the last one free; a wide table as a list, an entry a row."""
+    """The ``rows`` of a Markdown table in aligned columns; a table of sentences as a list, an entry for each row."""
     # An escaped bar is text of a cell.
     cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", row.strip("|"))] for row in rows.splitlines()]
+    # Without the line of dashes below the titles.
     cells = [row for row in cells if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
     # The last column needs no width: nothing stands after it.
     widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]) - 1)]

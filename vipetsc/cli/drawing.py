@@ -23,19 +23,19 @@ from vipetsc.parallel import on_every_rank, on_root
 if TYPE_CHECKING:
     from vipetsc.figures.sweep_members import Files
 
-MEASURES = "analysis.h5"  # the file of what `Pictures.prepare` measures
-SWEEP_FIGURES = "sweep"  # the source of pictures whose measures are those of the file
+MEASURES = "analysis.h5"  # the file of a run's measures, which `Pictures.prepare` writes
+SWEEP_FIGURES = "sweep"  # the name in the registry of the pictures of sweeps
 
 
 class Helper(Protocol):
-    """A process or ranks that draw pictures while this one computes, or draws others.
+    """A process, or ranks, that draw pictures while this process computes, or draws other pictures.
 
-    These are `vipetsc.figures.second_process.SecondProcess` and `vipetsc.cli.helping_ranks.HelpingRanks`.
+    There are `vipetsc.figures.second_process.SecondProcess` and `vipetsc.cli.helping_ranks.HelpingRanks`.
     """
 
     @property
     def turns(self) -> Iterator[int]:
-        """Numbers of pictures that both draw, each for one of them."""
+        """Numbers of pictures to draw; the helper takes from the same numbers, so that each goes to one of both."""
 
     @property
     def is_asked(self) -> bool:
@@ -44,22 +44,23 @@ class Helper(Protocol):
     def ask(self, source: str, folders: Sequence[Path], divided: bool = False, **options: Any) -> None:
         """Ask for what ``vipetsc.figures.registry.draw`` draws with these arguments; returns at once.
 
-        Of pictures that are ``divided`` it draws those whose turns this process does not take.
+        The helper draws all of it, or, if ``divided``, the pictures whose numbers it takes from ``turns``.
         """
 
     def drawn(self) -> list[Path] | None:
-        """Wait for all that was asked for; returns the files, or None where this process has to draw all of them."""
+        """Wait for all that was asked for; returns the files, or None if it failed and all is to be drawn here."""
 
 
 @dataclass(frozen=True)
 class Pictures:
     """Pictures that a verb draws of its results.
 
-    ``source`` is the name of these pictures in the registry of figures, ``file`` the file that shows that a folder
-    contains results to draw (a pattern as of ``Path.glob``), ``noun`` what that file is. ``prepare`` checks folders,
-    and measures what is missing in them or older than its run; without it, a file that cannot be read is found out by
-    drawing it. ``recognise`` says whether folders hold such results where one ``file`` in one folder does not decide.
-    ``unmeasured`` are figures that show the ``file`` alone, so that they can be drawn while it is measured.
+    ``source`` is the name of these pictures in the registry of figures. ``file`` is the name of the file of results (a
+    pattern as of ``Path.glob``): a folder that has it can be drawn; ``noun`` says what the file is. ``prepare`` checks
+    folders before they are drawn, and measures what is missing in them or older than its run; without it, the drawing
+    finds out which file cannot be read. ``recognise`` says whether folders hold such results, where that takes more
+    than one ``file`` in one folder. ``unmeasured`` are figures that show the ``file`` alone, without its measures, and
+    can be drawn while these are taken.
     """
 
     source: str
@@ -79,10 +80,10 @@ class Pictures:
 def second_process(
     pictures: Pictures, comm: MPI.Comm, names: Sequence[str] | None = None
 ) -> AbstractContextManager[SecondProcess | None]:
-    """A second process for ``pictures``, or None where it is of no use.
+    """A second process for ``pictures``, or None where it is of no use; as a context.
 
-    It helps where pictures take long, those of a run that are not restricted to ``names``, and where this process is
-    alone and a core is idle.
+    It is of use for pictures that take long, those of a run that are not restricted to ``names``, and where this
+    process is the only rank of ``comm`` and a core is idle.
     """
     if pictures.unmeasured and not names and comm.size == 1 and SecondProcess.is_useful():
         return SecondProcess()
@@ -90,8 +91,8 @@ def second_process(
 
 
 def draw_unmeasured(pictures: Pictures, folder: Path, helper: Helper) -> None:
-    """Let the ``helper`` draw what shows the new results in ``folder`` alone; they are measured meanwhile."""
-    # Earlier measures would put their warnings below the pictures.
+    """Let the ``helper`` draw, of new results in ``folder``, the pictures that need no measures, which come next."""
+    # Pictures carry the warnings of the measures that are there: earlier ones are not those of these results.
     if not (folder / MEASURES).exists():
         helper.ask(pictures.source, [folder], names=pictures.unmeasured)
 
@@ -105,21 +106,22 @@ def draw_pictures(
     afresh: bool = True,
     helper: Helper | None = None,
 ) -> list[Path]:
-    """Draw what ``folders`` hold as `vipetsc.figures.registry.draw`, measured first where that is missing or older.
+    """Draw the ``pictures`` of ``folders`` on all ranks; results without measures, or newer than these, are measured.
 
-    ``names`` are figures among ``pictures``, all by default; unless ``afresh``, those that are newer than the files
-    they show stay. A ``helper``, which may have been asked to `draw_unmeasured`, draws a part of all figures.
-    Returns the files written, on rank 0, an empty list on the others. Raises FolderError for folders that hold nothing
-    to draw, and for a figure that does not exist.
+    ``names`` are the figures to draw, all by default. Unless ``afresh``, pictures stay that are newer than the files
+    that they show. A ``helper``, which may have been asked to `draw_unmeasured`, draws a part of the figures. Returns
+    the files written on rank 0, and an empty list on the others. Raises FolderError for folders that hold nothing to
+    draw, and for a figure that does not exist. Collective.
     """
     on_root(comm, lambda: prepare(pictures, folders, names))
     # Rank 0 reads the time, so that all ranks use the same one even if their file systems differ.
     newest = None
     if not afresh:
         newest = on_root(comm, lambda: newest_result(folders))
-    # Asked before this process loads what it needs to draw itself.
+    # The helper is asked before this process loads matplotlib, so that it draws meanwhile.
     drawn_ahead: tuple[str, ...] = ()
     if helper:
+        # Pictures that were drawn before the measures lack warnings of these, and are drawn again if there are any.
         if helper.is_asked and not measures_warn(folders[0]):
             drawn_ahead = pictures.unmeasured
         helper.ask(pictures.source, folders, divided=True, formats=formats, newest=newest, omit=drawn_ahead)
@@ -148,7 +150,7 @@ def draw_pictures(
                 # A lattice without sites has no impacts: no matter to warn of.
                 echo(comm, f"  {sentence}")
         drawn = on_every_rank(comm, draw_part)
-    # ``gather`` gives None on all ranks but the first.
+    # ``gather`` returns None on all ranks but the first.
     return sorted(path for paths in comm.gather(drawn) or [] for path in paths)
 
 
@@ -159,15 +161,14 @@ def measures_warn(folder: Path) -> bool:
 
 @contextmanager
 def reading(pictures: Pictures, folders: Sequence[Path]) -> Iterator[None]:
-    """Raise FolderError for a file that cannot be read within the block, unless `prepare` has checked it."""
+    """Turn errors of reading within the block into a FolderError, unless ``pictures.prepare`` has checked the file."""
     try:
         yield
     except FolderError:
         # The message says which file, and why.
         raise
     except (OSError, KeyError, ValueError) as error:
-        # `prepare` has checked the folder: an error after that is an error of the program. A full disk says nothing
-        # about the file.
+        # After a check by `prepare` an error is one of the program. A full disk says nothing about the file.
         if pictures.prepare or is_disk_full(error):
             raise
         article = "an" if pictures.noun[0] in "aeiou" else "a"
@@ -176,13 +177,13 @@ def reading(pictures: Pictures, folders: Sequence[Path]) -> Iterator[None]:
 
 
 def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None = None) -> None:
-    """Check the requested pictures, and compute measures that are missing or older than their run; on one rank.
+    """Check the figures ``names``, and take measures that are missing or older than their run; on one rank.
 
-    Raises FolderError for an unknown picture, before any file is written.
+    Raises FolderError for a figure that does not exist, before any file is written, and as ``pictures.prepare``.
     """
     # Names first: measuring writes files, and a wrong --fig must leave none.
     if names is not None:
-        # Before any module that loads it as it is.
+        # First by this function, which loads matplotlib without its help texts: the registry would load these too.
         load_matplotlib()
         from vipetsc.figures.registry import figure_names
 
@@ -195,9 +196,9 @@ def prepare(pictures: Pictures, folders: Sequence[Path], names: list[str] | None
 
 
 def left_out(pictures: Pictures, folders: Sequence[Path], files: "Files", names: list[str] | None) -> list[str]:
-    """Messages about pictures that are not drawn; on one rank, which opens results as ``files``.
+    """Sentences about pictures that the results do not allow; on one rank, which opens results through ``files``.
 
-    Raises FolderError for a requested figure.
+    Raises FolderError if a figure among ``names`` is one of them.
     """
     from vipetsc.figures.registry import OVER_BRANCHES
     from vipetsc.figures.transfer_curves import curves_left_out
@@ -227,5 +228,5 @@ def left_out(pictures: Pictures, folders: Sequence[Path], files: "Files", names:
 
 
 def newest_result(folders: Sequence[Path]) -> float:
-    """Time at which the newest file of results in ``folders`` was written."""
+    """Time, as ``st_mtime``, at which the newest file of results in ``folders`` was written."""
     return max(path.stat().st_mtime for folder in folders for path in folder.glob("*.h5"))

@@ -1,7 +1,8 @@
-"""Features of cases that each verb accepts: a table that follows from checking a small case for each pair of the two.
+"""The chapter of the manual with a table of which verb accepts which feature of a case.
 
-A verb accepts a feature if its case with this feature is valid, and if the checks that follow the reading of the case
-(of an engine, of linear modes) accept it too. Otherwise the message that refuses it stands in the table.
+Every entry follows from a check of a small case. A verb accepts a feature if its case with this feature is valid, and
+if the checks that come after reading it (of an engine, of linear modes) accept it too. Otherwise the entry is the
+message that refuses it.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,10 +44,11 @@ OWN: Table = {
 
 @dataclass(frozen=True)
 class Feature:
-    """A feature by its ``name``, and the ``changes`` of a case that bring it in, by section.
+    """A feature of cases: its ``name``, and the ``changes`` of the case ``BASE`` after which it has the feature.
 
-    ``of_system`` are the changes that bring it into the system of [nnm.own], None if such a system cannot have it.
-    ``scaled`` are further changes for a column, by its heading, where numbers have another unit with the feature.
+    ``of_system`` are the changes after which the system of [nnm.own] has it, None if such a system cannot. ``scaled``
+    are further changes for single columns, by their headings: with the feature their case needs numbers of another
+    size, or would take long.
     """
 
     name: str
@@ -57,9 +59,10 @@ class Feature:
 
 @dataclass(frozen=True)
 class Column:
-    """A verb in one of its forms: the ``heading``, the class of its case, and the ``sections`` that it needs.
+    """A column of the table, a verb in one of its forms: its ``heading``, the ``kind`` of its case, and its sections.
 
-    ``refusal`` checks a valid case further and returns the reason for which it is refused, or an empty text.
+    ``sections`` are the changes of ``BASE`` that the verb needs. ``refusal`` checks a valid case further, and returns
+    the reason for which it is refused, or an empty text. ``is_system`` is true for the system of [nnm.own].
     """
 
     heading: str
@@ -69,14 +72,14 @@ class Column:
     is_system: bool = False
 
     def table(self, feature: Feature) -> Table | None:
-        """The case with ``feature``, as a file would give it; None if the verb reads no section that has it."""
+        """The table of the case with ``feature``, as of a case file; None if the verb reads no section that has it."""
         changes = feature.of_system if self.is_system else feature.changes
         if changes is None:
             return None
 
         if not changes.keys() <= {*self.kind.keywords(), "plugins"}:
             return None
-        # One after the other: a key that changes remove is removed from the case.
+        # Changes are merged one after the other: None in a later one removes a key that an earlier one has put in.
         return merged(merged(merged(BASE, self.sections), changes), feature.scaled.get(self.heading, {}))
 
     def answer(self, feature: Feature) -> str:
@@ -94,7 +97,7 @@ class Column:
 
 
 def merged(table: Mapping[str, Any], changes: Mapping[str, Any]) -> Table:
-    """``table`` with the ``changes`` put into it, tables within tables as well; None removes a key."""
+    """A copy of ``table`` with the ``changes``, which go into tables within tables too; None removes a key."""
     result = dict(table)
     for key, value in changes.items():
         if isinstance(value, dict) and isinstance(result.get(key), dict):
@@ -128,20 +131,20 @@ def _modes_refusal(case: Case) -> str:
 
 QUIET: Table = {"output": {"figures": False}}
 NNM = {"modes": [1], "points": 2, "energy": [0.0, 1.0]}
-# By the usual bound on what is left out hundreds would be taken along.
+# By the default bound on the harmonics that are left out, hundreds would be taken along.
 FEW_HARMONICS = {"harmonics": 41, "truncation": 1e-3}
 BREATHER = {"start_frequency": [4500.0], "start_sites": [1]}
 STEPS = {"points": 6, "harmonics": 5, "first_step": 0.2, "largest_step": 0.3}
 FORCE = {"source": "force", "infinite": False, "range": [0.44, 1.0]}
 FEW_RUNS = {"largest": 2.0, "tolerance": 0.9, "finest": 0.5, "samples": 1}
 PREDICT = {"predict": {"amplitudes": [2.0], "points": 16}}
-# Until the burst has come to the sites, roughly: whether a feature changes results is asked, not by how much.
+# About as long as the burst takes to the sites: the table asks whether a run is accepted, not what comes out.
 SHORT = {"time": {"end": 0.03, "sample_interval": 5e-4, "rtol": 1e-6}}
-# Well below the band's edge, at which waves are slow: a ring in which they do not return has 109 cells, not 1911.
+# Well below the band's edge, at which waves are slow: the ring of a law then has 109 cells, not 1911.
 FAST = {"drive": {"frequency": 800.0}}
 SEARCH = {"budget": 2, "variables": {"profile": [1e-5, 1e-3]}, "objective": [{"measure": "entropy"}]}
-# The record of an example, of another lattice: the fit begins, and that is all that is asked. Such noise explains every
-# misfit, so that windows are not repeated.
+# The record of an example, which is of another lattice: the table asks whether a fit is accepted, not what comes out.
+# With so much noise every misfit is explained, so that the fit ends soon.
 RECORD = {
     "file": str(files("vipetsc") / "examples" / "identify.csv"),
     "time": 1,
@@ -178,13 +181,13 @@ def _contacts(**changes: Any) -> Table:
 
 
 def _own_contacts(*contacts: tuple[int, float]) -> Table:
-    """Contacts (host, clearance in m) of the second mass of [nnm.own]."""
+    """Changes after which the second mass of [nnm.own] has these ``contacts``, pairs of a host and a clearance in m."""
     pairs = [{"host": host, "resonator": 2, "clearance": clearance} for host, clearance in contacts]
     return {"nnm": {"own": {"contacts": pairs}}}
 
 
 def _drive(**changes: Any) -> Table:
-    # Keys of the burst of other columns that the waveform may not have are removed.
+    # Without the keys of the burst in ``DRIVEN``, which another waveform may not have.
     return {"drive": {"cycles": None, "frequency": None, **changes}}
 
 
@@ -317,7 +320,7 @@ def _introduction() -> Iterator[str]:
 
 
 def _table(rows: Mapping[str, Sequence[str]], reasons: Sequence[str]) -> Iterator[str]:
-    """The lines of the table, with numbers in place of ``reasons``."""
+    """The lines of the table, whose entries refer to the ``reasons`` by numbers."""
     shown = {reason: str(number) for number, reason in enumerate(reasons, 1)} | {YES: YES, UNREAD: UNREAD}
     yield f"| feature | {' | '.join(column.heading for column in COLUMNS)} |"
     yield "|---" * (len(COLUMNS) + 1) + "|"

@@ -27,16 +27,17 @@ ACCENTS = {
     "bar": "\N{COMBINING MACRON}",
     "tilde": "\N{COMBINING TILDE}",
 }
-# What changes the look of its argument alone, and what makes a delimiter as tall as what it holds.
+# Commands that change the typeface of their argument, and commands that change sizes; both leave the text as it is.
 LOOKS = ("mathrm", "mathbf", "boldsymbol", "text", "operatorname", "mathcal", "mathit")
 SIZES = ("left", "right", "big", "Big", "bigl", "bigr", "displaystyle")
 FRACTIONS = ("frac", "tfrac", "dfrac")
 RAISED = dict(zip("0123456789+−=()ijkmnptx*′ᵀ", "⁰¹²³⁴⁵⁶⁷⁸⁹⁺⁻⁼⁽⁾ⁱʲᵏᵐⁿᵖᵗˣ*′ᵀ", strict=True))
 LOWERED = dict(zip("0123456789+−=()aehijklmnoprstuvx", "₀₁₂₃₄₅₆₇₈₉₊₋₌₍₎ₐₑₕᵢⱼₖₗₘₙₒₚᵣₛₜᵤᵥₓ", strict=True))
 TOKEN = re.compile(r"\\[a-zA-Z]+|\\.|\s+|.", flags=re.S)
-# One factor, which a fraction or a root takes without brackets.
+# A text that is one factor, which a fraction or a root takes without brackets.
 FACTOR = re.compile(r"[^\s+\-−=·×/()]*")
-ROWS = re.compile(r"\\(?:begin|end)\{\w+\*?\}|&+")
+# The begin and end of an environment, and the marks between its columns.
+MARKS = re.compile(r"\\(?:begin|end)\{\w+\*?\}|&+")
 
 
 class FormulaError(ValueError):
@@ -49,26 +50,26 @@ def formula_text(formula: str) -> str:
     Fractions become quotients, with brackets where they need some; scripts are raised and lowered where Unicode has
     all their letters, and follow ``^`` or ``_`` elsewhere. Raises FormulaError for a command that no table has.
     """
-    rows = re.split(r"\\\\(?:\[[^]]*\])?", ROWS.sub(lambda mark: _gap(mark[0]), formula))
+    rows = re.split(r"\\\\(?:\[[^]]*\])?", MARKS.sub(lambda mark: _gap(mark[0]), formula))
     texts = [_rendered([token[0] for token in TOKEN.finditer(row)]) for row in rows]
     lines = [re.sub(r"\s+", _blank, text).strip() for text in texts]
     return "\n".join(line for line in lines if line)
 
 
 def _blank(space: re.Match[str]) -> str:
-    """Return blanks in place of a ``space``: that of the source and thin ones are one together, wide ones stay wide."""
+    """Return what replaces a run of blanks: one blank, or four if a wide space (``quad``, ``&&``) is among them."""
     if WIDE in space[0]:
         return "    "
     return " "
 
 
 def _gap(mark: str) -> str:
-    """Return what takes the place of ``mark``, which begins or ends an environment or parts its columns."""
+    """Return what replaces a ``mark``, which begins or ends an environment, or separates its columns."""
     return {"&": " ", "&&": WIDE}.get(mark, "")
 
 
 def _rendered(tokens: list[str]) -> str:
-    """Return the text of all tokens, which are consumed."""
+    """Return the text of all ``tokens``, which are taken out of the list."""
     parts = []
     while tokens:
         parts.append(_next(tokens))
@@ -77,7 +78,7 @@ def _rendered(tokens: list[str]) -> str:
 
 
 def _next(tokens: list[str]) -> str:
-    """Return the text of the next token with its argument; they are consumed."""
+    """Return the text of the next token with its arguments, which are taken out of ``tokens``."""
     token = tokens.pop(0)
     if token == "{":
         return _rendered(_group(tokens))
@@ -94,9 +95,9 @@ def _next(tokens: list[str]) -> str:
 
 
 def _command(name: str, tokens: list[str]) -> str:
-    """Return the text of a command with its arguments, which are consumed."""
+    """Return the text of the command ``name`` with its arguments, which are taken out of ``tokens``."""
     if name in FRACTIONS:
-        # The arguments are taken from the tokens in this order.
+        # In this order: each call takes the next argument.
         upper = _argument(tokens)
         lower = _argument(tokens)
         return f"{_factor(upper)}/{_factor(lower)}"
@@ -114,7 +115,7 @@ def _command(name: str, tokens: list[str]) -> str:
     if name in FUNCTIONS:
         if tokens and tokens[0].removeprefix("\\") in FRACTIONS:
             return f"{name}({_next(tokens)})"
-        # A blank before letters, none before brackets and scripts.
+        # A blank before letters and commands, none before brackets and scripts.
         is_followed = bool(tokens) and (tokens[0].isalnum() or tokens[0].startswith("\\"))
         return name + " " * is_followed
     if name not in SYMBOLS:
@@ -123,7 +124,10 @@ def _command(name: str, tokens: list[str]) -> str:
 
 
 def _script(mark: str, text: str, is_word: bool) -> str:
-    """Return an exponent or index (``mark`` ^ or _) raised or lowered, if it can be and is no word."""
+    """Return the exponent (``mark`` ^) or index (_) ``text`` raised or lowered, if Unicode has its letters.
+
+    A word, and what Unicode cannot raise, follows the mark, in brackets unless it reads as one factor without them.
+    """
     letters = {"^": RAISED, "_": LOWERED}[mark]
     if text and not is_word and all(character in letters for character in text):
         return "".join(letters[character] for character in text)
@@ -143,7 +147,7 @@ def _factor(text: str) -> str:
 
 
 def _argument(tokens: list[str]) -> str:
-    """Return the text of the next group or single token; they are consumed."""
+    """Return the text of the next group or single token, which is taken out of ``tokens``."""
     while tokens and tokens[0].isspace():
         tokens.pop(0)
     if not tokens:
@@ -152,7 +156,7 @@ def _argument(tokens: list[str]) -> str:
 
 
 def _group(tokens: list[str]) -> list[str]:
-    """Return the tokens up to the bracket that ends the group; they and the bracket are consumed."""
+    """Return the tokens up to the bracket that ends the group; they and the bracket are taken out of ``tokens``."""
     depth = 1
     inner: list[str] = []
     while tokens:

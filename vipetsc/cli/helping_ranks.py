@@ -1,8 +1,8 @@
 """Ranks that draw pictures while rank 0 simulates and measures alone, where more ranks would not simulate faster.
 
-Rank 0 computes as a process that was started without mpirun, and the others are what the second process is there: they
-load the tools for pictures during the simulation, draw while rank 0 measures what their pictures do not show, and take
-turns with it at the others. All of them would otherwise load and wait at the same times.
+Rank 0 computes like a process that was started without mpirun. The other ranks do what `SecondProcess` does there: they
+load matplotlib during the simulation, draw the pictures that need no measures while rank 0 measures, and share the
+other pictures with it. If all ranks worked on the simulation, they would then all load matplotlib at the same time.
 """
 
 import time
@@ -18,23 +18,27 @@ from vipetsc.figures.loading import load_matplotlib
 from vipetsc.parallel import SharedCounter, StopRequest, on_root
 
 T = TypeVar("T")
-TAG = 1  # of all messages here
-LOOK_EVERY = 1e-3  # s between two looks for a message: ranks that wait at full speed would keep cores from others
+TAG = 1  # of all messages of this module
+LOOK_EVERY = 1e-3  # s between two looks for a message: MPI's own wait would keep a core busy
 
 
 class DrawRequest(NamedTuple):
-    """Pictures for ``vipetsc.figures.registry.draw``, by its ``options``; rank 0 draws some of those ``divided``."""
+    """A call of ``vipetsc.figures.registry.draw`` with ``options``; rank 0 draws a part of it if it is ``divided``."""
 
     divided: bool
     options: dict[str, Any]
 
 
 class AnswerRequest:
-    """The request for the answer to all requests before it: the files, or the error that a picture raised."""
+    """A request for the outcome of all requests before it: the files, or the error that a picture raised."""
 
 
 class HelpingRanks:
-    """The other ranks of ``comm`` as rank 0 sees them; ``turns`` are numbers of pictures that all ranks draw."""
+    """The other ranks of ``comm``, as rank 0 uses them.
+
+    ``turns`` are numbers of pictures to draw; all ranks take from the same ones. ``is_asked`` says whether anything was
+    asked for that ``drawn`` has not waited for.
+    """
 
     def __init__(self, comm: MPI.Comm, turns: Iterator[int]) -> None:
         self.turns = turns
@@ -45,13 +49,13 @@ class HelpingRanks:
     def ask(self, source: str, folders: Sequence[Path], divided: bool = False, **options: Any) -> None:
         """Ask for what ``vipetsc.figures.registry.draw`` draws with these arguments; returns at once.
 
-        Of pictures that are ``divided`` they draw those whose turns rank 0 does not take.
+        The other ranks draw all of it, or, if ``divided``, the pictures whose numbers they take from ``turns``.
         """
         self.is_asked = True
         self._send(DrawRequest(divided, options | {"source": source, "folders": folders}))
 
     def drawn(self) -> list[Path]:
-        """Wait for all that was asked for; returns the files, and raises what one of the ranks raised."""
+        """Wait for all that was asked for; returns the files, or raises the error of a rank whose picture failed."""
         self._send(AnswerRequest())
         answers = [_received(self._comm, rank) for rank in self._ranks]
         self.is_asked = False
@@ -61,20 +65,20 @@ class HelpingRanks:
         return [path for files in answers for path in files]
 
     def dismiss(self) -> None:
-        """Let them go, whether or not they have been asked for an answer."""
+        """End the helpers' wait for requests, whether or not `drawn` was called."""
         self._send(None)
 
     def _send(self, request: DrawRequest | AnswerRequest | None) -> None:
-        """Send a request to each of them."""
+        """Send a request to every helper."""
         for rank in self._ranks:
             self._comm.send(request, rank, TAG)
 
 
 def with_helping_ranks(comm: MPI.Comm, stop: StopRequest, work: Callable[[HelpingRanks], T]) -> T:
-    """Value of ``work``, on all ranks of ``comm``; rank 0 calls it alone, and the others draw what it asks them for.
+    """Call ``work`` on rank 0 alone, while the others draw what it asks them for; its value on all ranks of ``comm``.
 
-    A request to ``stop`` that another rank gets counts as one of rank 0. All ranks must call it; what ``work`` raises
-    is raised on all of them.
+    A request to ``stop`` that another rank gets is passed on to rank 0. All ranks must call it; what ``work`` raises is
+    raised on all of them.
     """
     with SharedCounter.within(comm) as pictures, stop.passed_on(comm):
         turns = iter(pictures.draw, None)
@@ -93,7 +97,7 @@ def with_helping_ranks(comm: MPI.Comm, stop: StopRequest, work: Callable[[Helpin
 
 def _help(comm: MPI.Comm, stop: StopRequest, turns: Iterator[int]) -> None:
     """Draw what rank 0 asks for until it dismisses this rank."""
-    # What cannot be loaded is reported where it is needed.
+    # Loaded while rank 0 simulates. An error is not reported here but at the first picture.
     with suppress(Exception):
         load_matplotlib()
         import vipetsc.figures.registry  # noqa: F401
@@ -104,10 +108,10 @@ def _help(comm: MPI.Comm, stop: StopRequest, turns: Iterator[int]) -> None:
         if isinstance(request, AnswerRequest):
             comm.send(failure or files, 0, TAG)
             continue
-        # Pictures that rank 0 leaves to the helpers are shared by rank.
+        # Those that are not divided with rank 0 are divided between the helpers, by their ranks.
         own_turns = turns if request.divided else count(comm.rank - 1, comm.size - 1)
         try:
-            # The run is saved: a request to stop ends all ranks.
+            # The run is saved by now: a request to stop may end the picture, and all ranks.
             with stop.at_once():
                 files += _drawn(request.options, own_turns)
         except Exception as error:
@@ -115,14 +119,14 @@ def _help(comm: MPI.Comm, stop: StopRequest, turns: Iterator[int]) -> None:
 
 
 def _drawn(options: dict[str, Any], turns: Iterator[int]) -> list[Path]:
-    """Draw as ``vipetsc.figures.registry.draw``."""
+    """Draw the pictures of these ``turns``; ``options`` are those of ``vipetsc.figures.registry.draw``."""
     from vipetsc.figures.registry import draw
 
     return draw(**options, turns=turns)
 
 
 def _received(comm: MPI.Comm, rank: int, stop: StopRequest | None = None) -> Any:
-    """The next message of ``rank``, for which this one waits asleep; it passes on a request to ``stop`` meanwhile."""
+    """Wait asleep for the next message of ``rank``; requests to ``stop`` that come meanwhile are passed on."""
     while not comm.Iprobe(rank, TAG):
         if stop:
             stop.pass_on()

@@ -1,4 +1,4 @@
-"""Requirements of the program: versions of packages, PETSc's scalar type, and a single MPI for all packages."""
+"""Checks of an installation: versions of packages, PETSc's scalar type, one MPI for all packages, BLAS, HDF5, SLEPc."""
 
 import importlib
 import os
@@ -20,11 +20,14 @@ BUILT_FOR_MPI = "mpi4py", "petsc4py"
 LAUNCHED = "OMPI_COMM_WORLD_SIZE", "PMI_SIZE"
 MPI_LIBRARY = re.compile(r"\S*/lib(?:mpi|mpich|mpi_abi)\.so[.\d]*$", re.MULTILINE)
 BLAS_LIBRARY = re.compile(r"\S*/lib(?:\w*blas|blis|mkl_rt)[\w.-]*\.so[.\d]*$", re.MULTILINE)
-REFERENCE_BLAS = "blas"  # the folder of Debian's
+REFERENCE_BLAS = "blas"  # the name of the folder in which Debian has it
 
 
 class Package(NamedTuple):
-    """Python package: its name for pip, the ``oldest`` version that works and the newest version that was ``tried``."""
+    """A Python package: its name for pip, the ``oldest`` version that works, the newest one that was ``tried``.
+
+    ``module`` is the name by which it is imported, if that is another.
+    """
 
     name: str
     oldest: str
@@ -54,7 +57,7 @@ PACKAGES = (
 
 
 class Check(NamedTuple):
-    """One check of the machine: its ``value``, a ``fault`` that prevents the program from working, or a ``note``."""
+    """Outcome of a check: the ``value`` found, a ``fault`` with which the program cannot work, or a ``note``."""
 
     name: str
     value: str = ""
@@ -85,7 +88,7 @@ def checks(comm: MPI.Comm) -> list[Check]:
 
 
 def check_package(package: Package) -> Check:
-    """The check of a package: that it loads, and that its version is one that the program works with."""
+    """Check that a package loads, and that its version is one that the program works with."""
     if package.name in BUILT_FOR_MPI:
         remedy = "install it from the distribution, a module or conda, or by scripts/recipes/pip (chapter install)"
     else:
@@ -120,7 +123,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def check_scalars(scalar: Any = None) -> Check:
-    """The check of PETSc's numbers, of the type ``scalar`` or as PETSc is installed."""
+    """Check that PETSc computes with real doubles; ``scalar`` is the type of its numbers, by default as installed."""
     from petsc4py import PETSc
 
     value = np.dtype(scalar or PETSc.ScalarType)
@@ -134,7 +137,7 @@ def check_scalars(scalar: Any = None) -> Check:
 
 
 def loaded_libraries(name: re.Pattern[str]) -> list[str]:
-    """Files of libraries of that ``name`` that this process has loaded; none where the system has no list of them."""
+    """Files of libraries that this process has loaded and whose path matches ``name``; on Linux, elsewhere none."""
     try:
         loaded = Path("/proc/self/maps").read_text()
     except OSError:
@@ -143,9 +146,10 @@ def loaded_libraries(name: re.Pattern[str]) -> list[str]:
 
 
 def check_mpi(libraries: list[str], size: int, environment: Mapping[str, str]) -> Check:
-    """The check that mpi4py, petsc4py and the launcher are of one MPI.
+    """Check that mpi4py, petsc4py and the launcher are of one MPI.
 
-    ``libraries`` are loaded in this process, ``size`` is that of COMM_WORLD.
+    ``libraries`` are the MPI libraries in this process, ``size`` is the number of ranks of COMM_WORLD, ``environment``
+    has the variables in which the launcher writes how many processes it started.
     """
     value = ", ".join(libraries)
     if len(libraries) > 1:
@@ -166,7 +170,7 @@ def check_mpi(libraries: list[str], size: int, environment: Mapping[str, str]) -
 
 
 def check_mpirun() -> Check:
-    """The path of mpirun; the launcher of a cluster, or a single rank, does not need it."""
+    """Look for mpirun; its absence is no fault, since single ranks and the launchers of clusters do not need it."""
     value = shutil.which("mpirun")
     if value:
         return Check("mpirun", value)
@@ -175,7 +179,7 @@ def check_mpirun() -> Check:
 
 
 def check_blas(libraries: list[str]) -> Check:
-    """The BLAS that numpy and PETSc use, out of the loaded ``libraries``; the reference BLAS is correct, but slow."""
+    """Name the BLAS of numpy and PETSc among the loaded ``libraries``; the reference BLAS is correct but slow."""
     note = ""
     if any(Path(library).parent.name == REFERENCE_BLAS for library in libraries):
         note = "the reference BLAS: analyses, nnm and nfrc are faster with OpenBLAS (Debian: libopenblas0-serial)"
@@ -183,7 +187,7 @@ def check_blas(libraries: list[str]) -> Check:
 
 
 def check_parallel_hdf5(size: int) -> Check:
-    """Whether ``size`` ranks can write one file together; only ``output.writer = "parallel"`` asks for it."""
+    """Check whether ``size`` ranks can write one file together, which only ``output.writer = "parallel"`` asks for."""
     # Debian loads its MPI build under mpirun alone.
     if size == 1:
         return Check("parallel HDF5", "only visible under mpirun")
@@ -194,7 +198,7 @@ def check_parallel_hdf5(size: int) -> Check:
 
 
 def check_native_calls() -> Check:
-    """Whether PETSc can call the compiled right-hand side."""
+    """Check that PETSc can call the compiled right-hand side."""
     from vipetsc.dynamics.ts.right_hand_side import compile_callback
 
     try:
@@ -208,7 +212,7 @@ def check_native_calls() -> Check:
 
 
 def check_slepc() -> Check:
-    """The version of SLEPc, or how to install it; only some verbs need it, so that its absence is not a fault."""
+    """Look for SLEPc; its absence is no fault, since only some verbs need it."""
     from vipetsc.dynamics.eigen import load_slepc
 
     try:

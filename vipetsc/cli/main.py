@@ -19,7 +19,9 @@ from vipetsc.io.errors import FolderError, ResultFileError
 from vipetsc.parallel import EndedError, StoppedError, StopRequest, all_meet, on_root
 from vipetsc.register import PartError
 
-PATIENCE = 5.0  # s within which stopped ranks must meet; a launcher kills the remaining ranks sooner
+# s within which all ranks that were stopped must meet. If one of them was killed they never do, and the launcher kills
+# the others within this time.
+PATIENCE = 5.0
 ABOUT_THE_PROGRAM = "-h", "--help", "--version"
 
 
@@ -31,7 +33,7 @@ class Parser(argparse.ArgumentParser):
             super()._print_message(message, file)
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
-        """End the program; what --help could not print decides the exit code."""
+        """End the program with ``status``; if that is 0, with the code of a failure to print the help."""
         super().exit(status or on_root(MPI.COMM_WORLD, lambda: report_unwritten([sys.stdout])), message)
 
 
@@ -70,7 +72,7 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
         if getattr(options, "force", False) and getattr(options, "resume", False):
             raise FolderError("--force and --resume exclude each other: one starts again, the other continues")
 
-        # A verb that never looks at the request has nothing to save and ends at once.
+        # A verb that never looks at the request has nothing to save, and is ended by the signal at once.
         with StopRequest().listening() as stop, nullcontext() if verb.is_stoppable else stop.at_once():
             return int(verb.call(options, MPI.COMM_WORLD, stop))
 
@@ -85,13 +87,14 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
         echo(MPI.COMM_WORLD, f"vipetsc: {error}", sys.stderr)
         return BAD_INPUT
     except EndedError:
-        # The others may wait for this rank.
+        # Other ranks may be in a collective call, and would wait for this one for ever.
         if MPI.COMM_WORLD.size > 1:
             MPI.COMM_WORLD.Abort(STOPPED)
         echo(MPI.COMM_WORLD, "vipetsc: stopped on request", sys.stderr)
         return STOPPED
     except StoppedError as error:
-        # The launcher asks ranks to stop when one of them was killed: then nobody has stopped on request.
+        # A launcher also asks the other ranks to stop when one was killed. Then they do not all meet, and no message
+        # claims that somebody asked for it.
         if all_meet(MPI.COMM_WORLD, PATIENCE):
             text = f"vipetsc: {error}"
             if getattr(options, "force", False):
@@ -101,7 +104,10 @@ def _call(options: argparse.Namespace, petsc: Mapping[str, str]) -> int:
 
 
 def _parser(complete: Mapping[str, Any] | None = None) -> Parser:
-    """The parser of all verbs; ``complete`` holds how a shell completes arguments, by their names or flags."""
+    """The parser of all verbs.
+
+    ``complete`` says how a shell completes arguments (values of ``shtab``), by the arguments' names or flags.
+    """
     parser = Parser(
         prog="vipetsc",
         description="Waves in phononic lattices with vibro-impacts. Without a verb, the built-in four-band case runs.",
@@ -118,7 +124,7 @@ def _parser(complete: Mapping[str, Any] | None = None) -> Parser:
             epilog=f"example: vipetsc {verb.example}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        # The verb `completion` describes the parser to a shell.
+        # The verb `completion` makes a parser of its own with this function, to describe it to a shell.
         of_verb.set_defaults(parser=_parser)
         for flag, keywords in (*verb.arguments, *OF_EVERY_VERB):
             added = of_verb.add_argument(flag, **keywords)

@@ -1,4 +1,7 @@
-"""Messages: answers on stdout, progress and warnings on stderr, all of them in a file if ``--log`` names one."""
+"""Messages: results on stdout, progress and warnings on stderr, all of them in a file if ``--log`` names one.
+
+What a verb was asked to print is an "answer", as opposed to progress and warnings about it.
+"""
 
 import argparse
 import logging
@@ -18,7 +21,7 @@ from vipetsc.progress import BAR
 
 logger = logging.getLogger("vipetsc")
 answers = logging.getLogger("vipetsc.answers")
-OFTEN = {"vipetsc.step", "vipetsc.landing", "vipetsc.read"}  # phases that --verbose leaves out
+OFTEN = {"vipetsc.step", "vipetsc.landing", "vipetsc.read"}  # audit events too frequent for --verbose
 
 
 def echo(comm: MPI.Comm, text: str, stream: TextIO | None = None) -> None:
@@ -45,10 +48,11 @@ def echo_warnings(comm: MPI.Comm, warnings: Iterable[str]) -> None:
 
 @contextmanager
 def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> Iterator[list[TextIO]]:
-    """Print within the block according to ``options`` (quiet, verbose, log); answers are printed even with --quiet.
+    """Print messages within the block as ``options`` ask for (quiet, verbose, log).
 
-    Gives the streams that have to take all of it, for ``report_unwritten``. All ranks must call it. Raises FolderError
-    if the file of ``--log`` cannot be opened.
+    With ``is_answer``, answers are printed even with --quiet. The value of the block is the list of the streams that
+    must take all output, for ``report_unwritten``. All ranks must call it. Raises FolderError if the file of ``--log``
+    cannot be opened.
     """
     handlers = _stream_handlers(quiet=options.quiet, is_answer=is_answer)
     streams = [sys.stdout]
@@ -57,12 +61,12 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
         on_root(comm, lambda: streams.append(_open_log(options.log)))
         handlers += [_log_handler(stream) for stream in streams[1:]]
 
-    # Without propagation: the front door's own handler would print everything again.
+    # Without propagation: the handler that `__main__` gives the root logger would print everything again.
     is_verbose = options.verbose and comm.rank == 0
     level = logger.level
     logger.propagate = False
     logger.setLevel(logging.DEBUG if is_verbose else logging.INFO)
-    # Progress bars write to stderr themselves: the level of their own logger switches them off.
+    # Progress bars write to stderr themselves, and look at the level of a logger of their own.
     logging.getLogger(BAR).setLevel(logging.CRITICAL if options.quiet else logging.NOTSET)
     for handler in handlers:
         logger.addHandler(handler)
@@ -72,7 +76,7 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
     try:
         yield streams
     except Exception as error:
-        # Only in the file: the exception hook of the process reports it on stderr.
+        # Into the file alone: on stderr the exception hook of the process reports the error.
         for handler in handlers:
             if handler.stream in streams[1:]:
                 handler.handle(logger.makeRecord(logger.name, logging.CRITICAL, "", 0, f"vipetsc: {error}", (), None))
@@ -88,7 +92,7 @@ def reporting(comm: MPI.Comm, options: argparse.Namespace, is_answer: bool) -> I
 
 
 def _stream_handlers(quiet: bool, is_answer: bool) -> "list[logging.StreamHandler[TextIO]]":
-    """The handlers of stdout, for answers, and of stderr, for all else."""
+    """The handlers of stdout, for answers, and of stderr, for everything else."""
     out = logging.StreamHandler(sys.stdout)
     out.addFilter(lambda record: record.name == answers.name and (is_answer or not quiet))
     err = logging.StreamHandler(sys.stderr)

@@ -1,4 +1,7 @@
-"""Text streams whose errors in writing decide the exit code, and drop what cannot be written until then."""
+"""Standard streams on which an error in writing is kept for the exit code, instead of ending a computation.
+
+What cannot be written is dropped: a closed pipe or a full disk must not cost a run that is saved elsewhere.
+"""
 
 import errno
 import io
@@ -13,10 +16,10 @@ CUT_OFF = 128 + signal.SIGPIPE  # exit code that a shell reports for a program t
 
 
 class CheckedStream(io.TextIOWrapper):
-    """Text stream on a file ``descriptor``, called ``title`` in messages, that keeps its first ``error``.
+    """A text stream on a file ``descriptor``, called ``title`` in messages, that keeps its first ``error`` in writing.
 
-    Writing raises nothing: what comes after the error is dropped, so that a computation goes on to its end. Characters
-    that the encoding lacks are written as escapes.
+    Writing never raises OSError; what comes after the first error is dropped. Characters that the ``encoding`` lacks
+    are written as escapes.
     """
 
     def __init__(self, descriptor: int, title: str, encoding: str) -> None:
@@ -26,12 +29,12 @@ class CheckedStream(io.TextIOWrapper):
 
     @property
     def error(self) -> OSError | None:
-        """The first error in writing."""
+        """The first error in writing; None without any."""
         return self._raw.error
 
 
 class _CheckedFile(io.RawIOBase):
-    """Unbuffered file that keeps its first error in writing, and drops what comes after it."""
+    """An unbuffered file that keeps its first error in writing, and drops what comes after it."""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
@@ -59,7 +62,7 @@ class _CheckedFile(io.RawIOBase):
         super().close()
 
     def write(self, data: Any) -> int:
-        """Write part of ``data``; returns its length, that of all ``data`` where nothing can be written."""
+        """Write a part of ``data``; returns its number of bytes, after an error that of all ``data``."""
         while self.error is None:
             try:
                 return os.write(self.descriptor, data)
@@ -72,9 +75,9 @@ class _CheckedFile(io.RawIOBase):
 
 
 def check_standard_streams() -> None:
-    """Replace stdout and stderr by checked streams, unless a caller put streams of its own there."""
-    # A number that the caller has closed would be given to the next file that is opened, and messages written into it.
-    # Reading from nowhere keeps the number, and writing to it remains an error.
+    """Replace stdout and stderr by checked streams, unless a caller has put streams of its own there."""
+    # If the caller has closed one of the numbers 0 to 2, the next file that is opened gets it, and messages would be
+    # written into that file. /dev/null takes the number; opened for reading, it refuses what is written.
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
@@ -88,7 +91,10 @@ def check_standard_streams() -> None:
 
 
 def report_unwritten(streams: Iterable[Any]) -> int:
-    """Report on stderr which of the checked ``streams`` lost output; returns an exit code, 0 if none."""
+    """Report on stderr which of the ``streams`` lost output; returns an exit code, 0 if none did.
+
+    Of a closed pipe the code is that of a program that SIGPIPE has ended, without a message; else it is 1.
+    """
     errors = {stream.title: stream.error for stream in streams if isinstance(stream, CheckedStream) and stream.error}
     # A reader that closes the pipe, as `head` does, needs no message.
     complaints = {title: error for title, error in errors.items() if error.errno != errno.EPIPE}

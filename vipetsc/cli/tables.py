@@ -1,4 +1,4 @@
-"""How tables are printed: rows of a name and a value, lists cut after a few, durations."""
+"""Text of tables: rows of a name and a value, lists that are cut after a few entries, durations."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ from vipetsc.wording import shortened
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
-    """Names and values in two columns; a row without a value is left out."""
+    """The ``rows`` (name, value) in two columns; a row with an empty value is left out."""
     width = max(len(name) for name, value in rows if value)
     return "\n".join(f"  {name:<{width}}  {value}" for name, value in rows if value)
 

@@ -1,8 +1,8 @@
 """Records of verbs, from which the parser, completion, checks and tests take their lists.
 
-A ``PlainVerb`` is a function. A ``StudyVerb`` computes results of a case into a folder, and all of these run in one
-frame: the case is read, its PETSc options are checked, its warnings are printed, the folder is locked, the study
-computes, the pictures are drawn, and the exit code says how that went.
+A ``PlainVerb`` is a function. A ``StudyVerb`` computes results of a case into a folder. All verbs of this kind run in
+the same frame: the case is read, its PETSc options are checked, its warnings are printed, the folder is locked, the
+study computes, the pictures are drawn, and the exit code says how the study ended.
 """
 
 import argparse
@@ -36,13 +36,13 @@ Function = Callable[[argparse.Namespace, MPI.Comm, StopRequest], int]
 
 @dataclass(frozen=True, kw_only=True)
 class Verb(ABC):
-    """Verb of the command line.
+    """A verb of the command line.
 
     ``text`` is its line in the help, ``example`` a call that the help shows, without the program's name. ``results``
-    is the kind of its folder, for verbs that write results and can continue them. A verb that ``is_stoppable``
-    saves its state on a request to stop; other verbs end at once. The output of a verb that ``is_answer`` was requested
-    and is printed even with ``--quiet``. A verb that ``takes_petsc_options`` adds options of time stepping to its
-    case.
+    is the kind of its folder, for verbs that write results and can continue them. A verb that ``is_stoppable`` saves
+    its state on a request to stop; other verbs end at once. The output of a verb that ``is_answer`` is what the user
+    asked for, and is printed even with ``--quiet``. A verb that ``takes_petsc_options`` puts PETSc options on the
+    command line into its case.
     """
 
     name: str
@@ -72,9 +72,10 @@ class PlainVerb(Verb):
 
 @dataclass
 class Work:
-    """Arguments of a study besides its case: the folder of its results, the ranks, the options and the stop request.
+    """Arguments of a study besides its case: the parsed ``options``, the ``folder`` of its results, ranks, stop.
 
-    ``helper`` draws pictures, while the study still measures what they do not show.
+    A ``helper``, if there is one, can draw pictures while the study computes. ``warned`` are the warnings that were
+    printed.
     """
 
     options: argparse.Namespace
@@ -95,7 +96,7 @@ class Work:
         echo(self.comm, text)
 
     def warn(self, sentences: Iterable[str]) -> None:
-        """Print on rank 0 those ``sentences`` that were not printed before."""
+        """Print those ``sentences`` on rank 0, as warnings, that were not printed before."""
         new = [sentence for sentence in dict.fromkeys(sentences) if sentence not in self.warned]
         echo_warnings(self.comm, new)
         self.warned += new
@@ -103,10 +104,10 @@ class Work:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Ending of a study, the same on all ranks.
+    """The ending of a study, the same on all ranks.
 
-    ``complete``: all requested results exist; ``failures`` name missing results with the reason, and are printed last;
-    ``drawable``: the folder contains results that can be drawn.
+    ``complete`` says that all requested results exist, ``drawable`` that the folder has results that can be drawn.
+    ``failures`` name missing results, each with the reason, and are printed last.
     """
 
     complete: bool = True
@@ -118,11 +119,11 @@ class Outcome:
 class StudyVerb(Verb):
     """A verb that computes results of a ``case`` into a folder.
 
-    ``study`` computes, prints what came out, and says how it ended; all ranks call it. ``table`` are the rows that
-    ``validate`` prints of a case on so many ranks, ``pictures`` what is drawn of the results, if anything is. The
-    folder is named after the case, with the ``suffix``. ``load`` reads the case from the parsed options, where ``CASE``
-    and ``--set`` do not say all. ``is_for_one_rank`` says of a case whether one rank computes it as fast as so many
-    ranks do.
+    ``study`` computes, prints the results, and returns how it ended; all ranks call it. ``table`` gives the rows that
+    ``validate`` prints of a case on a number of ranks. ``pictures`` are drawn of the results, if there are any. The
+    folder is named after the case, with the ``suffix``. ``load`` reads the case from the parsed options, for a verb
+    whose case depends on more than ``CASE`` and ``--set``. ``is_for_one_rank`` says whether one rank computes a case as
+    fast as a number of ranks.
     """
 
     case: type[CaseFile]
@@ -137,15 +138,17 @@ class StudyVerb(Verb):
 
     def call(self, options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
         """Compute, draw and report; returns the exit code."""
-        # Before anything is written: what is refused leaves no folder behind.
+        # Before anything is written: a case that is refused leaves no folder behind.
         case = on_root(comm, lambda: self.checked_case(options))
-        # One rank has read the case: the others import what it names.
+        # One rank has read the case, and has imported the modules that it names; the others do now.
         on_every_rank(comm, case.import_plugins)
+
         folder = options.out or Path("runs") / path_named(f"{case.name}{self.suffix}")
         work = Work(options, folder, comm, stop)
-        # On rank 0, since warnings compute the bands of the cell.
+        # Found on rank 0 alone, since warnings compute the bands of the cell.
         work.warn(on_root(comm, case.warnings))
-        # Without pictures there would be nothing to do for the other ranks.
+
+        # Where no pictures are drawn, the other ranks could not help one that computes alone.
         if comm.size > 1 and self.pictures_of(case) and on_root(comm, lambda: self.suits_one_rank(case, comm.size)):
             work.report(f"one of {comm.size} ranks computes, which is as fast; the others draw pictures")
 
@@ -156,7 +159,7 @@ class StudyVerb(Verb):
         else:
             outcome = self.compute_and_draw(case, work)
 
-        # Last, where a user sees them; with --quiet they are all that is printed.
+        # Last, where a user sees them, and on stderr, so that --quiet does not silence them.
         for failure in outcome.failures:
             echo(comm, f"vipetsc: {failure}", sys.stderr)
         return DONE if outcome.complete and not outcome.failures else FAILED
@@ -167,15 +170,15 @@ class StudyVerb(Verb):
         folder = work.folder
         comm = work.comm
         pictures = self.pictures_of(case)
-        # Studies lock their folder themselves, which the same process may do again; this lock spans the pictures too.
+        # A study locks its folder too, as the same process may; this lock lasts until the pictures are drawn.
         with ExitStack() as stack:
             stack.enter_context(locked(comm, folder))
-            # Results of an earlier command have their pictures.
+            # Results of an earlier command have their pictures already: there is nothing to help with.
             if pictures and not work.helper and (options.force or not pictures.are_of([folder])):
                 work.helper = stack.enter_context(second_process(pictures, comm))
 
             outcome = self.study(case, work)
-            # What was computed is saved; pictures are drawn by the command that goes on.
+            # After a request to stop nothing is drawn: what was computed is saved, and the next command draws it.
             work.stop.check(comm)
             if pictures and outcome.drawable:
                 with work.stop.at_once():
@@ -190,12 +193,12 @@ class StudyVerb(Verb):
         return None
 
     def suits_one_rank(self, case: CaseFile, ranks: int) -> bool:
-        """Whether one rank computes the case as fast as so many ranks."""
+        """Whether one rank computes the case as fast as a number of ``ranks``."""
         return self.is_for_one_rank is not None and self.is_for_one_rank(case, ranks)
 
     def checked_case(self, options: argparse.Namespace) -> CaseFile:
-        """The case, with PETSc options that time stepping knows; raises CaseError. Called on one rank."""
-        # Imported here: `manual` and `schema` need neither PETSc nor compiled kernels.
+        """Read the case, on one rank; raises CaseError, also for PETSc options that time stepping does not know."""
+        # Imported here: verbs such as `manual` and `schema` need neither PETSc nor compiled kernels.
         from vipetsc.dynamics.options import check_options
 
         case = self.load(options) if self.load else self.case.load(options.case, options.set)

@@ -1,5 +1,5 @@
-"""The verbs: each module declares the record of one verb, or of a few related ones, and implements it.
+"""The verbs: each module declares the records of one verb, or of a few related ones, and implements them.
 
-``verb_list`` collects the verbs of all modules. Modules that only one verb needs are imported inside its functions,
-because compiled kernels and matplotlib take seconds to load.
+``verb_list`` collects the verbs of all modules. What only one verb needs is imported inside its functions, because
+compiled kernels and matplotlib take seconds to load.
 """

@@ -48,12 +48,12 @@ def bands(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
 
 
 def write_bands(case: Case, folder: Path, as_json: bool) -> str:
-    """Leave ``bands.json`` and ``bands.png`` in ``folder``; returns what is printed. Called on one rank."""
+    """Write ``bands.json`` and ``bands.png`` to ``folder``; returns what is printed. Called on one rank."""
     from vipetsc.figures.registry import draw_bands
 
     cell = case.lattice.unit_cell()
     numbers = bands_table(cell) | damping_table(cell, case.wave_frequency or 0.0)
-    # This rank alone is here, so that the lock must not wait for others.
+    # With the communicator of this rank, the only one here: on another the lock would wait for all ranks.
     with locked(MPI.COMM_SELF, folder):
         picture: dict[str, str] = {}
         if cell.springs:
@@ -69,7 +69,10 @@ def write_bands(case: Case, folder: Path, as_json: bool) -> str:
 
 
 def bands_table(cell: UnitCell) -> dict[str, Any]:
-    """Bands of a cell with edges and largest group velocity, and gaps; neither of a cell without springs."""
+    """The bands of a cell, each with its edges and its fastest wave, and the gaps, as for JSON; with their ``units``.
+
+    A cell without springs has neither bands nor gaps.
+    """
     edges: tuple[Band, ...] = ()
     if cell.springs:
         edges = pass_bands(cell)
@@ -99,7 +102,12 @@ def bands_report(numbers: dict[str, Any]) -> str:
 
 
 def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
-    """Damping ratio and decay time in s of each band's fastest wave; the decay length in cells at ``frequency``."""
+    """Damping of a cell as for JSON: of the fastest wave of each band, and the decay length at ``frequency`` in rad/s.
+
+    ``damping`` has the damping ratio, the damped frequency in rad/s and the time in s to decay to 1/e of each wave,
+    ``decay_length`` the number of ``cells`` to 1/e of the wave that goes farthest. It is empty for a cell without
+    dashpots or without springs.
+    """
     if not (cell.is_damped and cell.springs):
         return {}
 
@@ -110,7 +118,7 @@ def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
         rate = point.rate[band.number - 1]
         decay_time = np.inf
         if rate.real:
-            # The complex rate has the decay in its negative real part.
+            # Amplitudes go as exp(rate t), with a negative real part.
             decay_time = float(-1 / rate.real)
         rows.append({
             "band": band.number,
@@ -139,9 +147,10 @@ def damping_report(numbers: dict[str, Any]) -> str:
 
 
 def modes_report(case: Case, options: argparse.Namespace, folder: Path, comm: MPI.Comm) -> str:
-    """The linear modes of ``--modes`` as text on rank 0, which writes them; empty if none are requested.
+    """Find the linear modes that ``--modes`` asks for, and write them to ``folder``; returns text about them on rank 0.
 
-    Raises CaseError for options that do not fit together.
+    The text is empty if none are requested, and on the other ranks. Collective. Raises CaseError for options that do
+    not fit together.
     """
     if options.modes is None:
         if options.near is not None:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-MOST_SPECIAL = 4  # points of a kind that are printed; the file has all
+MOST_SPECIAL = 4  # special points of a kind that are printed; the file has all
 # Headings of the special points of frequency responses, by their kinds.
 SPECIAL_POINTS = {
     "fold": "folds",
@@ -62,7 +62,10 @@ def follow_branches(
     report: Callable[["Branch"], None],
     show_point: "Callable[[Branch, Point], None] | None" = None,
 ) -> Outcome:
-    """Follow all branches of the case on all ranks, ``report`` each that has ended, and publish their files."""
+    """Follow all branches of the case on all ranks, call ``report`` with each at the end, and publish their files.
+
+    ``show_point`` is called with each new point while branches grow. The branches are on rank 0 alone. Collective.
+    """
     from vipetsc.modes.branches.follow import claim_branches, follow_all
 
     comm = work.comm
@@ -71,9 +74,9 @@ def follow_branches(
         for branch in branches:
             report(branch)
 
-        # Branches that were stopped do not take the place of earlier ones.
+        # Raises after a request to stop: unfinished branches do not replace earlier ones.
         work.stop.check(comm)
-        # Branches that fail before their first point leave no file, and nothing to replace earlier ones by.
+        # If all branches failed before their first point, there is no file to replace earlier ones by.
         has_branches = on_root(comm, lambda: any(claim.folder.glob("branch-*.h5")))
         if has_branches:
             claim.publish()
@@ -84,7 +87,7 @@ def follow_branches(
 
 
 def nnm_rows(case: NnmCase, ranks: int) -> Rows:
-    """System, modes, range of energy and contact law of the branches."""
+    """Rows of ``validate`` on nonlinear modes: system, modes, range of energy and contact law of the branches."""
     low, high = case.nnm.energy
     laws = dict.fromkeys(f"{law.law}, {law.stiffness:.6g} N/m^{law.onset_exponent:g}" for law in case.laws())
     return [
@@ -94,7 +97,7 @@ def nnm_rows(case: NnmCase, ranks: int) -> Rows:
 
 
 def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
-    """Lattice and contacts; the number of curves, their parameter and fixed values, and the method."""
+    """Rows of ``validate`` on steady states: the lattice, the number of curves, their parameter, the fixed values."""
     options = case.nfrc
     if options.source == "wave":
         excitation = f"an incident wave of band {options.band}, {options.direction}"
@@ -141,7 +144,7 @@ def nfrc_rows(case: NfrcCase, ranks: int) -> Rows:
 
 
 def _isola_rows(case: NfrcCase) -> Rows:
-    """Where and how isolated curves are looked for, if they are."""
+    """A row on where and how isolated curves are looked for; none if they are not."""
     options = case.nfrc
     if not options.isolas:
         return []
@@ -157,7 +160,7 @@ def _isola_rows(case: NfrcCase) -> Rows:
 
 
 def _family_rows(case: NfrcCase) -> Rows:
-    """The keys that vary in the family, and their values."""
+    """A row for each key that varies in the family of curves, with its values."""
     rows = []
     for key, values in (case.nfrc.family or {}).items():
         unit = unit_of(key, case.table or {})
@@ -166,8 +169,8 @@ def _family_rows(case: NfrcCase) -> Rows:
 
 
 def branch_log() -> Callable[["Branch", "Point"], None]:
-    """A live table of growing branches: one line per point, at most two lines per second."""
-    # Of reduced models points come in milliseconds: a line for each would hide all else.
+    """A function that prints growing branches as a table, a line for a point, at most two lines per second."""
+    # Points of reduced models follow each other in milliseconds: a line for each would scroll all else away.
     title = "branch           point      T (s)        E (J)  Newton  contacts  max multiplier\n"
     last = -math.inf
 
@@ -188,7 +191,7 @@ def branch_log() -> Callable[["Branch", "Point"], None]:
 
 
 def branch_table(branch: "Branch") -> str:
-    """Summary of a branch: length, range, special points, power laws."""
+    """Summary of a branch as text: its length and range, its special points, tongues, power laws of the slope."""
     from vipetsc.modes.branches.regions import slope_laws, tongues
 
     regular = branch.regular()
@@ -233,7 +236,7 @@ def parameter_unit(case: NfrcCase, curve: "Branch") -> str:
 
 
 def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
-    """Summary of a curve: length, folds, jumps of a slow sweep up and down, stable points, energy balance."""
+    """Summary of a curve as rows: its length, special points, jumps of slow sweeps, stable points, energy balance."""
     from vipetsc.modes.branches.response_layout import measure, parameter_values, sweep_down, sweep_up
 
     options = case.nfrc
@@ -252,14 +255,14 @@ def curve_rows(case: NfrcCase, curve: "Branch") -> Rows:
 
     jumps = []
     for direction, path in (("up", sweep_up(curve)), ("down", sweep_down(curve))):
-        # Neighbouring states of the curve follow each other unless the sweep jumps.
+        # The numbers of the states along a slow sweep go up or down one by one, unless the sweep jumps.
         jumps += [f"{parameter[a]:.5g} {direction}" for a, b in itertools.pairwise(path) if abs(a - b) > 1]
     rows.append(("jumps", ", ".join(jumps) or "none"))
 
     stable = measure(curve, "unstable") == 0
     rows.append(("stable", f"{stable.sum()} of {len(stable)} points"))
     if options.infinite:
-        # The balance of energies is a check of the whole computation: it is no equation that was solved.
+        # The balance of energies is none of the equations that were solved, and so checks the whole computation.
         error = np.nanmax(np.abs(measure(curve, "share").sum(axis=1) - 1))
         rows.append(("T + R + U + L - 1", f"{error:.1e}"))
     return rows

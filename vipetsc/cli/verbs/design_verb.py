@@ -16,7 +16,7 @@ def search_cells(case: DesignCase, work: Work) -> Outcome:
 
 
 def design_rows(case: DesignCase, ranks: int) -> Rows:
-    """The size of the grid, and the readings in which it is searched."""
+    """A row of ``validate`` with the size of the grid, and the readings in which it is searched."""
     search = case.design
     cells = f"{len(search.lam.values())} lambda x {len(search.eta.values())} eta"
     return [("design", f"{cells}, {search.wavenumbers} wavenumbers, {' and '.join(search.readings)}")]

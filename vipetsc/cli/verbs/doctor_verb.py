@@ -12,7 +12,7 @@ from vipetsc.cli.verb import BAD_INPUT, DONE, PlainVerb
 from vipetsc.io.folder import provenance
 from vipetsc.parallel import StopRequest
 
-# s of the compiler's clock: kernels that are there are loaded in less, and to compile one takes more.
+# Seconds of compilation: to load all kernels from their cache takes less, to compile one of them more.
 LOADING = 1.0
 
 
@@ -38,17 +38,17 @@ def compile_now(comm: MPI.Comm) -> None:
 
 
 def doctor_table(comm: MPI.Comm) -> tuple[str, bool]:
-    """The checks as a table, and whether the program can work here; all ranks must call it."""
+    """The versions and checks as a table, and whether the program can work here; all ranks must call it."""
     results = checks(comm)
     names = {check.name for check in results}
     about = {name.replace("_version", ""): str(value) for name, value in provenance(comm).items()}
     rows = [(name, value) for name, value in about.items() if name not in names]
     rows += [(check.name, check.text) for check in results]
-    # Collective, so all ranks build the table although rank 0 alone prints it.
+    # All ranks build the table, which rank 0 alone prints: gathering the hosts is collective.
     hosts = comm.allgather(MPI.Get_processor_name())
     rows.append(("hosts", ", ".join(f"{host} x{hosts.count(host)}" for host in sorted(set(hosts)))))
 
-    # Hosts may differ.
+    # From all ranks, since what is installed may differ from host to host.
     by_rank = comm.allgather([check.name for check in results if check.fault])
     faults = sorted(set().union(*by_rank))
     if faults:

@@ -25,9 +25,9 @@ FOLDER = Path(str(files("vipetsc") / "examples"))
 
 
 class Example(NamedTuple):
-    """A case file of the package: its name, the sentence in its first line, the verbs that it has sections for.
+    """A case file of the package: the ``sentence`` in its first line, and the ``verbs`` that it has sections for.
 
-    The ``name`` is its path in the folder of examples without ``.toml``.
+    The ``name`` is its path in the folder of examples, without ``.toml``.
     """
 
     name: str
@@ -53,11 +53,11 @@ def examples(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> 
 
 def shipped_examples() -> dict[str, Example]:
     """The case files of the package by their names."""
-    # Imported here: the classes of cases take a second to load, which the list of verbs does without.
+    # Imported here: the classes of cases take a second to load, and the parser, which loads this module, needs none.
     from vipetsc.case.verb_cases import verbs_of
 
     shipped = {}
-    # Those of the folder itself before those of the gallery.
+    # The files of the folder itself come before those of the gallery in it.
     for path in (*sorted(FOLDER.glob("*.toml")), *sorted(FOLDER.glob("*/*.toml"))):
         name = path.relative_to(FOLDER).with_suffix("").as_posix()
         first_line, _, _ = path.read_text(encoding="utf-8").partition("\n")
@@ -107,15 +107,15 @@ def copy_examples(chosen: Iterable[Example], folder: Path, *, force: bool = Fals
         table = tomllib.loads(case_file.read_text(encoding="utf-8"))
         needed = [*relative_names(table), *relative_modules(table)]
         for path in (case_file, *(case_file.parent / name for name in needed)):
-            # What is not shipped is left by another command, as a branch whose motion begins a run.
+            # A file that is not there is the result of another command, as a branch from whose motion a run begins.
             if path.exists():
                 contents[folder / path.relative_to(FOLDER)] = path.read_bytes()
 
-    # A copy that is there already is no file to lose.
+    # A file with the same content is a copy already, and loses nothing.
     others = [path for path, content in contents.items() if path.exists() and not _holds(path, content)]
     if others and not force:
         raise FolderError(f"{', '.join(map(str, others))}: exists and differs; --force replaces it")
-    # This rank alone is here, so that the lock must not wait for others.
+    # With the communicator of this rank, the only one here: on another the lock would wait for all ranks.
     with locked(MPI.COMM_SELF, *{path.parent for path in contents}):
         for path, content in contents.items():
             with atomic_write(path) as aside:

@@ -32,26 +32,29 @@ def export(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 
 
 def existing_folders(paths: list[Path], comm: MPI.Comm) -> list[Path]:
-    """The folders that those of ``paths`` that exist are or lie in."""
-    # Missing paths are left to the verb, which refuses them with a reason; there is no folder to lock.
+    """The folders to lock for ``paths``: each path itself, or the folder of a file."""
+    # A missing path has no folder to lock; the verb refuses it with a reason.
     return on_root(comm, lambda: [_folder_of(path) for path in paths if path.exists()])
 
 
 def _folder_of(path: Path) -> Path:
-    """The folder that ``path`` is, or the one of the file that it is."""
+    """The ``path`` itself if it is a folder, else the folder of the file."""
     if path.is_dir():
         return path
     return path.parent
 
 
 def write_exports(path: Path) -> list[Path]:
-    """Export what ``path`` is or holds; returns the files. Raises FolderError for one that cannot be read."""
+    """Export the results in ``path``, a file or folder of results; returns the files written.
+
+    Raises FolderError for results that cannot be read, and for a path without any.
+    """
     from vipetsc.io.export import write_curves, write_xdmf
 
     folder = _folder_of(path)
     sources = [path]
     if path.is_dir():
-        # A folder of branches is the one kind with several files of curves.
+        # Folders of branches alone have several files of curves; in another folder `write_curves` finds the file.
         sources = sorted(path.glob("branch-*.h5")) or [path]
     written = []
     try:
@@ -61,7 +64,7 @@ def write_exports(path: Path) -> list[Path]:
                 written.append(mesh)
         for source in sources:
             written += write_curves(source)
-    # OSError: a file that was cut off or is no HDF5. TypeError: another program's, of types that no table can hold.
+    # OSError: a file that was cut off or is no HDF5. TypeError: a file of another program, whose types fit no table.
     except (OSError, TypeError, ValueError) as error:
         if is_disk_full(error):
             raise

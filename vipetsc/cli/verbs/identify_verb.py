@@ -17,12 +17,14 @@ def identify_parameters(plan: IdentifyCase, work: Work) -> Outcome:
 
 
 def identify_rows(plan: IdentifyCase, ranks: int) -> Rows:
-    """The parameters, the records and the starts."""
+    """Rows of ``validate``: the parameters and the number of starts, and each record with its sensors."""
     parameters = first_few([parameter.name for parameter in plan.parameters])
     rows = [("identify", f"{parameters}; starts: {plan.options.starts}")]
     for record in plan.options.records:
         sensors = first_few([sensor.name for sensor in record.sensors])
-        begin = "; its initial state is estimated" if record.initial == "estimate" else ""
+        begin = ""
+        if record.initial == "estimate":
+            begin = "; its initial state is estimated"
         rows.append(("record", f"{record.file}: {sensors}{begin}"))
     return rows
 

@@ -18,7 +18,7 @@ def take_law(case: LawCase, work: Work) -> Outcome:
 
 
 def law_rows(case: LawCase, ranks: int) -> Rows:
-    """Range of the law, and the site, the ring and the samples of its runs."""
+    """A row of ``validate`` with the range of the law, and the site, the ring and the samples of its runs."""
     site = case.one_site()
     where = f"a clearance of {site.clearance:.5g} m {site.distance} cells from the drive"
     return [("law", f"z to {case.law.largest:g}, {where}; ring of {site.cells} cells, {site.samples} samples")]

@@ -18,7 +18,7 @@ def search_designs(plan: OptimiseCase, work: Work) -> Outcome:
 
 
 def optimise_rows(plan: OptimiseCase, ranks: int) -> Rows:
-    """Number of designs, the variables, the frequency responses that are measured, and the objectives."""
+    """Rows of ``validate``: number of designs, variables, frequency responses that are measured, objectives."""
     responses: Rows = []
     if plan.options.measures_responses:
         case = plan.responses(plan.base)

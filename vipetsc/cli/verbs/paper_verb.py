@@ -20,7 +20,7 @@ def paper(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int
     from vipetsc.paper.report import claims_table
 
     plan = paper_plan(QUICK if options.quick else FULL)
-    # Two folders by default: one holds the paper on one grid only.
+    # A folder holds the paper on one grid only: by default the quick one has a folder of its own.
     folder = options.out or Path("runs") / ("paper-quick" if options.quick else "paper")
     # A list looks at the folder, and neither locks nor creates it.
     if options.list:

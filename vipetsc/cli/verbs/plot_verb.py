@@ -24,10 +24,10 @@ MOVIE_FORMATS = "gif", "mp4"
 
 
 def positive(text: str) -> float:
-    """The positive, finite number in ``text``; raises ArgumentTypeError for another."""
+    """The number in ``text``; raises ArgumentTypeError if it is not positive and finite, ValueError if it is none."""
     value = float(text)
     if not 0 < value < float("inf"):
-        # argparse prints the text of this exception; that of a ValueError it hides.
+        # argparse prints the text of this exception; in place of that of a ValueError it prints its own.
         raise argparse.ArgumentTypeError(f"{text} is not positive and finite")
     return value
 
@@ -40,7 +40,7 @@ def window(text: str) -> tuple[int, int]:
     return int(first), int(last)
 
 
-# By the field of a movie's `Shot` that each of them sets.
+# Arguments of movies, by the field of `figures.movie_frames.Shot` that each of them sets.
 OF_MOVIES: dict[str, Argument] = {
     "speed": argument(
         "--speed",
@@ -71,7 +71,7 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
         wrong = formats - {*MOVIE_FORMATS} or (options.fig and {"--fig"})
         if wrong:
             raise FolderError(f"--movie: writes a GIF or MP4 file and cannot be combined with {min(wrong)}")
-        # On rank 0: the frames go into one file in their order.
+        # On rank 0 alone: all frames go into one file, in their order.
         paths, missing = on_root(comm, lambda: film(pictures, folders[0], options.movie, of_movie, formats))
         echo_paths(comm, paths)
         if missing:
@@ -91,14 +91,14 @@ def plot(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
 
 
 def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
-    """The pictures of what ``paths`` hold, and their folders, where files were named; on one rank.
+    """The pictures of the results in ``paths``, and their folders, also where files of results are named; on one rank.
 
-    Folders in which nothing is recognised are those of a run, whose pictures say what is missing. Raises FolderError
-    for folders that cannot share a page.
+    A folder in which no results are recognised counts as that of a run, whose pictures say what is missing. Raises
+    FolderError for folders whose results cannot share a page.
     """
     from vipetsc.cli.verbs.verb_list import study_verbs
 
-    # Verbs that leave the same kind of folder have their pictures in common.
+    # By the source, since verbs that leave the same kind of folder have their pictures in common.
     by_source = {verb.pictures.source: verb.pictures for verb in study_verbs() if verb.pictures}
     files = {pictures.file for pictures in by_source.values()}
     folders = list(paths)
@@ -117,10 +117,11 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
 def film(
     pictures: Pictures, folder: Path, quantity: str, options: dict[str, Any], formats: set[str]
 ) -> tuple[list[Path], str]:
-    """Render a movie of the run in ``folder``, in ``formats``; ``options`` by their names in `Shot`; on one rank.
+    """Render a movie of a ``quantity`` of the run in ``folder``; on one rank.
 
-    Returns the files, and which format could not be written and why. Raises FolderError before anything is
-    written where ``folder`` holds no run, or the options do not fit it.
+    ``options`` are arguments of `Shot` by name, ``formats`` the names in `MOVIE_FORMATS` to write, none for all that
+    can be written. Returns the files, and a sentence about a format that was left out, empty if none was. Raises
+    FolderError, before anything is written, if ``folder`` holds no run or the options do not fit it.
     """
     from vipetsc.figures import movie, movie_frames
     from vipetsc.figures.style import rc_style
@@ -158,7 +159,7 @@ def film(
         except ValueError as error:
             raise FolderError(f"{folder}: {error}") from None
 
-        # After all options were checked: measuring writes a file, and bad input writes none.
+        # Only after all options were checked: measuring writes a file, and bad input must write none.
         prepare(pictures, [folder])
         analysis = stack.enter_context(open_netcdf(folder / "analysis.h5", "analysis"))
         stage = movie.MovieFigure(run, movie_frames.movie_frames(run, analysis, shot), shot.width)

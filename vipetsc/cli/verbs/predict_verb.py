@@ -34,7 +34,7 @@ def compose_sites(case: PredictCase, work: Work) -> Outcome:
 
 
 def predict_rows(case: PredictCase, ranks: int) -> Rows:
-    """Lattice and contacts; the amplitudes, the runs from which predictions are composed, and the comparison."""
+    """Rows of ``validate``: the lattice, the amplitudes, the runs that predictions are composed of, the comparison."""
     options = case.predict
     if options.amplitudes:
         low = min(options.amplitudes)
@@ -60,7 +60,7 @@ def predict_rows(case: PredictCase, ranks: int) -> Rows:
 
 def prediction_table(data: xr.Dataset) -> str:
     """Predicted and simulated fractions of the energy at every amplitude, and their differences."""
-    # Without ``predict.simulate`` nothing is simulated.
+    # Without ``predict.simulate`` there is nothing simulated, without dashpots no column of theirs.
     kinds = [kind for kind in ("predicted", "simulated") if f"{kind}/other" in data]
     quantities = [name for name in ("upper", "other", "dissipated", "dashpots") if f"predicted/{name}" in data]
     columns = [(kind, quantity) for quantity in quantities for kind in kinds]

@@ -31,13 +31,13 @@ def manual(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> in
 
 
 def schema(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -> int:
-    """Print the JSON schema of case files, with the names that modules register which a case names."""
+    """Print the JSON schema of case files, with the names of laws and other parts that a case's [plugins] register."""
     echo(comm, on_root(comm, lambda: json.dumps(schema_of(options.case), indent=2)))
     return DONE
 
 
 def schema_of(path: str | None) -> dict[str, Any]:
-    """The schema of the case file ``path`` and of others that name the same modules; raises CaseError."""
+    """The JSON schema of case files that name the same modules as the file ``path``, or none; raises CaseError."""
     from vipetsc.case.case_file import read_toml
     from vipetsc.case.keys import json_schema
     from vipetsc.case.parts import module_names, with_parts
@@ -52,7 +52,7 @@ def completion(options: argparse.Namespace, comm: MPI.Comm, stop: StopRequest) -
     """Print a script by which the shell completes verbs, options and files."""
     import shtab
 
-    # By the names and flags of arguments, whichever verb takes them.
+    # Kinds of completion by the names and flags of arguments, the same for all verbs.
     kinds = {"case": shtab.FILE, "path": shtab.FILE, "--out": shtab.DIRECTORY}
     echo(comm, on_root(comm, lambda: shtab.complete(options.parser(kinds), options.shell)))
     return DONE

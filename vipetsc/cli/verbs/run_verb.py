@@ -43,7 +43,8 @@ def load(options: argparse.Namespace) -> Case:
 
 
 def _sweep_of(options: argparse.Namespace) -> Sweep:
-    """The sweep whose file or folder is given; raises CaseError."""
+    """The sweep whose file or folder is given as CASE; raises CaseError."""
+    # Without CASE, a name that no file has: the message about it says what is missing.
     path = Path(options.case or "the case of a sweep")
     if path.is_dir():
         path = path / "case.toml"
@@ -61,7 +62,7 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
 
     opening = None
     if work.options.member:
-        # As in the sweep, the member begins from its linear run.
+        # As in the sweep, the member begins from its linear run, and so has the same bits.
         opening = opening_of(_sweep_of(work.options), case, work.comm, work.stop)
     result = simulate(case, work.folder, work.comm, opening=opening, **work.keywords)
     work.warn(result.warnings)
@@ -69,7 +70,7 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     work.report(run_table(result, faster))
     if work.comm.rank == 0:
         logger.debug("statistics %s", json.dumps(result.statistics))
-    # The run is saved; the command that goes on measures it.
+    # After a request to stop: the run is saved, and the next command measures it.
     work.stop.check(work.comm)
 
     # Measures need a second sample: a run that fails in its first has none.
@@ -93,14 +94,14 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
 
 
 def one_rank_suffices(case: Case, ranks: int) -> bool:
-    """Whether messages between so many ranks cost what these save of the simulation of a case."""
+    """Whether more ranks do not simulate the case faster, since messages between them take the time that they save."""
     from vipetsc.dynamics.cost import estimate
 
     return estimate(case, ranks).one_rank_suffices
 
 
 def run_rows(case: Case, ranks: int) -> Rows:
-    """Numbers that follow from a case of a run: bands, drive, times, samples, file size, cost on ``ranks`` ranks."""
+    """Rows of ``validate`` on a run: lattice, drive, times, samples, size of files, memory and time on ``ranks``."""
     from vipetsc.dynamics.cost import estimate
     from vipetsc.dynamics.memory import check_indices, memory_available, memory_needed
     from vipetsc.dynamics.recorded_sizes import recorded_cells, written_together
@@ -114,8 +115,8 @@ def run_rows(case: Case, ranks: int) -> Rows:
     if case.initial:
         begins_with = case.initial.describe()
 
-    # Doubles: fields at every stride-th sample; at all samples, the losses of each site, perhaps its force,
-    # and three quantities of each point. The rest is small.
+    # The file holds doubles: fields at every stride-th sample; at all samples the losses of each site, perhaps its
+    # force, and three quantities of each point. The rest is small.
     columns = len(recorded_cells(case.output, chain.cells)) * chain.cell.dofs * len(case.output.fields)
     every_sample = len(chain.sites) * (1 + bool(case.output.forces)) + 3 * len(case.output.points or [])
     size = 8 * (columns * -(-model.samples // case.output.stride) + every_sample * model.samples)
@@ -154,7 +155,7 @@ def run_rows(case: Case, ranks: int) -> Rows:
 
 
 def _drive_rows(case: Case) -> Rows:
-    """The drives, the waves at their frequency, and the times at which the drives and the run end."""
+    """Rows on the drives, the waves at their frequency, and the times at which the drives and the run end."""
     model = case.model()
     rows: Rows = []
     for _, drive in case.drive.every:
@@ -186,7 +187,7 @@ def _drive_rows(case: Case) -> Rows:
 
 
 def run_table(result: "Result", faster: str = "") -> str:
-    """Ending and statistics of a run; ``faster`` names a faster alternative."""
+    """Ending and statistics of a run as text; ``faster`` names a faster alternative, if there is one."""
     numbers = result.statistics
     if numbers["engine"] == "propagator":
         method = f"{numbers['method']}, {numbers['bandwidth']} cells to each side, exact to {numbers['truncation']:.1g}"
@@ -195,7 +196,7 @@ def run_table(result: "Result", faster: str = "") -> str:
         steps = f"{numbers['steps']} accepted, {numbers['rejected']} rejected ({numbers['method']})"
 
     energy = ""
-    # Without work, as in a lattice that only begins with a motion, there is nothing to relate losses to.
+    # Losses are relative to the work, of which there is none in a lattice that only begins with a motion.
     if work := numbers.get("work"):
         energy = f"work {work:.6g} J, dissipated {100 * numbers['dissipated'] / work:.4g} %"
         if damped := numbers.get("dissipated_by_damping", 0.0):
@@ -229,7 +230,10 @@ def run_table(result: "Result", faster: str = "") -> str:
 
 
 def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
-    """A table of the measures of the run's named points, empty without points, and sentences about those without."""
+    """A table of the measures of the run's named points, and sentences about steady amplitudes that are none.
+
+    The table is empty if the case names no points.
+    """
     from vipetsc.io.netcdf import open_netcdf
     from vipetsc.spectra.measures import MEASURES, UNSETTLED, measures_of
 
@@ -239,8 +243,9 @@ def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
     rows = []
     with open_netcdf(folder / "analysis.h5", "analysis") as analysis:
         for name in measures_of(points, case.output.transmission or []):
+            # Measures of the whole run, and those that were not taken, have no row.
             if name in MEASURES or name not in analysis:
-                continue  # of no point, or not measured
+                continue
             item = analysis[name]
             if np.isnan(item.values).all():
                 rows.append((name, "no value"))
@@ -257,9 +262,10 @@ def measures_of_points(case: Case, folder: Path) -> tuple[str, list[str]]:
 
 
 def measure_where_missing(folders: Sequence[Path]) -> None:
-    """Check that a folder holds a finished run, and measure it if its measures are missing or older than the run.
+    """Check that the only one of ``folders`` holds a finished run, and measure the run if its measures are missing.
 
-    Raises FolderError where there is no run or it has not ended.
+    Measures that are older than the run count as missing. Raises FolderError if there is no run, or none that can be
+    read.
     """
     from vipetsc.studies.analysis_options import is_measured
 

@@ -16,7 +16,7 @@ from vipetsc.io.read import outdated
 if TYPE_CHECKING:
     from vipetsc.studies.sweep import SweepResult
 
-MOST_FAILURES = 10  # that are printed; the index of the sweep has all
+MOST_FAILURES = 10  # failed members that are printed; the index of the sweep has all
 
 
 def simulate_members(plan: Sweep, work: Work) -> Outcome:
@@ -30,7 +30,7 @@ def simulate_members(plan: Sweep, work: Work) -> Outcome:
 
 
 def sweep_rows(plan: Sweep, ranks: int) -> Rows:
-    """Number of members of a sweep, and number of tested members that are not valid cases."""
+    """A row of ``validate`` with the number of members, and how many are no valid cases, out of those tried."""
     tried = plan.tried()
     impossible = sum(member.case is None for member in tried)
     counts = " x ".join(map(str, plan.shape))
@@ -41,8 +41,8 @@ def sweep_rows(plan: Sweep, ranks: int) -> Rows:
 
 
 def sweep_table(result: "SweepResult") -> str:
-    """Ending of a sweep: counts, time, failed members."""
-    # The verb names one.
+    """Ending of a sweep as a table: how its members ended, times, the first failures."""
+    # A sweep of the command line always has a folder.
     assert result.folder
     complete, scaled, failed, missing = (result.count(status) for status in range(4))
     counts = f"{complete} simulated, {scaled} scaled from a linear run, {failed} failed"
@@ -63,9 +63,10 @@ def sweep_table(result: "SweepResult") -> str:
 
 
 def relate_to_branches(folders: Sequence[Path]) -> None:
-    """Check that folders hold finished sweeps or branches, and lay the sweeps over the branches.
+    """Check that ``folders`` hold finished sweeps or branches, and relate the sweeps to the branches.
 
-    Raises FolderError for a folder that does not.
+    The relation, ``backbone.h5``, is written to the folder of the sweep. Raises FolderError for a folder that holds
+    neither.
     """
     from vipetsc.studies.backbone import relate_folders
 
@@ -79,7 +80,7 @@ def relate_to_branches(folders: Sequence[Path]) -> None:
 
 
 def begin_with_a_sweep(folders: Sequence[Path]) -> bool:
-    """Whether the first of the folders holds a sweep; the others may be branches or sweeps for the same pages."""
+    """Whether the first of ``folders`` holds a sweep; the others may hold branches, or sweeps for the same pages."""
     return (folders[0] / "ensemble.h5").exists()
 
 

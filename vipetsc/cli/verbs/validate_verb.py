@@ -41,28 +41,33 @@ def report_of(options: argparse.Namespace, ranks: int) -> str:
     if disorder:
         rows += disorder_rows(*disorder)
 
-    # Rows and warnings of the lattice are the same for all verbs that have one.
+    # Once each: verbs that have a lattice have the same rows and warnings about it.
     lines = [table([*dict.fromkeys(rows)])]
     lines += [f"warning: {warning}" for warning in dict.fromkeys(warnings)]
     return "\n".join(lines)
 
 
 def part_rows(case: CaseFile) -> Rows:
-    """A row for each registered part that a case uses: its name and kind, its module and the version of that."""
+    """A row for each part, such as a contact law, that a module has registered and the case uses."""
     rows = []
     for plugin, part in parts_in_use(tomllib.loads(case.to_toml())):
-        version = f", version {plugin.version}" if plugin.version else ""
+        version = ""
+        if plugin.version:
+            version = f", version {plugin.version}"
         rows.append((part.kind, f"{part.name}, registered by {plugin.name}{version}"))
     return rows
 
 
 def disorder_rows(disorder: DisorderTable, nominal: Case, drawn: Case) -> Rows:
-    """Scattered quantities, their deviations, and the first values drawn over those of the ``nominal`` case."""
+    """A row for each quantity with ``disorder``: its deviation, and the first values of the case that was ``drawn``.
+
+    The values are ratios to those of the ``nominal`` case; those of sites are cells.
+    """
     before = values_of(nominal.lattice, nominal.contacts)
     after = values_of(drawn.lattice, drawn.contacts)
     rows = []
     for name, deviation in disorder.quantities().items():
-        # Sites move by cells; all else is scattered about a value, so that the ratio shows how far.
+        # Sites move by whole cells. Other quantities scatter about a value, to which the ratio shows the distance.
         if name == "sites":
             values = f"cells {first_few([f'{cell:.5g}' for cell in after[name]])}"
         else:

@@ -10,7 +10,8 @@ from vipetsc.cli.verb import StudyVerb, Verb
 
 
 def _declared() -> Iterator[Verb]:
-    # Modules are found rather than listed: a verb that is there cannot be left out of help, completion or tests.
+    """All verbs that the modules of this folder declare, module by module."""
+    # Modules are found, not listed: a verb that is there cannot be missing from the help, completion or tests.
     for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
         name = f"{__package__}.{module.name}"
         # This module declares no verb, and is still being imported itself.
