@@ -1,4 +1,4 @@
-"""Record of finished figures, claims and report, of their inputs and their cost: ``made.json``."""
+"""``made.json``: the inputs of which figures, claims and report of a folder were made, and the CPU time they took."""
 
 import json
 from pathlib import Path
@@ -9,18 +9,20 @@ from vipetsc.paper.plan import read_json
 
 RECORD = "made.json"
 FORMATS = ("png", "pdf", "json")
-# What files of each kind end with: one that was cut off does not.
+# Bytes near the end of every whole file of a kind; a file that was cut off lacks them.
 LAST = {".png": b"IEND", ".pdf": b"%%EOF", ".json": b"]", ".html": b"</html>"}
 
 BuildRecord = dict[str, Any]
-"""Hashes of inputs of "claims" and "report", of "figures" by id with the stems of their pictures.
+"""The content of ``made.json``.
 
-"cpu": CPU time in s of all ranks that "steps" by name, "figures", "claims" and "report" took.
+"claims" and "report" are hashes of their inputs. "figures" has for each figure, by id, the hash of its "inputs" and the
+stems of its "pictures". "cpu" is CPU time in s of all ranks: of the "steps" by name, of "figures", "claims" and
+"report".
 """
 
 
 def read_record(root: Path) -> BuildRecord:
-    """Content of ``made.json``, or an empty record, after which everything is computed again."""
+    """Content of ``made.json`` in ``root``; without it an empty record, by which all but the steps is made again."""
     empty = {"figures": {}, "cpu": {"steps": {}, "figures": 0.0, "claims": 0.0, "report": 0.0}}
     return empty | (read_json(root / RECORD) or {})
 
@@ -32,15 +34,15 @@ def write_record(root: Path, record: BuildRecord) -> None:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a picture or page is there to its end."""
+    """Whether the picture or page ``path`` is there and was not cut off."""
     if not path.exists():
         return False
     with path.open("rb") as file:
-        # The end alone: a file that was cut off lacks its last bytes.
+        # The last bytes alone: pictures are large, and there are a hundred of them.
         file.seek(max(path.stat().st_size - 32, 0))
         return LAST[path.suffix] in file.read()
 
 
 def is_drawn(root: Path, stem: str) -> bool:
-    """Whether a picture is there in every format."""
+    """Whether the picture ``stem`` is there, whole, in each of ``FORMATS``."""
     return all(is_whole(root / "figures" / f"{stem}.{kind}") for kind in FORMATS)

@@ -1,4 +1,4 @@
-"""The search of the supplement for the values of (lambda, eta) that best suit inter-band transfer."""
+"""Costs of four-band cells over (lambda, eta), by which the supplement chooses the best cell for transfer."""
 
 import itertools
 import sys
@@ -12,9 +12,9 @@ from vipetsc.lattice.cell import Reading, UnitCell, four_band
 
 COSTS = ("deflection", "group_velocity", "weighted")
 PAPER_CELL = (0.1, 0.5)  # the (lambda, eta) that the paper takes (SPEC 11, C10; Suppl. 3)
-DRIVEN = 2  # the band whose wave is to open and close the contacts; waves are to be fast from here upwards
-# Product of two unit-norm displacements below which they have no phase: at the zone's border one of them vanishes by
-# symmetry, and comes out as a rounding error of either sign.
+DRIVEN = 2  # the band, from 1, of the wave that closes the contacts; group velocities count from this band upwards
+# Product of two displacements, of vectors of unit norm, below which their phase has no meaning: at the zone's border
+# one of them vanishes by symmetry, and comes out as a rounding error of either sign.
 AT_REST = 1e-12
 
 
@@ -22,10 +22,10 @@ AT_REST = 1e-12
 class CellSearch:
     """Bloch bands over a grid of four-band cells, and the costs of the cells.
 
-    Over the grid ``lam`` (lambda), ``eta`` (eta) and wavenumbers (kappa, rad per cell) of the irreducible Brillouin
-    zone: ``frequency`` (lambda, eta, kappa, band) in rad/s; ``signed_deflection`` (lambda, eta, kappa), which is
-    |u3 - u2| sign(-u2 u3) on the second band for Bloch vectors of unit norm; ``speed`` (lambda, eta, band), the
-    largest |group velocity| in cells/s.
+    The axes are ``lam`` (lambda,), ``eta`` (eta,) and ``wavenumber`` (kappa,) in rad per cell, in the irreducible
+    Brillouin zone. Over them are ``frequency`` (lambda, eta, kappa, band) in rad/s, ``signed_deflection`` (lambda, eta,
+    kappa) of the second band (see the function of this name), and ``speed`` (lambda, eta, band), the largest
+    |group velocity| in cells/s over the wavenumber.
     """
 
     lam: np.ndarray
@@ -37,17 +37,17 @@ class CellSearch:
 
     @property
     def out_of_phase(self) -> np.ndarray:
-        """Mask (lambda, eta) of cells whose host and resonator move out of phase at every kappa of the second band.
+        """Mask (lambda, eta) of the cells whose host and resonator move out of phase at every kappa of the second band.
 
-        Wavenumbers at which either stands still (the zone's border, by symmetry) do not count.
+        Wavenumbers at which one of them stands still, as by symmetry at the zone's border, do not count.
         """
         return (self.signed_deflection >= 0).all(axis=-1) & (self.signed_deflection > 0).any(axis=-1)
 
     def cost(self, name: str) -> np.ndarray:
         """Cost ``name``, one of ``COSTS``, over (lambda, eta); the larger the better.
 
-        ``deflection``: largest signed deflection over kappa, 1. ``group_velocity``: the sum over bands 2 to 4
-        of the largest |v_g|, cells/s. ``weighted``: their product, Eq. (8).
+        ``deflection``, without unit, is the largest signed deflection over kappa. ``group_velocity`` in cells/s is the
+        sum over bands 2 to 4 of the largest |v_g|. ``weighted`` in cells/s is their product, Eq. (8) of the paper.
         """
         deflection = self.signed_deflection.max(axis=-1)
         speed = self.speed[..., DRIVEN - 1 :].sum(axis=-1)
@@ -59,7 +59,7 @@ class CellSearch:
         if not self.out_of_phase.any():
             return None
 
-        # Minus infinity rather than a selection: the argmax then refers to the whole grid.
+        # Minus infinity elsewhere, not a selection, so that the argmax is an index of the whole grid.
         cost = np.where(self.out_of_phase, self.cost(name), -np.inf)
         row, column = np.unravel_index(np.argmax(cost), cost.shape)
         return int(row), int(column)
@@ -97,10 +97,11 @@ def search_cells(reading: Reading, lam: ArrayLike, eta: ArrayLike, wavenumber: A
 
 
 def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:
-    """|u3 - u2| sign(-u2 u3) (..., band) of the contact pair: positive where it moves out of phase.
+    """Deflection |u3 - u2| sign(-u2 u3) (..., band) of the contact pair, positive where its masses move out of phase.
 
-    The paper leaves the length of the Bloch vectors open. They have unit norm here, which puts the optimum near the
-    paper's eta = 0.5 in both readings; unit modal mass would favour a light resonator (calibrated: eta = 0.16).
+    u2 is the host's displacement and u3 the resonator's in the waves ``point`` of a ``cell``. The paper leaves the
+    length of the Bloch vectors open. They have unit norm here, which puts the optimum near the paper's eta = 0.5 in
+    both readings; unit modal mass would favour a light resonator (calibrated: eta = 0.16).
     """
     u = unit_vectors(point)
     host = u[..., cell.host, :]
@@ -111,5 +112,5 @@ def signed_deflection(cell: UnitCell, point: BlochPoint) -> np.ndarray:
 
 
 def unit_vectors(point: BlochPoint) -> np.ndarray:
-    """Bloch vectors (..., dof, band) scaled to sum_dof |u|^2 = 1."""
+    """The Bloch vectors (..., dof, band) of ``point``, scaled such that the sum of |u|^2 over the masses is 1."""
     return point.vectors / np.linalg.norm(point.vectors, axis=-2, keepdims=True)

@@ -64,9 +64,9 @@ def search_design(
 ) -> str:
     """Search the grid of ``case`` in each of its readings; writes ``design.h5``, returns a table of the optima.
 
-    All ranks of ``comm`` must call it; rank 0 searches. That takes seconds, so ``stop`` and ``progress``, which every
-    study takes, are not asked. A search of the same case that is in ``folder`` is kept unless ``force`` replaces it;
-    ``resume`` needs one. Raises FolderError if the folder holds anything else.
+    All ranks of ``comm`` must call it; rank 0 searches. That takes seconds, so that ``stop`` and ``progress``, which
+    every study takes, are not used. A search of the same case in ``folder`` is kept unless ``force`` replaces it;
+    ``resume`` requires one. Raises FolderError if the folder contains anything else.
     """
     with claimed(comm, folder, SEARCH, case.to_toml(), force=force, resume=resume) as claim:
         on_root(comm, lambda: _make_search(case, claim.folder / "design.h5"))
@@ -80,13 +80,13 @@ def search_design(
 
 
 def _make_search(case: DesignCase, path: Path) -> None:
-    """Write the search of ``case`` to ``path`` unless it is there; names a file that cannot be read."""
+    """Write the search of ``case`` to ``path`` unless it is there, or if the file there cannot be read."""
     try:
-        # Whole or absent: the file is written under another name, and takes this one when it is complete.
+        # A file of this name is complete: it is written under another name, and renamed at the end.
         with open_netcdf(path, "search", BEST):
             return
     except (OSError, ValueError) as error:
-        # A missing file is the usual case; one that cannot be read deserves a word.
+        # Usually there is no file yet; of one that cannot be read the user is told.
         if path.exists():
             logger.warning("vipetsc: warning: %s; computed again", error)
 
@@ -94,7 +94,7 @@ def _make_search(case: DesignCase, path: Path) -> None:
 
 
 def _search(case: DesignCase) -> xr.Dataset:
-    """Content of ``design.h5``."""
+    """Search the grid of ``case``; returns the content of ``design.h5``."""
     options = case.design
     sys.audit("vipetsc.set-up", case.name)
     wavenumber = np.linspace(0, np.pi, options.wavenumbers)
@@ -129,15 +129,16 @@ def _search(case: DesignCase) -> xr.Dataset:
 
 
 def _paper_costs(reading: Reading, wavenumber: np.ndarray) -> list[float]:
-    """The costs (cost) of the cell that the paper takes."""
+    """The costs of the cell that the paper takes, in the order of ``COSTS``."""
     cell = search_cells(reading, *PAPER_CELL, wavenumber)
     return [cell.cost(name).item() for name in COSTS]
 
 
 def _optima(grids: Mapping[Reading, CellSearch], values: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Best cell of each cost, and the Bloch vectors there; NaN in a reading in which no cell is out of phase.
+    """The best cell by each cost, and the Bloch vectors there: the variables ``optimum_*`` of ``LAYOUT``.
 
-    The sizes of the dimensions are those of the coordinates in ``values``.
+    They are NaN in a reading in which no cell is out of phase. Sizes of dimensions are those of the coordinates in
+    ``values``.
     """
     optima: dict[str, np.ndarray] = {}
     for name, (dims, *_) in LAYOUT.items():

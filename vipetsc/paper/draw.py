@@ -1,4 +1,4 @@
-"""Drawing the figures of the paper that are missing or were drawn from other results, on all ranks."""
+"""Drawing of the paper's figures on all ranks, as far as they are missing or were drawn from other results."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,15 +13,17 @@ from vipetsc.paper.build_record import FORMATS, BuildRecord, is_drawn, read_reco
 from vipetsc.paper.plan import Plan
 from vipetsc.parallel import SharedCounter, StopRequest, on_every_rank, on_root
 
-MANY = 2**40  # more than any count
+MANY = 2**40  # more than the number of pictures
 
 
 def draw_paper(
     plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Callable[[str], None], inputs: Mapping[str, str]
 ) -> tuple[Path, ...]:
-    """Draw the figures that are missing or drawn from other ``inputs``; returns the files written, on all ranks.
+    """Draw the figures of ``plan`` in ``root`` that are missing or were drawn from other ``inputs``; returns the files.
 
-    The ranks draw pictures from one count, the dearest first; none is begun after a request to stop.
+    ``inputs`` are the hashes of what each figure is drawn from, by id (`Plan.inputs`). The ranks take one picture after
+    the other from all that are to be drawn, the dearest first; none is begun after a request to stop. ``tell`` is
+    called on rank 0 when drawing begins. Collective; all ranks get the same files.
     """
     begin = time.process_time()
     folders = on_root(comm, lambda: plan.folders(root))
@@ -33,7 +35,7 @@ def draw_paper(
     if comm.rank == 0:
         tell("figures")
     with Files() as files, style.rc_style():
-        # Every rank opens the files and knows all pictures; which of them it draws is decided one by one.
+        # Every rank opens the files and knows all pictures: which of them it will draw is not known yet.
         offers = on_every_rank(comm, lambda: {f.id: [*f.offers(folders, files)] for f in missing})
         for key, pictures in offers.items():
             record["figures"][key]["pictures"] = [picture.stem for picture in pictures]
@@ -45,10 +47,9 @@ def draw_paper(
 
     spent = comm.allreduce(time.process_time() - begin)
     if drawn:
-        # Only if all pictures are new is their cost that of this call alone.
+        # Where some pictures stay that earlier calls drew, the time of those calls counts too.
         drawn_anew = len(undrawn) == sum(len(entry["pictures"]) for entry in record["figures"].values())
         if not drawn_anew:
-            # The cost of pictures from earlier calls counts, too.
             spent += record["cpu"]["figures"]
         record["cpu"]["figures"] = spent
     on_root(comm, lambda: write_record(root, record))
@@ -56,13 +57,17 @@ def draw_paper(
 
 
 def _draw_shared(drawings: Sequence[Drawing], root: Path, comm: MPI.Comm, stop: StopRequest, note: str) -> list[Path]:
-    """Draw on all ranks, each the next picture that none has begun."""
+    """Draw the ``drawings`` on all ranks, each the next picture that none has begun; returns the files, on all ranks.
+
+    ``note`` is printed on every picture.
+    """
     counter = SharedCounter(comm)
 
     def turns() -> Iterator[int]:
         while not stop.requested:
             yield counter.draw()
-        counter.draw(MANY)  # so that no rank begins another
+        # The count is then beyond all pictures, so that no other rank begins one either.
+        counter.draw(MANY)
 
     try:
         written = on_every_rank(comm, lambda: draw_each(drawings, root / "figures", FORMATS, turns(), note))
@@ -73,18 +78,18 @@ def _draw_shared(drawings: Sequence[Drawing], root: Path, comm: MPI.Comm, stop: 
 
 
 def _is_complete(key: str, record: BuildRecord, root: Path) -> bool:
-    """Whether a figure's pictures are there, all of them."""
+    """Whether all pictures of the figure ``key`` are there."""
     stems = record["figures"][key]["pictures"]
     return bool(stems) and all(is_drawn(root, stem) for stem in stems)
 
 
 def _drop_stale(plan: Plan, root: Path, inputs: Mapping[str, str]) -> BuildRecord:
-    """Remove pictures of other ``inputs``, so that every picture that is there is up to date."""
+    """Remove the pictures that were drawn from other ``inputs``; returns the record without them."""
     record = read_record(root)
     for figure in plan.figures:
         if record["figures"].get(figure.id, {}).get("inputs") != inputs[figure.id]:
             for path in (root / "figures").glob(f"{figure.id}-*"):
-                # Before the record is written: after a kill between the two, the old record still names the old inputs.
+                # Removed before the record is written: after a kill in between, the record still has the old inputs.
                 path.unlink()
             record["figures"][figure.id] = {"inputs": inputs[figure.id], "pictures": []}
     write_record(root, record)

@@ -1,7 +1,7 @@
 """The whole paper in one folder: steps computed, figures drawn, claims measured, the report written.
 
-Figures, claims and report are computed again when the hash of their inputs changed: the steps' resolved cases, the
-contents of their results, the version of the package. ``made.json`` keeps the hashes.
+Figures, claims and report are made again when the hash of their inputs has changed: the resolved cases of the steps,
+the contents of their results, the version of the package. ``made.json`` keeps the hashes.
 """
 
 import json
@@ -32,9 +32,10 @@ Announce = Callable[[str], None]
 
 @dataclass(frozen=True)
 class PaperResult:
-    """Outcome of a call: ``new_steps`` computed now, files ``drawn`` now, the rows of ``claims.json``.
+    """Outcome of a call: the ``new_steps`` computed, the files ``drawn``, the ``claims`` (rows of ``claims.json``).
 
-    ``complete``: every step asked for is there, without failures; ``notes`` are warnings, and say what failed and why.
+    ``complete`` says that every step asked for is there, without failures. ``notes`` are warnings, and sentences about
+    what failed and why.
     """
 
     new_steps: tuple[str, ...]
@@ -82,23 +83,24 @@ def _make_paper(plan: Plan, part: Plan, root: Path, comm: MPI.Comm, stop: StopRe
     with noted(comm, "backbone", notes):
         on_root(comm, lambda: _relate(plan.folders(root)))
     inputs = on_root(comm, lambda: plan.inputs(root))
-    # Stays empty where drawing fails: ``noted`` reports it and goes on.
+    # Stays empty if drawing fails, which ``noted`` notes.
     drawn: tuple[Path, ...] = ()
     with noted(comm, "figures", notes):
         drawn = draw_paper(part, root, comm, stop, tell, inputs)
     stop.check(comm)
     claims = on_root(comm, lambda: _conclude(plan, root, comm, tell, inputs["claims"]))
 
-    # Asked again: steps may have failed, and are then missing still.
+    # Steps may have failed, and are then still to be done.
     left = on_root(comm, lambda: part.left(root))
     failed = any(note.startswith("failed") for note in notes)
     return PaperResult(new_steps=new_steps, drawn=drawn, claims=claims, complete=not (left or failed), notes=notes)
 
 
 def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[Claim]:
-    """Claim ``root`` for this plan; a case that cannot be used raises before anything is written."""
+    """Claim ``root`` for this plan; raises before anything is written, CaseError for a case that cannot be used."""
     for step in plan.steps:
-        _ = step.text  # resolves the case, which raises
+        # For its error alone: the text is that of the resolved case.
+        _ = step.text
 
     def difference(text: str) -> str | None:
         """Reason why ``plan.json`` with this ``text`` is of another plan; None if it is of this one."""
@@ -114,15 +116,18 @@ def _claimed(plan: Plan, root: Path, comm: MPI.Comm) -> AbstractContextManager[C
 
 
 def _relate(folders: Mapping[str, Path]) -> None:
-    """Lay the transfer of the four-band lattice over the branches, as far as they are done (``backbone.h5``)."""
+    """Relate the transfer of the four-band lattice to the branches, as far as both are done (``backbone.h5``)."""
     branches = [folders[name] for name in RELATED if name in folders]
     if TRANSFER in folders and branches and not is_related(folders[TRANSFER], branches):
         relate_folders([folders[TRANSFER], *branches])
 
 
 def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Announce, inputs: str) -> list[dict[str, Any]]:
-    """Write ``claims.json`` and ``report.html`` as far as their ``inputs`` changed; returns the claims."""
-    # The record is written last: after a kill before that, its files are written again.
+    """Write ``claims.json`` and ``report.html`` if their inputs have changed; returns the claims. Called on one rank.
+
+    ``inputs`` is the hash of what the claims are measured from.
+    """
+    # The record is written at the end: after a kill before that, the files are written again.
     record = read_record(root)
     path = root / "claims.json"
     if read_json(path) is None or record.get("claims") != inputs:
@@ -136,7 +141,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Announce, inputs: st
     claims = path.read_text(encoding="utf-8")
     about = provenance(comm)
     versions = {key: value for key, value in about.items() if key.endswith("_version")}
-    # The report's own time is none of its inputs: it would never be up to date.
+    # Without the report's own time: if that were among its inputs, the report would never be up to date.
     cpu = {key: seconds for key, seconds in record["cpu"].items() if key != "report"}
     report_inputs = fingerprint(claims, json.dumps([inputs, record["figures"], versions, cpu]))
     if not is_whole(root / "report.html") or record.get("report") != report_inputs:
@@ -159,7 +164,7 @@ def _conclude(plan: Plan, root: Path, comm: MPI.Comm, tell: Announce, inputs: st
 
 
 def _pictures(plan: Plan, root: Path, record: BuildRecord) -> list[tuple[PaperFigure, list[Path]]]:
-    """The figures of the ``plan`` with their pictures (PNG), as far as they are there."""
+    """The figures of the ``plan``, each with those of its pictures (PNG) that are there."""
     pictures = []
     for figure in plan.figures:
         stems = record["figures"].get(figure.id, {}).get("pictures", ())
@@ -169,7 +174,7 @@ def _pictures(plan: Plan, root: Path, record: BuildRecord) -> list[tuple[PaperFi
 
 
 def plan_table(plan: Plan, root: Path, ranks: int) -> str:
-    """Table of what is done and left of ``plan`` in ``root``: steps with the time they need, figures, claims."""
+    """Table of the steps and figures of ``plan``, with their state in ``root`` and the time left on ``ranks``."""
     lines = [f"{'step':<26}{'state':<10}{'left':>9}  claims"]
     total = 0.0
     for step in plan.steps:
@@ -202,7 +207,7 @@ def _figure_state(root: Path, figure: PaperFigure, entry: BuildRecord | None, in
     files = sum(path.exists() for path in paths)
     if not files:
         state = MISSING
-    # All formats of all pictures: a kill may leave a PNG without its PDF.
+    # Every format of every picture: a kill may leave a PNG without its PDF.
     elif files == len(paths) and entry["inputs"] == inputs:
         state = DONE
     else:

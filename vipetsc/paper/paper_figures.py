@@ -19,12 +19,13 @@ from vipetsc.figures.schematics import lattice_page, reduced_model
 from vipetsc.figures.sweep_members import Files
 
 READINGS = ("calibrated", "printed")
-TRANSFER = "interband"  # the sweep that is laid over branches
+# The sweep whose transfer is related to branches, and the steps of these.
+TRANSFER = "interband"
 RELATED = ("nnm-hertz", "nnm-bilinear", "nnm-hertz-calibrated", "nnm-bilinear-calibrated")
 
 
 class Picture(NamedTuple):
-    """A picture to come: the stem of its files' names, what draws it, and about how long that takes in s."""
+    """A picture that can be drawn: the ``stem`` of its files' names, the function that draws it, the ``cost`` in s."""
 
     stem: str
     make: Callable[[], Figure]
@@ -33,10 +34,11 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True)
 class Part:
-    """Pictures of a figure: of the registry's ``figure`` from ``steps``, or a ``schematic`` from ``arguments``.
+    """Pictures of a figure: those of the registry's ``figure`` from ``steps``, or of a ``schematic``.
 
-    Of the registry's pictures those are taken whose names hold all of ``only``; ``stem`` names them, with ``{stem}``
-    for the registry's name. ``cost`` is the CPU time in s that one takes.
+    Of the registry's pictures those are taken whose names contain all words of ``only``. ``stem`` names their files,
+    with ``{stem}`` for the registry's name. A schematic is a function in ``SCHEMATICS``, called with a reading and the
+    ``arguments``. ``cost`` is the CPU time in s that one picture takes.
     """
 
     figure: str = ""
@@ -50,10 +52,10 @@ class Part:
 
 @dataclass(frozen=True)
 class PaperFigure:
-    """A figure of the paper; ours are one or more pictures, for every reading (and law, and average).
+    """A figure of the paper, reproduced by one or more pictures: for every reading, and perhaps law and average.
 
-    ``id`` begins the names of their files, ``label`` is the paper's number, ``caption`` says in our words what is
-    seen, ``claims`` are those that it bears on.
+    ``id`` begins the names of their files, ``label`` is the paper's number, ``title`` and ``caption`` say in our words
+    what is seen, ``claims`` are the ids of the claims that it shows.
     """
 
     id: str
@@ -69,11 +71,11 @@ class PaperFigure:
         return tuple(dict.fromkeys(step for part in self.parts for step in part.steps))
 
     def offers(self, folders: Mapping[str, Path], files: Files) -> Iterator[Picture]:
-        """The pictures that the ``folders`` of finished steps (by name) allow, drawn while ``files`` are open."""
+        """The pictures that can be drawn from the ``folders`` of finished steps, by name, while ``files`` are open."""
         for part in self.parts:
             if part.schematic:
                 for reading in READINGS:
-                    # Bound now: the picture is drawn after this loop has gone on to the next reading.
+                    # Bound now, since the picture is drawn when this loop has gone on to the next reading.
                     schematic = partial(SCHEMATICS[part.schematic], reading, *part.arguments)
                     yield Picture(f"{self.id}-{part.stem}-{reading}", schematic, part.cost)
 
@@ -82,7 +84,7 @@ class PaperFigure:
             if finished:
                 for drawing in drawings(FIGURES[part.figure].source, finished, files, [part.figure]):
                     stem = drawing.stem
-                    # Between dashes, so that no part of a longer word matches.
+                    # A word stands between dashes or at an end: a part of a longer word does not match.
                     if all(f"-{word}-" in f"{stem}-" for word in part.only):
                         yield Picture(f"{self.id}-{part.stem.format(stem=stem)}", drawing.draw, part.cost)
 
@@ -93,12 +95,13 @@ def lattice(reading: str, preset: str, sites: Sequence[int]) -> Figure:
 
 
 def two_masses(reading: str) -> Figure:
-    """The reduced model of the four-band cell: host and resonator."""
+    """The reduced model of the four-band cell, of host and resonator, as `modes.system.System.reduced` has it."""
     cell = _case("four-band", reading).lattice.unit_cell()
+    pair = {cell.host, cell.resonator}
     masses = (cell.masses[cell.host], cell.masses[cell.resonator])
-    inner = [s.stiffness for s in cell.springs if {s.start, s.end} == {cell.host, cell.resonator}]
-    # Half of the total of springs that are held at their middles, as the paper divides them.
-    outer = [s.stiffness for s in cell.springs if cell.host in (s.start, s.end) and s.stiffness not in inner]
+    inner = [s.stiffness for s in cell.springs if {s.start, s.end} == pair]
+    # A spring that is held at its middle has twice its stiffness, and the paper takes half of the total of the host's.
+    outer = [s.stiffness for s in cell.springs if cell.host in (s.start, s.end) and {s.start, s.end} != pair]
     return reduced_model(masses, (sum(outer), sum(inner)), PRESETS["four-band"].clearance_span(1)[0])
 
 
@@ -111,7 +114,7 @@ _TABLES = tomllib.loads((files("vipetsc.paper") / "figures.toml").read_text(enco
 _ROWS = [{"id": key} | table for key, table in _TABLES.items()]
 PAPER_FIGURES = TypeAdapter(tuple[PaperFigure, ...]).validate_python(_ROWS)
 
-# Pattern in the name of a picture's file, and what it says.
+# Patterns in the names of pictures' files, and what they mean in words.
 NAMES = (
     (r"neighbours", "neighbouring sites"),
     (r"-hertz(?=-|$)", "Hertz"),
@@ -132,5 +135,5 @@ NAMES = (
 
 
 def describe(stem: str) -> str:
-    """The name of a picture's file in words: "calibrated reading, 5π/9, energy-weighted average"."""
+    """The name ``stem`` of a picture's file in words, as in "calibrated reading, 5π/9, energy-weighted average"."""
     return ", ".join(match.expand(text) for pattern, text in NAMES for match in re.finditer(pattern, stem))

@@ -1,6 +1,6 @@
 """The plan of the verb ``paper``, in full or on coarse grids: steps, each of which computes one case in its folder.
 
-A step has its state, and the plan the inputs of figures and claims.
+A step knows the state of its folder and what is left to compute; the plan knows the inputs of figures and claims.
 """
 
 import hashlib
@@ -41,12 +41,12 @@ from vipetsc.studies.sweep import run_sweep
 FULL, QUICK = "full", "quick"
 COARSE = "quick: coarse grid"  # the note on every picture of the quick grid
 DONE, BEGUN, STALE, MISSING = "done", "begun", "stale", "missing"
-SEED = 2024  # of the members that the other engine simulates as well
-TS_COST = 2.5  # s of CPU time of one of them
-IN_PHASE = 10  # times as long as the other branch takes the one that goes through all tongues
-RELATION = "backbone.h5"  # in the folder of a sweep that is laid over branches
+SEED = 2024  # of the choice of members that the engine ts simulates too
+TS_COST = 2.5  # CPU time in s of one of these by ts
+IN_PHASE = 10  # cost of the in-phase branch, which goes through all tongues, over that of the out-of-phase branch
+RELATION = "backbone.h5"  # the relation of a sweep to branches, in the folder of the sweep
 
-# Steps that a claim is measured from besides those whose results its figures show.
+# Steps from which a claim is measured, besides those whose results its figures show.
 FURTHER_STEPS = {"C8": ("scattering",), "C15": ("nnm-hertz", "nnm-bilinear"), "C16": RELATED}
 
 StepCase = Sweep | NnmCase | DesignCase | PredictCase
@@ -59,7 +59,10 @@ KINDS: dict[str, type[StepCase]] = {
 
 
 class PartMaker(NamedTuple):
-    """Functions by which one rank computes a part of a step, and all ranks replace earlier parts by the new ones."""
+    """Functions that compute the parts of a step: ``make`` is called on one rank with the number of a part.
+
+    ``publish`` is called on all ranks when all parts are there, and puts them in the place of earlier ones.
+    """
 
     make: Callable[[int], object]
     publish: Callable[[], None] = lambda: None
@@ -67,11 +70,12 @@ class PartMaker(NamedTuple):
 
 @dataclass(frozen=True)
 class PaperStep:
-    """Step of the paper, a case in ``root/<name>``: a sweep, branches or a search.
+    """A step of the paper, a case that is computed in ``root/<name>``: a sweep, branches, a search or a prediction.
 
-    ``kind`` of case and its ``file``, ``changes`` what is changed in it (``section.key=value``), ``cost`` the CPU time
-    in s of a part (of a member, for sweeps) on a core of the 2020s, used until rates are measured. With ``checks``,
-    the name of another step, it simulates ``sample`` of that sweep's members by the engine ``ts``.
+    ``kind`` is the class of the case in ``file``, ``changes`` are made in it (``section.key=value``). ``cost`` is the
+    CPU time in s of a part, of a sweep's member, or of the whole step if it has neither, on a core of the 2020s; it is
+    used until a rate is measured. A step with ``checks``, the name of another step, simulates ``sample`` members of
+    that sweep by the engine ``ts``.
     """
 
     name: str
@@ -83,7 +87,7 @@ class PaperStep:
     sample: int = 0
 
     def folder(self, root: Path) -> Path:
-        """The folder of the step's files."""
+        """The folder of the step's files in the folder ``root`` of the paper."""
         return root / self.name
 
     @cached_property
@@ -100,7 +104,7 @@ class PaperStep:
         return self.case.to_toml()
 
     def results(self, root: Path) -> list[Path]:
-        """Files from which pictures are drawn and claims measured."""
+        """The files of results, from which pictures are drawn and claims are measured; they need not be there yet."""
         if isinstance(self.case, NnmCase):
             system = System.from_case(self.case)
             names = [f"branch-{system.branch_name(mode - 1)}.h5" for mode in self.case.nnm.modes]
@@ -114,7 +118,11 @@ class PaperStep:
 
     @property
     def parts(self) -> dict[int, float]:
-        """Parts that single ranks compute, by number with CPU times in s: branches by mode, the search; else none."""
+        """The parts that single ranks compute, by number, with their CPU times in s.
+
+        They are the branches by their modes, or the search as part 1. Sweeps and predictions, on which all ranks work
+        together, have none.
+        """
         if isinstance(self.case, NnmCase):
             costs = dict.fromkeys(self.case.nnm.modes, self.cost)
             if 1 in costs:
@@ -126,7 +134,10 @@ class PaperStep:
 
     @contextmanager
     def claimed(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> Iterator[PartMaker]:
-        """Claim the folder of a step of parts on all ranks, to compute what is missing, everything if ``afresh``."""
+        """Claim the folder of a step with parts, on all ranks, and give the functions that compute the missing parts.
+
+        With ``afresh`` all parts are computed, and replace those of another case.
+        """
         case = self.case
         folder = self.folder(root)
         if isinstance(case, NnmCase):
@@ -138,9 +149,9 @@ class PaperStep:
             yield PartMaker(lambda part: search_design(case, folder, MPI.COMM_SELF, force=afresh))
 
     def sweep(self, root: Path, comm: MPI.Comm, stop: StopRequest, afresh: bool) -> list[str]:
-        """Compute what is missing of a sweep or prediction on all ranks, all if ``afresh``; a ``stop`` ends it early.
+        """Compute what is missing of a sweep or prediction on all ranks, all of it if ``afresh``.
 
-        Returns warnings about the results.
+        A request to ``stop`` ends it early. Returns warnings about the results.
         """
         if isinstance(self.case, PredictCase):
             predict(self.case, self.folder(root), comm, force=afresh, stop=stop)
@@ -149,13 +160,13 @@ class PaperStep:
         return run_sweep(self.case, self.folder(root), comm, force=afresh, stop=stop, progress=True).warnings
 
     def state(self, root: Path) -> str:
-        """State of the step: DONE, BEGUN, MISSING, or STALE if the folder holds another case."""
+        """State of the step: DONE, BEGUN, MISSING, or STALE if the folder holds results of another case or version."""
         folder = self.folder(root)
         if not (folder / "case.toml").exists():
             return MISSING
         if not self._is_case_of(folder):
             if self._is_case_of(folder / NEW):
-                # Results of this case are under computation, to replace those of the other.
+                # Results of this case were begun, aside, and will replace those of the other case.
                 return BEGUN
             return STALE
         if outdated(folder):
@@ -165,12 +176,16 @@ class PaperStep:
         return BEGUN
 
     def _is_case_of(self, folder: Path) -> bool:
-        """Whether a ``folder`` is there for results of this case."""
+        """Whether a ``folder`` is marked as one for results of this case."""
         marker = folder / "case.toml"
         return marker.exists() and self._is_same_case(marker.read_text(encoding="utf-8", errors="replace"))
 
     def _is_complete(self, path: Path) -> bool:
-        """Whether a result is of this case; a branch has ended, by itself or in a failure that it names."""
+        """Whether the file ``path`` is a finished result of this step.
+
+        A branch is finished if it has ended, also in a failure that it names; other files are written when they are
+        complete, and must be of this case.
+        """
         with suppress(OSError), h5py.File(path) as file:  # one that was cut off does not open
             if "ending" in file.attrs:
                 return bool(file.attrs["complete"]) or str(file.attrs["ending"]).startswith("failed")
@@ -178,20 +193,23 @@ class PaperStep:
         return False
 
     def _is_same_case(self, text: str) -> bool:
-        """Whether a case in TOML is this step's, in whatever order its keys stand."""
-        # One that cannot be read is another's: the step says so when it claims its folder.
+        """Whether the case ``text`` in TOML is this step's, in whatever order its keys stand."""
+        # A text that cannot be read is no case of this step, which will say so when it claims its folder.
         with suppress(tomllib.TOMLDecodeError, RecursionError):
             return tomllib.loads(text) == tomllib.loads(self.text)
         return False
 
     def identity(self, root: Path) -> str:
-        """Hash of the case and of what the results hold."""
-        # What is related to a sweep is drawn with it.
+        """Hash of the case and of the contents of its results."""
+        # With the relation to branches, which is drawn from the folder of the sweep.
         paths = [*self.results(root), self.folder(root) / RELATION]
         return fingerprint(self.text, *(path.read_bytes() for path in paths if path.exists()))
 
     def left(self, root: Path) -> float:
-        """CPU time in s that is still needed; of a sweep, for its missing members, at the mean of the finished ones."""
+        """CPU time in s that the step still needs.
+
+        A sweep needs it for its missing members, each at the mean time of the finished ones, but at least at ``cost``.
+        """
         state = self.state(root)
         if state == DONE:
             return 0.0
@@ -200,19 +218,19 @@ class PaperStep:
 
         times: list[float] = []
         if state == BEGUN:
-            # Members that are done show the rate of this machine.
+            # The members that are done show how fast this machine is.
             times = [*Results(self.case, self.folder(root)).cpu_seconds.values()]
         rate = self.cost
         if times:
-            rate = max(float(np.mean(times)), self.cost)  # measuring a run takes time as well
+            rate = max(float(np.mean(times)), self.cost)
         return rate * max(int(np.prod(self.case.shape)) - len(times), 0)
 
     def failures(self, root: Path) -> int:
-        """Number of members or branches that failed, of a step that is done."""
+        """Number of members or branches of a step that failed; the step is DONE."""
         if isinstance(self.case, NnmCase):
             return int(_branch_statistics(self.results(root))["failed"])
         if isinstance(self.case, Sweep):
-            # To read all measures takes much longer, and a call with nothing to do does it for every sweep.
+            # The status alone: a call with nothing to do asks every sweep, and to read all measures takes much longer.
             with open_netcdf(self.folder(root) / "ensemble.h5", "sweep's ensemble", ("status",)) as ensemble:
                 return int((ensemble["status"] == FAILED).sum())
         return 0
@@ -232,10 +250,10 @@ class PaperStep:
 
 @dataclass(frozen=True)
 class Plan:
-    """Steps in the order of their computation, and the figures of the paper.
+    """The steps in the order in which they are computed, and the figures of the paper.
 
-    ``grid`` is "full" or "quick"; ``note`` is printed on every picture; ``measure`` gives the rows of ``claims.json``
-    from the folder of all steps.
+    ``grid`` is "full" or "quick"; ``note`` is printed on every picture; ``measure`` returns the rows of ``claims.json``
+    from the folder that has the folders of all steps.
     """
 
     grid: str
@@ -245,7 +263,10 @@ class Plan:
     measure: Callable[[Path], Sequence[Mapping[str, Any]]] = measure_claims
 
     def only(self, ids: Sequence[str]) -> Self:
-        """The part of the plan that figures and claims need; all of it without ``ids``; raises FolderError."""
+        """The part of the plan that the figures and claims ``ids`` need; the whole plan without any.
+
+        Raises FolderError for an id that the plan does not have.
+        """
         if not ids:
             return self
 
@@ -272,15 +293,15 @@ class Plan:
         return {step.name: step.folder(root) for step in self.steps if step.state(root) == DONE}
 
     def claims_of(self, step: PaperStep) -> list[str]:
-        """The claims that rest on a step."""
+        """The ids of the claims that are measured from a step, or whose figures show it."""
         claims = {claim for figure in self.figures if step.name in figure.steps for claim in figure.claims}
         claims |= {claim for claim, steps in FURTHER_STEPS.items() if step.name in steps}
         return [claim for claim in CLAIMS if claim in claims]
 
     def inputs(self, root: Path) -> dict[str, str]:
-        """Hash of what each figure is drawn from, by id; of all steps under "claims"."""
+        """Hash of what each figure is drawn from, by id; under "claims" that of all finished steps."""
         steps = {step.name: step.name + step.identity(root) for step in self.steps if step.state(root) == DONE}
-        # The note is printed on every picture, and another version may draw or measure otherwise.
+        # The note is printed on every picture. Another version of the package may draw or measure otherwise.
         version = (vipetsc.__version__, self.note)
         inputs: dict[str, str] = {}
         for figure in self.figures:
@@ -303,7 +324,8 @@ def paper_plan(grid: str = FULL) -> Plan:
         if grid == QUICK:
             # Later changes win: the quick grid overrides those of the full one.
             changes += row.get("quick", ())
-        if row["kind"] == "sweep":  # the figures of the paper are drawn from all sweeps together
+        # The figures of the paper are drawn from all sweeps together, not by each sweep.
+        if row["kind"] == "sweep":
             changes.insert(0, "output.figures=false")
         steps.append(
             PaperStep(
@@ -320,7 +342,7 @@ def paper_plan(grid: str = FULL) -> Plan:
 
 
 def _sweep_statistics(folder: Path) -> dict[str, Any]:
-    """Members and how they ended, contact episodes, the largest error of the ledger, CPU time in s."""
+    """Numbers of the sweep in ``folder`` for the report: members by ending, contacts, ledger error, CPU time in s."""
     ensemble = open_ensemble(folder)
     status = ensemble["status"].values
     return {
@@ -335,7 +357,10 @@ def _sweep_statistics(folder: Path) -> dict[str, Any]:
 
 
 def _branch_statistics(paths: Sequence[Path]) -> dict[str, Any]:
-    """Points, largest residual, endings with tongues and warnings of the branches, and how many of them failed."""
+    """Numbers of the branches in the files ``paths`` for the report.
+
+    ``points`` and their largest ``residual``, the ``endings`` with tongues and warnings, and how many ``failed``.
+    """
     residuals: list[float] = []
     endings: list[str] = []
     for path in paths:

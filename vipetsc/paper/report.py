@@ -22,22 +22,24 @@ from vipetsc.paper.claims.criteria import FAILS, HOLDS, IN_PART, UNMEASURED
 from vipetsc.paper.paper_figures import READINGS, PaperFigure, describe
 from vipetsc.studies.engines import COMPARED
 
-# One page holds some hundred pictures. Those of lines keep all pixels in few colours; those of maps, which are larger
-# so, are narrower and with losses that only an enlargement shows.
+# The page holds about a hundred pictures. Pictures of lines keep all their pixels, in few colours. Pictures of maps
+# would be large in this form: they are made narrower, and compressed with losses that only an enlargement shows.
 COLOURS = 256
 WIDTH = 1000  # pixels
 QUALITY = 50  # of WebP
+# A picture in the page: the hash of its file, and its data URI.
 ENCODED = re.compile(r'<img data-of="(\w+)" src="([^"]+)"')
-# What several claims do that each have a verdict.
+# The verdicts as verbs for several claims: "12 hold".
 OF_SEVERAL = {HOLDS: "hold", IN_PART: "hold in part", FAILS: "do not hold", UNMEASURED: "not measured"}
 VERDICTS = (HOLDS, IN_PART, FAILS, UNMEASURED)
 
 
 class ReportContents(NamedTuple):
-    """Contents of the page: the rows of ``claims.json``, the pictures (PNG) of every figure, numbers and versions.
+    """Contents of the page.
 
-    ``note`` is not empty for coarse grids; ``statistics`` are about the steps by name; ``cpu`` is the time in s of
-    "steps" by name, "figures" and "claims".
+    ``note`` says that the grid is coarse, and is empty if it is not. ``claims`` are the rows of ``claims.json``,
+    ``pictures`` the pictures (PNG) of every figure, ``statistics`` numbers about the steps by name, ``versions`` those
+    of the libraries. ``cpu`` is the CPU time in s of "steps" by name, of "figures" and "claims".
     """
 
     note: str
@@ -49,8 +51,8 @@ class ReportContents(NamedTuple):
 
 
 def write_report(path: Path, contents: ReportContents) -> None:
-    """Write the page to ``path``, whole or not at all; pictures that the page there shows already are taken from it."""
-    # By the hash of the picture: one that has not changed is not encoded again.
+    """Write the page to ``path``, whole or not at all; pictures that have not changed are taken from the page there."""
+    # Data URIs of the pictures that are encoded already, by the hash of the picture's file.
     encoded: dict[str, str] = {}
     if path.exists():
         encoded = dict(ENCODED.findall(path.read_text(encoding="utf-8")))
@@ -67,10 +69,12 @@ def write_report(path: Path, contents: ReportContents) -> None:
     statistics = contents.statistics
     verdicts = Counter((claim["reading"], claim["verdict"]) for claim in contents.claims)
     readings = [r for r in READINGS if any(reading == r for reading, _ in verdicts)]
+    # A claim links to the first figure that shows it.
     figure_of: dict[str, PaperFigure] = {}
     for figure, _ in contents.pictures:
         for claim in figure.claims:
-            figure_of.setdefault(claim, figure)  # the first figure that bears on a claim
+            figure_of.setdefault(claim, figure)
+
     page = environment.get_template("report.html").render(
         note=contents.note,
         pictures=contents.pictures,
@@ -91,7 +95,11 @@ def write_report(path: Path, contents: ReportContents) -> None:
 
 
 def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str, str]:
-    """Width and height in pixels, a hash of the file, the data URI, ``encoded`` before or now, and its axes, packed."""
+    """What the template needs of the picture (PNG) at ``path``.
+
+    These are its width and height in pixels, the hash of the file, its data URI, and the content of its JSON file (the
+    axes and data that the page can show), compressed, in base64. URIs are taken from ``encoded``, by the hash, or made.
+    """
     data = path.read_bytes()
     key = hashlib.sha256(data).hexdigest()
     with Image.open(io.BytesIO(data)) as image:
@@ -108,14 +116,15 @@ def picture(encoded: Mapping[str, str], path: Path) -> tuple[int, int, str, str,
 
 
 def small(image: Image.Image) -> bytes:
-    """The picture as WebP: with all pixels in few colours, or, where that is larger, narrower and with losses."""
+    """The picture as WebP: with all pixels in few colours, or, if that is larger, narrower and with losses."""
     few = image.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     lines = _webp(few.convert("RGB"), lossless=True, quality=60, method=2)
 
     narrow = image
     if image.width > WIDTH:
         narrow = image.resize((WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS)
-    # Which kind a picture is shows by which encoding is shorter. A quick one first: a slow one shortens it by a fifth.
+    # The shorter encoding shows whether a picture is one of lines or a map. The best compression with losses is slow,
+    # and saves a fifth over a quick one: where lines are far shorter than the quick one, the slow one is not tried.
     if len(lines) < 0.6 * len(_webp(narrow, quality=QUALITY, method=0)):
         return lines
     return min(lines, _webp(narrow, quality=QUALITY, method=4), key=len)
@@ -129,18 +138,18 @@ def _webp(image: Image.Image, **options: Any) -> bytes:
 
 
 def numbers(named: Mapping[str, float | None]) -> list[str]:
-    """Numbers with their names as short texts; those that could not be had are left out."""
+    """The ``named`` numbers as short texts with their names; those that could not be measured are left out."""
     return [f"{name} = {value:.4g}" for name, value in named.items() if value is not None]
 
 
 def sources(files: Sequence[str]) -> str:
-    """The steps that ``files`` belong to, with how many of each."""
+    """The steps to whose folders ``files`` belong, as text, with the number of files if there are several."""
     counts = Counter(name.partition("/")[0] for name in files)
     return ", ".join(step if n == 1 else f"{step} ({n} files)" for step, n in counts.items())
 
 
 def claims_table(claims: Sequence[Mapping[str, Any]]) -> str:
-    """Claims in rows, readings in columns, verdicts in words."""
+    """The verdicts as a table of text: claims in rows, readings in columns."""
     readings = list(dict.fromkeys(claim["reading"] for claim in claims))
     lines = [f"{'':<5}" + "".join(f"{reading:<18}" for reading in readings) + "claim"]
     for key, row in by_reading(claims).items():

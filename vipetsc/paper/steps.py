@@ -19,13 +19,16 @@ from vipetsc.studies.pool import TaskPool
 
 @contextmanager
 def noted(comm: MPI.Comm, name: str, notes: list[str]) -> Iterator[None]:
-    """Note what the block raises and go on; not where one rank failed alone, nor for a full disk."""
+    """Add a note about an exception of the block, called ``name``, and go on.
+
+    StoppedError, errors of a full disk, and errors of one rank alone are raised.
+    """
     try:
         yield
     except StoppedError:
         raise
     except Exception as error:
-        # A rank that failed alone left the others in a collective, where they would wait for ever.
+        # If one rank fails alone, the others are in a collective call and would wait for it for ever.
         alone = comm.size > 1 and not getattr(error, "from_root", False)
         if alone or is_disk_full(error):
             raise
@@ -35,9 +38,11 @@ def noted(comm: MPI.Comm, name: str, notes: list[str]) -> Iterator[None]:
 def make_steps(
     plan: Plan, root: Path, comm: MPI.Comm, stop: StopRequest, tell: Callable[[str], None], notes: list[str]
 ) -> tuple[str, ...]:
-    """Compute the steps that are not done or had failures, until a request to stop; returns their names.
+    """Compute the steps of ``plan`` in ``root`` that are not done or had failures; returns the names of those computed.
 
-    The parts of single ranks come first, of all steps together, then the sweeps one by one.
+    The parts that single ranks compute come first, those of all steps together, then the sweeps, one by one. After a
+    request to ``stop`` no further step begins. ``tell`` is called on rank 0 with what is about to be done; warnings
+    and failures are added to ``notes``. Collective.
     """
     left = on_root(comm, lambda: plan.left(root))
     stale = on_root(comm, lambda: {step.name for step in plan.steps if step.state(root) == STALE})
@@ -53,7 +58,7 @@ def make_steps(
         announce(*(step.name for step in parted))
         finished += _make_parts(parted, stale, root, comm, stop, notes)
 
-    # Then the steps on which all ranks work, one by one: each is whole before the next begins.
+    # Then the steps on which all ranks work: after an interruption at most one of them is incomplete.
     for step in missing:
         if step.parts:
             continue
@@ -72,7 +77,7 @@ def make_steps(
 
 
 class PartJob(NamedTuple):
-    """A part of a step, by number, that one rank computes; jobs are sorted by their ``cost`` in s."""
+    """A part of a step, by its number, that one rank computes; ``cost`` in s comes first: jobs are sorted by it."""
 
     cost: float
     step: str
@@ -82,7 +87,10 @@ class PartJob(NamedTuple):
 def _make_parts(
     steps: Sequence[PaperStep], stale: Collection[str], root: Path, comm: MPI.Comm, stop: StopRequest, notes: list[str]
 ) -> list[str]:
-    """Compute all parts of ``steps`` on single ranks, the longest first; returns the steps without failures."""
+    """Compute all parts of ``steps`` on single ranks, the longest first; returns the names of steps without failures.
+
+    Earlier results of ``stale`` steps are replaced. Failures are added to ``notes``. Collective.
+    """
     cpu: dict[str, float] = {}
     reasons: dict[str, str] = {}
     with ExitStack() as claims:
@@ -119,8 +127,11 @@ def _make_parts(
 
 
 def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: bool) -> None:
-    """Add the CPU time in s that each rank spent on ``steps`` to the record; of steps computed ``afresh`` only this."""
-    # Several ranks work on a step: each has spent a part of its time.
+    """Add the CPU time in s that each rank has spent on ``steps`` to the record in ``root``. Collective.
+
+    Of steps that were computed ``afresh`` the record has this time alone.
+    """
+    # Several ranks may have worked on a step.
     spent = Counter[str]()
     for from_rank in comm.allgather(steps):
         spent.update(from_rank)
@@ -138,7 +149,7 @@ def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: boo
 
 
 def duration(seconds: float) -> str:
-    """A time in words; a dash for none."""
+    """A time as text, in seconds or from two minutes on in minutes; a dash for none."""
     if seconds <= 0:
         return "-"
     if seconds < 120:

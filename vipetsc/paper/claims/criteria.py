@@ -1,7 +1,7 @@
-"""Criteria that decide on the claims (``claims.toml``), and the constants inside of the quantities they compare.
+"""Criteria that decide on the claims (``claims.toml``), and the constants in the quantities that they compare.
 
-Every number that decides a verdict is in one of the two. Sections (sec., App., Suppl.) are the paper's; SPEC is the
-specification that fixes what the paper leaves open.
+Every number on which a verdict depends is in that file or in this module. Sections (sec., App., Suppl.) are the
+paper's; SPEC is the specification that fixes what the paper leaves open.
 """
 
 import tomllib
@@ -12,11 +12,11 @@ from math import inf, isfinite
 from typing import Any, SupportsFloat
 
 HOLDS, IN_PART, FAILS, UNMEASURED = "holds", "holds in part", "does not hold", "not measured"
-# By which a measured number may miss its threshold: a count over a count, as 3/5, is not exact in binary.
+# A measured number may miss its threshold by this: a quotient of counts, as 3/5, is not exact in binary.
 ROUNDING = 1e-9
 LAWS = ("hertz", "bilinear")
 
-# Constants of quantities: what is counted or measured, rather than what decides.
+# Constants of quantities: they say what is counted or measured, while thresholds decide on it.
 STRAIGHT = 0.95  # adjusted R^2 of a power law (SPEC 11, C7)
 STRAIGHT_EVERYWHERE = 0.9  # adjusted R^2 of the power law of each curve (SPEC 11, C8)
 QUIET = 0.1  # normalised entropy that is still "nearly zero" (sec. II.C)
@@ -25,14 +25,14 @@ PEAK = (0.9, 1.8)  # N (sec. II.C; SPEC 4: 1.1-1.4 N)
 HIGH = 10.0  # N, the paper's high amplitude
 SEVERAL = 3  # the fewest sites that are several
 HALF_WIDTH = 0.02  # half-width of the band about a Bloch branch over the top edge of the pass bands
-NATIVE = (7, 8)  # wavenumber bins that the packet starts in (SPEC 11, C5)
-GRID = 0.1  # spacing of its grid
-LOW = 10  # times the floor: up to there the transfer has not set in
+NATIVE = (7, 8)  # wavenumber bins, from 1, in which the packet starts (SPEC 11, C5)
+GRID = 0.1  # spacing of lambda and eta in the paper's search
+LOW = 10  # times the floor: the transfer counts as not set in up to there
 COUNTED = ("band 1", "band 2", "band 3", "band 4", "gap 1", "gap 2")  # the parts that the paper filters (App. A3)
-FEWEST_FOLDS = 2  # back in energy and forth again (SPEC 9)
+FEWEST_FOLDS = 2  # folds of a branch that turns back in energy and forth again (SPEC 9)
 HERTZ_LIMIT = 0.1  # d ln f / d ln E of a resonator on a spring of force w^n, n = 3/2: (n - 1)/(2 (n + 1))
-SAME_MOTION = 0.9  # correlation of motions that are the same
-SAME_EXPONENT = 0.2  # difference of exponents that are the same
+SAME_MOTION = 0.9  # least correlation of motions that count as the same
+SAME_EXPONENT = 0.2  # largest difference of exponents that count as the same
 
 
 @dataclass(frozen=True)
@@ -87,11 +87,11 @@ class Criterion:
 
 @dataclass(frozen=True)
 class ClaimSpec:
-    """A claim before it is measured: a sentence, where the ``paper`` makes it, and what decides on it.
+    """A claim before it is measured: the sentence ``claim``, where the ``paper`` makes it, and the ``criteria``.
 
-    ``figure`` is the stem of the picture that shows it, and may hold ``{reading}``. ``measure`` names a function
-    "module.name" (evidence, reading, measurement) that fills the measurement, or raises MissingEvidence. It is measured
-    in those ``readings``.
+    ``figure`` is the stem of the picture that shows it, and may contain ``{reading}``. ``measure`` is the name
+    "module.function" of the function (evidence, reading, measurement) that fills the measurement or raises
+    MissingEvidence. The claim is measured in each of ``readings``.
     """
 
     claim: str
@@ -103,12 +103,13 @@ class ClaimSpec:
 
 
 def verdict(criteria: Sequence[Criterion], value: Mapping[str, SupportsFloat | None]) -> tuple[str, list[str]]:
-    """The verdict on the numbers ``value``, and the quantities of the criteria that are not met or not measured.
+    """The verdict on the numbers ``value``, by quantity, and the quantities of the criteria that they do not meet.
 
-    It holds when every criterion is met, not at all when none is or a decisive one is not, and else in part; what
-    was not measured keeps it from holding.
+    The claim holds if every criterion is met. It does not hold if none is met, or if a decisive one is not. Otherwise
+    it holds in part. A number that is None was not measured and meets no criterion; if all are, the claim is not
+    measured.
     """
-    # A number that was not measured misses its criterion, but does not fail it.
+    # A number that was not measured does not meet its criterion, but decides nothing.
     missed = [c for c in criteria if not c.met(value.get(c.quantity))]
     failed = [c for c in missed if value.get(c.quantity) is not None]
     names = [c.quantity for c in missed]
@@ -122,14 +123,14 @@ def verdict(criteria: Sequence[Criterion], value: Mapping[str, SupportsFloat | N
 
 
 def _criteria(rows: Sequence[Sequence[Any]]) -> tuple[Criterion, ...]:
-    """The criteria of one claim; those of both laws (quantities that end in *) first, law by law."""
+    """The criteria of a claim from its ``rows`` in ``claims.toml``; those of the contact laws (*) come first."""
     criteria = []
     for law in (*LAWS, ""):
         for quantity, comparison, threshold, unit, source, *decisive in rows:
             if quantity.endswith("*") != bool(law):
                 continue
+            # TOML has lists, no tuples; a frozen criterion needs one, to be hashable.
             if isinstance(threshold, list):
-                # TOML has no tuples, and a frozen criterion shall not hold a list.
                 threshold = tuple(threshold)
             criteria.append(
                 Criterion(

@@ -22,10 +22,12 @@ class Fraction(NamedTuple):
 
 
 class AmplitudeTriple:
-    """The ``runs`` at ``low``, ``medium`` and ``high`` amplitude, and the wave they drive; raises MissingEvidence.
+    """The ``runs`` at ``low``, ``medium`` and ``high`` amplitude, and the wave that they drive.
 
-    ``wavenumber`` in rad/cell, ``speed`` in cells/s; ``lobe`` (rad/cell) is the half-width of the burst's main
-    lobe, 2 Om/(Nc v_g); ``duration`` of the burst in s; ``distance`` in cells to the first site.
+    The wave has the ``wavenumber`` in rad/cell and the group velocity ``speed`` in cells/s. The burst lasts
+    ``duration`` in s; ``lobe`` in rad/cell is the half-width of its main lobe, 2 Om/(Nc v_g) with its frequency Om and
+    its Nc cycles under a Hann window. ``distance`` in cells is that from the drive to the first site. Raises
+    MissingEvidence if there are fewer than three runs, or no such wave or site.
     """
 
     def __init__(self, evidence: Evidence, reading: str, *needs: str) -> None:
@@ -49,17 +51,20 @@ class AmplitudeTriple:
         self.distance = int(np.min(np.abs(sites - model.drive_cell)))
 
     def new_fraction(self, run: AnalysedMember) -> Fraction:
-        """Part of the kinetic energy outside the main lobe, from when the middle of the burst passes the first site."""
+        """Fraction of the kinetic energy of a ``run`` at new wavenumbers, outside of the burst's main lobe.
+
+        It is over the time from the passage of the burst's middle at the first site to the end.
+        """
         time, wavenumber, content = run.arrays("time", "wavenumber", "wavenumber_content")
         content = content[time >= self.duration / 2 + self.distance / self.speed]
-        # The burst itself has a main lobe of that width about the driven wavenumber.
+        # The burst itself spreads over its main lobe about the driven wavenumber.
         new = np.abs(wavenumber - self.wavenumber) > self.lobe
         outside = content[:, new].sum(axis=1)
         whole = content.sum(axis=1)
         return Fraction(outside.sum() / whole.sum(), np.std(outside / whole))
 
     def explain_medium(self, result: Measurement) -> None:
-        """Add a reason if the medium amplitude makes no contact: from where on there is one."""
+        """Add a reason if the medium amplitude makes no contact, with the amplitude at which contact begins."""
         if self.medium.episodes:
             return
         onset = self.medium.onset
@@ -73,7 +78,7 @@ class AmplitudeTriple:
 def optical_ridge(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C1: distance of the linear run's spectral ridge from the optical branch, in bins (Fig. 2).
 
-    Raises MissingEvidence where results lack what is measured.
+    Raises MissingEvidence if results are missing, or if the run at low amplitude has contacts.
     """
     triple = AmplitudeTriple(evidence, reading, "dispersion")
     if triple.low.episodes:
@@ -97,9 +102,9 @@ def optical_ridge(evidence: Evidence, reading: str, result: Measurement) -> None
 
 
 def linear_content(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C2: part of the energy that changes its wavenumber between drive and far end at low amplitude (Fig. 2).
+    """C2: fraction of the energy that changes its wavenumber on the way to the far end, at low amplitude (Fig. 2).
 
-    Raises MissingEvidence where results lack what is measured.
+    Raises MissingEvidence if results are missing, or if the record has no time between drive and far end.
     """
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content")
     model = triple.low.case.model()
@@ -119,7 +124,7 @@ def linear_content(evidence: Evidence, reading: str, result: Measurement) -> Non
 
 
 def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C3: energy at new wavenumbers and off the Bloch branches at medium amplitude (Figs. 2, 3)."""
+    """C3: energy at new wavenumbers, and energy near the Bloch branches, at medium amplitude (Figs. 2, 3)."""
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "dispersion")
     low = triple.new_fraction(triple.low)
     medium = triple.new_fraction(triple.medium)
@@ -136,17 +141,20 @@ def new_wavenumbers(evidence: Evidence, reading: str, result: Measurement) -> No
 
 
 def _on_branches(run: AnalysedMember) -> float:
-    """Part of the 2-D spectrum's energy that lies within ``HALF_WIDTH`` times the top edge from a branch."""
+    """Fraction of the energy in the space-time spectrum of a ``run`` that lies near a Bloch branch.
+
+    Near are frequencies less than ``HALF_WIDTH`` times the top edge of the bands away.
+    """
     wavenumber, frequency, energy = run.arrays("wavenumber", "frequency", "dispersion")
     cell = run.case.lattice.unit_cell()
     branches = bloch(cell, wavenumber).frequency
-    # To the nearest of all branches: which one a new wave belongs to is not asked.
+    # From the nearest branch: a new wave may belong to any of them.
     distance = np.abs(frequency[None, :, None] - branches[:, None, :]).min(axis=2)
     return energy[distance <= HALF_WIDTH * pass_bands(cell)[-1].high].sum() / energy.sum()
 
 
 def reflected(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C4: new wavenumbers at high over medium amplitude, and the part reflected (Figs. 2, 3)."""
+    """C4: new wavenumbers at high over medium amplitude, and the fraction that is reflected (Figs. 2, 3)."""
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "kinetic_energy")
     new: dict[str, float] = {}
     for name, run in triple.runs.items():
@@ -167,11 +175,11 @@ def reflected(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def _reflected_fraction(triple: AmplitudeTriple, run: AnalysedMember) -> Fraction:
-    """Kinetic energy before the first site over the incident, when the reflected packet is halfway back to the drive.
+    """Kinetic energy before the first site over the incident one, when the reflected packet is halfway to the drive.
 
-    The mean and the deviation are over half a burst's length about that time: the incident packet has passed then, and
-    the reflected one does not stand against the end yet. What is incident is the energy of the linear run, scaled by
-    the amplitudes' squares.
+    Mean and deviation are over half a burst's duration about that time, when the incident packet has passed the site
+    and the reflected one has not reached the end of the lattice. The incident energy is that of the whole run at low
+    amplitude, times the square of the ratio of the amplitudes.
     """
     time, cell, energy = run.arrays("time", "cell", "kinetic_energy")
     returning = np.abs(time - triple.duration / 2 - 1.5 * triple.distance / triple.speed) <= triple.duration / 4
@@ -183,9 +191,9 @@ def _reflected_fraction(triple: AmplitudeTriple, run: AnalysedMember) -> Fractio
 
 
 def native_bins(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C5: part of the packet in its own wavenumber bins before it meets a site (Fig. 4).
+    """C5: fraction of the packet's energy in its own wavenumber bins before it meets a site (Fig. 4).
 
-    Raises MissingEvidence where results lack what is measured.
+    Raises MissingEvidence if results are missing, or if no sample lies before that.
     """
     triple = AmplitudeTriple(evidence, reading, "wavenumber_content", "partition")
     # At the largest speed in the band, so that no part of the packet has met the site.
@@ -214,13 +222,13 @@ def native_bins(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def reconstruction(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C6: error of the kinetic energy of the bins' summed velocities (App. A, Fig. A1)."""
+    """C6: error of the kinetic energy of the sum of the bins' velocities (App. A, Fig. A1)."""
     triple = AmplitudeTriple(evidence, reading, "partition")
     largest = []
     cross = []
     for name, run in triple.runs.items():
         snapshot, error, between_bins = run.arrays("partition/snapshot", "partition/error", "partition/cross_share")
-        # While the drive acts the packet is cut off at the lattice's first cell, where wavelets have no neighbour.
+        # While the drive acts the packet ends at the first cell, beyond which wavelets meet nothing.
         after = snapshot >= triple.duration
         largest.append(error[after].max())
         cross.append(between_bins[after].mean())

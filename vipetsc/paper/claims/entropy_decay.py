@@ -14,11 +14,12 @@ AVERAGES = ("energy_weighted", "masked", "joint")
 
 
 class EntropyDecay(AmplitudeCurve):
-    """An ``average`` of the entropy with one number of ``sites`` at one wavenumber, and the power laws of its fall.
+    """An ``average`` of the entropy over the amplitude, for one number of ``sites`` and one wavenumber, with its fits.
 
-    The values run from 0.01 to 1 as the paper's, NaN if they are all equal. Of the fits from the peak on, over
-    ``points``, ``r2`` is the adjusted R^2 of the log-log line, ``best`` the better one of line and nonlinear fit, NaN
-    without a fit; the ``exponent`` of the line has a 95 % interval of ``half_width`` to either side.
+    The values are normalised to 0.01 to 1, as in the paper, and NaN if they are all equal. The power laws are fitted
+    from the peak on, to ``points`` points: ``r2`` is the adjusted R^2 of the log-log line, ``best`` the better one of
+    this and of the nonlinear fit, NaN without a fit. ``half_width`` is half of the 95 % interval of the line's
+    ``exponent``.
     """
 
     def __init__(self, members: xr.Dataset, average: str) -> None:
@@ -41,18 +42,21 @@ class EntropyDecay(AmplitudeCurve):
         self.half_width = (fitted("exponent_high") - fitted("exponent_low")) / 2
 
     def reaches(self, r2: float, bound: float) -> bool:
-        """Whether ``r2``, one of the fits', reaches ``bound`` over enough points."""
+        """Whether ``r2``, that of one of the fits, reaches the ``bound``, and the fit has enough points."""
         return bool(r2 >= bound and self.points >= FEWEST)
 
     @property
     def falls(self) -> bool:
-        """Whether the peak lies between the ends, and less than half of it is left at either of them."""
+        """Whether the peak lies within the range of amplitudes, and both ends are below half of it."""
         y = self.value
         return bool(0 < self.peak < len(y) - 1 and y[-1] < 0.5 and y[0] < 0.5)
 
 
 def decays(evidence: Evidence, step: str, reading: str, average: str, **wanted: float) -> list[EntropyDecay]:
-    """The configurations of a sweep with one ``average`` of the entropy; raises MissingEvidence."""
+    """The curves of one ``average`` of the entropy in the sweep ``step``, one for each number of sites.
+
+    ``wanted`` are coordinates of the sweep, as of `Evidence.select`. Raises MissingEvidence.
+    """
     ensemble = evidence.ensemble(step)
     if f"fits/entropy/{average}/points" not in ensemble or "sites" not in ensemble.coords:
         raise MissingEvidence(f"{step} holds no fits of the entropy over the numbers of sites")
@@ -68,7 +72,7 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     abrupt = np.mean([c.growth_ratio(QUIET, 0.5) <= ABRUPT for c in spread])
     in_place = np.mean([PEAK[0] <= c.peak_amplitude <= PEAK[1] for c in spread])
     several = [c for c in spread if c.sites >= SEVERAL]
-    # Where the peak lies above, the value belongs to the rise and not to the decay.
+    # Where the peak lies at a higher amplitude, the value belongs to the rise, not to the decay.
     behind = [c.interpolate(HIGH) for c in several if c.peak_amplitude < HIGH]
     highest = floor = None
     if several:
@@ -86,7 +90,7 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
     _list_fits(result, spread, "spread", "spread")
     try:
         _list_fits(result, decays(evidence, NEIGHBOURS, reading, "masked"), "neighbouring", "neighbours, masked")
-    # The numbers of the spread sites stand without this sweep.
+    # Without this sweep the numbers of spread sites are reported alone.
     except (MissingEvidence, OSError, ValueError) as missing:
         result.reasons.append(str(missing).replace(f"{evidence.root}/", ""))
 
@@ -107,12 +111,15 @@ def power_law(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def _list_fits(result: Measurement, configurations: list[EntropyDecay], sites: str, kind: str) -> None:
-    """Add the fraction of configurations with a power law, and the fit of each of them."""
+    """Add the fraction of ``configurations`` that have a power law, and the fit of each, to ``result``.
+
+    ``sites`` and ``kind`` are the words for them in the names of numbers.
+    """
     straight = np.mean([c.reaches(c.r2, STRAIGHT) for c in configurations])
     fit = f"adjusted R^2 >= {STRAIGHT:g} over {FEWEST} points or more"
     result.value[f"fraction of configurations of {sites} sites with {fit}"] = straight
     for c in configurations:
-        # Numbers that cannot be relied on stand as missing.
+        # None, as a missing number, for those that cannot be relied on.
         r2 = exponent = half_width = None
         name = f"{counted(c.sites, 'site')}, {kind}"
         doubts = doubt(c.points, c.r2)
@@ -133,7 +140,7 @@ def _list_fits(result: Measurement, configurations: list[EntropyDecay], sites: s
 def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C8: rise, peak and decay at every wavenumber from 2 pi/9 to 7 pi/9 (Suppl., Fig. S2).
 
-    Raises MissingEvidence where results lack what is measured.
+    Raises MissingEvidence if results are missing.
     """
     ensemble = evidence.ensemble(SPREAD)
     if "wavenumber" not in ensemble.coords:
@@ -164,7 +171,7 @@ def everywhere(evidence: Evidence, reading: str, result: Measurement) -> None:
     result.uncertainty |= {f"{fit}, {average} mean": straight[average] for average in AVERAGES[1:]}
     result.uncertainty["fewest points of a fit"] = min(c.points for c in primary)
 
-    # Of the points from the peak on, two or fewer are beyond it.
+    # At most two points lie behind the peak.
     late = sum(c.peak >= len(c.amplitude) - 3 for c in primary)
     if late:
         text = f"{late} of {len(primary)} curves have their peak among the three largest amplitudes"
@@ -184,7 +191,7 @@ def error_bars(evidence: Evidence, reading: str, result: Measurement) -> None:
         high = error.value[error.amplitude >= HIGH]
         if not high.size:
             raise MissingEvidence(f"{SPREAD} has no amplitude of {HIGH:g} N or more")
-        # Where the peak is no lower than that, nothing lies behind it to compare with.
+        # A peak at a high amplitude itself has no error bars behind it to compare with.
         at_peak = error.value[(error.amplitude == c.peak_amplitude) & (error.amplitude < HIGH)]
         ratio = np.nan
         if at_peak.size:

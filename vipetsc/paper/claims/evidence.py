@@ -26,9 +26,9 @@ class MissingEvidence(Exception):
 
 @dataclass
 class Measurement:
-    """Numbers by name, their uncertainties, and sentences that explain them.
+    """What a claim's measurement has found: numbers by name, their uncertainties, and sentences that explain them.
 
-    ``figure`` takes the place of the claim's where the picture's name depends on the data.
+    ``figure`` is the stem of the picture that shows it, if that depends on the data; otherwise the claim's is taken.
     """
 
     value: Numbers = field(default_factory=dict)
@@ -38,9 +38,9 @@ class Measurement:
 
 
 class AnalysedMember:
-    """A member of a sweep whose fields were kept: its case, folder, ``analysis.h5`` and number of contacts.
+    """A member of a sweep whose fields were kept: its ``folder``, its ``case`` and its ``analysis`` (``analysis.h5``).
 
-    ``amplitude`` is that of the drive in N.
+    ``episodes`` is the number of contact episodes, ``amplitude`` that of the drive in N.
     """
 
     def __init__(self, folder: Path, analysis: xr.Dataset, episodes: int) -> None:
@@ -52,7 +52,7 @@ class AnalysedMember:
 
     @property
     def onset(self) -> float:
-        """Amplitude in N of the first contact of runs like this one; NaN if their linear run is gone."""
+        """Least amplitude in N at which a run like this one has a contact; NaN without the record of its linear run."""
         with suppress(OSError, ValueError):
             return initiation_of(self.folder.parent, self.case).onset
         return float("nan")
@@ -63,10 +63,11 @@ class AnalysedMember:
 
 
 class AmplitudeCurve:
-    """The measure ``name`` of ``Evidence.select`` over rising ``amplitude`` (point) in N, without failed members.
+    """A measure over rising ``amplitude`` (point,) in N: the ``value`` (point,), without failed members.
 
-    ``untouched`` (point) is true where there is no contact, ``peak`` is the index of the largest value. Raises
-    MissingEvidence.
+    ``members`` are what `Evidence.select` gives, ``name`` is the measure's. ``untouched`` (point,) is true where there
+    is no contact; ``peak`` is the index of the largest value, at ``peak_amplitude``. Raises MissingEvidence if the
+    measure is missing or all members failed.
     """
 
     def __init__(self, members: xr.Dataset, name: str) -> None:
@@ -83,11 +84,12 @@ class AmplitudeCurve:
         self.peak_amplitude = float(self.amplitude[self.peak])
 
     def growth_ratio(self, low: float, high: float) -> float:
-        """Ratio of the amplitudes between which the values grow: from the last <= ``low`` to the first >= ``high``.
+        """Ratio of the amplitudes between which the values grow on the way to the peak.
 
-        Up to the peak; NaN if none is so low before it.
+        It is that of the first point with a value >= ``high`` after the last one with a value <= ``low``; NaN if there
+        are no such points.
         """
-        # Behind the peak the values fall again, and could be as low as before it.
+        # Up to the peak: behind it the values fall again, and may be as low as before.
         value = self.value[: self.peak + 1]
         before = np.nonzero(value <= low)[0]
         above = np.nonzero(value >= high)[0]
@@ -101,9 +103,9 @@ class AmplitudeCurve:
 
 
 class Evidence(ExitStack):
-    """The steps in ``root``, opened as they are asked for, and closed when the context ends.
+    """Access to the results of the steps in ``root``: files are opened when asked for, and closed with the context.
 
-    ``files`` are those asked for since this list was emptied, relative to ``root``, in order. Every method raises
+    ``files`` lists those asked for since the list was emptied, relative to ``root``, in order. Every method raises
     MissingEvidence for what is not there, OSError or ValueError for a file that cannot be used.
     """
 
@@ -129,17 +131,18 @@ class Evidence(ExitStack):
         return self._open(self.path(*parts), needs)
 
     def ensemble(self, step: str) -> xr.Dataset:
-        """The finished sweep of a step."""
+        """The ensemble of the finished sweep ``step``."""
         return self._open_ensemble(self.path(step, "ensemble.h5").parent)
 
     def select(self, step: str, reading: str, **wanted: Any) -> xr.Dataset:
-        """The members of a sweep over rising amplitude, in one reading and with the coordinates ``wanted``.
+        """The members of the sweep ``step`` over rising amplitude, in one reading and with the coordinates ``wanted``.
 
-        Of an axis that is not named the first value is taken. Raises MissingEvidence if the sweep has no such members.
+        Of an axis that is not among these the first value is taken. Raises MissingEvidence if the sweep has no such
+        members.
         """
         ensemble = self.ensemble(step)
         wanted = {"reading": reading} | wanted
-        # A case that does not name its reading has the default one.
+        # A sweep over no reading has that of its case, by default the calibrated one.
         only = tomllib.loads(ensemble.attrs["case"]).get("lattice", {}).get("reading", "calibrated")
         swept = "reading" in ensemble.coords
         if not swept and only != reading:
@@ -156,7 +159,10 @@ class Evidence(ExitStack):
         return members.isel({axis: 0 for axis in axes(members) if axis != "amplitude"}).sortby("amplitude")
 
     def runs(self, step: str, reading: str, *needs: str, **wanted: Any) -> list[AnalysedMember]:
-        """The members of ``select`` with their analyses; raises MissingEvidence where one lacks any of ``needs``."""
+        """The members that ``select`` gives, each with its analysis, by rising amplitude.
+
+        Raises MissingEvidence if a member failed or is missing, ValueError if an analysis lacks one of ``needs``.
+        """
         members = self.select(step, reading, **wanted)[["member", "contact_episodes"]]
         runs = []
         for i in range(members.sizes["amplitude"]):

@@ -1,4 +1,4 @@
-"""C10-C14: energy transfer to higher bands in the four-band lattice (the paper's section III and supplement)."""
+"""C10-C14 and C18: energy transfer to higher bands in the four-band lattice (section III of the paper, supplement)."""
 
 import tomllib
 from contextlib import suppress
@@ -16,13 +16,15 @@ STEP = "interband"
 AMPLITUDES = "interband-amplitudes"
 DESIGN = "design"
 SCATTER = "interband-scatter"
-FIELDS = 16  # random ones, by which a Frobenius norm is estimated to a quarter: a bound needs its order of magnitude
+# Random fields by which a Frobenius norm is estimated. With m fields its relative standard deviation is at most
+# 1/(2 m)^(1/2), 18 % here: a bound that is compared with 1e-6 needs its order of magnitude alone.
+FIELDS = 16
 
 
 def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C10: the best (lambda, eta) of the search, on the paper's grid and on all of it (Suppl. 3, Fig. S3).
+    """C10: the best (lambda, eta) of the search, on the paper's coarse grid and on the whole grid (Suppl. 3, Fig. S3).
 
-    Raises MissingEvidence where results lack what is measured.
+    Raises MissingEvidence if results are missing.
     """
     search = evidence.open(DESIGN, "design.h5")
     readings = list(map(str, search["reading"].values))
@@ -42,7 +44,7 @@ def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
         for symbol in ("lambda", "eta"):
             result.value[f"{symbol} at the optimum, {name}"] = search[f"optimum_{symbol}"].values[row, i]
 
-    # The paper searched a coarse grid; a finer one has its optimum between that one's points.
+    # The paper searched a coarse grid, and a finer one has its optimum between the points of that.
     rows = _on_grid(lam)
     columns = _on_grid(eta)
     coarse = np.where(out_of_phase, cost, -np.inf)[np.ix_(rows, columns)]
@@ -59,7 +61,7 @@ def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def _on_grid(values: np.ndarray) -> np.ndarray:
-    """Indices of the multiples of ``GRID`` among ``values``; of all of them if there are fewer than two."""
+    """Indices of those ``values`` that are multiples of ``GRID``; of all values if fewer than two are."""
     # Values of a grid are rounded to twelve digits, and so are no exact multiples.
     multiples = np.nonzero(np.abs(values / GRID - np.round(values / GRID)) < 1e-6)[0]
     if multiples.size < 2:
@@ -70,14 +72,14 @@ def _on_grid(values: np.ndarray) -> np.ndarray:
 def _transfer(
     evidence: Evidence, reading: str, law: str, sites: int, cycles: int, mean: str = "ibtet"
 ) -> AmplitudeCurve:
-    """The transfer over the amplitude with so many ``sites`` and ``cycles`` of the burst."""
+    """The transfer over the amplitude, with so many ``sites`` and ``cycles``; ``mean`` is the name of the average."""
     return AmplitudeCurve(evidence.select(STEP, reading, law=law, sites=sites, cycles=cycles), mean)
 
 
 def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C11: floor, sudden onset and maximum of the transfer with five sites (Figs. 8, 9).
 
-    The floor is that of the paper's mean, in which the record's last samples are.
+    The floor is that of the paper's mean, which goes to the end of the record (``ibtet_whole``).
     """
     maxima = []
     inner_floors = []
@@ -98,7 +100,7 @@ def onset(evidence: Evidence, reading: str, result: Measurement) -> None:
             f"amplitude of the maximum (N), {law}": curve.peak_amplitude,
             f"transfer at the largest amplitude, {law}": curve.value[-1],
         }
-        # The larger of its two neighbours shows how well the grid of amplitudes resolves the maximum.
+        # The fall to the larger of the two neighbours shows how well the grid of amplitudes resolves the maximum.
         neighbour = np.sort(curve.value[max(curve.peak - 1, 0) : curve.peak + 2])[-2:][0]
         result.uncertainty[f"fall to the better neighbour of the maximum, {law}"] = highest - neighbour
         result.uncertainty[f"amplitudes, {law}"] = len(curve.amplitude)
@@ -121,7 +123,10 @@ def _floor(curve: AmplitudeCurve) -> float:
 
 
 def _add_scatter(evidence: Evidence, reading: str, law: str, sites: int, result: Measurement) -> None:
-    """Add mean and deviation near the maximum with clearances that scatter, if that sweep exists; no criterion."""
+    """Add mean and deviation of the transfer with clearances that scatter, if that sweep exists.
+
+    They are at one amplitude near the maximum, with so many ``sites``, and enter no criterion.
+    """
     with suppress(MissingEvidence, KeyError):
         ensemble = evidence.ensemble(SCATTER)
         member = select(ensemble, reading=reading, law=law, sites=sites)
@@ -133,9 +138,9 @@ def _add_scatter(evidence: Evidence, reading: str, law: str, sites: int, result:
 
 
 def medium_most(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C12: energy of the upper bands at medium over low and high amplitude (Figs. 7, 8, S6).
+    """C12: energy of the upper bands at medium amplitude over that at low and high amplitude (Figs. 7, 8, S6).
 
-    Raises MissingEvidence where results lack what is measured.
+    Raises MissingEvidence if results are missing.
     """
     for law in LAWS:
         curve = AmplitudeCurve(evidence.select(AMPLITUDES, reading, law=law), "ibtet")
@@ -151,7 +156,7 @@ def medium_most(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def bands_sum(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C13: energies of the bands and gaps against the total (App. A3, Fig. A3)."""
+    """C13: the sum of the energies of all bands and gaps compared with the total (App. A3, Fig. A3)."""
     runs = [run for law in LAWS for run in evidence.runs(AMPLITUDES, reading, "bands", "dispersion", law=law)]
     errors = [split_errors(run) for run in runs]
     worst = {quantity: max(error[quantity] for error in errors) for quantity in errors[0]}
@@ -168,10 +173,13 @@ def bands_sum(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def modal_error(run: AnalysedMember) -> float:
-    """Bound on how far the linear modes' energies miss kinetic and spring energy, relative to these, in any motion.
+    """Bound on the relative error of the sum of the linear modes' energies, of any motion at any instant.
 
-    With V the modes and A the stiffness over the masses (``lattice.modes``) it is the larger of the norms of V^T V - 1
-    and of Om^-1 V^T (V Om^2 V^T - A) V Om^-1: the Frobenius norms, which are not smaller, from random fields.
+    In mass-normalised displacements x (``lattice.modes``), with the modes V and their frequencies Om, the modes have
+    the kinetic energy |V^T x'|^2/2 and the spring energy |Om V^T x|^2/2. The actual energies are |x'|^2/2 and x^T A x/2
+    with A = M^(-1/2) K M^(-1/2). The relative errors are at most the norms of V^T V - 1 and of
+    Om^-1 V^T (V Om^2 V^T - A) V Om^-1. The larger of the two Frobenius norms, which are no smaller, is returned; they
+    are estimated from random fields.
     """
     chain = run.case.model().chain
     modes = linear_modes(chain)
@@ -179,7 +187,8 @@ def modal_error(run: AnalysedMember) -> float:
     frequency = modes.frequency[:, None]
     root = 1 / np.sqrt(chain.masses())[:, None]
 
-    # Random fields: products of the matrices themselves would take n^3 operations.
+    # The mean of |E x|^2 over random x of unit variance is the square of E's Frobenius norm. The product of the
+    # matrices themselves would take n^3 operations.
     x = np.random.default_rng(0).standard_normal((len(v), FIELDS))
     y = v @ (x / frequency)
     spring = v @ (frequency**2 * (v.T @ y)) - root * (chain.stiffness_matrix() @ (root * y))
@@ -189,13 +198,13 @@ def modal_error(run: AnalysedMember) -> float:
 
 
 def split_errors(run: AnalysedMember) -> dict[str, float]:
-    """Errors of the sums of one run's parts, which are energies over time by frequency filters.
+    """Errors of a run's split into bands and gaps, whose energies over time come from frequency filters; by name.
 
-    The means over the record agree for any complete split without overlap (Parseval). Over a period of the drive they
-    agree where no motion straddles an edge; judged in the inner part of the record, a burst away from its ends, where
-    the filters see less than a period. The energy must be divided between the parts as in an independent spectrum, the
-    space-time one, and lie in those that the paper counts. Raises MissingEvidence for a
-    record that has no inner part.
+    The mean over the record agrees with the total for any complete split without overlap (Parseval). The mean over a
+    period of the drive agrees if no motion straddles an edge between two parts; it is judged a burst away from the ends
+    of the record, where filters see less than a period. The energy must be divided between the parts as in an
+    independent spectrum, the space-time one, and must lie in the parts that the paper counts. Raises MissingEvidence
+    for a record that is no longer than two bursts.
     """
     names = ("bands/sample", "bands/edges", "bands/energy", "bands/total", "frequency", "dispersion")
     time, edges, energy, total, frequency, dispersion = run.arrays(*names)
@@ -241,7 +250,7 @@ def one_site(evidence: Evidence, reading: str, result: Measurement) -> None:
         common, i, j = np.intersect1d(many.amplitude, short.amplitude, return_indices=True)
         correlation = np.nan
         if len(common) > 2:
-            # Of logarithms: the transfer spans decades, and its largest values would decide a correlation alone.
+            # Of logarithms, since the transfer spans decades: its largest values would decide the correlation alone.
             correlation = np.corrcoef(np.log(many.value[i]), np.log(short.value[j]))[0, 1]
         peaks = (many.peak_amplitude, short.peak_amplitude)
         result.value |= {

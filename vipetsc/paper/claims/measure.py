@@ -15,13 +15,13 @@ DIGITS = 6  # significant ones of the numbers in claims.json: further ones depen
 
 
 def measure_claims(root: str | Path) -> list[dict[str, Any]]:
-    """C1-C17 in both readings and C18 in one, from the steps in ``root`` (scattering/, interband/, nnm-hertz/, ...).
+    """Measure all claims in their readings from the steps in ``root``; returns the rows of ``claims.json``.
 
-    A row of ``claims.json`` is a claim in one ``reading`` of the paper's parameters. ``value`` holds named numbers,
-    None where one could not be had, the deciding ones among them under their names in ``threshold``;
-    ``uncertainty`` intervals, spreads and numbers of points by name. ``figure`` is the stem of the picture that shows
-    the claim, ``files`` are what it was measured from, relative to ``root``. What cannot be measured because its files
-    are missing has the verdict "not measured", and ``reason`` says what is missing.
+    A row is a claim, by its ``id``, in one ``reading`` of the paper's parameters. ``value`` has numbers by name, None
+    where one could not be measured; those that decide have the names of the criteria in ``threshold``. ``uncertainty``
+    has intervals, spreads and numbers of points by name. ``figure`` is the stem of the picture that shows the claim;
+    ``files`` are those that it was measured from, relative to ``root``. A claim whose files are missing or cannot be
+    used has the verdict "not measured", and ``reason`` says why.
     """
     with Evidence(root) as evidence:
         rows = []
@@ -33,17 +33,19 @@ def measure_claims(root: str | Path) -> list[dict[str, Any]]:
 def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any]:
     """Row of ``claims.json`` for a claim, by its id, in one reading."""
     spec = CLAIMS[claim]
-    # By name, so that the table of claims says all about a claim, its measurement too.
+    # By its name in the table of claims, so that all about a claim stands in one place.
     measure = resolve_name(f"vipetsc.paper.claims.{spec.measure}")
     result = Measurement()
     judgement = UNMEASURED
     missed: list[str] = []
-    evidence.files = []  # those of this claim alone are named in its row
+    # Emptied, since the row names the files of this claim alone.
+    evidence.files = []
     try:
         measure(evidence, reading, result)
     except MissingEvidence as missing:
         result.reasons.append(str(missing))
-    except (KeyError, OSError, ValueError) as error:  # files of another version, or cut off
+    # Files of another version, or files that were cut off.
+    except (KeyError, OSError, ValueError) as error:
         message = " ".join(str(error).split()).replace(f"{evidence.root}/", "")
         file = "a file"
         if evidence.files:
@@ -54,7 +56,7 @@ def measure_claim(claim: str, reading: str, evidence: Evidence) -> dict[str, Any
         judgement, missed = verdict(spec.criteria, result.value)
 
     reasons = result.reasons
-    # Where all or none are missed the verdict says it already.
+    # If all criteria are missed, or none, the verdict says so already.
     if 0 < len(missed) < len(spec.criteria):
         reasons = [f"not met: {' / '.join(missed)}", *reasons]
     return {

@@ -20,7 +20,8 @@ INTERBAND = "interband"
 ONE_SITE = "interband-one-site"
 MAIN = "5-sites-30-cycles"
 IN_PHASE = "branch-in-phase.h5"
-# What the in-phase branch passes at 100 MPa up to ``HIGHEST`` in J; steps of a third of the usual ones find no more.
+# Numbers of tongues and special points of the in-phase branch at 100 MPa, up to the energy ``HIGHEST`` in J. Steps of a
+# third of the usual ones find no more.
 HIGHEST = 6e9
 TRUE = {
     "hertz": {"tongues": 17, "grazing": 316, "symmetry-breaking": 62, "period-doubling": 41, "fold-energy": 90},
@@ -31,7 +32,7 @@ TRUE = {
 def branches(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C15: slope, folds and stability over regions I-IV of the out-of-phase branch (Fig. 11).
 
-    Raises MissingEvidence where results lack what is measured.
+    Raises MissingEvidence if results are missing, or are of another law or reading.
     """
     for law in LAWS:
         step = f"nnm-{law}"
@@ -48,10 +49,11 @@ def branches(evidence: Evidence, reading: str, result: Measurement) -> None:
 
 
 def _add_out_of_phase(branch: xr.Dataset, case: NnmCase, law: str, result: Measurement) -> None:
-    """Add slope, folds and stability of the out-of-phase branch, region by region."""
+    """Add slope, folds and stability of the out-of-phase ``branch`` of a ``case`` to ``result``, region by region."""
     names = ("energy", "frequency", "slope", "region", "multiplier_max", "kind")
     energy, frequency, slope, region, multiplier, kind = (branch[name].values for name in names)
     regular = kind == 0
+    # |d ln f / d ln E|
     steepness = np.abs(slope * energy / frequency)
     first = np.nonzero((region == 1) & regular)[0]
     last = np.nonzero(regular)[0][-1]
@@ -74,8 +76,8 @@ def _add_out_of_phase(branch: xr.Dataset, case: NnmCase, law: str, result: Measu
     result.uncertainty[f"energy of the last point (J), {law}"] = energy[last]
 
     if law == "bilinear":
-        # At high energy a bilinear contact is closed nearly all of the time, and the system is the one with its
-        # spring.
+        # At high energy a bilinear contact is closed nearly all of the time, and the system is linear, with the contact
+        # as a further spring.
         limit = System.from_case(case).closed_frequencies()[-1] / (2 * np.pi)
         result.value["high-energy limit (Hz), bilinear"] = limit
         distance = abs(frequency[last] / limit - 1)
@@ -91,8 +93,11 @@ def _add_out_of_phase(branch: xr.Dataset, case: NnmCase, law: str, result: Measu
 
 
 def _add_in_phase(branch: xr.Dataset, law: str, result: Measurement) -> None:
-    """Add tongues, special points and largest frequency of the in-phase branch; say where they differ from ``TRUE``."""
-    # A branch that was followed further has more tongues, which are not among those counted.
+    """Add tongues, special points and largest frequency of the in-phase ``branch`` to ``result``.
+
+    A reason is added for each number that differs from ``TRUE``.
+    """
+    # Up to the energy of ``TRUE``: a branch that was followed further has more.
     passed = branch["energy"].values <= HIGHEST
     kind, tongue, frequency = (branch[name].values[passed] for name in ("kind", "resonance", "frequency"))
     counts = {name: int(np.sum(kind == KINDS.index(name))) for name in TRUE[law] if name != "tongues"}
@@ -105,7 +110,7 @@ def _add_in_phase(branch: xr.Dataset, law: str, result: Measurement) -> None:
 
 
 def _largest(values: np.ndarray) -> float | None:
-    """The largest of ``values`` that are numbers; None if there is none."""
+    """The largest of the ``values`` that are finite; None if none is."""
     if not np.isfinite(values).any():
         return None
     return float(np.nanmax(values))
@@ -114,7 +119,7 @@ def _largest(values: np.ndarray) -> float | None:
 def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None:
     """C16: power law of the transfer in region III compared with that of the branch's slope (Figs. 12, S7, S8).
 
-    Raises MissingEvidence where results lack what is measured.
+    Raises MissingEvidence if there is no relation of the transfer to a branch in this reading.
     """
     relation = evidence.open(INTERBAND, "backbone.h5")
     left_out = [str(text) for text in np.atleast_1d(relation.attrs.get("left_out", []))]
@@ -134,7 +139,8 @@ def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None
         energy, ibtet = (relation[f"{name}/{key}"].values[fitted] for key in ("energy", "ibtet"))
         branch = (relation[f"{name}/branch/{key}"].values for key in ("energy", "slope", "region"))
 
-        # Transfer over (slope / divisor + floor); the mean factor is exp of the rms logarithm.
+        # The logarithm of the transfer over slope/divisor + floor, as the picture draws it. The mean factor is exp of
+        # its root mean square.
         ratio = np.log(ibtet / (np.exp(log_slope(energy, *branch)) / about["divisor"] + about["floor"]))
         result.value |= {
             f"adjusted R^2 in region III, {label}": about["r2_adjusted"],
@@ -157,9 +163,9 @@ def follows_slope(evidence: Evidence, reading: str, result: Measurement) -> None
 
 
 def portraits(evidence: Evidence, reading: str, result: Measurement) -> None:
-    """C17: regimes of host and resonator at the only site of the lattice (Suppl., Figs. S4, S5).
+    """C17: regimes of the motion of host and resonator at the only site of the lattice (Suppl., Figs. S4, S5).
 
-    Raises MissingEvidence where results lack what is measured.
+    Raises MissingEvidence if results are missing, or have no runs without contact and with it.
     """
     for law in LAWS:
         runs = evidence.runs(ONE_SITE, reading, law=law)
@@ -184,16 +190,18 @@ def portraits(evidence: Evidence, reading: str, result: Measurement) -> None:
         if grazing < SAME_MOTION:
             run = runs[first]
             beyond = 100 * (run.amplitude / run.onset - 1)
-            excess = f", {beyond:.2g} % above first contact," if np.isfinite(beyond) else ""
+            excess = ""
+            if np.isfinite(beyond):
+                excess = f", {beyond:.2g} % above first contact,"
             text = f"{law}: at {run.amplitude:g} N{excess} the resonator's motion has already left the linear one"
             result.reasons.append(text)
 
 
 def pair_motion(evidence: Evidence, run: AnalysedMember) -> tuple[np.ndarray, np.ndarray, float]:
-    """Velocities (t) in m/s of host and resonator at the only site of a run, and how much of their motion is fast.
+    """Velocities (t,) in m/s of host and resonator at the only site of a ``run``, and the fraction of fast motion.
 
-    That is the part of the pair's kinetic energy at frequencies above the driven band, of the whole record under a
-    Hann window. Raises MissingEvidence if the cell was not recorded.
+    The fraction is that of the pair's kinetic energy at frequencies above the driven band, over the whole record under
+    a Hann window. Raises MissingEvidence if the site's velocity was not recorded.
     """
     model = run.case.model()
     cell = model.chain.cell
@@ -210,7 +218,7 @@ def pair_motion(evidence: Evidence, run: AnalysedMember) -> tuple[np.ndarray, np
     energy = spectrum @ np.asarray(cell.masses)[pair]
     frequency = 2 * np.pi * np.fft.rfftfreq(len(velocity), interval)
     waves = waves_at(cell, model.drive.frequency)
-    # In a gap there is no driven band, so that the frequency itself divides.
+    # A drive in a gap has no band, and its own frequency divides slow from fast.
     edge = model.drive.frequency
     if waves:
         edge = pass_bands(cell)[waves[0][0] - 1].high
