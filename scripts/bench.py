@@ -1,10 +1,10 @@
 """Work and precision of vipetsc's engines and of their peers, interleaved, in CPU time at equal error.
 
 The lattice is the four-band one of 300 cells with its five sites, A = 30 N, conservative; all solvers return the
-velocities every 2e-4 s, on one core. Then whole programs compared with an earlier version, members of a sweep, the
-paper's budget (from where ``paper`` left it), scaling over cells and ranks with a model of many ranks, set-up and files
-of large lattices. Writes ``latest.json`` and pictures. The full bench takes about half an hour, ``--quick`` five
-minutes; ``--large`` adds the whole program on a million cells (minutes).
+velocities every 2e-4 s, on one core. Further parts measure whole programs compared with an earlier version, members of
+a sweep, the CPU time of the paper (from the folder that ``paper`` left), scaling over cells and ranks, which a model
+extends to many ranks, and set-up and files of large lattices. Writes ``latest.json`` and pictures. The full bench takes
+about half an hour, ``--quick`` five minutes; ``--large`` adds the whole program on a million cells (minutes).
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-# Before numpy is imported: every solver on one core.
-# BLAS starts its threads as numpy is imported, so that a later setting would change nothing.
+# Every solver has one core. Set before numpy is imported, since BLAS starts its threads then.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -43,7 +42,7 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import provenance
 
 PARTS = ("precision", "whole", "programs", "members", "scaling", "builds")
-# What a machine lacks where a peer of that name is missing from the table.
+# What a machine must have for a peer whose name begins so.
 NEEDED = {
     "odeint": "g++ and libboost-dev",
     "ARKODE": "g++ and libsundials-dev",
@@ -69,7 +68,7 @@ QUICK = {
 
 
 def options_from(arguments: list[str]) -> argparse.Namespace:
-    """The command line, with what ``--quick`` or the full bench means filled in."""
+    """The options of the command line; those not given have the values of ``QUICK`` or ``FULL``."""
     parser = argparse.ArgumentParser(
         "scripts/bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -88,14 +87,14 @@ def options_from(arguments: list[str]) -> argparse.Namespace:
     if options.rounds is not None and options.rounds < 1:
         parser.error(f"--rounds {options.rounds}: must be at least 1")
     for key, value in (QUICK if options.quick else FULL).items():
-        # What the command line gives goes before what the mode means.
+        # What the command line gives has precedence.
         if getattr(options, key, None) is None:
             setattr(options, key, value)
     return options
 
 
 def measure(case: Case, options: argparse.Namespace) -> dict:
-    """The results of all parts asked for, as ``latest.json`` holds them."""
+    """Measure all parts asked for; returns the content of ``latest.json``."""
     parts = options.only or PARTS
     cells = case.lattice.cells
     found: dict = {
@@ -124,7 +123,7 @@ def measure(case: Case, options: argparse.Namespace) -> dict:
         if "programs" in parts:
             found["programs"] = measured_programs(options)
         if "members" in parts:
-            # A round has four sweeps: three rounds are enough for a median.
+            # At most three, since a round has four sweeps.
             found["members"] = member_seconds(Path(folder), min(options.rounds, 3))
             found["paper"] = paper_budget(options.paper)
         if "scaling" in parts:

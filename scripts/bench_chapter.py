@@ -1,4 +1,4 @@
-"""The chapter ``measurements`` of the manual takes its tables and its picture from a bench."""
+"""Puts the tables and the picture of a bench into the manual's chapter ``measurements``."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from vipetsc.io.atomic import atomic_write, write_text
 
 MANUAL = Path(__file__).parents[1] / "vipetsc" / "manual"
 CHAPTER = MANUAL / "measurements.md"
-# A part of the bench has a part of the goals: the others stay as they were measured before.
+# The first titles of the table of goals. A bench of some parts has some of the goals; the others stay in the table.
 GOALS = "goal|measured"
 PICTURES = {"work-precision.png": MANUAL / "pictures" / "bench.png"}
 
 
 def with_tables(chapter: str, measured: str) -> tuple[str, list[str]]:
-    """``chapter`` with its tables replaced by those in ``measured`` that have the same first two titles of columns.
+    """The ``chapter`` with its tables replaced by those in ``measured`` whose first two columns have the same titles.
 
-    The second value has the titles of the tables in ``measured`` for which the chapter has no place. Tables of the
-    chapter that were not measured, goals of parts that were not, and all other text, remain.
+    Tables of the chapter that were not measured, goals that were not, and all other text remain. The second value has
+    the titles of the tables in ``measured`` for which the chapter has no place.
     """
     found = {_titles(table): table for is_table, table in _blocks(measured) if is_table}
     blocks = []
@@ -43,8 +43,8 @@ def with_tables(chapter: str, measured: str) -> tuple[str, list[str]]:
 
 
 def _with_goals(before: str, measured: str) -> str:
-    """The table of goals ``before`` with the rows of ``measured`` in place of those of the same names, or after all."""
-    # A dictionary keeps the order of the chapter's goals as their rows are replaced.
+    """The table of goals ``before`` with the rows of ``measured``, which replace rows of the same name or come last."""
+    # A dictionary keeps the order of its keys when values are replaced.
     rows = {_titles(row, columns=1): row for row in before.splitlines()}
     rows |= {_titles(row, columns=1): row for row in measured.splitlines()}
     return "\n".join(rows.values())
@@ -57,7 +57,7 @@ def _blocks(text: str) -> list[tuple[bool, str]]:
 
 
 def _titles(table: str, columns: int = 2) -> str:
-    """The titles of a table's first ``columns``, by which it is recognised; of one line, what it has there."""
+    """The texts in the first ``columns`` of a table's first line, by which a table, or a single row, is recognised."""
     cells = table.splitlines()[0].split("|")
     return "|".join(cell.strip() for cell in cells[1 : columns + 1])
 

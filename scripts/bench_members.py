@@ -1,4 +1,4 @@
-"""One member of a sweep, all in: simulated, measured and recorded by the sweep itself; and the paper's budget."""
+"""CPU time of one member of a sweep, simulated, measured and recorded by the sweep itself, and of the whole paper."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from vipetsc.case import Sweep
 from vipetsc.studies.sweep import run_sweep
 
 EXAMPLES = Path(__file__).parents[1] / "vipetsc" / "examples"
-# Four more members take a second together, which is measured to a few per cent.
+# Members by which two sweeps differ: four take about a second together, which is measured to a few per cent.
 MEMBERS = 4
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A sweep of the paper's: its case file, what is changed in its tables, and an amplitude with many contacts."""
+    """A sweep of the paper: its case ``file``, ``changes`` in its tables, an ``amplitude`` in N with many contacts."""
 
     file: str
     changes: dict[str, dict[str, Any]]
@@ -47,15 +47,15 @@ KINDS = {
 
 
 def _sweep_seconds(kind: Kind, members: int, folder: Path) -> float:
-    """CPU seconds of a whole sweep over so many amplitudes, which lie close together: members cost the same."""
+    """CPU seconds of a whole sweep of so many ``members``, in ``folder``; raises RuntimeError if a member fails."""
     table = tomllib.loads((EXAMPLES / kind.file).read_text(encoding="utf-8")) | {"name": folder.name}
     for section, changes in kind.changes.items():
         table[section] = table.get(section, {}) | changes
-    # Equal amplitudes would be one member; so close, all have the same contacts and cost the same.
+    # Equal amplitudes would be one member. As close as these, members have the same contacts and cost the same.
     amplitudes = [kind.amplitude * (1 + 1e-4 * k) for k in range(members)]
     table["sweep"] = {"measures": list(kind.measures), "drive": {"amplitude": amplitudes}}
 
-    # Only now: reading the case file is no part of a member.
+    # After the case file was read, which is no part of a member.
     begin = time.process_time()
     result = run_sweep(Sweep.from_table(table), folder, MPI.COMM_SELF)
     # A failed member ends early and would pass for a fast one.
@@ -65,14 +65,18 @@ def _sweep_seconds(kind: Kind, members: int, folder: Path) -> float:
 
 
 def member_seconds(folder: Path, rounds: int) -> dict[str, float]:
-    """CPU seconds of one more member of a sweep: what ``1 + MEMBERS`` take more than one, median of ``rounds``."""
+    """CPU seconds of one more member of a sweep, by the names in ``KINDS``, as the median of ``rounds``.
+
+    It is the difference between sweeps of ``1 + MEMBERS`` members and of one, over ``MEMBERS``.
+    """
     measured: dict[str, list[float]] = {name: [] for name in KINDS}
     for turn in range(rounds + 1):
         for name, seconds in measured.items():
             # In the difference the linear run that members share, set-up and the final file cancel.
             one = _sweep_seconds(KINDS[name], 1, folder / f"{name}-{turn}-one")
             many = _sweep_seconds(KINDS[name], 1 + MEMBERS, folder / f"{name}-{turn}-many")
-            if turn:  # the first one fills caches
+            # The first turn fills caches.
+            if turn:
                 seconds.append((many - one) / MEMBERS)
     return {name: statistics.median(seconds) for name, seconds in measured.items()}
 
@@ -83,6 +87,6 @@ def paper_budget(folder: Path) -> dict[str, float]:
     if not record.exists():
         return {}
     seconds = json.loads(record.read_text(encoding="utf-8")).get("cpu", {})
-    # Steps of the study are stages like the figures and the report, which the record lists apart.
+    # The record lists the steps apart from the other stages, which are figures, claims and report.
     stages = seconds.pop("steps", {}) | seconds
     return {name: float(value) for name, value in stages.items()}

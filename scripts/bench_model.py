@@ -1,4 +1,4 @@
-"""A model of many ranks from what one and two ranks measured here; each assumption is stated below the tables."""
+"""A model of the time on many ranks, from what one and two ranks measured; its assumptions stand below its table."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ import numpy as np
 
 # A core, a node, and sixteen nodes.
 RANKS = (1, 64, 1024)
-# A common cluster's network.
+# Of the network of a common cluster.
 LATENCY = 2e-6  # s a message
 BANDWIDTH = 10e9  # bytes/s a rank
-# A lattice's state of some MB, which caches still hold: with fewer cells a rank, messages cost a larger fraction.
+# The state of so many cells has some MB, which caches still hold; with fewer, messages cost a larger fraction.
 WEAK = 100_000  # cells a rank
-# On 1,024 ranks each has 10,000 of these, within the range that was measured here.
+# On 1,024 ranks each rank has 10,000 of these, which is within the range that was measured here.
 STRONG = 10_000_000  # cells in all
 
 
 class ScalingModel:
-    """Seconds that an engine takes for a sample interval on many ranks.
+    """A model of the seconds that an ``engine`` takes for a sample interval on many ranks.
 
-    ``rows`` are those of ``bench_scaling.scaling``. Cells cost what one rank took here for so many, interpolated in
-    logarithms, times what sharing the memory with a second rank costs a rank. A rank exchanges with two neighbours,
-    one after the other, as many messages and bytes as one of two ranks sent here; a reduction takes as many messages
-    in turn as the ranks have binary digits. Contacts are taken as spread evenly; nothing overlaps.
+    ``rows`` are those of ``bench_scaling.scaling``. The cells of a rank cost what one rank took here for as many,
+    interpolated in logarithms, times ``shared``, the factor by which a rank is slower beside a second one on the same
+    memory. A rank exchanges with two neighbours, one after the other, as many ``messages`` and ``bytes`` with each as
+    two ranks exchanged here. Each of the ``reductions`` takes log2(ranks) messages in turn. Contacts are spread evenly
+    over the ranks, and nothing overlaps. Raises ValueError unless the engine was measured on one rank and on two.
     """
 
     def __init__(self, rows: list[dict[str, Any]], engine: str) -> None:
@@ -37,36 +38,39 @@ class ScalingModel:
 
         self._cells = [row["cells"] for row in alone]
         self._seconds = [row["wall_ms"] / 1e3 for row in alone]
-        # From the largest lattice, which exceeds the caches; below 1 the ratio would be noise of the measurement.
+        # From the largest lattice, which exceeds the caches. A ratio below 1 would be noise of the measurement.
         self.shared = max(1.0, 2 / paired[-1]["memory_speedup"])
-        # The most of all lengths: what a rank sends does not grow with its cells.
+        # The largest numbers of all lattices: what a rank sends does not grow with its cells.
         self.messages = max(row["messages"] for row in paired)
         self.bytes = max(row["message_bytes"] for row in paired)
         self.reductions = max(row["reductions"] for row in paired)
 
     def compute(self, cells: float) -> float:
-        """Seconds of one rank for so many cells; beyond the measured ones, in proportion to them."""
+        """Seconds that one rank computes for so many ``cells``.
+
+        Beyond the longest lattice that was measured they grow in proportion to the cells; below the shortest one they
+        are its time, a bound from above.
+        """
         largest = self._cells[-1]
-        # In logarithms, since lengths and times span decades. Below the shortest lattice its time is a bound from
-        # above.
+        # In logarithms, since lengths and times span decades.
         within = np.exp(np.interp(np.log(min(cells, largest)), np.log(self._cells), np.log(self._seconds)))
         return float(within) * max(1.0, cells / largest) * self.shared
 
     def communicate(self, ranks: int) -> float:
-        """Seconds that a rank sends, receives and reduces."""
+        """Seconds that a rank among so many ``ranks`` sends, receives and reduces."""
         if ranks == 1:
             return 0.0
-        # With the neighbour to the left and then the one to the right: a rank inside the lattice has two.
+        # With the left neighbour and then with the right one.
         exchange = 2 * (self.messages * LATENCY + self.bytes / BANDWIDTH)
         return exchange + self.reductions * math.ceil(math.log2(ranks)) * LATENCY
 
     def total(self, cells: float, ranks: int) -> float:
-        """Seconds of ``ranks`` for ``cells`` in all."""
+        """Seconds that so many ``ranks`` take for a lattice of ``cells`` in all."""
         return self.compute(cells / ranks) + self.communicate(ranks)
 
 
 def _time_and_efficiency(seconds: float, efficiency: float) -> str:
-    """An entry of the tables."""
+    """An entry of the table: milliseconds, and the efficiency in per cent."""
     return f"{1e3 * seconds:.3g} ({100 * efficiency:.0f} %)"
 
 
@@ -76,7 +80,7 @@ def model_tables(rows: list[dict[str, Any]]) -> str:
     for engine in dict.fromkeys(row["engine"] for row in rows):
         try:
             model = ScalingModel(rows, engine)
-        # An engine that was not measured on two ranks has no row; the other one's is of use without it.
+        # An engine that was not measured on two ranks has no row; the other one still has.
         except ValueError:
             continue
         weak = []

@@ -1,4 +1,4 @@
-"""Solvers of this package: every engine of the case files, through the parts of a run, without its files."""
+"""Solvers of this package: each engine that a case file can choose, run as by the program but without files."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ def engines() -> tuple[str, ...]:
 
 
 class Flight:
-    """A case in motion on the ranks of ``comm``, by the engine that it asks for; the run is kept in memory.
+    """A run of ``case`` on the ranks of ``comm`` by the engine that it asks for, in memory.
 
-    Raises RuntimeError if that engine refuses the case: another one's time would stand under its name.
+    Raises RuntimeError if that engine refuses the case: a run would go on with another one, whose time would be
+    reported under the wrong name.
     """
 
     def __init__(self, case: Case, comm: MPI.Comm) -> None:
@@ -46,7 +47,7 @@ class Flight:
         self._run = Run(setup, (Guard, Ledger))
 
     def advance(self, begin: int, end: int) -> None:
-        """Go from a sample to a later one and record none; ``ts`` ends a step at each, the propagator anyhow."""
+        """Go from the sample ``begin`` to the sample ``end`` and record none; ``ts`` ends a step at each sample."""
         if self.engine.name == "propagator":
             self.engine.fill(self._run.recorder.room(end + 1, 0))
             return
@@ -54,10 +55,10 @@ class Flight:
             self.engine.advance(sample * self.model.sample_interval)
 
     def velocities(self) -> tuple[np.ndarray, float]:
-        """All velocities (sample, cell, dof) in m/s on one rank, and the CPU seconds that they took.
+        """Compute all velocities (sample, cell, dof) in m/s on one rank; returns them and the CPU seconds it took.
 
-        ``ts`` goes from sample to sample, the propagator in blocks, by the run's own loop with its energies. Raises
-        RuntimeError where the run fails.
+        ``ts`` goes from sample to sample. The propagator computes samples in blocks, in the run's own loop, with the
+        energies. Raises RuntimeError if the run fails.
         """
         n = self.layout.owned
         d = self.layout.dofs
@@ -79,12 +80,12 @@ class Flight:
 
 
 def solve(case: Case) -> Solution:
-    """The case by its own engine on one rank."""
-    # Peers return velocities alone: displacements would cost this side what they do not pay.
+    """Solve ``case`` by its own engine on one rank."""
+    # Velocities alone, as the peers return: to record displacements too would cost time.
     output = case.output.model_copy(update={"fields": ["velocity"]})
     flight = Flight(case.model_copy(update={"output": output}), MPI.COMM_SELF)
     sampled, seconds = flight.velocities()
-    # PETSc's objects are freed by their ranks together, not when Python collects them.
+    # PETSc's objects must be freed by all ranks together, not when Python collects them.
     flight.engine.destroy()
     return Solution(sampled.reshape(flight.model.samples, -1), seconds)
 
@@ -95,7 +96,7 @@ def _by_engine(case: Case, name: str) -> Case:
 
 
 def own_solvers() -> dict[str, Solver]:
-    """One solver an engine, by name; each uses its engine whatever the case says."""
+    """A solver for each engine, by name; it uses this engine whichever the case asks for."""
 
     def with_engine(name: str) -> Solver:
         return lambda case: solve(_by_engine(case, name))
@@ -103,9 +104,9 @@ def own_solvers() -> dict[str, Solver]:
     return {f"vipetsc {name}": with_engine(name) for name in engines()}
 
 
-# About a microsecond each: 20,000 take a fiftieth of a second, to which the clock's step is nothing.
+# At a microsecond each, 20,000 take a fiftieth of a second, which is long compared with the resolution of the clock.
 def right_hand_side_us(case: Case, evaluations: int = 20_000) -> float:
-    """Microseconds of CPU that one right-hand side of the case costs through PETSc."""
+    """Microseconds of CPU time that one right-hand side of the case takes through PETSc; mean over ``evaluations``."""
     flight = Flight(_by_engine(case, "ts"), MPI.COMM_SELF)
     ts = flight.engine.ts
     state = flight.engine.state

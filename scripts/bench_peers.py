@@ -1,7 +1,7 @@
 """Solvers to compare with: C++ odeint, ARKODE and plain TSRK from scripts/peers, diffrax, SciPy's DOP853.
 
-All of them solve the case's own lattice and return its velocities at the case's samples. ARKODE ends its steps at
-contact changes by its root finding; the others step over kinks of the contact law. Conservative cases only.
+All of them solve the lattice of a case and return its velocities at the case's samples. ARKODE's root finding ends
+steps where contacts change; the others step over the kinks of the contact law. They know conservative cases only.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ Solver = Callable[[Case], Solution]
 
 
 def parameters(model: Model) -> str:
-    """The lattice as the C++ peers read it; raises ValueError for what they do not know."""
+    """The lattice of ``model`` as text that the peers read; raises ValueError for what they do not know."""
     chain = model.chain
     contact = model.contact
     drive = model.drive
-    # Refused here rather than in four languages.
+    # Refused here, not by each peer.
     if contact.restitution != 1 or chain.ends == "periodic":
         raise ValueError("the peers know conservative lattices with fixed or free ends only")
     if contact.law not in ("hertz", "bilinear"):
@@ -79,7 +79,7 @@ def parameters(model: Model) -> str:
 
 
 def petsc_flags() -> list[str]:
-    """Flags of a compiler for the PETSc of petsc4py; none where pkg-config knows none, or only another one."""
+    """Compiler flags for the PETSc of petsc4py; empty if pkg-config knows no PETSc, or another version."""
     if not which("pkg-config"):
         return []
 
@@ -87,7 +87,7 @@ def petsc_flags() -> list[str]:
         command = ["pkg-config", *options, "PETSc"]
         return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
-    # Against another PETSc than ours a ratio would compare two PETScs.
+    # With another version the bench would compare two PETScs.
     version = ".".join(map(str, PETSc.Sys.getVersion()))
     if ask("--modversion") != version:
         return []
@@ -104,7 +104,7 @@ def compile_peers(folder: Path) -> dict[str, Path]:
     if which("mpicxx") and (petsc := petsc_flags()):
         commands["tsrk"] = ["mpicxx", *FLAGS, str(SOURCES / "tsrk.cpp"), *petsc]
 
-    # All at once: each takes some seconds.
+    # All at the same time, since each takes some seconds.
     programs = {name: (folder / name).resolve() for name in commands}
     building = {name: subprocess.Popen([*commands[name], "-o", str(path)]) for name, path in programs.items()}
     ended = {name: compiler.wait() for name, compiler in building.items()}
@@ -112,7 +112,7 @@ def compile_peers(folder: Path) -> dict[str, Path]:
 
 
 def compiled(program: Path, method: str, folder: Path) -> Solver:
-    """A C++ peer as a solver; its files pass through ``folder``. It raises RuntimeError where the peer fails."""
+    """A C++ peer as a solver, which exchanges files with it in ``folder`` and raises RuntimeError if it fails."""
 
     def solve(case: Case) -> Solution:
         model = case.model()
@@ -134,21 +134,25 @@ def compiled(program: Path, method: str, folder: Path) -> Solver:
 
 
 def _solution(output: Path, model: Model, seconds: float) -> Solution:
-    """What a peer wrote: doubles (sample, mass, cell)."""
+    """The solution in the file ``output`` of a peer, doubles (sample, mass, cell)."""
     sampled = np.fromfile(output).reshape(model.samples, model.chain.cell.dofs, model.chain.cells)
     return Solution(sampled.transpose(0, 2, 1).reshape(model.samples, -1), seconds)
 
 
 def diffrax(folder: Path) -> Solver:
-    """diffrax's Dopri8 as a solver: one process, which compiles once, on one core; it ends with its input."""
+    """diffrax's Dopri8 as a solver, by a process of its own that exchanges files in ``folder``.
+
+    The process starts with the first case, so that it compiles only once, and ends when its input is closed.
+    """
     given = folder / "parameters.txt"
     output = folder / "diffrax.bin"
-    core = min(os.sched_getaffinity(0))  # every solver has one
+    # On one core, as all solvers.
+    core = min(os.sched_getaffinity(0))
     command = ["taskset", "-c", str(core), str(DIFFRAX), str(SOURCES / "diffrax_dopri8.py"), str(output)]
 
     @cache
     def process() -> subprocess.Popen[str]:
-        # This package's path would lead diffrax to another numpy.
+        # With this process' PYTHONPATH diffrax would import another numpy.
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | ONE_THREAD
         return subprocess.Popen(
             command,
@@ -168,9 +172,9 @@ def diffrax(folder: Path) -> Solver:
             running.stdin.write(f"{given} {case.time.rtol} {WEAKEST * case.time.rtol}\n")
             running.stdin.flush()
         except BrokenPipeError:
-            pass  # it has ended: there will be no answer
+            pass  # the process has ended, and gives no answer below
         answer = running.stdout.readline()
-        # An empty line is the end of its output: the process has ended without an answer.
+        # An empty text is the end of its output.
         if not answer:
             raise RuntimeError("diffrax failed")
         return _solution(output, model, json.loads(answer)["cpu_seconds"])
@@ -179,7 +183,7 @@ def diffrax(folder: Path) -> Solver:
 
 
 def scipys(right_hand_side: Callable[[Model], RightHandSide]) -> Solver:
-    """SciPy's DOP853 as a solver; ``right_hand_side`` returns that of a model."""
+    """SciPy's DOP853 as a solver; ``right_hand_side`` makes the right-hand side of a model."""
 
     def solve(case: Case) -> Solution:
         model = case.model()
@@ -199,13 +203,13 @@ def scipys(right_hand_side: Callable[[Model], RightHandSide]) -> Solver:
 
 
 def _pairs(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Hosts and resonators of the sites as indices of masses, and the clearances in m."""
+    """Hosts and resonators (site,) as indices of masses, and the clearances (site,) in m."""
     first = np.array(chain.sites, int) * chain.cell.dofs
     return first + chain.cell.host, first + chain.cell.resonator, np.array(chain.clearances)
 
 
 def plain_right_hand_side(model: Model) -> RightHandSide:
-    """The lattice in numpy, its stiffness as a sparse matrix."""
+    """The right-hand side of ``model`` in numpy, with the stiffness as a sparse matrix."""
     stiffness = model.chain.stiffness_matrix().tocsr()
     inverse_mass = 1 / model.chain.masses()
     n = inverse_mass.size
@@ -227,15 +231,15 @@ def plain_right_hand_side(model: Model) -> RightHandSide:
 
 
 def compiled_right_hand_side(model: Model) -> RightHandSide:
-    """The lattice by numba, row by row of its stiffness."""
+    """The right-hand side of ``model``, compiled by numba."""
     driven = model.drive_cell * model.chain.cell.dofs + model.drive_mass
     return _compile(model.chain, model.contact, model.drive, driven)
 
 
 @cache
 def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> RightHandSide:
-    """The compiled right-hand side; ``driven`` is the number of the driven mass."""
-    # Arrays and numbers of this function are constants in the kernel: it is compiled for one lattice.
+    """The compiled right-hand side; ``driven`` is the number of the driven mass among all."""
+    # numba takes the arrays and numbers of this function as constants: the kernel is compiled for one lattice.
     stiffness = chain.stiffness_matrix().tocsr()
     first = stiffness.indptr
     columns = stiffness.indices
@@ -244,7 +248,8 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
     n = inverse_mass.size
     host, resonator, clearance = _pairs(chain)
     contact = law.stiffness
-    exponent = law.onset_exponent  # hertz and bilinear are powers throughout
+    # The force of the laws hertz and bilinear is this power of the indentation throughout, not at its onset alone.
+    exponent = law.onset_exponent
     amplitude = drive.window_amplitude
     frequency = drive.frequency
     cycles = drive.cycles
@@ -276,15 +281,15 @@ def _compile(chain: Chain, law: Contact, drive: ToneBurst, driven: int) -> Right
             f[n + driven] += amplitude * (1.0 - np.cos(phase / cycles)) * np.sin(phase) * inverse_mass[driven]
         return f
 
-    # Compiled now: compiling is no part of a solution's time.
+    # Called once, which compiles it: that is no part of a solution's time.
     slope(0.0, np.zeros(2 * n))
     return slope
 
 
 def peers(folder: Path) -> dict[str, Solver]:
-    """Every peer this machine has, by name; ``folder`` takes programs and passing files."""
+    """The solvers of all peers that this machine has, by name; ``folder`` is for their programs and files."""
     programs = compile_peers(folder)
-    # Name: program and method.
+    # The program of each peer, and the name of the method in it.
     methods = {
         "odeint dopri5": ("odeint", "dopri5"),
         "odeint fehlberg78": ("odeint", "fehlberg78"),

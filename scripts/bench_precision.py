@@ -1,4 +1,4 @@
-"""Work and precision: all solvers on one lattice, in turn, against a reference that an independent one confirms."""
+"""Work and precision: all solvers on one lattice, in turn, against a reference that an independent solver confirms."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from bench_peers import Solver
 
 from vipetsc.case import Case
 
-# A ratio at an error below this many separations of the references would measure the references.
+# Solvers are compared at errors of at least this many times the distance between references: at smaller ones the bench
+# would measure the references.
 MARGIN = 5
-# From what a picture shows to what a convergence study needs.
+# Errors at which solvers are compared, from what a picture shows to what a study of convergence needs.
 ERRORS = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 
 
 def lattice_case(overrides: Iterable[str] = ()) -> Case:
-    """The compared case: four-band, A = 30 N, conservative; it ends while solvers still agree after first contact."""
-    # Conservative, because the peers' laws are; up to 0.3 s, since rounding grows by every contact in a chaotic
-    # motion.
+    """The case that all solvers solve: the four-band lattice, A = 30 N, conservative, to 0.3 s; with ``overrides``."""
+    # Conservative, because the peers' laws are. It ends early after the first contacts: each further one multiplies
+    # rounding errors, by which solvers would soon differ more than by their own errors.
     given = ("drive.amplitude=30.0", "contacts.restitution=1.0", "time.sample_interval=2e-4", "time.end=0.3")
     return Case.load(overrides=[*given, *overrides])
 
@@ -32,16 +33,17 @@ def at_tolerance(case: Case, rtol: float) -> Case:
 
 
 def error(sampled: np.ndarray, exact: np.ndarray) -> float:
-    """Relative l2 error of all samples."""
+    """Relative l2 error of all samples ``sampled`` (sample, mass)."""
     return float(np.linalg.norm(sampled - exact) / np.linalg.norm(exact))
 
 
 def reference(solvers: Mapping[str, Solver], case: Case) -> tuple[np.ndarray, dict[str, Any]]:
-    """Velocities by our ``ts`` at 1e-13, and how far others at the edge of double precision lie from them."""
-    # By ts, whose error falls with the tolerance down to rounding; the propagator shares no step with it.
+    """Velocities by the engine ``ts`` at a tolerance of 1e-13, and the distances from them of other tight solutions."""
+    # By ts, whose error falls with the tolerance down to rounding. The propagator, which takes other steps, is compared
+    # with it like the peers.
     exact = solvers["vipetsc ts"](at_tolerance(case, 1e-13)).velocity
     tight = {"vipetsc ts": 3e-14}
-    # A solver by others confirms the reference; where none was built, one of SciPy's does.
+    # A solver by others confirms the reference: odeint, or SciPy's where that was not built.
     if "odeint dopri5" in solvers:
         tight["odeint dopri5"] = 1e-14
     else:
@@ -53,9 +55,11 @@ def reference(solvers: Mapping[str, Solver], case: Case) -> tuple[np.ndarray, di
 
 
 def work_precision(solvers: Mapping[str, Solver], case: Case, tolerances: Iterable[float], rounds: int) -> dict:
-    """Rows (solver, rtol, error, seconds), ratios of CPU time at equal error, and what the reference is worth.
+    """Solve ``case`` by all ``solvers`` at all ``tolerances``; returns tables of ``latest.json``.
 
-    Every round runs each solver at each tolerance once, in turn. ``seconds`` is the median over rounds.
+    ``rows`` are solver, rtol, error and CPU ``seconds``, the median over the rounds; ``ratios`` are those of CPU times
+    at equal error, with their ``spread`` over the rounds; ``reference`` says how exact the reference is. Every round
+    runs each solver at each tolerance once, in turn.
     """
     exact, about = reference(solvers, case)
     # The first call of an engine loads what is compiled.
@@ -63,8 +67,8 @@ def work_precision(solvers: Mapping[str, Solver], case: Case, tolerances: Iterab
     rows: dict[tuple[str, float], dict] = {}
     for _ in range(rounds):
         for rtol in tolerances:
-            # The solvers are inside the loop over tolerances: what disturbs the machine for a minute disturbs all of
-            # them.
+            # All solvers at one tolerance before the next tolerance: what disturbs the machine for a minute then
+            # disturbs all of them.
             for name, solver in solvers.items():
                 row = rows.setdefault((name, rtol), {"solver": name, "rtol": rtol, "error": None, "all": []})
                 try:
@@ -80,17 +84,18 @@ def work_precision(solvers: Mapping[str, Solver], case: Case, tolerances: Iterab
         row["seconds"] = statistics.median(row["all"]) if row["all"] else None
     # Sorted by tolerance, so that the points of a solver join to a curve.
     table = sorted(rows.values(), key=lambda row: (list(solvers).index(row["solver"]), -row["rtol"]))
-    # Of all separations the largest: the reference is worth no more than the worst agreement.
+    # The reference is no more exact than the largest distance says.
     about["floor"] = MARGIN * max(about["separation"].values())
     ratios, spread = equal_error_ratios(table, [e for e in ERRORS if e >= about["floor"]])
     return {"reference": about, "rows": table, "ratios": ratios, "spread": spread}
 
 
 def at_equal_error(points: Iterable[tuple[float, float]], wanted: float, bound: bool = False) -> float | None:
-    """CPU seconds at the error ``wanted`` from ``points`` (error, seconds), interpolated in logarithms.
+    """CPU seconds of a solver at the error ``wanted``, interpolated in logarithms between its ``points``.
 
-    Points that another one beats in both are left out, which favours a solver whose error falls unevenly. None where
-    the points do not reach; with ``bound``, an error larger than all of them costs no more than the largest one.
+    Points (error, seconds) that another one beats in both are left out, which favours a solver whose error falls
+    unevenly. Returns None if ``wanted`` is outside the range of the points; with ``bound``, an error larger than all of
+    theirs has the time of the largest, which is a bound from above.
     """
     front: list[tuple[float, float]] = []
     for e, s in sorted(points):
@@ -104,16 +109,19 @@ def at_equal_error(points: Iterable[tuple[float, float]], wanted: float, bound: 
 
 
 def equal_error_ratios(rows: list[dict], wanted: list[float]) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """CPU time of each peer over that of each engine of ours, by name; median and extremes over the rounds."""
+    """CPU times of all other solvers over that of each engine of this package, at the errors ``wanted``.
+
+    Returns medians over the rounds, and their smallest and largest values, by names "solver / engine at error".
+    """
     names = list(dict.fromkeys(row["solver"] for row in rows))
-    # A row with fewer failed in some round, and has no ratio for it.
+    # A row with fewer times failed in some round, and is left out below.
     rounds = max(len(row["all"]) for row in rows)
 
     def seconds(name: str, turn: int, wanted_error: float) -> float | None:
-        # An error of zero is the reference itself.
+        # A row whose error is zero is the reference itself.
         complete = [row for row in rows if row["solver"] == name and len(row["all"]) == rounds and row["error"] > 0]
         points = [(row["error"], row["all"][turn]) for row in complete]
-        # A bound counts against the solver to which it is applied: ours may have one, a peer may not.
+        # A bound from above is unfavourable to its solver: it is allowed for engines of this package, not for peers.
         return at_equal_error(points, wanted_error, bound=name.startswith("vipetsc"))
 
     ratios = {}

@@ -1,7 +1,7 @@
 """Whole programs as a user calls them, compared with an earlier version: time from the prompt to the last picture.
 
-Calls of the two versions alternate, each in a process of its own, so that both meet the same machine. The earlier
-version comes out of the repository's history; the package needs no build.
+Calls of the two versions alternate, each in a process of its own, so that both meet the same state of the machine. The
+earlier version is taken out of the repository's history; the package needs no build.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 ROOT = Path(__file__).parents[1]
 CASES = ROOT / "vipetsc" / "paper" / "cases"  # the same for both versions
-# The version before programs were made fast to start: the targets below are ratios to its times.
+# The earlier version: the targets below are ratios to its times.
 BASELINE = "b03848f"
 # The slowest program, a first run of the earlier version, compiles for a minute; ten leave room for a slow machine.
 PATIENCE = 600  # seconds that one call may take
@@ -38,11 +38,11 @@ amplitude = [2.0, 6.0, 12.0, 18.0, 24.0, 30.0]
 
 @dataclass(frozen=True)
 class Program:
-    """A call of ``python -m vipetsc``: its ``words``, the ``ranks``, and whether kernels are compiled in it.
+    """A call of ``python -m vipetsc``: its ``words``, the number of ``ranks``, and whether it ``compiles`` kernels.
 
-    ``{folder}`` in a word is the folder of the version that is measured, ``{cases}`` that of the paper's cases;
-    ``--force`` lets a round replace another's results. ``target`` is what the ratio of times may be at most, None where
-    there is no goal; it is one of CPU time where ``by_cpu``, else of wall time.
+    ``{folder}`` in a word is the folder of the version that is measured, ``{cases}`` that of the paper's cases.
+    ``--force`` lets a round replace the results of another. ``target`` is the largest ratio of times that is aimed at,
+    None without a goal: a ratio of CPU times if ``by_cpu``, else of wall times.
     """
 
     words: str
@@ -54,7 +54,7 @@ class Program:
 
 PROGRAMS = {
     "help": Program("--help"),
-    # Targets are written as the seconds that were aimed at over those of the earlier version.
+    # A target is written as the seconds aimed at over the seconds of the earlier version.
     "validate": Program("validate", target=0.7 / 1.6),
     "run without pictures, propagator": Program(
         "run --set time.engine=propagator --set output.figures=false --force --out {folder}/plain"
@@ -65,7 +65,7 @@ PROGRAMS = {
         "run --set time.engine=propagator --force --out {folder}/propagator", target=3.0 / 8.4
     ),
     "run with pictures, ts": Program("run --set time.engine=ts --force --out {folder}/ts", ranks=2, target=4.5 / 9.3),
-    # By CPU time: how many members run at once is a matter of the machine's cores.
+    # By CPU time, since the wall time depends on how many members run at once, on the cores of the machine.
     "sweep of six": Program("sweep {folder}/six.toml --force --out {folder}/six", target=2.2 / 4.3, by_cpu=True),
     # The largest steps of the paper at fewer amplitudes and wavenumbers: every third member is scaled, as there.
     "members of the step interband": Program(
@@ -98,12 +98,11 @@ class Version:
 
     def seconds(self, program: Program) -> tuple[float, float]:
         """Wall and CPU time in s of one call of ``program``; raises RuntimeError if the call fails."""
-        # This process has its own MPI: the processes that it starts must not inherit that.
+        # This process has initialised MPI: with its variables, a process that it starts would take itself for a rank.
         environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX", "OMPI_UNIVERSE"))}
         environment["PYTHONPATH"] = str(self.source)
         if program.compiles:
-            # A folder of its own, emptied before, holds the machine code: kernels that a user's cache holds would not
-            # be compiled.
+            # With an empty cache of machine code: kernels in the user's cache would not be compiled.
             kernels = self.folder / "kernels"
             shutil.rmtree(kernels, ignore_errors=True)
             environment["NUMBA_CACHE_DIR"] = str(kernels)
@@ -113,7 +112,7 @@ class Version:
         if program.ranks > 1:
             command = ["mpirun", "-n", str(program.ranks), *command]
 
-        # Of children that have ended; mpirun waits for its ranks, so that theirs are among them.
+        # The time of children that have ended: of ranks too, since mpirun waits for them.
         before = _cpu_seconds_of_children()
         begin = time.perf_counter()
         ended = subprocess.run(
@@ -132,16 +131,19 @@ def _cpu_seconds_of_children() -> float:
 
 
 def unpack(commit: str, folder: Path) -> Path:
-    """The package as it was at ``commit``, in a folder below ``folder``; raises RuntimeError without that commit."""
+    """Write the package as of ``commit`` to a folder below ``folder``; returns that folder.
+
+    Raises RuntimeError if the repository does not have the commit.
+    """
     source = folder / commit
-    # From an earlier bench; a commit does not change.
+    # An earlier bench may have left it, and a commit does not change.
     if (source / "vipetsc").is_dir():
         return source
 
     archive = subprocess.run(["git", "-C", str(ROOT), "archive", commit, "vipetsc"], capture_output=True, check=False)
     if archive.returncode:
         raise RuntimeError(archive.stderr.decode().strip())
-    # Unpacked aside: a bench that is ended meanwhile leaves no half of a package.
+    # Unpacked under another name: a bench that is ended meanwhile leaves no half of a package.
     aside = folder / f"{commit}.part"
     shutil.rmtree(aside, ignore_errors=True)
     aside.mkdir(parents=True)
@@ -151,26 +153,26 @@ def unpack(commit: str, folder: Path) -> Path:
 
 
 def programs(folder: Path, rounds: int, commit: str, names: Iterable[str]) -> list[dict]:
-    """One row for each of ``names``: medians over the rounds of both versions' wall and CPU times, and of their ratios.
+    """Measure the programs ``names`` in both versions; returns a row for each.
 
-    A round before the first fills caches and is not counted. A program that compiles runs once. Raises RuntimeError
-    where the repository has no such commit.
+    A row has the medians over the rounds of wall and CPU times and of their ratios. A round before the first one fills
+    caches and is not counted. A program that compiles runs once. Raises RuntimeError if the repository does not have
+    the ``commit``.
     """
     source = unpack(commit, folder / "baseline")
     versions = {"before": Version(source, folder / "before"), "now": Version(ROOT, folder / "now")}
     for version in versions.values():
         version.folder.mkdir(parents=True, exist_ok=True)
-        # Each version has its folder: neither must find the results of the other, and resume them.
+        # Each version has a folder of its own: one must not find the results of the other and resume them.
         (version.folder / "six.toml").write_text(SWEEP, encoding="utf-8")
 
     rows = []
     for name in names:
         program = PROGRAMS[name]
-        # The first turn is not counted: it loads files and kernels into memory.
+        # The first turn, which loads files and kernels into memory, is not counted.
         first = 1
         turns = rounds
-        # A program that compiles is measured as a user meets it first: with empty caches, and once, since it takes a
-        # minute.
+        # A program that compiles is measured with empty caches, and once, since it takes a minute.
         if program.compiles:
             first = 0
             turns = 1
@@ -182,7 +184,7 @@ def programs(folder: Path, rounds: int, commit: str, names: Iterable[str]) -> li
                     if turn >= first:
                         measured[label].append(seconds)
         except (RuntimeError, subprocess.TimeoutExpired) as failure:
-            # A failure is a row of the table, and the other programs are measured.
+            # The table has a row for the failure, and the other programs are measured.
             rows.append({"program": name, "ranks": program.ranks, "failure": str(failure)})
             continue
         rows.append({"program": name, "ranks": program.ranks, "baseline": commit} | _summary(measured))
@@ -193,7 +195,7 @@ def _summary(measured: dict[str, list[tuple[float, float]]]) -> dict:
     """Medians over the rounds of wall and CPU seconds, of their ratios, and the range of the ratios."""
     before = np.array(measured["before"])
     now = np.array(measured["now"])
-    # Ratios of calls that followed each other: the machine's speed changes over a bench, and cancels in them.
+    # Ratios of calls that followed each other, in which the speed of the machine cancels; it changes over a bench.
     ratios = now / before
     found = {}
     for column, kind in enumerate(("wall", "cpu")):
@@ -206,7 +208,7 @@ def _summary(measured: dict[str, list[tuple[float, float]]]) -> dict:
 
 def programs_table(rows: list[dict]) -> str:
     """The rows in Markdown."""
-    # Rows of failures have no baseline; all others have the same one.
+    # All rows have the same baseline, but rows of failures have none.
     commit = next((row["baseline"] for row in rows if "baseline" in row), BASELINE)
     lines = [
         f"| program | ranks | wall s at {commit} | now | ratio (range) | CPU s at {commit} | now | ratio (range) |",

@@ -40,12 +40,12 @@ def solver_names(found: dict[str, Any]) -> list[str]:
 
 
 def curve(found: dict[str, Any], solver: str) -> list[tuple[float, float]]:
-    """Errors and CPU seconds of one solver, loosest tolerance first, without failures and the reference itself."""
+    """Errors and CPU seconds of one solver by falling tolerance, without failures and without the reference itself."""
     return [(r["error"], r["seconds"]) for r in found["rows"] if r["solver"] == solver and r["error"]]
 
 
 def markdown(found: dict[str, Any]) -> str:
-    """The tables of the manual's chapter: CPU time at equal error, whole programs, scaling, goals."""
+    """All tables for which ``found`` has numbers, as Markdown: CPU time at equal error, programs, scaling, goals."""
     parts = {
         "provenance": _origin_table,
         "rows": _precision_table,
@@ -64,7 +64,7 @@ def markdown(found: dict[str, Any]) -> str:
 
 
 def _origin_table(found: dict[str, Any]) -> str:
-    """When, of what and on what the bench was measured."""
+    """When the bench was made, of which version, on which machine and with which libraries."""
     origin = found["provenance"]
     rows = {
         "date": origin["date"][:10],
@@ -78,7 +78,7 @@ def _origin_table(found: dict[str, Any]) -> str:
 
 
 def processor() -> str:
-    """The name of the processor as Linux gives it; elsewhere that of the architecture."""
+    """The name of the processor, on Linux; elsewhere that of the architecture."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -88,9 +88,9 @@ def processor() -> str:
 
 
 def _precision_table(found: dict[str, Any]) -> str:
-    """CPU seconds at equal error, and ratios to the last engine of ours."""
+    """CPU seconds of all solvers at equal error, and their ratios to the propagator's, or to those of ``ts``."""
     names = solver_names(found)
-    # The last one is the propagator, the faster of ours where it applies.
+    # The last engine of this package: the propagator, which is faster than ts where it applies.
     engine = [name for name in names if name.startswith("vipetsc")][-1]
     reference = found["reference"]
     lines = [
@@ -102,7 +102,8 @@ def _precision_table(found: dict[str, Any]) -> str:
         cells = []
         for wanted in ERRORS:
             seconds = None
-            if wanted >= reference["floor"]:  # below it, references differ
+            # Below the floor the references differ by as much.
+            if wanted >= reference["floor"]:
                 seconds = at_equal_error(curve(found, name), wanted, bound=name.startswith("vipetsc"))
             ratio = found["ratios"].get(f"{name} / {engine} at {wanted:g}")
             cells.append(_seconds_and_ratio(seconds, ratio))
@@ -128,7 +129,7 @@ def _seconds_and_ratio(seconds: float | None, ratio: float | None) -> str:
 
 
 def _whole_table(found: dict[str, Any]) -> str:
-    """CPU time of the built-in case without the start of the program, and of a right-hand side."""
+    """CPU time of the built-in case inside a program that has started, and of a right-hand side."""
     lines = ["| inside the program | CPU time |", "|---|---|"]
     for engine, seconds in found["whole"].items():
         lines.append(f"| built-in case up to `run.h5`, {engine} | {seconds:.2f} s |")
@@ -148,7 +149,6 @@ def _paper_table(found: dict[str, Any]) -> str:
     """CPU time of the paper over all ranks, by stage, the longest first."""
     budget = found["paper"]
     lines = ["| stage of the paper | CPU s of all ranks |", "|---|---|", f"| all | {sum(budget.values()):.0f} |"]
-    # The longest first: it is where time can be saved.
     for stage, seconds in sorted(budget.items(), key=lambda item: -item[1]):
         lines.append(f"| {stage} | {seconds:.0f} |")
     return "\n".join(lines)
@@ -182,7 +182,7 @@ def _scaling_table(found: dict[str, Any]) -> str:
         if "failure" in row:
             lines.append(f"| {row['engine']} | {row['cells']:,} | | failed | | | |")
             continue
-        # One rank is what the others are compared with.
+        # Two ranks are compared with one, whose own row has no gain.
         gain = ""
         if "speedup" in row:
             gain = f"{row['speedup']:.2f} ({row['memory_speedup']:.2f})"
@@ -199,9 +199,9 @@ def _power(value: float) -> str:
 
 
 def draw(found: dict[str, Any], folder: Path) -> list[Path]:
-    """``work-precision.png`` and ``scaling.png`` in ``folder``, each where it was measured."""
+    """Draw ``work-precision.png`` and ``scaling.png`` to ``folder``, if they were measured; returns the files."""
     pictures = {"rows": ("work-precision", work_precision_figure), "scaling": ("scaling", scaling_figure)}
-    # Rows of failures have no numbers that could be drawn.
+    # Without rows of failures, which have no numbers to draw.
     found = found | {"scaling": [row for row in found.get("scaling", []) if "failure" not in row]}
     paths = []
     for key, (name, make) in pictures.items():
@@ -214,7 +214,7 @@ def draw(found: dict[str, Any], folder: Path) -> list[Path]:
 
 
 def work_precision_figure(found: dict[str, Any]) -> Figure:
-    """CPU seconds over the relative error of all sampled velocities."""
+    """A figure of the CPU seconds over the relative error of all sampled velocities, for each solver."""
     figure = style.new_figure(4.6, 3.0)
     axes = figure.subplots()
     for name in solver_names(found):
@@ -223,7 +223,7 @@ def work_precision_figure(found: dict[str, Any]) -> Figure:
             colour, marker, line = _LOOKS.get(name, _OTHER)
             axes.loglog(*points.T, line, color=colour, marker=marker, ms=3, label=name)
 
-    # Errors below the distance of the references cannot be distinguished from theirs.
+    # Errors below the distance of the references may be those of the references.
     floor = max(found["reference"]["separation"].values())
     left = min(axes.get_xlim()[0], floor / 5)
     axes.axvspan(left, floor, color=style.PALE, lw=0)
@@ -239,7 +239,7 @@ def work_precision_figure(found: dict[str, Any]) -> Figure:
 
 
 def scaling_figure(found: dict[str, Any]) -> Figure:
-    """Wall time and memory over the number of cells."""
+    """A figure of wall time and memory over the number of cells, for each engine on one rank and on two."""
     figure = style.new_figure(style.PAGE, 2.6)
     left, right = figure.subplots(1, 2)
     for engine in dict.fromkeys(row["engine"] for row in found["scaling"]):
@@ -252,7 +252,7 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
             right.semilogx(cells, [r["peak_gib_a_rank"] for r in rows], line, color=colour, marker=marker, ms=3)
 
     _limit(left, found["scaling"])
-    # From zero, so that heights compare as memory does.
+    # From zero, so that heights are in proportion to memory.
     right.set_ylim(0, 1.15 * max(row["peak_gib_a_rank"] for row in found["scaling"]))
     left.set_ylabel("wall time per 2e-4 s of model time (ms)")
     right.set_ylabel("peak memory a rank (GiB)")
@@ -264,8 +264,8 @@ def scaling_figure(found: dict[str, Any]) -> Figure:
 
 
 def _limit(axes: Axes, rows: list[dict]) -> None:
-    """The time in which one rank's memory reads and writes the state once."""
-    # The bound is one of the machine: the rows of either engine give the same line.
+    """Draw the time in which one rank reads and writes the state once, at the bandwidth of its memory."""
+    # This is a bound of the machine: the rows of one engine are enough.
     first = [r for r in rows if r["ranks"] == 1 and r["engine"] == rows[0]["engine"]]
     limit = [r["wall_ms"] * r["fraction_of_bandwidth_limit"] for r in first]
     axes.loglog([r["cells"] for r in first], limit, ":", color=style.GREY, label="memory alone, 1 rank")

@@ -1,4 +1,4 @@
-"""Scaling in cells and ranks, memory, bandwidth, set-up and files; and whole runs of the program."""
+"""Scaling over cells and ranks, with memory and bandwidth; set-up and files of large lattices; whole runs."""
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 
 WORKER = Path(__file__).with_name("bench_worker.py")
-# A lattice that the machine cannot hold swaps instead of failing; the others are measured in some seconds each.
+# A lattice that exceeds the machine's memory would swap for hours; any other is measured in some seconds.
 PATIENCE = 300  # seconds that one measurement may take
 MOST_TS_CELLS = 300_000  # beyond which `ts` takes minutes and shows nothing more
 
 
 def on_ranks(ranks: int, task: str, **arguments: object) -> dict:
-    """What the worker's ``task`` measures on ``ranks``; raises RuntimeError if it fails."""
-    # This process has its own MPI: the mpirun it starts must not inherit that.
+    """Run the worker's ``task`` with its ``arguments`` on so many ``ranks``; returns its measures.
+
+    Raises RuntimeError if it fails or takes more than ``PATIENCE``.
+    """
+    # This process has initialised MPI: with its variables, mpirun would take itself for one of its ranks.
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX", "OMPI_UNIVERSE"))}
     command = ["mpirun", "-n", str(ranks), sys.executable, str(WORKER), task, json.dumps(arguments)]
     try:
@@ -34,20 +37,23 @@ def on_ranks(ranks: int, task: str, **arguments: object) -> dict:
         raise RuntimeError(f"{task} on {ranks} ranks took more than {PATIENCE} s") from error
     if ended.returncode:
         raise RuntimeError(f"{task} on {ranks} ranks failed: {ended.stderr.strip()[-2000:]}")
-    # The last line: libraries may print before it.
+    # From the last line, since libraries may print before it.
     return json.loads(ended.stdout.strip().splitlines()[-1])
 
 
 def scaling(cells: Iterable[int], rounds: int) -> list[dict]:
-    """One row for each engine, length and number of ranks; a row that failed says why."""
+    """Measure every engine at all lengths in ``cells``; returns rows for one rank and for two.
+
+    A length that failed has one row, which says why. Numbers are medians over ``rounds``.
+    """
     rows = []
     for engine in engines():
         for n in cells:
-            # Its time is in proportion to the cells from 30,000 on.
+            # From 30,000 cells on its time is in proportion to the cells.
             if engine == "ts" and n > MOST_TS_CELLS:
                 continue
             try:
-                # A pair at a time: a lattice that two ranks cannot hold must not cost the rows of the shorter ones.
+                # Length by length, so that one that the machine cannot hold does not cost the rows of the others.
                 rows += _pair(engine, n, rounds)
             except RuntimeError as failure:
                 rows.append({"engine": engine, "cells": n, "ranks": 0, "failure": str(failure)})
@@ -55,9 +61,9 @@ def scaling(cells: Iterable[int], rounds: int) -> list[dict]:
 
 
 def _pair(engine: str, cells: int, rounds: int) -> list[dict]:
-    """The rows of one and of two ranks: medians over ``rounds``, the ranks in turn."""
+    """The rows of one rank and of two at one length, as medians over ``rounds``, in which they take turns."""
     turns: dict[int, list[dict]] = {1: [], 2: []}
-    # Long enough to time, short enough to wait for.
+    # The same work at all lengths, a million cells times an interval, within bounds that can be timed and waited for.
     intervals = max(10, min(200, 1_000_000 // cells))
     for _ in range(rounds):
         for ranks, found in turns.items():
@@ -67,7 +73,7 @@ def _pair(engine: str, cells: int, rounds: int) -> list[dict]:
         medians = {key: statistics.median(turn[key] for turn in found) for key in found[0] if key != "ranks"}
         rows.append({"engine": engine, "cells": cells, "ranks": ranks} | medians)
 
-    # Gains are medians of ratios, since the machine's speed changes from turn to turn.
+    # Gains are medians of ratios of one turn, since the speed of the machine changes from turn to turn.
     pairs = list(zip(turns[1], turns[2], strict=True))
     rows[-1]["speedup"] = statistics.median(one["wall_ms"] / two["wall_ms"] for one, two in pairs)
     slower = statistics.median(one["triad_gb_per_second"] / two["triad_gb_per_second"] for one, two in pairs)
@@ -76,7 +82,7 @@ def _pair(engine: str, cells: int, rounds: int) -> list[dict]:
 
 
 def builds(sizes: Iterable[tuple[int, int]]) -> list[dict]:
-    """Set-up and files of runs of so many cells and sites, on one rank and on two."""
+    """Measure set-up and files of runs of these ``sizes`` (cells, sites) on one rank and on two; a row for each."""
     rows = []
     for cells, sites in sizes:
         for ranks in (1, 2):
@@ -94,9 +100,9 @@ def whole_runs(folder: Path, rounds: int) -> dict[str, float]:
         for engine, found in seconds.items():
             overrides = [f"time.engine={engine}"]
             if turn == 0:
-                # The warm-up loads the compiled kernels; a hundredth of a second is enough for that.
+                # The warm-up loads the compiled kernels, for which a hundredth of a second of motion is enough.
                 overrides.append("time.end=0.01")
-            # With force, since every round writes to the folder of the one before.
+            # With force, since all rounds use one folder.
             result = simulate(Case.load(overrides=overrides), folder / f"whole-{engine}", MPI.COMM_SELF, force=True)
             if turn:
                 found.append(result.statistics["cpu_seconds"])
@@ -104,7 +110,10 @@ def whole_runs(folder: Path, rounds: int) -> dict[str, float]:
 
 
 def large(folder: Path, rounds: int) -> dict:
-    """A million cells by the whole program on one and on two ranks, in turn; what two gain, and what memory does."""
+    """Run the whole program on a million cells, on one rank and on two in turn; returns the runs and their medians.
+
+    ``speedup_on_two_ranks`` is the gain of two ranks, ``memory_speedup_on_two_ranks`` that of the memory's bandwidth.
+    """
     runs: dict[int, list[dict]] = {1: [], 2: []}
     for _ in range(rounds):
         for ranks, found in runs.items():

@@ -1,4 +1,4 @@
-"""What a bench must show: a few named numbers and their targets, from ``latest.json`` alone."""
+"""Goals of a bench: a few named numbers and their targets, from ``latest.json`` alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bench_programs import PROGRAMS
 
 @dataclass(frozen=True)
 class Target:
-    """A measured ``value``, and the ``target`` that it should reach at least, or at most."""
+    """A measured ``value``, and the ``target`` that it should reach: at least, or, if not ``at_least``, at most."""
 
     name: str
     value: float
@@ -19,14 +19,14 @@ class Target:
 
     @property
     def met(self) -> bool:
-        """Whether the number is as it should be."""
+        """Whether the value reaches the target."""
         if self.at_least:
             return self.value >= self.target
         return self.value <= self.target
 
 
 def targets(found: dict[str, Any]) -> list[Target]:
-    """The numbers that were measured, in the order of the parts."""
+    """The goals of which ``found``, the content of ``latest.json``, has the numbers, in the order of its parts."""
     return [
         *_against_peers(found),
         *_scaling(found.get("scaling", [])),
@@ -52,17 +52,17 @@ def _scaling(rows: list[dict[str, Any]]) -> list[Target]:
     for cells in (10**5, 10**6):
         one = rows_by_case.get(("propagator", cells, 1))
         if one:
-            # A method that passes over the state three times an interval reaches a third of the limit.
+            # 0.3, since a method that passes over the state three times an interval reaches a third of the limit.
             fraction = one["fraction_of_bandwidth_limit"]
             found.append(Target(f"propagator: fraction of the memory's limit at {cells:,} cells", fraction, 0.3))
         two = rows_by_case.get(("propagator", cells, 2), {})
         if "speedup" in two:
-            # Two ranks share a memory, which gains less than twice by a second core; of that gain nine tenths must
-            # arrive.
+            # Two ranks share one memory, whose bandwidth a second core does not double. Nine tenths of what it gains
+            # must arrive.
             gain = two["speedup"] / two["memory_speedup"]
             found.append(Target(f"gain of a second rank over that of bare memory at {cells:,} cells", gain, 0.9))
 
-    # At 300 cells a rank has little to compute: messages must not cost more than a second rank saves.
+    # At 300 cells a rank has little to compute, and messages must not cost more than a second rank saves.
     two = rows_by_case.get(("propagator", 300, 2), {})
     if "speedup" in two:
         found.append(Target("two ranks against one at 300 cells (times as fast)", two["speedup"], 1.0))
@@ -90,7 +90,7 @@ def _whole_programs(rows: list[dict[str, Any]]) -> list[Target]:
 
 def _studies(found: dict[str, Any]) -> list[Target]:
     """CPU time of a sweep's member, and of the whole paper."""
-    # A member of either kind when targets were set; the paper's two largest stages are sweeps of such members.
+    # What a member of either kind took when targets were set. The two largest stages of the paper are sweeps of them.
     most = {"four-band": 0.35, "diatomic": 0.25}
     measured = []
     for kind, seconds in found.get("members", {}).items():
@@ -102,7 +102,7 @@ def _studies(found: dict[str, Any]) -> list[Target]:
 
 
 def table(found: dict[str, Any]) -> str:
-    """The numbers and their targets in Markdown; empty if none was measured."""
+    """The goals with their numbers and targets as a table in Markdown; empty if none was measured."""
     measured = targets(found)
     if not measured:
         return ""

@@ -30,15 +30,15 @@ from vipetsc.case import Case
 from vipetsc.dynamics import simulate
 
 COMM = MPI.COMM_WORLD
-# A run's phases, as its audit events name them; "read" is everything before the first.
+# The phases of a run, as its audit events name them. "read" is the time before the first of them.
 PHASES = ("claim", "set-up", "step", "checkpoint", "flush", "assemble", "conclude", "clean", "swap")
 
-# Of PETSc's log; the first two are PETSc's own.
+# Events of PETSc's log: the first two are PETSc's own, the others are registered by this package.
 EVENTS = ("VecScatterBegin", "TSStep", "Propagator", "ContactSearch", "Landing", "Recorder")
 
 
 class Counting(MPI.Intracomm):
-    """A communicator that counts the reductions over it, which PETSc does not see."""
+    """A communicator that counts the reductions by mpi4py over it, which PETSc's log does not have."""
 
     reductions: int
     __module__ = "mpi4py.MPI"  # what petsc4py asks of a communicator
@@ -67,15 +67,15 @@ def triad(a: np.ndarray, b: np.ndarray, c: np.ndarray, s: float) -> None:
         a[i] = b[i] + s * c[i]
 
 
-# Three arrays of 64 MB each exceed every cache of a processor's last level, so that the memory itself is measured.
+# Three arrays of 64 MB each exceed the caches of a processor, so that the memory itself is measured.
 def bandwidth(size: int = 8_000_000, turns: int = 12) -> float:
-    """GB/s of a triad on all ranks at once, the best of ``turns``, 24 bytes an element as STREAM counts."""
+    """Bandwidth in GB/s of STREAM's triad on all ranks at once: the best of ``turns``, with 24 bytes an element."""
     a = np.zeros(size)
     b = np.ones(size)
     c = np.ones(size)
-    # The first call compiles, and touches the memory.
+    # The first call compiles, and has the operating system provide the memory.
     triad(a, b, c, 0.5)
-    # The best, as in STREAM: other processes can only take from the bandwidth.
+    # The best turn counts, as in STREAM, since other processes can only take from the bandwidth.
     best = np.inf
     for _ in range(turns):
         COMM.Barrier()
@@ -92,13 +92,16 @@ def peak() -> float:
 
 
 def flight(engine: str, cells: int, intervals: int) -> dict:
-    """Milliseconds a sample interval of a lattice of ``cells``, once a short burst has reached its full strength."""
-    # Three cycles end soon, and a window of nine cells keeps what is recorded small at every length.
+    """Measure an ``engine`` on a lattice of ``cells`` over so many sample ``intervals``, in the midst of a short burst.
+
+    Returns milliseconds a sample interval, memory, bandwidth, and what ``counted`` counts.
+    """
+    # A burst of three cycles ends soon; the window of nine cells keeps what is recorded small at every length.
     case = lattice_case([f"lattice.cells={cells}", f"time.engine={engine}", "drive.cycles=3", "output.window=[1, 9]"])
     comm = Counting(COMM)
     moving = Flight(case, comm)
     model = moving.model
-    # At rest the engines have less to do: ts takes its longest steps there.
+    # Timed from a third of the burst on: in a lattice at rest ts takes its longest steps.
     first = round(model.drive.duration / 3 / model.sample_interval)
     moving.advance(0, first)
     COMM.Barrier()
@@ -109,39 +112,40 @@ def flight(engine: str, cells: int, intervals: int) -> dict:
     wall = (time.perf_counter() - begin) / intervals
     cpu = COMM.allreduce(time.process_time() - begin_cpu) / intervals
 
-    memory = peak()  # before the triad, whose arrays are larger
+    # Before the triad, whose arrays may be larger than all else.
+    memory = peak()
     traffic = counted(moving, comm, first + intervals, min(intervals, 50))
     gigabytes = bandwidth()
-    state = 2 * 8 * model.chain.cell.dofs * cells  # bytes
+    state_bytes = 2 * 8 * model.chain.cell.dofs * cells
     return {
         "wall_ms": 1e3 * wall,
         "cpu_ms": 1e3 * cpu,
         "peak_gib_a_rank": memory,
         "triad_gb_per_second": gigabytes,
-        # No method can do with less than reading and writing the state once an interval.
-        "fraction_of_bandwidth_limit": 2 * state / (1e9 * gigabytes) / wall,
+        # Every method reads and writes the state at least once an interval.
+        "fraction_of_bandwidth_limit": 2 * state_bytes / (1e9 * gigabytes) / wall,
     } | traffic
 
 
 def counted(moving: Flight, comm: Counting, done: int, intervals: int) -> dict[str, float]:
-    """Messages and bytes that a rank sends to one neighbour, and reductions of all ranks, in a sample interval.
+    """Messages and bytes that a rank sends to one neighbour, and reductions, in a sample interval; over ``intervals``.
 
-    Messages are what PETSc's log has of its scatters, reductions those of its steps and those over ``comm``; ms are
-    those of this rank's ``EVENTS``.
+    ``moving`` has reached the sample ``done``. Messages are those of the scatters in PETSc's log, reductions those of
+    its steps and those over ``comm``. The time of each of ``EVENTS`` on this rank is in ms.
     """
-    # Only now: the log would slow down the steps that were timed before.
+    # The log begins after the steps that were timed, which it would slow down.
     PETSc.Log.begin()
 
     def logged() -> np.ndarray:
         events = [PETSc.Log.Event(name).getPerfInfo() for name in EVENTS]
-        # PETSc counts since the start of the log, hence the difference of two readings below.
+        # PETSc counts from the start of the log: two readings are subtracted below.
         scatter, step = events[:2]
         traffic = scatter["numMessages"], scatter["messageLength"], step["numReductions"] + comm.reductions
         return np.array([*traffic, *(1e3 * event["time"] for event in events)])
 
     before = logged()
     moving.advance(done, done + intervals)
-    # PETSc counts a message where it is sent and where it is received; of two ranks, each has one neighbour.
+    # PETSc counts a message where it is sent and where it is received. Each of two ranks has one neighbour.
     messages, length, reductions, *spent = ((logged() - before) / intervals).tolist()
     found = {"messages": messages / 2, "message_bytes": length / 2, "reductions": reductions}
     for name, milliseconds in zip(EVENTS, spent, strict=True):
@@ -150,7 +154,10 @@ def counted(moving: Flight, comm: Counting, done: int, intervals: int) -> dict[s
 
 
 def build(cells: int, sites: int) -> dict:
-    """A run from its tables to its folder, of three samples and all velocities: wall seconds by phase, and sizes."""
+    """Run a lattice from its tables to its folder, with three samples and all velocities.
+
+    Returns wall seconds by phase, and the sizes of file and memory.
+    """
     marks: list[tuple[str, float]] = []
 
     def mark(event: str, _: object) -> None:
@@ -161,7 +168,8 @@ def build(cells: int, sites: int) -> dict:
     sys.addaudithook(mark)
     with tempfile.TemporaryDirectory(dir=os.environ.get("BENCH_FOLDER")) as own:
         folder = Path(COMM.bcast(own))
-        simulate(_spread(1000, 10), folder / "compiles", COMM)  # compiling is no part of what is measured
+        # A short lattice first, which compiles the kernels: that is not to be measured.
+        simulate(_spread(1000, 10), folder / "compiles", COMM)
         marks[:] = [("read", time.perf_counter())]
         simulate(_spread(cells, sites), folder / "run", COMM)
         marks.append(("end", time.perf_counter()))
@@ -183,10 +191,10 @@ def build(cells: int, sites: int) -> dict:
 
 
 def _spread(cells: int, sites: int) -> Case:
-    """A lattice with evenly spread sites that nothing reaches in three samples."""
-    # Away from the ends, the first of which is driven.
+    """A case with evenly spread ``sites``, which no wave reaches in its three samples."""
+    # Away from the ends, of which the first is driven.
     places = np.linspace(cells // 10, cells - cells // 10, sites).round().astype(int).tolist()
-    # "auto" would choose by size; the same writer at every size lets rows be compared.
+    # "auto" would choose by size: with the same writer rows of all sizes can be compared.
     writer = "parallel" if h5py.get_config().mpi else "gather"
     table = {
         "name": "build",
@@ -199,7 +207,7 @@ def _spread(cells: int, sites: int) -> Case:
 
 
 def large(folder: str) -> dict:
-    """The whole program on a million cells: runs/examples/large.toml, files included."""
+    """Run the whole program on a million cells, runs/examples/large.toml, with its files; returns its measures."""
     result = simulate(Case.load("runs/examples/large.toml", ["output.window=[1, 2000]"]), folder, force=True)
     memory = peak()
     return {

@@ -1,9 +1,9 @@
-"""The pictures of the manual's gallery: its pages' commands are run as they stand, their figures kept small.
+"""Makes the pictures of the manual's gallery again: runs the commands of its pages, and keeps small copies of figures.
 
     python scripts/gallery.py [--folder FOLDER] [PAGE ...]
 
-Works in ``FOLDER``, by default a temporary one, on the pages named, or all. A picture ``runs/gallery/RUN.FIGURE`` of a
-page is ``runs/RUN/figures/FIGURE`` there; what is larger than ``MOST`` is a mistake.
+The commands run in ``FOLDER``, by default a temporary one; without a ``PAGE`` those of all pages. The picture
+``RUN.FIGURE`` of a page is a copy of ``runs/RUN/figures/FIGURE`` there. A copy larger than ``MOST`` is refused.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from small_pictures import save_small
 
 ROOT = Path(__file__).parents[1]
 INDEX = ROOT / "vipetsc/manual/gallery.md"
-# Figures of runs are 1400 pixels wide; at 900 they have 60 % of the bytes.
-WIDTH = 900  # pixels
-# The gallery is part of the package that users install: these bounds keep it to a few MB.
+# The width of a picture in pixels. Figures of runs have 1400; at 900 they have 60 % of the bytes.
+WIDTH = 900
+# The gallery is a part of the package that users install: these bounds keep it to a few MB.
 MOST = {".png": 125_000, ".gif": 1_500_000}  # bytes
 
 
@@ -36,20 +36,20 @@ def pages() -> dict[str, Path]:
 
 
 def commands(page: Path) -> list[list[str]]:
-    """The words of every command of a page, in its order."""
+    """The commands in the blocks ``sh`` of a page, in order, each as its words."""
     blocks = re.findall(r"^```sh\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.M | re.S)
     lines = "".join(blocks).splitlines()
     return [shlex.split(line, comments=True) for line in lines if line.strip()]
 
 
 def pictures(page: Path) -> list[Path]:
-    """The pictures of a page."""
+    """The files of the pictures that a page shows."""
     links = re.findall(r"!\[[^]]*\]\((\S+)\)", page.read_text(encoding="utf-8"))
     return [(page.parent / link).resolve() for link in links]
 
 
 def make_small(source: Path, target: Path) -> None:
-    """Copy a picture, a PNG in few colours and ``WIDTH`` pixels wide; raises ValueError for one too large."""
+    """Copy a picture, a PNG in few colours and at most ``WIDTH`` pixels wide; raises ValueError if it is too large."""
     most = MOST[source.suffix]
     if source.suffix == ".png":
         save_small(Image.open(source), target, WIDTH, most)
@@ -64,9 +64,9 @@ def make_small(source: Path, target: Path) -> None:
 def make(page: Path, folder: Path) -> None:
     """Run the commands of a page in ``folder``, and renew its pictures."""
     for words in commands(page):
-        # This interpreter, whatever `python` is on the path.
+        # Whatever `python` on the path is, the page is run by this interpreter.
         command = [sys.executable if word == "python" else word for word in words]
-        # A command that fails ends all: pictures of a run before it would pass for new ones.
+        # An error ends the script: otherwise pictures of an earlier run would pass for new ones.
         subprocess.run(command, cwd=folder, check=True)
     for target in pictures(page):
         run, figure = target.name.split(".", 1)
@@ -82,7 +82,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.folder or Path(scratch)
-        # Commands name case files below runs/; results there are left out, so that every one is computed.
+        # Commands name case files below runs/. Results there are not copied, so that all are computed.
         shutil.copytree(ROOT / "runs", folder / "runs", ignore=shutil.ignore_patterns("*.h5"), dirs_exist_ok=True)
         for name in options.page:
             begin = time.monotonic()

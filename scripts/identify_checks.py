@@ -1,13 +1,14 @@
-"""What an identification can do without noise, how far derivatives reach, and how errors fall with a record's length.
+"""Checks of identification: without noise, of its derivatives, and of its errors over the length of a record.
 
     python scripts/identify_checks.py exact
     python scripts/identify_checks.py derivatives [--out PICTURE]
     python scripts/identify_checks.py length [--seeds 8]
 
-``exact``: five clearances, stiffness and restitution of a four-band lattice from three velocities without noise, from
-starts 30 % off. ``derivatives``: those of the motion by a clearance against central differences of runs, and what a
-change of 0.1 % predicted by them misses, over the number of impacts. ``length``: a chain that is shaken steadily and
-meets a stop in every period; standard errors and actual errors over records of 0.5 to 4 s with 2 % noise.
+``exact`` identifies five clearances, stiffness and restitution of a four-band lattice from three velocities without
+noise, with starts 30 % off, and prints the errors. ``derivatives`` compares derivatives of the motion by a clearance
+with central differences of runs, and with them predicts the motion after a change of 0.1 %; it prints and draws the
+errors over the number of impacts. ``length`` identifies two parameters of a chain that is shaken steadily and meets a
+stop in every period, and prints standard errors and actual errors for records of 0.5 to 4 s with 2 % noise.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-# The tests' records and tables are used, and tests are no part of the installed package.
+# For records and tables of the tests, which are no part of the installed package.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.conftest import run_of
@@ -41,20 +42,22 @@ CLEARANCES = (1.32e-3, 1.20e-3, 1.08e-3, 0.96e-3, 0.90e-3)
 
 
 def work_of(table: dict[str, Any]) -> Identification:
-    """The fits of an identification."""
+    """The identification of the case ``table``, ready for its fits."""
     plan = IdentifyCase.from_table(table)
     return Identification(plan, read_records(plan), StopRequest())
 
 
 def computed_record(table: dict[str, Any], folder: Path, noise: float = 0.0, seed: int = 1) -> dict[str, Any]:
-    """A record of the points of ``table``, computed by the propagator."""
+    """Simulate ``table``, and write the velocities of its points to a file in ``folder``; the table of this record.
+
+    ``noise`` is relative to the root mean square of each sensor's record, ``seed`` that of its random numbers.
+    """
     run = run_of(Case.from_table(table))
     values = run["points/velocity"].values
-    # Noise is relative to the root mean square of each sensor's record, over its whole length.
     sizes = np.sqrt(np.mean(values**2, axis=0))
     values = values + noise * sizes * np.random.default_rng(seed).standard_normal(values.shape)
     path = folder / f"{table['name']}-{seed}.csv"
-    # With 17 digits a double is read as it was written: without noise the record has no error of its own.
+    # With 17 digits doubles are read as they were, so that without noise the record has no error of its own.
     np.savetxt(path, np.column_stack([run["time"].values, values]), delimiter=",", fmt="%.17g")
     sensors = [
         {"quantity": "velocity", "column": column, "cell": point["cell"], "mass": point.get("mass", 1)}
@@ -64,19 +67,19 @@ def computed_record(table: dict[str, Any], folder: Path, noise: float = 0.0, see
 
 
 def exact(folder: Path) -> None:
-    """Print the errors of seven parameters without noise."""
+    """Print the errors of seven parameters that are identified without noise; the record is written to ``folder``."""
     example = tomllib.loads(EXAMPLE.read_text())
     points = [
         {"name": sensor["column"].split()[0], "cell": sensor["cell"], "mass": sensor["mass"]}
         for sensor in example["identify"]["records"][0]["sensors"]
     ]
     contacts = example["contacts"] | {"clearance": list(CLEARANCES), "stiffness": STIFFNESS, "restitution": 0.7}
-    # A tolerance far below the default, so that the record's own error bounds no parameter.
+    # At a tolerance far below the default, the record's own error does not limit how well parameters are found.
     time = {"end": 0.04, "sample_interval": 2.5e-4, "engine": "propagator", "rtol": 1e-12}
     table = {key: example[key] for key in ("lattice", "drive")}
     table |= {"name": "truth", "contacts": contacts, "time": time, "output": {"points": points}}
 
-    # Alternately too large and too small: a common factor would be the easier start.
+    # Alternately too large and too small: a factor that all have in common would be an easier start.
     factors = np.array([1.3, 0.7, 1.3, 0.7, 1.3])
     unknowns = [
         {"quantity": "clearance", "of": "each", "bounds": [3e-4, 5e-3], "start": (factors * CLEARANCES).tolist()},
@@ -93,7 +96,10 @@ def exact(folder: Path) -> None:
 
 
 def derivatives(folder: Path, picture: Path) -> None:
-    """Print and draw the errors of derivatives by a clearance over the number of impacts, with loss and without."""
+    """Print the errors of derivatives by a clearance over the number of impacts, with loss and without, and draw them.
+
+    The figure is written to ``picture``.
+    """
     figure, axes = plt.subplots(1, 2, figsize=(7.6, 3.2), layout="constrained", sharex=True, sharey=True)
     for panel, restitution in zip(axes, (0.7, 1.0), strict=True):
         rows = derivative_errors(folder, restitution)
@@ -123,8 +129,12 @@ def derivatives(folder: Path, picture: Path) -> None:
 
 
 def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float, float, float]]:
-    """Impacts, the largest derivative in m/s, its relative error, and that of a predicted change, over windows."""
-    # Differences over h = 1e-5 lose five digits: with runs to 1e-13 they keep eight.
+    """Errors of derivatives by a clearance in windows that end after more and more impacts; a row for each window.
+
+    A row has the number of impacts, the largest derivative by the logarithm of the clearance in m/s, its largest
+    relative error, and the relative error of the change that it predicts for 0.1 %.
+    """
+    # The differences below, over h = 1e-5, lose five digits: of runs to 1e-13 they keep eight.
     table = lattice_table(time={"end": 0.06, "rtol": 1e-13}, contacts={"restitution": restitution})
     unknowns = [{"quantity": "clearance", "of": [[1]], "bounds": [1e-4, 2e-3], "start": 5e-4}]
     work = work_of(identify_table(table, measured_table(folder, table), unknowns=unknowns))
@@ -135,10 +145,12 @@ def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float
     onsets = np.sort(misfit.respond(z, 0, 1.0).episodes["onset"])
 
     def moved(step: float) -> np.ndarray:
+        """The velocities of a run whose clearance is exp(``step``) times as large."""
         case = work.plan.case_of([work.plan.parameters[0].from_coordinate(z[0] + step)])
         return np.asarray(run_of(case)["points/velocity"].values)
 
-    # Of the error, h^4 from the formula and 1e-13 / h from the runs, neither is above 1e-8 at this step.
+    # Central differences of fourth order. At this step neither part of their error, h^4 of the formula and 1e-13/h of
+    # the runs, is above 1e-8.
     h = 1e-5
     differences = np.zeros_like(slopes)
     for steps, weight in ((-2, 1), (-1, -8), (1, 8), (2, -1)):
@@ -147,12 +159,12 @@ def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float
 
     rows = []
     times = misfit.records[0].times
-    # Evenly in logarithms, since derivatives grow as powers or exponentials of the number of impacts.
+    # Spaced evenly in logarithms, since derivatives grow as powers or exponentials of the number of impacts.
     for impacts in np.unique(np.geomspace(1, len(onsets) - 1, 16).astype(int)):
-        # Up to the next impact, before which the number is the one that is printed.
+        # Until the next impact begins: the window then has the number of impacts that is printed.
         window = times < onsets[impacts]
         largest = float(np.abs(slopes[window]).max())
-        # Before the clearance is first touched nothing depends on it, and a relative error has no meaning.
+        # Before the first contact with this clearance nothing depends on it, and there is no relative error.
         if not largest:
             continue
         error = float(np.abs(slopes - differences)[window].max()) / largest
@@ -162,7 +174,7 @@ def derivative_errors(folder: Path, restitution: float) -> list[tuple[int, float
 
 
 def length(folder: Path, seeds: int) -> None:
-    """Print errors over the length of a record of a chain that is shaken steadily."""
+    """Print standard errors and actual errors over the length of a record, from so many ``seeds`` of its noise."""
     spring = {"start": 1, "end": 1, "stiffness": 4e4, "next_cell": True}
     table = {
         "name": "shaken",
@@ -185,7 +197,8 @@ def length(folder: Path, seeds: int) -> None:
     truth = np.array([4e-4, 0.7])
     print("length  impacts  standard errors                actual errors")
     for duration in (0.5, 1.0, 2.0, 4.0):
-        # The first second, in which the drive rises, is left out: it constrains more than a second of the steady state.
+        # Without the first second, in which the drive rises: it says more of the parameters than a second of the
+        # steady state does.
         end = 1.0 + duration
         timed = table | {"time": {"end": end, "sample_interval": 2e-3, "engine": "propagator", "rtol": 1e-12}}
         found = []

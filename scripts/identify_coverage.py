@@ -1,10 +1,12 @@
-"""How often the stated intervals of an identification hold the truth, and how errors fall with the record's length.
+"""Counts how often the intervals that an identification states contain the true values, for several sizes of noise.
 
     python scripts/identify_coverage.py [--noise 0.01 0.02 0.05] [--seeds 50] [--end 0.014]
 
-Records of a four-band lattice with three sites and three sensors are computed by the propagator, with normal noise over
-their size; three clearances and the restitution are fitted from starts about 30 % off. Prints, for each noise, the
-fraction of 90 % intervals with the truth in them, and the root mean square of the errors.
+Records of a four-band lattice with three sites and three sensors, which end at ``--end`` in s, are computed by the
+propagator. They get normal noise of the relative size ``--noise``. Three clearances and the restitution are fitted from
+starts about 30 % off. For each noise the script prints the fraction of the 90 % intervals that contain the true value,
+and the root mean square of the errors: relative ones of clearances, that of the restitution over the range between its
+bounds.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-# The tests' records and tables are used, and tests are no part of the installed package.
+# For records and tables of the tests, which are no part of the installed package.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.identified import identify_table, lattice_table, measured_table
@@ -40,19 +42,18 @@ def main() -> None:
 
 
 def row(table: dict, noise: float, seeds: int, folder: Path) -> str:
-    """What comes out with one ``noise`` over so many ``seeds``."""
+    """Identify the records of ``table`` with one ``noise`` and so many ``seeds``; returns a line of the output."""
     truth = [*table["contacts"]["clearance"], table["contacts"]["restitution"]]
 
     inside = []
     errors = []
-    # A record, and so its noise, for each seed; the lattice stays.
+    # A record with other noise for each seed, of the same lattice.
     for seed in range(seeds):
         plan = IdentifyCase.from_table(identify_table(table, measured_table(folder, table, noise=noise, seed=seed)))
         work = Identification(plan, read_records(plan), StopRequest())
         windows, z = work.placed(work.fit(0))
         uncertainty = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(len(z))))
-        # Errors are compared in the coordinates of the fit, logarithms for positive quantities, in which intervals
-        # are symmetric.
+        # In the coordinates of the fit, which are logarithms of positive quantities: there intervals are symmetric.
         expected = [p.to_coordinate(value) for p, value in zip(plan.parameters, truth, strict=True)]
         inside.append(np.abs(z - expected) < quantile(0.9) * uncertainty.errors)
         errors.append(z - expected)

@@ -2,14 +2,14 @@
 
     python scripts/manual_pages.py [FOLDER] [--python PACKAGE ...]
 
-Everything becomes Markdown in ``FOLDER/source``, which Sphinx reads through MyST; warnings are errors. The interface
-is read from the sources, not imported: compiled kernels, PETSc and names loaded late are no matter. Docstrings are
-Markdown as they stand: indented formulas are code.
+Everything becomes Markdown in ``FOLDER/source``, which Sphinx reads through MyST; warnings are errors. The interface is
+read from the sources, not imported, so that neither PETSc nor compiled kernels are needed. Docstrings are Markdown as
+they stand: indented formulas are code.
 
-Formulas are LaTeX that MathJax sets in the reader's browser. The pages hold MathJax as one file that needs no other,
-from the package sphinx-mathjax-offline, so that they can be read without a network; as an extension that package would
-add all of MathJax, 24 MB. Pictures of formulas (sphinx.ext.imgmath) need LaTeX where pages are built, and neither scale
-nor follow a dark theme; KaTeX sets formulas as well, from sixty files of fonts.
+Formulas are LaTeX, which MathJax sets in the reader's browser. The pages contain one file of MathJax that needs no
+other, from the package sphinx-mathjax-offline, so that they can be read without a network. Used as an extension that
+package would add all of MathJax, 24 MB. Of the alternatives, pictures of formulas (sphinx.ext.imgmath) need LaTeX where
+pages are built, and neither scale nor follow a dark theme; KaTeX needs sixty files of fonts.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ PACKAGE = ROOT / "vipetsc"
 CHAPTERS = PACKAGE / "manual"
 GALLERY = CHAPTERS / "gallery"
 NOTEBOOKS = CHAPTERS / "notebooks"
-# Pages that are no chapters: the README, and the interface.
+# Names of the pages that are no chapters: the README, and the Python interface.
 START = "start"
 API = "api"
-MATHJAX = "tex-svg.js"  # its letters are curves, so that it needs no font either
+MATHJAX = "tex-svg.js"  # the version that draws letters as curves, and so needs no fonts
 STYLE = "manual.css"
 CONFIGURATION = {
     "project": "vipetsc",
@@ -48,7 +48,7 @@ CONFIGURATION = {
     "html_title": f"vipetsc {vipetsc.__version__}",
     "extensions": ["myst_parser"],
     "html_theme": "furo",
-    "highlight_language": "none",  # of formulas
+    "highlight_language": "none",  # indented formulas in docstrings are no code to highlight
     "myst_enable_extensions": ["amsmath", "colon_fence", "dollarmath"],
     "mathjax_path": MATHJAX,
     "html_css_files": [STYLE],
@@ -64,10 +64,13 @@ Named = ast.ClassDef | ast.FunctionDef
 
 
 def write_sources(folder: Path, packages: list[str]) -> None:
-    """All pages as Markdown in ``folder``, with their pictures; the interface of ``packages``, all if there is none."""
+    """Write all pages to ``folder`` as Markdown, with their pictures.
+
+    Of the interface there are pages of the ``packages`` alone, or of all if the list is empty.
+    """
     (folder / GALLERY.name).mkdir(parents=True)
 
-    # The pages that are no chapters stand where a reader looks for them.
+    # The README is the first tutorial, and the interface the last of the reference.
     listed = parts()
     listed["Tutorials"] = [START, *listed["Tutorials"]]
     listed["Reference"] = [*listed["Reference"], API]
@@ -100,7 +103,7 @@ def write_sources(folder: Path, packages: list[str]) -> None:
 
 
 def contents(caption: str, names: list[str], hidden: bool = True) -> str:
-    """A table of contents, in the margin alone if ``hidden``."""
+    """A table of contents with the pages ``names``; if ``hidden``, it is in the margin alone."""
     options = ":maxdepth: 1\n"
     if hidden:
         options = ":hidden:\n"
@@ -110,7 +113,7 @@ def contents(caption: str, names: list[str], hidden: bool = True) -> str:
 
 
 def case_files(text: str) -> str:
-    """The case files that a study's commands name, as blocks."""
+    """The case files that commands in ``text`` name, as sections of a page."""
     blocks = []
     for name in dict.fromkeys(re.findall(r"\bruns/[\w/-]+\.toml", text)):
         path = ROOT / name
@@ -120,7 +123,7 @@ def case_files(text: str) -> str:
 
 
 def notebook_page(path: Path) -> str:
-    """The cells of a notebook as a page: text, code in blocks, and the picture of each cell that draws one."""
+    """The cells of a notebook as a page: text, blocks of code, and the pictures that cells draw."""
     parts = []
     for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
         text = "".join(cell["source"])
@@ -136,7 +139,10 @@ def notebook_page(path: Path) -> str:
 
 
 def put(path: Path, text: str, home: Path) -> None:
-    """Write a page to ``path`` whose links are those of a file in ``home``; pictures are copied to its folder."""
+    """Write a page to ``path``; links in ``text``, relative to the folder ``home``, are changed to those of pages.
+
+    Pictures are copied to the folder of the page. Raises OSError for a link to a file that is not there.
+    """
     up = "../" if home == GALLERY else ""
 
     def link(match: re.Match[str]) -> str:
@@ -145,14 +151,17 @@ def put(path: Path, text: str, home: Path) -> None:
             return f"]({up}{START}.md{match[2] or ''})"
         if target.suffix == ".md":
             return f"]({up}{target.relative_to(CHAPTERS)}{match[2] or ''})"
-        shutil.copy(target, path.parent / target.name)  # raises where a link leads nowhere
+        shutil.copy(target, path.parent / target.name)
         return f"]({target.name})"
 
     path.write_text(re.sub(r"\]\((?!https?:|#)([^)#\s]+)(#[^)\s]*)?\)", link, text), encoding="utf-8")
 
 
 def add_static(folder: Path) -> None:
-    """Put what pages load into the ``_static`` of ``folder``: MathJax, and the style of code."""
+    """Copy MathJax and the style of code, which pages load, to ``_static`` in ``folder``.
+
+    Raises ModuleNotFoundError without the package that has MathJax.
+    """
     package = find_spec("sphinx-mathjax-offline")
     if package is None or package.origin is None:
         raise ModuleNotFoundError("pages with formulas need the package sphinx-mathjax-offline (the extra manual)")
@@ -177,7 +186,7 @@ def interface(package: Path) -> str:
         if path != first:
             module = dotted(path)
             lines += [f"## {module}", ""]
-        # An empty directive: names that follow belong to this module, and links lead to it.
+        # An empty directive of the module: names that follow belong to it, and links can lead to it.
         lines += [f":::{{py:module}} {module}", ":::", ""]
         lines += [prose(tree), ""]
         for node in public(tree):
@@ -186,17 +195,21 @@ def interface(package: Path) -> str:
 
 
 def public(tree: ast.Module | ast.ClassDef) -> Iterator[Named]:
-    """Classes and functions of a module, methods of a class, that have a docstring and no leading underscore."""
+    """Classes and functions of a module, or methods of a class, that have a docstring and no leading underscore."""
     seen = set()
     for node in tree.body:
         if isinstance(node, Named) and not node.name.startswith("_") and ast.get_docstring(node):
-            if node.name not in seen:  # setters
+            # The setter of a property has the name of its getter, which comes first.
+            if node.name not in seen:
                 yield node
             seen.add(node.name)
 
 
 def described(node: Named, depth: int = 6) -> Iterator[str]:
-    """The directive of a name: signature, docstring and, within it, a class's methods; ``depth`` colons open it."""
+    """The lines of the directive of a name: its signature, its docstring and, of a class, the methods within it.
+
+    ``depth`` is the number of colons that open the directive, fewer for one within another.
+    """
     inner: list[str] = []
     signature = node.name
     if isinstance(node, ast.ClassDef):
@@ -221,12 +234,13 @@ def described(node: Named, depth: int = 6) -> Iterator[str]:
 
 
 def prose(node: Named | ast.Module) -> str:
-    """A docstring as Markdown: its headings are bold words, what looks like a tag is text."""
-    # A heading within a docstring would enter the page's table of contents.
+    """The docstring of ``node`` as Markdown, in which no character is taken for a heading, a tag or a table."""
+    # Headings become bold words: as headings they would enter the page's table of contents.
     text = re.sub(r"(?m)^(.+)\n-{3,}$", r"**\1**\n", ast.get_docstring(node) or "")
     text = text.replace("::\n", ":\n")
+    # Every second part is what the pattern matched, and is code, which stays.
     parts = re.split(r"(``.*?``|^ {4}.*$)", text, flags=re.M | re.S)
-    for i in range(0, len(parts), 2):  # the others are code, which stays
+    for i in range(0, len(parts), 2):
         bold_kept = parts[i].replace("**", "\0")
         parts[i] = re.sub(r"([<*|])", r"\\\1", bold_kept)
     return "".join(parts).replace("\0", "**")
@@ -241,7 +255,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     folder = options.folder.resolve()
     source = folder / "source"
-    # A page whose chapter was removed would stay in the index.
+    # From nothing, since the page of a chapter that was removed would stay in the index.
     shutil.rmtree(source, ignore_errors=True)
     write_sources(source, options.python)
     add_static(folder)

@@ -1,9 +1,9 @@
-"""The pictures of the chapters theory and read-pictures and of the notebooks, drawn by the package and kept small.
+"""Makes the pictures of the chapters theory and read-pictures and of the notebooks again, as small files.
 
     python scripts/manual_pictures.py [--folder FOLDER]
 
-The built-in run, a sweep over two keys and the notebooks are run in ``FOLDER``, by default a temporary one: two minutes
-of CPU.
+The built-in run, two sweeps and the notebooks are run in ``FOLDER``, by default a temporary one, which takes two
+minutes of CPU time.
 """
 
 from __future__ import annotations
@@ -38,15 +38,16 @@ from vipetsc.lattice import Contact
 
 PICTURES = ROOT / "vipetsc/manual/pictures"
 NOTEBOOKS = ROOT / "vipetsc/manual/notebooks"
-# The width of a page's column; at 1520 pixels the pictures have twice the bytes.
-WIDTH = 760  # pixels
-# The largest, that of phases, has 48 kB; a picture beyond the bound has been drawn at another size.
-MOST = 60_000  # bytes
-# Half of the largest approach velocity in the built-in run.
-SPEED = 2.0  # m/s, of the impact that is drawn
-# The step is of first order: 4,000 leave 4e-4 of the force, a fifth of a line's width in the picture.
-STEPS = 4000  # of that impact
-# Figures of runs: the file in the manual, and where it is among the results.
+# The width of a page's column in pixels. At twice as many the pictures have twice the bytes.
+WIDTH = 760
+# The most bytes of a picture. The largest one, that of phases, has 48 kB; one that has more was drawn at another size.
+MOST = 60_000
+# The approach velocity in m/s of the impact that is drawn, half of the largest in the built-in run.
+SPEED = 2.0
+# Steps of that impact. Their rule is of first order: 4,000 leave an error of 4e-4 of the force, a fifth of a line's
+# width in the picture.
+STEPS = 4000
+# Figures of runs: the name of the picture in the manual, and its file among the results.
 DRAWN = {
     "spacetime": "four-band/figures/spacetime.png",
     "impacts": "four-band/figures/impacts.png",
@@ -81,13 +82,16 @@ COMMANDS = (
 
 
 def impact(contact: Contact, mass: float, clearance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Relative displacement in m and force in N during an impact of a free pair with the reduced ``mass`` in kg."""
+    """Relative displacement in m and force in N (step,) during an impact of a free pair of masses.
+
+    The pair has the reduced ``mass`` in kg and approaches at ``SPEED``; ``clearance`` is in m.
+    """
     dt = 2 * contact.impact_time(SPEED, mass) / STEPS
     x = 0.0
     rate = SPEED
     indentation = [0.0]
     force = [0.0]
-    # An impact with loss takes longer than the elastic one, of which a step is 2 / STEPS.
+    # Up to four times as long as an elastic impact, which takes STEPS/2 steps: one with loss takes longer.
     for _ in range(2 * STEPS):
         pressed = float(contact.elastic_force(x) * contact.dissipation_factor(rate, SPEED))
         # Velocity before displacement: this order keeps the energy of an elastic impact bounded.
@@ -101,7 +105,7 @@ def impact(contact: Contact, mass: float, clearance: float) -> tuple[np.ndarray,
 
 
 def contact_law(case: Case) -> Figure:
-    """Draw the force of one impact over the relative displacement, and what impacts return by damping factor."""
+    """Draw the force of one impact over the relative displacement, and the effective restitution of damping factors."""
     model = case.model()
     cell = model.chain.cell
     host = cell.masses[cell.host]
@@ -115,7 +119,8 @@ def contact_law(case: Case) -> Figure:
         contact = Contact("hertz", law.stiffness, restitution)
         w, force = impact(contact, mass=host * resonator / (host + resonator), clearance=clearance)
         left.plot(1e3 * w, force, color=colour, label=f"r = {restitution:g}")
-    left.plot([1.6, 1e3 * clearance], [0, 0], color=style.BLACK, lw=2.0)  # between the stops nothing acts
+    # Between the stops there is no force.
+    left.plot([1.6, 1e3 * clearance], [0, 0], color=style.BLACK, lw=2.0)
     left.axvline(1e3 * clearance, color=style.GREY, lw=0.8, ls="--")
     left.annotate(
         "clearance Δ", (1e3 * clearance, 6), (-4, 0), textcoords="offset points", ha="right", color=style.GREY
@@ -124,7 +129,7 @@ def contact_law(case: Case) -> Figure:
     left.legend(loc="upper left")
     left.set_title(f"(a) One impact at {SPEED:g} m/s")
 
-    # From 0.06: the factor flores is defined above a restitution of 0.05.
+    # From 0.06, since the factor flores is defined above a restitution of 0.05.
     asked = np.linspace(0.06, 1, 95)
     for factor, colour in (("paper", style.BLUE), ("flores", style.ORANGE), ("exact", style.BLACK)):
         effective = [Contact("hertz", 1.0, r, factor=factor).effective_restitution for r in asked]
@@ -136,7 +141,7 @@ def contact_law(case: Case) -> Figure:
 
 
 def named_cell(run: xr.Dataset) -> Figure:
-    """Draw the cell and the lattice of a run, with the words of the chapter at host, resonator and stop."""
+    """Draw the cell and the lattice of a ``run``, and write the words host, resonator and stop at its boxes."""
     figure = schematics.unit_cell(run, None)
     axes = figure.axes[0]
     by_colour: dict[str, list[Rectangle]] = {style.SKY: [], style.ORANGE: []}
@@ -145,7 +150,7 @@ def named_cell(run: xr.Dataset) -> Figure:
         if isinstance(patch, Rectangle) and colour in by_colour:
             by_colour[colour].append(patch)
 
-    # The largest of the host's boxes is its frame; the others are stops.
+    # The widest of the host's boxes is its frame; the others are stops.
     frame, *stops = sorted(by_colour[style.SKY], key=lambda box: -box.get_width())
     (resonator,) = by_colour[style.ORANGE]
     left_stop = min(stops, key=lambda box: (box.get_x(), -box.get_y()))
@@ -154,7 +159,7 @@ def named_cell(run: xr.Dataset) -> Figure:
         x = box.get_x() + box.get_width() / 2
         y = box.get_y() + 0.8 * box.get_height()
         if box is frame:
-            # The other two are drawn in its middle.
+            # At its edge, since the other two are drawn in its middle.
             x = box.get_x() + 0.1
             y = top
         arrow = {"arrowstyle": "-", "color": style.GREY, "lw": 0.6, "shrinkA": 0, "shrinkB": 0}
@@ -180,11 +185,11 @@ def draw_notebook(notebook: Path, folder: Path) -> None:
                 continue
 
             with contextlib.redirect_stdout(nowhere):
-                # In one namespace, since each cell uses the names of those before.
+                # In one namespace for all cells, which use names of earlier ones.
                 exec(compile("".join(cell["source"]), f"{notebook.name}, cell {number}", "exec"), names)
             if plt.get_fignums():
                 plt.savefig("cell.png", dpi=style.SCREEN)
-                # Otherwise the next cell would show this picture once more.
+                # An open figure would be saved for the next cell too.
                 plt.close("all")
                 save_small(Image.open("cell.png"), PICTURES / f"notebook-{notebook.stem}-{number}.png", WIDTH, MOST)
 

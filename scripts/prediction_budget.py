@@ -2,15 +2,18 @@
 
     python scripts/prediction_budget.py FOLDER
 
-FOLDER has a prediction of sites of one kind, with simulations. For each of its amplitudes there are the energy of the
-upper bands and the dissipated energy over the work, and the differences from them, in decades and absolute:
+FOLDER has a prediction of a lattice without dashpots, whose sites are of one kind, with simulations. For each amplitude
+a line has the simulated energy of the upper bands and the dissipated energy, both over the work, and then
 
-``scatter``: standard deviation of nine runs with amplitudes up to 1 % apart. ``predicted``: the prediction. ``waves``:
-composed of the response of one site, but of the driven waves that arrive at the sites in the simulation. ``times``: in
-the same manner, but with sites in contact while they are in the simulation.
+- ``scatter``: the standard deviation of both over nine runs with amplitudes up to 1 % apart;
+- ``predicted``: the error of the prediction;
+- ``waves``: the error if the driven waves that arrive at the sites are taken from the simulation, and the rest is
+  composed from the response of one site;
+- ``times``: the error if the times at which sites are in contact are taken from the simulation too.
 
-The forces of the contacts are f = G^-1 (w - w0) at each frequency, with the compliance G of the lattice between the
-sites and the linear wave w0; what arrives at a site is w - g f. Third harmonics are composed throughout.
+Errors of the upper bands are in decades. What arrives at a site is w - g f, with the simulated relative displacement w
+and the force f = G^-1 (w - w0) of the contacts at each frequency: G is the compliance of the lattice between the sites,
+w0 the linear wave, and g the compliance of one site in an infinite lattice. Third harmonics are composed in all cases.
 """
 
 from __future__ import annotations
@@ -39,10 +42,11 @@ from vipetsc.studies.prediction_runs import SITE
 from vipetsc.studies.recorded_runs import run_in_memory
 from vipetsc.studies.response import FIRST_LINE, TOP, Burst, SiteResponse, SiteResponses, in_contact, unit_phase
 
-# A standard deviation from nine runs is uncertain by a quarter.
-SCATTER = np.linspace(-0.01, 0.01, 9)  # relative amplitudes of the runs that show the scatter
-# Each goes half of the distance: after 30 of them 1e-9 of it is left.
-ROUNDS = 30  # iterations of the third harmonics
+# Relative changes of the amplitude of the runs that show the scatter. A standard deviation from nine runs is itself
+# uncertain by a quarter.
+SCATTER = np.linspace(-0.01, 0.01, 9)
+# Iterations of the third harmonics. Each goes half of the way: after 30 a part of 1e-9 is left.
+ROUNDS = 30
 
 
 class Fractions(NamedTuple):
@@ -53,14 +57,17 @@ class Fractions(NamedTuple):
 
 
 class Simulation(NamedTuple):
-    """Driven waves (site, time) in m that arrive at the sites over a network's time, and where these are in contact."""
+    """Envelopes ``waves`` (site, time) in m of the driven waves that arrive at the sites, over the network's time.
+
+    ``on`` (site, time) is true while a site is in contact.
+    """
 
     waves: np.ndarray
     on: np.ndarray
 
 
 class Budget:
-    """What one prediction in a ``folder`` is composed of, and simulations of its lattice."""
+    """The prediction in ``folder``: its network of sites and the response of one, and simulations of its lattice."""
 
     def __init__(self, folder: Path) -> None:
         self.data = read_prediction(folder)
@@ -68,10 +75,10 @@ class Budget:
         model = self.case.model()
         chain = model.chain
         rows: list[Record] = [record for record, _ in read_records(folder / "prediction-runs.jsonl", sys.exit)]
-        answers = [record for record in rows if record["kind"] == SITE]
+        runs_of_one = [record for record in rows if record["kind"] == SITE]
         [kind] = self.case.kinds.kinds
         drive = model.drive.frequency
-        response = SiteResponse.of(answers, chain.cell, drive, answers[0]["largest"], kind.pair)
+        response = SiteResponse.of(runs_of_one, chain.cell, drive, runs_of_one[0]["largest"], kind.pair)
         self.sites = SiteResponses((response,), np.zeros(len(chain.sites), int))
         self.network = Network(model)
 
@@ -80,7 +87,7 @@ class Budget:
         self.compliance = WaveCompliance(chain).at(self.burst.omega - 1j * self.burst.decay)
 
     def _run(self, amplitude: float, contacts: dict[str, object] | None = None) -> xr.Dataset:
-        """A run under ``amplitude`` of which the cells of the sites are kept."""
+        """Run the lattice under ``amplitude``; the dataset has the cells of the sites. ``contacts`` change the case."""
         sites = self.case.model().chain.sites
         # Files count cells from 1; the last site's contact may be with the cell after it.
         output = {"window": [min(sites) + 1, max(sites) + 2]}
@@ -90,15 +97,15 @@ class Budget:
         return run_in_memory(case, MPI.COMM_SELF, StopRequest())[0]
 
     def _motion(self, run: xr.Dataset) -> PairMotion:
+        """The relative motion at the sites in a ``run`` as of `_run`."""
         chain = self.case.model().chain
         return PairMotion.between(run, [site - min(chain.sites) for site in chain.sites], chain.contact_pairs)
 
     def simulation(self, amplitude: float) -> Simulation:
-        """The waves that arrive in a run under ``amplitude``, and the times of contact."""
+        """Simulate the lattice under ``amplitude``; the waves that arrive at the sites, and the times of contact."""
         run = self._run(amplitude)
         burst = self.burst
-        # Above the last band waves do not travel, and the matrix of compliances is close to diagonal and small: not
-        # divided by.
+        # Above the last band no wave travels and compliances are small: the quotient would be noise.
         carried = burst.omega < TOP * burst.bands[-1].high
         w = np.array([burst.spectrum(column) for column in self._motion(run).displacement.T])
         free = amplitude * np.array([burst.spectrum(column) for column in self.linear.displacement.T])
@@ -108,13 +115,13 @@ class Budget:
 
         network = self.network
         waves = [_at(network.time, burst.time, row) for row in arriving]
-        # A site that touched nothing remains False throughout.
         on = np.zeros((len(waves), len(network.time)), bool)
-        # Contact goes on over the drive's period, in which a site touches on both sides.
+        # As in the prediction, contact goes on between impacts that follow each other: each one is extended by half a
+        # period of the drive before and behind, in which a site touches on both sides.
         period = 2 * np.pi / burst.drive
         impacts = (run[f"impacts/{name}"].values for name in ("site", "onset", "separation"))
         for site, onset, separation in zip(*impacts, strict=True):
-            # A contact at the end of the run has no separation.
+            # A contact that lasts to the end of the run has no separation.
             until = burst.time[-1]
             if np.isfinite(separation):
                 until = separation
@@ -122,7 +129,10 @@ class Budget:
         return Simulation(np.array(waves) * network.during, on & network.during)
 
     def composed(self, waves: np.ndarray, on: np.ndarray | None = None) -> tuple[float, float]:
-        """Energies in J of upper bands and dissipated, of ``waves`` that arrive; in contact by the rule, or ``on``."""
+        """Compose energies in J, of the upper bands and dissipated, from the driven ``waves`` (site, time) that arrive.
+
+        Sites are in contact while ``on`` (site, time) is true, by default while the prediction's rule says so.
+        """
         network = self.network
         third = np.zeros_like(waves)
         for _ in range(ROUNDS):
@@ -133,21 +143,20 @@ class Budget:
                 touching = in_contact(z, release) & network.during
             force = self.sites.at(z).third * np.abs(waves) * unit_phase(waves) ** 3 * touching
             sent = network._sent(network.received3, force) * network.centre
-            # Half of each step: the sites' third harmonics drive each other, and whole steps may swing about the
-            # solution.
+            # Half steps: third harmonics of the sites drive each other, and full steps may swing about the solution.
             third = third + 0.5 * (network._solve(network.between3, -1.0 * touching, sent, third) - third)
 
         energies = network._energies(Arriving(waves, third, touching), self.sites, change=0.0, amplitude=0.0)
         return float(energies.into[int(self.data.attrs["drive_band"]) :].sum()), energies.dissipated
 
     def scatter(self, amplitude: float) -> Fractions:
-        """Standard deviations of runs near ``amplitude``: of log10 of the upper bands, and of the dissipated part."""
+        """Standard deviations over runs near ``amplitude``: of log10 of the upper bands, and of the dissipated part."""
         modes = ModalParts.of(self.case.model().chain).modes
-        # The mode at the band's edge belongs to it, whatever its rounding.
+        # A mode at the band's edge belongs to the band, whatever its last digits are.
         above = modes.frequency > self.burst.bands[int(self.data.attrs["drive_band"])].low * (1 - 1e-9)
         rows = []
         for change in SCATTER:
-            # Only the first and the last sample: the energy at the end is what is compared.
+            # The first and the last sample alone, since energies at the end are compared.
             output = {"stride": self.case.model().samples - 1}
             case = self.case.varied(without=("output",), drive={"amplitude": amplitude * (1 + change)}, output=output)
             run, result = run_in_memory(case, MPI.COMM_SELF, StopRequest())
@@ -158,7 +167,7 @@ class Budget:
 
 
 def _at(times: np.ndarray, given: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Complex ``values`` over ``given`` times at other ``times``; 0 beyond."""
+    """Complex ``values`` at the ``given`` times, interpolated at other ``times``; 0 beyond the last given one."""
     return np.asarray(
         np.interp(times, given, values.real, right=0.0) + 1j * np.interp(times, given, values.imag, right=0.0)
     )

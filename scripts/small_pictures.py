@@ -1,4 +1,4 @@
-"""Pictures of the manual: PNGs of few colours and a bounded width, which the package's users download."""
+"""Small PNGs for the manual, with few colours and a bounded width: users download them with the package."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from pathlib import Path
 
 from PIL import Image
 
-# What a palette holds, less one. With 64 colours a picture has a third fewer bytes, and colours off by 35 of 255 rather
-# than by 20.
+# One less than a palette holds. With 64 colours a picture has a third fewer bytes, and colours are off by up to 35 of
+# 255, not 20.
 COLOURS = 255
 
 
@@ -18,8 +18,8 @@ def save_small(image: Image.Image, target: Path, width: int, most: int) -> None:
     height = round(image.height * narrow / image.width)
     image = image.resize((narrow, height), Image.Resampling.LANCZOS)
 
-    # By coverage rare colours stay, those of lines and of the ends of scales: halving the set of pixels by its median
-    # (Pillow's default) leaves colours off by up to 117 of 255, and half as many bytes more.
+    # The method MAXCOVERAGE keeps rare colours, as those of lines and of the ends of scales. Pillow's default, median
+    # cut, leaves colours off by up to 117 of 255, and pictures half as large again.
     few = image.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     few.save(target, optimize=True)
     if target.stat().st_size > most:

@@ -1,10 +1,10 @@
 // Peer: SUNDIALS ARKODE's explicit Runge-Kutta with its root finding, by which it ends a step at every contact change.
 // arkode PARAMETERS METHOD RTOL ATOL OUTPUT, METHOD a table's name; ATOL in units of the drive's linear wave.
 //
-// Debian's library is compiled without optimisation, so that the vector operations of a step are ours.
+// Debian's library is compiled without optimisation: the vector operations of a step are replaced by those below.
 //
-// Which sites touch is held during a step, so that its error estimate and its interpolant see no kink. Where the root
-// finding reports a change, the step is taken anew up to it: the interpolant is of lower order than the step.
+// Which sites touch is fixed during a step, so that neither its error estimate nor its interpolant meets a kink. Where
+// the root finding reports a change, the step is repeated up to it: the interpolant is of lower order than the step.
 #include <algorithm>
 #include <cstdlib>
 #include <exception>
@@ -28,7 +28,8 @@ static void scale(realtype factor, N_Vector from, N_Vector to) {
     for (sunindextype i = 0; i < size; ++i) out[i] = factor * in[i];
 }
 
-// The sum may be its own first term. By pieces that stay in the nearest cache.
+// sum = factors[0] terms[0] + ..., where the sum may be the first term itself; piece by piece, each of which stays in
+// the first-level cache while all terms are added.
 static int linear_combination(int count, realtype *factors, N_Vector *terms, N_Vector sum) {
     constexpr sunindextype piece = 512;
     const sunindextype size = N_VGetLength(sum);
@@ -126,7 +127,7 @@ class Solver {
         return 0;
     }
 
-    // Indentation of every site; constant on the way to a change that is known.
+    // The functions whose roots end a step: the indentation of every site, without roots while land() repeats a step.
     static int crossings(realtype, N_Vector y, realtype *indentations, void *pointer) {
         const auto *self = static_cast<Solver *>(pointer);
         const double *state = N_VGetArrayPointer(y);
@@ -139,7 +140,7 @@ class Solver {
         return 0;
     }
 
-    // Go back to `from`, step to the change that the root finding reported, and let the sites meet or part.
+    // Go back to the time `from`, step to the change that the root finding reported, and change which sites touch.
     void land(double from) {
         const double at = time_;
         std::vector<int> changed(held_.size()), directions(held_.size());

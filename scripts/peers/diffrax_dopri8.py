@@ -1,8 +1,8 @@
 """Peer: diffrax's Dopri8 on JAX, compiled, in double precision on one CPU thread; runs in an environment of its own.
 
-``diffrax_dopri8.py OUTPUT`` reads lines ``PARAMETERS RTOL ATOL`` and answers each with one line of JSON, after it has
-written the sampled velocities (m/s, doubles, as the C++ peers do). Compiling is not counted. Samples are
-interpolated, which costs less at equal error than landing on them.
+``diffrax_dopri8.py OUTPUT`` reads lines ``PARAMETERS RTOL ATOL``. It solves each and writes the sampled velocities to
+OUTPUT, in m/s as doubles, as the C++ peers do; then it prints a line of JSON. The CPU time in it is without that of
+compiling. Samples are interpolated, which costs less at equal error than steps that end at them.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-# JAX computes in single precision unless it is set before the first array.
+# JAX computes in single precision unless this is set before its first array.
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_platforms", "cpu")
 
 
 def words_in(path: str) -> Iterator[str]:
-    """The words of a parameter file in turn."""
+    """The words of the parameter file ``path``, one after the other."""
     with open(path, encoding="utf-8") as file:
         yield from file.read().split()
 
@@ -42,7 +42,7 @@ class Lattice:
         self.cells, self.dofs, self.walls = map(int, numbers(3, "lattice"))
         samples, interval = numbers(2, "sampling")
         self.scale, self.rate = numbers(2, "scale")
-        # With times in units of the drive's, accelerations have the factor rate^2, which goes into the masses.
+        # With times in units of 1/Om, Om being the rate, accelerations have the factor 1/Om^2, which goes into masses.
         self.masses = np.array(numbers(self.dofs, "masses")) * self.rate**2
         self.couplings = [numbers(4) for _ in range(int(numbers(1, "couplings")[0]))]
         hertz, stiffness, host, resonator = numbers(4, "contact")
@@ -114,14 +114,14 @@ def main(output: str) -> None:
         text = "\n".join(words_in(path))
         if text not in compiled:
             lattice = Lattice(path)
-            # By the content, since every case is handed over in a file of the same name.
+            # Kept by the content of the file, since the files of all cases have the same name.
             compiled[text] = lattice, lattice.solver()
-            # A first solution at loose tolerances compiles; tolerances are arguments, so that others need no
+            # A first solution at loose tolerances compiles. Tolerances are arguments, so that others need no further
             # compilation.
             jax.block_until_ready(compiled[text][1](1e-3, 1e-4))
         lattice, solve = compiled[text]
         begin = time.process_time()
-        # JAX returns before it has computed: without the wait only the call would be timed.
+        # JAX returns before it has computed: without waiting only the call would be timed.
         found = jax.block_until_ready(solve(float(rtol), float(atol)))
         seconds = time.process_time() - begin
         (np.asarray(found.ys) * lattice.scale * lattice.rate).tofile(output)

@@ -1,7 +1,8 @@
-// The contact lattice of the peers: read from the bench's parameter file, in units of the drive's linear wave.
+// The contact lattice that the peers in C++ solve: read from the bench's parameter file, in units of the drive's linear
+// wave.
 //
-// Displacements are in units of that wave's amplitude, times in units of 1/Om: displacements and velocities are then of
-// one size, so that a solver with a single absolute tolerance weighs both as it should.
+// Displacements are in units of that wave's amplitude, times in units of 1/Om. Displacements and velocities are then of
+// one size, which a solver with a single absolute tolerance needs.
 #pragma once
 
 #include <array>
@@ -70,8 +71,8 @@ class Lattice {
 
     const std::vector<Site> &sites() const { return sites_; }
 
-    // Time derivative of y at time t; allocates nothing. With `held`, whether a site touches and on which side (0, 1, -1)
-    // is what that says, and the force goes on smoothly where the masses would part.
+    // Time derivative of y at time t; allocates nothing. With `held`, that says for each site whether it touches and on
+    // which side (0, 1, -1), and the force goes on smoothly where the masses would part.
     void derivative(const double *__restrict y, double *__restrict f, double t, const signed char *held = nullptr) const {
         const int half = dofs * cells;
         double *acceleration = f + half;

@@ -4,7 +4,7 @@
 #include <exception>
 #include <iostream>
 
-// Only what is used: all of odeint takes the compiler twice as long.
+// The headers that are used, one by one: with all of odeint the compiler takes twice as long.
 #include <boost/numeric/odeint/integrate/integrate_times.hpp>
 #include <boost/numeric/odeint/stepper/controlled_runge_kutta.hpp>
 #include <boost/numeric/odeint/stepper/generation/generation_controlled_runge_kutta.hpp>
