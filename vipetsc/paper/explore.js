@@ -1,5 +1,6 @@
-// Pictures that can be read off: values of the point nearest to the pointer, a larger picture by a click, curves drawn anew
-// with zoom and without those that are switched off. The numbers of each picture are those of vipetsc.figures.figure_data.
+// Pictures from which numbers can be read: the page shows the values of the point nearest to the pointer, enlarges a
+// picture by a click, and draws its curves again, with a zoom and without those that are switched off. The numbers of
+// each picture are those of vipetsc.figures.figure_data.
 "use strict";
 
 const SVG = "http://www.w3.org/2000/svg", WIDTH = 720, HEIGHT = 400, LEFT = 64, RIGHT = 12, TOP = 10, BOTTOM = 42;
@@ -13,24 +14,26 @@ function make(name, attributes = {}, parent = null, text = "") {
 }
 
 const number = v => (v !== 0 && (Math.abs(v) < 1e-3 || Math.abs(v) >= 1e5)) ? v.toExponential(3) : String(+v.toPrecision(4));
-// The value at a share of an axis, and the share of a value.
-const share = (axis, v) => axis.log ? Math.log(v / axis.low) / Math.log(axis.high / axis.low) : (v - axis.low) / (axis.high - axis.low);
+// Where a value lies on an axis, as a fraction of its length (0 to 1), the value at such a fraction, and a point in words.
+const fraction = (axis, v) => axis.log ? Math.log(v / axis.low) / Math.log(axis.high / axis.low) : (v - axis.low) / (axis.high - axis.low);
 const value = (axis, s) => axis.log ? axis.low * (axis.high / axis.low) ** s : axis.low + s * (axis.high - axis.low);
-const told = (axes, x, y) => `${axes.x.label || "x"}: ${number(x)}; ${axes.y.label || "y"}: ${number(y)}`;
+const describe = (axes, x, y) => `${axes.x.label || "x"}: ${number(x)}; ${axes.y.label || "y"}: ${number(y)}`;
 
-// The point of the curves that is nearest to a place, both in shares of the axes; null where no point is within them.
+// The point of the curves that is nearest to a place, both as fractions of the axes; null if no point lies within these.
+// Distances are in the units of width and height.
 function nearest(axes, curves, sx, sy, width, height) {
   let best = null, reach = Infinity;
   for (const curve of curves) curve.x.forEach((x, i) => {
     if (x === null || curve.y[i] === null) return;
-    const px = share(axes.x, x), py = share(axes.y, curve.y[i]);
+    const px = fraction(axes.x, x), py = fraction(axes.y, curve.y[i]);
     const distance = Math.hypot((px - sx) * width, (py - sy) * height);
     if (distance < reach && px >= 0 && px <= 1 && py >= 0 && py <= 1) { reach = distance; best = {curve, x, y: curve.y[i], px, py}; }
   });
   return best;
 }
 
-// The value of a map at a share of its picture, by the colour that is there; nothing where no colour of the map is.
+// The value of a map at a place of its picture, in fractions of this, from the colour there; "" if the colour is farther
+// than FAR (of 255) from all colours of the map.
 const pixel = make("canvas", {width: 1, height: 1}).getContext("2d", {willReadFrequently: true}), FAR = 40;
 
 function read(map, image, fx, fy) {
@@ -68,7 +71,8 @@ function ticks(axis, most) {
   return found;
 }
 
-// The curves of one axes, drawn into `host`: dragging zooms, a double click or the button goes back, names switch off.
+// Draws the curves of one axes into `host`: dragging zooms, a double click or a button shows the whole range again, and
+// the name of a curve switches it off.
 function plot(axes, host) {
   const whole = {x: {...axes.x}, y: {...axes.y}}, shown = {...axes, ...whole}, off = new Set();
   const place = make("div", {class: "plot"}, host), legend = make("div", {class: "legend"}, place);
@@ -80,12 +84,12 @@ function plot(axes, host) {
     svg.replaceChildren();
     const clip = make("svg:svg", {x: LEFT, y: TOP, width: w, height: h, viewBox: `0 0 ${w} ${h}`, overflow: "hidden"});
     for (const v of ticks(shown.x, 7)) {
-      const x = LEFT + share(shown.x, v) * w;
+      const x = LEFT + fraction(shown.x, v) * w;
       make("svg:line", {x1: x, x2: x, y1: TOP, y2: TOP + h, class: "grid"}, svg);
       make("svg:text", {x, y: TOP + h + 16, "text-anchor": "middle"}, svg, number(v));
     }
     for (const v of ticks(shown.y, 6)) {
-      const y = TOP + (1 - share(shown.y, v)) * h;
+      const y = TOP + (1 - fraction(shown.y, v)) * h;
       make("svg:line", {x1: LEFT, x2: LEFT + w, y1: y, y2: y, class: "grid"}, svg);
       make("svg:text", {x: LEFT - 6, y: y + 4, "text-anchor": "end"}, svg, number(v));
     }
@@ -96,7 +100,7 @@ function plot(axes, host) {
     for (const curve of axes.curves) if (!off.has(curve)) {
       let path = "", pen = "M";
       curve.x.forEach((x, i) => {
-        const px = share(shown.x, x) * w, py = (1 - share(shown.y, curve.y[i])) * h;
+        const px = fraction(shown.x, x) * w, py = (1 - fraction(shown.y, curve.y[i])) * h;
         if (x === null || curve.y[i] === null || !isFinite(px) || !isFinite(py)) { pen = "M"; return; }
         if (curve.joined) { path += `${pen}${px.toFixed(1)} ${py.toFixed(1)}`; pen = "L"; }
         if (!curve.joined || curve.x.length < 80) make("svg:circle", {cx: px, cy: py, r: 2.5, fill: curve.colour}, clip);
@@ -130,7 +134,7 @@ function plot(axes, host) {
   svg.onpointermove = event => {
     const [sx, sy] = at(event);
     const best = nearest(shown, axes.curves.filter(c => !off.has(c)), sx, sy, w, h);
-    readout.textContent = best ? `${best.curve.label} ${told(axes, best.x, best.y)}` : told(axes, value(shown.x, sx), value(shown.y, sy));
+    readout.textContent = best ? `${best.curve.label} ${describe(axes, best.x, best.y)}` : describe(axes, value(shown.x, sx), value(shown.y, sy));
     if (begin) for (const [key, v] of Object.entries({
       x: LEFT + Math.min(begin[0], sx) * w, y: TOP + (1 - Math.max(begin[1], sy)) * h,
       width: Math.abs(begin[0] - sx) * w, height: Math.abs(begin[1] - sy) * h})) frame.setAttribute(key, v);
@@ -149,23 +153,23 @@ function plot(axes, host) {
   draw();
 }
 
-// The numbers beside a picture, which zlib has packed.
+// The numbers of a picture, which the page holds compressed by zlib.
 async function unpacked(source) {
   const bytes = Uint8Array.from(atob(source.textContent), letter => letter.charCodeAt(0));
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).json();
 }
 
-// The names of axes in full, no two of them equal: title, and what is drawn over what.
+// Names of all axes, no two of them equal: the title, and what is drawn over what.
 function names(all) {
   const full = all.map(({title, x, y}) => [title, [y.label, x.label].filter(Boolean).join(" over ")].filter(Boolean).join(": "));
   return full.map((name, i) => name && full.indexOf(name) === full.lastIndexOf(name) ? name : `${name || "panel"} (${i + 1})`);
 }
 
-// A picture on the whole screen, where a finger moves it; a tap, the button or Escape closes it.
+// Shows a picture on the whole screen, where a finger moves it; a tap, the button or Escape closes it.
 const viewer = document.querySelector("dialog");
 
 function show(image, fx, fy) {
-  // Before the button, which it would cover.
+  // In front of the button in the document: behind it, the picture would cover the button.
   const large = viewer.querySelector("img") || viewer.insertBefore(make("img"), viewer.firstChild), width = Math.max(2.5 * viewer.ownerDocument.documentElement.clientWidth, image.naturalWidth);
   large.src = image.src;
   large.alt = image.alt;
@@ -189,12 +193,12 @@ async function explore(figure) {
     if (!axes) { readout.textContent = ""; return; }
     const [l, t, r, b] = axes.box, sx = (fx - l) / (r - l), sy = (b - fy) / (b - t);
     const best = nearest(axes, axes.curves, sx, sy, (r - l) * box.width, (b - t) * box.height);
-    readout.textContent = best ? `${best.curve.label} ${told(axes, best.x, best.y)}` : told(axes, value(axes.x, sx), value(axes.y, sy));
+    readout.textContent = best ? `${best.curve.label} ${describe(axes, best.x, best.y)}` : describe(axes, value(axes.x, sx), value(axes.y, sy));
     if (axes.map) readout.textContent += read(axes.map, image, fx, fy);
     if (best) {
       mark.style.left = `${(l + best.px * (r - l)) * image.offsetWidth}px`;
       mark.style.top = `${(b - best.py * (b - t)) * image.offsetHeight}px`;
-      mark.hidden = false; // last: below the picture it would bring a scroll bar, which makes that narrower
+      mark.hidden = false; // shown last: at its old place below the picture it would bring a scroll bar
     }
   };
   image.onpointerleave = () => { mark.hidden = true; };
