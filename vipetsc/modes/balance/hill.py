@@ -6,25 +6,33 @@ Re lambda > 0). A perturbation that keeps itself going has d = -G J d: those tha
 
     D(lambda) = det(I + G(k Om - i lambda) J(lambda)),   Re lambda > 0,  |Im lambda| <= Om/2.
 
-A perturbation grows in a period by its multiplier exp(2 pi lambda/Om); in the code mu is lambda/Om. D is analytic
-there, tends to 1 for large Re lambda and is real on the real axis. To add i Om to lambda only renumbers the orders k:
-with all orders D has the period i Om and is a function of w = exp(-2 pi lambda/Om), analytic inside the circle of
-Re lambda = ``least`` Om, whose zeros there are the inverse multipliers. Their number N is minus the turns of D along
-that line (Cauchy's argument principle). Their sums of powers are Fourier coefficients on a circle |w| = R (Delves and
-Lyness): with w = R exp(-i phi),
+A perturbation grows in a period by its multiplier exp(2 pi lambda/Om); in the code mu is lambda/Om, and perturbations
+of Re mu up to ``least`` count as stable. The poles of G (linear modes) and its branch cuts (pass bands) lie at
+Re lambda <= 0: to the right of them D is analytic. It tends to 1 for large Re lambda, and D(lambda*) = D(lambda)*, so
+that it is real on the real axis. To add i Om to lambda only renumbers the orders k: with all orders D has the period
+i Om and is a function of w = exp(-2 pi lambda/Om), analytic inside the circle of Re lambda = ``least`` Om, whose zeros
+there are the inverse multipliers. Their number N is minus the turns of D along that line (Cauchy's argument principle),
+from Im lambda = -Om/2 to Om/2; by the symmetry it is minus the half turns from 0 to Om/2, which alone are followed.
+Their sums of powers are Fourier coefficients on a circle |w| = R (Delves and Lyness): with w = R exp(-i phi),
 
-    sum_j (w_j/R)^p = -(p/pi) int_0^pi Re[(log D - N log w) exp(-i p phi)] d phi,   p = 1, ..., N,
+    sum_j (w_j/R)^p = -(p/pi) int_0^pi Re[(log D - N log w) exp(-i p phi)] d phi,   p = 1, ..., N.
 
-and Newton's identities turn these into the polynomial of the zeros. It is ill-conditioned for large N; what it gives
-are guesses, which a secant method corrects on D itself. If a motion has odd orders alone and forces are odd, odd orders
-of perturbations do not meet even ones: D is the product of two determinants. J is a Toeplitz matrix unless forces
-dissipate.
+A real constant in the bracket, such as -N log R, adds nothing to them, and the sign of D moves no zero: the code leaves
+both out. Newton's identities turn the sums into the polynomial of the zeros. It is ill-conditioned for large N; what it
+gives are guesses, which a secant method corrects on D itself. If a motion has odd orders alone and forces are odd, odd
+orders of perturbations do not meet even ones: D is the product of two determinants. J is a Toeplitz matrix unless
+forces dissipate.
 
 **Many harmonics.** Without dissipation the orders beyond ``KEPT``, d_h = -(I + G_hh J_hh)^-1 G_hh J_hl d_l, are
 eliminated with G at lambda = 0: their part of J falls as KEPT^-4 with Hertz's law, and changes by lambda/(KEPT Om) of
-itself. At lambda = 0 the elimination is exact. Above the pass bands G is even in the frequency, so that the changes of
-the orders k and -k have opposite signs, and cancel to first order in lambda for a motion that is even in time: D keeps
-its double zero at lambda = 0, of a shift in time and of the neighbouring motion.
+itself. D is then what it was over det(I + G_hh J_hh), a constant, which moves no zero. At lambda = 0 the elimination is
+exact. Above the linear modes and pass bands G is even in the frequency, so that the changes of the orders k and -k have
+opposite signs, and cancel to first order in lambda for a motion that is even in time: D keeps its double zero at
+lambda = 0, of a shift in time and of the neighbouring motion. Where an order beyond ``KEPT`` meets a linear mode, as in
+a slow motion of a system with fast modes, growth rates are less accurate.
+
+**Words.** A *pair* is one of masses between which a force acts, as in ``harmonics``; exponents lambda that are not real
+come in *complex pairs*.
 
 Cf. G. W. Hill, Acta Math. 8 (1886) 1; von Groll and Ewins, J. Sound Vib. 241 (2001) 223; L. M. Delves and
 J. N. Lyness, Math. Comput. 21 (1967) 543.
@@ -37,6 +45,7 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from vipetsc.modes.balance.harmonics import ForceSeries
+from vipetsc.modes.balance.order_matrices import FEW_PAIRS, flat, of_pairs, plus_one, product_of
 from vipetsc.modes.balance.shifted_compliance import Compliance
 
 # Growth rate over Om up to which a motion counts as stable: 0.06 % a period.
@@ -53,10 +62,8 @@ COARSE = 24
 FINEST = 14
 # Largest turn of D in rad from one position to the next: at pi its sense would be ambiguous.
 TURN = 0.7
-# Exponent at which D(0) is taken: at 0 itself a lattice that is free to move has no compliance.
+# Exponent at which ``stability_changes`` takes D(0): at 0 itself a lattice that is free to move has no compliance.
 AT_ZERO = 1e-9
-# Pairs up to which all are taken, whether a force acts on them or not, and products are formed without BLAS.
-FEW_PAIRS = 3
 # Orders of perturbations, to both sides of 0, that are kept where nothing dissipates.
 KEPT = 48
 # Steps, first step and accuracy, over Om, of the secant method.
@@ -86,25 +93,38 @@ class ContourLine(NamedTuple):
         """The number of zeros to the right of the line; -1 if it is undecided."""
         turned = -float(self.logs[-1].imag) / np.pi
         # With all orders D is real at both ends, and it has turned by a whole number of half circles. A number that is
-        # far from whole says that orders are left out that matter. (Whether a turn was missed it cannot say: ``_line``
-        # sees to that.)
-        if abs(turned - round(turned)) >= 0.25:
-            return -1
-        return round(turned)
+        # far from whole, or below 0, says that orders are left out that matter, and NaN that D is not finite or 0 at a
+        # position. (Whether a turn was missed it cannot say: ``_line`` sees to that.)
+        count = np.round(turned)
+        is_whole = abs(turned - count) < 0.25
+        if is_whole and count >= 0:
+            return int(count)
+        return -1
 
 
 class Perturbations(NamedTuple):
     """The number of perturbations that grow, -1 if it is undecided, and lambda/Om of the ``fastest``, None if unknown.
 
-    Im lambda >= 0 of a pair; ``fastest`` is 0 if none grows.
+    ``fastest`` has Im lambda >= 0, and is 0 if none grows. ``response.steady`` makes these of a state for its measures,
+    and asks for ``Stability`` where states are compared.
     """
 
     unstable: int
     fastest: complex | None
 
 
+class _Determinants(NamedTuple):
+    """D at some exponents: ``values`` (exponents,), and the ``logs`` (block, exponents) of |D| in each block of orders.
+
+    Of a block in which |D| is too large a value has the phase alone.
+    """
+
+    values: np.ndarray
+    logs: np.ndarray
+
+
 class Stability(NamedTuple):
-    """Number of perturbations of a motion that grow (-1: undecided), and D where a multiplier is real.
+    """Number of perturbations of a motion that grow, -1 if it is undecided, and D where a multiplier is real.
 
     ``at_one`` and ``at_minus_one`` are D at Re lambda = ``least`` Om for Im lambda = 0 and Om/2: real, and zero where a
     multiplier has the size exp(2 pi least) and is positive, or negative.
@@ -147,10 +167,16 @@ class Hill:
 
     def determinants(self, series: ForceSeries, exponents: np.ndarray) -> np.ndarray:
         """D (exponents,) at lambda/Om = ``exponents``; large ones keep their phases."""
+        return self._evaluate(series, exponents).values
+
+    def _evaluate(self, series: ForceSeries, exponents: np.ndarray, units: np.ndarray | float = 0.0) -> _Determinants:
+        """D at lambda/Om = ``exponents``, its values over the exponentials of the ``units`` (block,)."""
         out = np.ones(len(exponents), complex)
+        sizes = np.zeros((len(self._blocks), len(exponents)))
+        units = np.broadcast_to(units, len(self._blocks))
         acting = self._acting(series)
         if not acting.size:
-            return out
+            return _Determinants(out, sizes)
         if self._reduced is None or self._reduced[0] is not series:
             self._reduced = series, [self._eliminated(series, orders) for orders in self._blocks]
         for block, (orders, jacobian) in enumerate(zip(self._blocks, self._reduced[1], strict=True)):
@@ -165,20 +191,21 @@ class Hill:
                 part = slice(begin, begin + count)
                 matrix = jacobian
                 if matrix is None:
-                    matrix = _flat(series.jacobians(exponents[part], low)[:, acting])
-                g = _of_pairs(np.array(compliances[part]), acting)
+                    matrix = flat(series.jacobians(exponents[part], low)[:, acting])
+                g = of_pairs(np.array(compliances[part]), acting)
                 # As phase and logarithm, since at large exponents the product of so many pivots overflows.
-                phases, logs = np.linalg.slogdet(_plus_one(g, matrix))
+                phases, logs = np.linalg.slogdet(plus_one(g, matrix))
+                sizes[block, part] = logs
                 # One by one: products of complex arrays are rounded otherwise on some processors.
-                for i, value in enumerate(phases * np.exp(np.minimum(logs, LARGEST_LOG)), begin):
+                for i, value in enumerate(phases * np.exp(np.minimum(logs - units[block], LARGEST_LOG)), begin):
                     out[i] *= value
-        return out
+        return _Determinants(out, sizes)
 
     def _acting(self, series: ForceSeries) -> np.ndarray:
         """Numbers of the pairs of which the determinant is taken.
 
-        Of a pair that no force acts on the row of J is zero, and it leaves the determinant as it is. Of few pairs all
-        are taken, which costs little, where a force acts on one of them.
+        Of a pair that no force acts on the row of J is zero, and it leaves the determinant as it is. Of ``FEW_PAIRS``
+        all are taken, which costs little, where a force acts on one of them.
         """
         acting = series.acting
         pairs = len(series.potential)
@@ -205,15 +232,15 @@ class Hill:
             return None
         acting = self._acting(series)
         pairs = len(acting)
-        jacobian = _flat(series.jacobian(orders=orders)[acting])
+        jacobian = flat(series.jacobian(orders=orders)[acting])
         high = np.abs(orders) > KEPT
         if not high.any():
             return jacobian
 
-        g = _of_pairs(self.compliance.at(orders[high] * self.omega), acting)
+        g = of_pairs(self.compliance.at(orders[high] * self.omega), acting)
         rows = np.repeat(high, pairs)
-        inner = _plus_one(g, jacobian[np.ix_(rows, rows)])
-        moved = np.linalg.solve(inner, _product(g, jacobian[np.ix_(rows, ~rows)]))
+        inner = plus_one(g, jacobian[np.ix_(rows, rows)])
+        moved = np.linalg.solve(inner, product_of(g, jacobian[np.ix_(rows, ~rows)]))
         return jacobian[np.ix_(~rows, ~rows)] - jacobian[np.ix_(~rows, rows)] @ moved
 
     def _line(self, series: ForceSeries, growth: float) -> ContourLine:
@@ -226,20 +253,22 @@ class Hill:
         if self.finite:
             intervals = max(COARSE, int(0.5 / (growth + self.decay)))
         positions = np.linspace(0, 0.5, intervals + 1)
-        values = self.determinants(series, growth + 1j * positions)
+        values, sizes = self._evaluate(series, growth + 1j * positions)
         for _ in range(FINEST):
             turns = np.abs(np.angle(values[1:] / values[:-1]))
             (wide,) = np.nonzero(turns > TURN)
             if not wide.size:
                 break
             middles = (positions[wide] + positions[wide + 1]) / 2
-            values = np.insert(values, wide + 1, self.determinants(series, growth + 1j * middles))
+            between = self._evaluate(series, growth + 1j * middles)
+            values = np.insert(values, wide + 1, between.values)
+            sizes = np.insert(sizes, wide + 1, between.logs, axis=1)
             positions = np.insert(positions, wide + 1, middles)
 
         turned = np.cumsum(np.angle(values[1:] / values[:-1]))
         return ContourLine(
             positions=positions,
-            logs=np.log(np.abs(values)) + 1j * np.insert(turned, 0, 0.0),
+            logs=sizes.sum(axis=0) + 1j * np.insert(turned, 0, 0.0),
             ends=(float(values[0].real), float(values[-1].real)),
         )
 
@@ -261,7 +290,10 @@ class Hill:
         return sorted((zero for zero in zeros if REAL < zero.imag < 0.5 - REAL), key=lambda zero: zero.real)
 
     def near(self, series: ForceSeries, guess: complex) -> complex:
-        """lambda/Om near a ``guess``, of a motion near one that has it; raises ArithmeticError if none is found."""
+        """lambda/Om of the complex pair to which the secant method goes from a ``guess``, that of a motion near by.
+
+        Raises ArithmeticError if it goes to none within 1 of the guess.
+        """
         zero = self._zero(series, guess, [])
         if zero is None or not REAL < zero.imag < 0.5 - REAL:
             raise ArithmeticError("no complex pair of multipliers is found near that of the state before")
@@ -273,6 +305,7 @@ class Hill:
             zeros = self._beyond(series, growth)
             if zeros:
                 return max(zeros, key=lambda mu: mu.real)
+        # To the right of the last line lies all that grows, whether the lines before it were decided or not.
         if zeros is None:
             return None
         return 0j
@@ -297,6 +330,7 @@ class Hill:
             if len(zeros) >= count:
                 break
             mu = self._zero(series, complex(guess.real, abs(guess.imag)), zeros)
+            # A zero may lie a little to the left of the line, and be counted to its right: see ``_line``.
             if mu is None or mu.real <= 0.9 * growth:
                 continue
             if REAL < mu.imag < 0.5 - REAL:
@@ -309,13 +343,15 @@ class Hill:
 
     def _zero(self, series: ForceSeries, guess: complex, others: list[complex]) -> complex | None:
         """A zero of D that is none of the ``others``, Im in [0, 1/2], by the secant method."""
+        before = guess + STEP * (1 + 1j)
+        # A large D in units of its size here: with a phase alone the method would go nowhere.
+        units = np.maximum(self._evaluate(series, np.array([before])).logs[:, 0] - LARGEST_LOG, 0.0)
 
         def value(mu: complex) -> complex:
             # Divided by what vanishes at the zeros found, so that the method does not return to them.
             factors = [1 - np.exp(2 * np.pi * (zero - mu)) for zero in others]
-            return complex(self.determinants(series, np.array([mu]))[0] / np.prod(factors))
+            return complex(self._evaluate(series, np.array([mu]), units).values[0] / np.prod(factors))
 
-        before = guess + STEP * (1 + 1j)
         value_before = value(before)
         mu = guess
         for _ in range(MOST_STEPS):
@@ -331,39 +367,3 @@ class Hill:
             if abs(mu - before) < ACCURACY:
                 return complex(mu.real, abs(mu.imag - round(mu.imag)))
         return None
-
-
-def _of_pairs(g: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """G (..., order, pair, pair) between some of the ``pairs``."""
-    if len(pairs) == g.shape[-1]:
-        return g
-    return g[..., pairs[:, None], pairs]
-
-
-def _flat(jacobian: np.ndarray) -> np.ndarray:
-    """J (..., pair, order, order) as a matrix (..., order pair, order pair)."""
-    *several, pairs, rows, columns = jacobian.shape
-    out = np.zeros((*several, rows, pairs, columns, pairs), jacobian.dtype)
-    for i in range(pairs):
-        out[..., i, :, i] = jacobian[..., i, :, :]
-    return out.reshape(*several, rows * pairs, columns * pairs)
-
-
-def _plus_one(g: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """1 + G J of G (..., order, pair, pair), which is diagonal in the orders, and J (..., order pair, order pair)."""
-    out = _product(g, matrix)
-    diagonal = np.arange(out.shape[-1])
-    out[..., diagonal, diagonal] += 1.0
-    return out
-
-
-def _product(g: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """G J of G (..., order, pair, pair), which is diagonal in the orders, and J (..., order pair, columns)."""
-    count, pairs = g.shape[-3:-1]
-    rows = matrix.reshape(*matrix.shape[:-2], count, pairs, -1)
-    # Products of matrices by BLAS pay for many pairs alone.
-    if pairs <= FEW_PAIRS:
-        product = np.einsum("...kij,...kjn->...kin", g, rows)
-    else:
-        product = np.matmul(g, rows)
-    return product.reshape(*product.shape[:-3], count * pairs, -1)

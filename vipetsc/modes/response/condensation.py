@@ -1,8 +1,24 @@
 """The condensed system of a case of ``nfrc``: contacts, nonlinear springs, driven masses, and the compliance between.
 
-Everything else in the lattice is linear. Its response to harmonic forces at these places is the compliance G(omega) in
-m/N, a matrix with a row and a column for each contact, nonlinear spring and driven mass. The equations of steady states
-(``steady``) have the motions at these places alone as unknowns.
+Everything else in the lattice is linear: M u'' + C u' + K u = p - b f. The forces f (pair,) are those of contacts and
+what nonlinear springs have beyond their linear part; they pull the masses of their pair together. The forces p (mass,)
+are those of the drive. The columns b pick the elongations z = b^T u, of a contact its relative displacement. At each
+multiple omega of the drive's frequency the harmonics of z and f obey
+
+    z = w - G(omega) f,    G(omega) = b^T (K + i omega C - omega^2 M)^-1 b,
+
+G is the compliance in m/N, and w the motion without f: b^T (K + i omega C - omega^2 M)^-1 p, or that by the incident
+wave. The equations of steady states (``steady``) are these, f being that of z: the motions of all other masses are
+eliminated, and z alone is unknown.
+
+**Contacts as springs.** A mean force f moves masses without bound that no wall holds and no spring joins: G(0) is then
+infinite. If contacts hold them that are pressed at rest (``NfrcCase.are_contacts_springs``), these are springs of the
+linear lattice, with the slope s of their law at rest:
+
+    z = w_s - G_s (f - s z),    G_s = b^T (K + b s b^T + i omega C - omega^2 M)^-1 b,    w_s likewise.
+
+This is the same equation, since s z is added on one side and taken off on the other. G_s is made here
+(``contact_springs``), and ``ForceSeries.add_load`` takes s z off the force (``Stops.spring``).
 """
 
 from typing import NamedTuple
@@ -18,7 +34,10 @@ from vipetsc.modes.balance.stops import Stops
 
 
 class DrivenPoints(NamedTuple):
-    """The masses on which a drive acts, as (cell, mass) from 0, and the force in N on each for the amplitude 1."""
+    """Masses on which drives act: ``places``, each (cell, mass) from 0, and ``weights`` (place,).
+
+    A weight is the force in N on the mass when the first drive has the amplitude 1, in its unit, N or m.
+    """
 
     places: tuple[tuple[int, int], ...]
     weights: np.ndarray
@@ -28,8 +47,9 @@ def driven_points(case: NfrcCase) -> DrivenPoints:
     """The driven masses of a ``case``; none under an incident wave.
 
     A force of the drive acts on its mass. A wall that moves acts on each mass that a spring ties to it, with the
-    spring's stiffness times the wall's motion: the amplitude is then in m. It is that of the first drive; all others
-    keep their ratios to it.
+    spring's stiffness times the wall's motion: such springs are linear and have no dashpot, as the case makes sure. The
+    amplitude of a curve is that of the first drive, a force in N or a wall's motion in m. All others keep their ratios
+    to it, which have a unit where one drive is a force and the other a wall.
     """
     if case.nfrc.source == "wave":
         return DrivenPoints((), np.empty(0))
@@ -47,9 +67,11 @@ def driven_points(case: NfrcCase) -> DrivenPoints:
 def compliance_of(case: NfrcCase) -> WaveCompliance | ModalCompliance:
     """The compliance of the lattice of a ``case`` between its contacts, nonlinear springs and driven masses.
 
-    Bloch waves give it of an infinite lattice, and of a finite one of equal cells without dashpots whose contacts join
-    the pair of their cell; else the modes of the finite lattice do, continued beyond ends that are open. That of modes
-    costs up to a minute at its first call: curves of one case are computed with one.
+    Where ends are open, the modes of the finite lattice give it, continued beyond these ends; ``OpenCompliance`` is a
+    ``ModalCompliance``. Otherwise Bloch waves do, of an infinite lattice and of a finite one of equal cells without
+    dashpots whose contacts join the pair of their cell, and modes of any other finite lattice. No contact of an
+    infinite lattice is a spring: the case refuses those that would be. The compliance by modes costs up to a minute at
+    its first use and is not kept here: one is made for all curves of a case.
     """
     chain = case.model().chain
     places = driven_points(case).places
@@ -77,9 +99,11 @@ def forces_of(case: NfrcCase, restitution: float) -> SiteForces:
 def stops_of(case: NfrcCase, restitution: float) -> list[Stops]:
     """The law and the stops of each site of a ``case``, with a ``restitution``.
 
-    Where a pressed contact is a spring of the linear lattice, its ``Stops.spring`` is the slope of its law at rest.
+    Where a pressed contact is a spring of the linear lattice, its ``Stops.spring`` is the slope of its law at rest. It
+    is 0 of a contact that is not pressed.
     """
     model = case.model()
+    # Without ``gaps`` every contact has its clearance on both sides.
     gaps = model.gaps or [(clearance, clearance) for clearance in model.chain.clearances]
     stops = [Stops(law, plus, minus) for law, (plus, minus) in zip(case.laws(restitution), gaps, strict=True)]
     if not case.are_contacts_springs:

@@ -1,7 +1,10 @@
 """Arcs of orbits, and the system in compiled form with its rates and contact changes, for every flow.
 
-The set of closed contacts is frozen inside a step, so that the force is smooth there. After each step the gap of every
-contact is searched, and the step is repeated so that it ends on the first change (see the package's docstring).
+Flows are those of the conservative system: contacts act by their elastic laws, and dashpots are left out. The set of
+closed contacts is frozen inside a step, so that the force is smooth there. After each step the gap of every contact is
+searched, and a flow's ``_advance`` repeats the step so that it ends on the first change. At a change the force of a
+contact is 0 on both sides, so that the rates are continuous: variations pass it without a jump (see the package's
+docstring).
 """
 
 from abc import ABC, abstractmethod
@@ -18,13 +21,16 @@ from vipetsc.modes.shooting.landing import EXTREMUM, NONE, Change, first_rise, h
 from vipetsc.modes.system import System
 
 CONTACT = np.dtype([("plus", np.float64), ("minus", np.float64), ("elastic", ELASTIC)])
-"""A contact: its clearances in m on the sides + and -, inf where there is no stop; its elastic law."""
+"""A contact: its clearances in m on the sides + and -, inf where there is no stop; its elastic law.
+
+The clearance of a contact that is pressed at rest is negative, and it has no stop on the other side.
+"""
 Shape = tuple[int, int, int]
-"""The first row of the displacements' rates, n, and 1 + m: see ``restore``."""
+"""Where ``restore`` puts forces, and how many: the first of their rows, the displacements n, the columns 1 + m."""
 # Kinds of changes in an arc's list of events.
 ONSET = 1
 SEPARATION = -1
-# A step below this fraction of the interval means that the flow is stuck.
+# A step below this fraction of the arc's duration means that the flow is stuck: for a flow's ``_advance``.
 SMALLEST_STEP = 1e-15
 
 
@@ -92,6 +98,7 @@ def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.nd
     """Forces in N that pull back the orbit, column 0 of ``y`` (n or more, 1 + m), and its variations.
 
     ``shape``, their first row in ``pull``, n and 1 + m, may be constants, so that the compiler knows all loops.
+    ``rates`` puts them where the velocities' rates are, and then divides by the masses.
     """
     first, n, columns = shape
     # The static load, which acts on the orbit alone, and the springs: -K times each column.
@@ -109,7 +116,8 @@ def restore(system: CompiledSystem, side: np.ndarray, y: np.ndarray, pull: np.nd
         if side[c] != 0:
             contact = system.contacts[c]
             x = side[c] * elongation(system.rows, c, y, 0, 0, n) - clearance_on(contact, side[c])
-            # Not cut off at x = 0: within a step the force is smooth, and steps end where the masses part.
+            # Not cut off at x = 0, but continued as an odd function: within a step the force is smooth, and steps end
+            # where the masses part.
             force, slope = elastic_force_and_slope(contact.elastic, x)
             _add(system.rows, c, (side[c] * force, slope), y, pull, shape)
 
@@ -174,8 +182,9 @@ def begin(system: CompiledSystem, y: np.ndarray) -> FlowStep:
 @kernel
 def first_change(step: FlowStep, h: float) -> Change:
     """The first change of a contact in a step of length ``h``, with the first attempt at it."""
+    # A rise at the very end, position 1, is found at the start of the next step.
     first = 1.0
-    change = Change(-1, 0, 0.0, 0.0, False, 0.0, h, h, 0)
+    change = Change(contact=-1, side=0, sign=0.0, offset=0.0, extremum=False, low=0.0, high=h, length=h, attempts=0)
     for c in range(step.side.size):
         for s in (-1, 1):
             clearance = clearance_on(step.system.contacts[c], s)
@@ -190,7 +199,17 @@ def first_change(step: FlowStep, h: float) -> Change:
             position, outcome = first_rise(hermite(step.start[c], step.end[c], h, sign, offset))
             if outcome != NONE and position < first:
                 first = position
-                change = Change(c, s, sign, offset, outcome == EXTREMUM, 0.0, h, position * h, 0)
+                change = Change(
+                    contact=c,
+                    side=s,
+                    sign=sign,
+                    offset=offset,
+                    extremum=outcome == EXTREMUM,
+                    low=0.0,
+                    high=h,
+                    length=position * h,
+                    attempts=0,
+                )
     return change
 
 
@@ -210,8 +229,9 @@ class Arc:
 
     ``start`` and ``end`` (2n,) hold displacements in m, then velocities in m/s; ``sensitivity`` (2n, 2n) is
     d end/d start; ``events`` (changes, 4) lists time in s, contact, side (1 or -1), kind (``ONSET``, ``SEPARATION``);
-    ``episodes`` counts how often contacts close, or open if they are pressed at rest, and ``closed`` are the seconds
-    with a contact closed. ``away_at_start`` (contact) says of which an episode goes on at the start.
+    ``episodes`` counts how often contacts close, or open if they are pressed at rest, within the arc: one that goes on
+    at the start counts as one that begins there. ``closed`` are the seconds with one or more contacts closed.
+    ``away_at_start`` (contact) says of which an episode goes on at the start.
     """
 
     duration: float
@@ -226,7 +246,8 @@ class Arc:
     def spans(self) -> Iterator[tuple[float, float]]:
         """Begin and end in s of every episode; those that go on at the start begin at 0, the last may end with the arc.
 
-        Changes of a contact alternate between away from what it is at rest and back to that.
+        Changes of a contact alternate between away from what it is at rest and back to that: one that is pressed at
+        rest has a single stop, on which alone it closes.
         """
         for contact, is_away in enumerate(self.away_at_start):
             times = self.events[self.events[:, 1] == contact, 0].tolist()
@@ -262,7 +283,7 @@ class Flow(ABC):
         self._away = np.where(system.is_pressed, SEPARATION, ONSET)
 
     def omega_ref(self, period: float) -> float:
-        """Frequency in rad/s by which velocities count as displacements: the fastest linear mode's, or the orbit's."""
+        """Frequency in rad/s that makes velocities displacements: the larger of the fastest mode's and the orbit's."""
         return max(self.omega, 2 * np.pi / period)
 
     def arc(self, start: np.ndarray, duration: float, period: float) -> Arc:
@@ -274,7 +295,8 @@ class Flow(ABC):
         y[:, 0] = start
         y, events, closed = self._advance(y, duration, period)
 
-        # Contacts that are not at the start as they are at rest, and changes away from what they are at rest.
+        # Contacts that are not at the start as they are at rest, and changes away from what they are at rest. A w is a
+        # difference of two displacements, so that this product has the bits of ``close``, by which the flow began.
         plus, minus = self.system.clearances.T
         w = self.system.contact_rows @ start[: self.system.dofs]
         is_closed = (w > plus) | (-w > minus)
