@@ -65,15 +65,19 @@ def test_only_temporary_files_of_processes_that_have_ended_are_removed(tmp_path,
     monkeypatch.setattr(os, "getpid", lambda: ended.pid)
     # Left as by a kill: the block is not left.
     abandoned = atomic_write(tmp_path / "a.png").__enter__()
-    monkeypatch.setattr(platform, "node", lambda: "elsewhere")
-    elsewhere = atomic_write(tmp_path / "a.png").__enter__()
+    here = platform.node()
+    others = []
+    # The name of a host may begin as that of this one with a process does.
+    for name in ("elsewhere", f"{here}-{ended.pid}"):
+        monkeypatch.setattr(platform, "node", lambda name=name: name)
+        others.append(atomic_write(tmp_path / "a.png").__enter__())
     monkeypatch.undo()
     written = atomic_write(tmp_path / "a.png").__enter__()
-    for path in (abandoned, elsewhere, written):
+    for path in (abandoned, *others, written):
         path.touch()
 
     remove_abandoned(tmp_path)
-    assert {*tmp_path.iterdir()} == {elsewhere, written}
+    assert {*tmp_path.iterdir()} == {*others, written}
 
 
 def test_temporary_names_are_not_those_of_another_host_process_or_call(tmp_path, monkeypatch):

@@ -395,6 +395,24 @@ def test_a_command_waits_only_as_long_as_announced_for_a_process_that_stays(run,
     assert 5 <= clock.seconds < 5 + 2 * lock.LOOK_EVERY
 
 
+@pytest.mark.parametrize("below", [".", "new"])
+def test_a_link_to_a_folder_that_is_missing_is_refused(tmp_path, monkeypatch, below):
+    """A folder cannot be created there: the command must not try again and again."""
+    (tmp_path / "link").symlink_to(tmp_path / "missing")
+    mkdir = os.mkdir
+    tried = []
+
+    def mkdir_a_few_times(path, *arguments):
+        tried.append(path)
+        assert len(tried) < 20
+        mkdir(path, *arguments)
+
+    monkeypatch.setattr(os, "mkdir", mkdir_a_few_times)
+    refused = pytest.raises(FolderError, match=f"link is a link to {tmp_path}/missing, which is missing")
+    with refused, locked(MPI.COMM_SELF, tmp_path / "link" / below):
+        pass
+
+
 def test_a_folder_that_cannot_be_locked_is_not_left_behind(tmp_path, monkeypatch):
     def refuse(*_):
         raise PermissionError(13, "Permission denied")

@@ -1,6 +1,6 @@
 """Files and folders of results.
 
 ``netcdf`` is the one layout of every HDF5 file (netCDF-4), ``atomic`` writes files whole or not at all, ``folder``
-claims output folders, ``store`` stores the chunks of a run and assembles ``run.h5``. Modules that need MPI are imported
-by their own names, so that figures load without it.
+claims output folders, ``store`` stores the chunks of a run and assembles ``run.h5``, ``read`` opens results. This
+module imports none of them: some need MPI, and figures, which use the others, load without it.
 """

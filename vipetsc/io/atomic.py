@@ -1,6 +1,5 @@
 """Files that are complete or absent: written under a temporary name, and renamed when complete."""
 
-import glob
 import os
 import platform
 import re
@@ -21,9 +20,10 @@ Arrays = Mapping[str, np.ndarray]
 def atomic_write(path: Path) -> Iterator[Path]:
     """A temporary path that replaces ``path`` when the block succeeds and vanishes when it fails.
 
-    Raises OSError that names ``path``.
+    Raises an OSError that names ``path`` if the temporary file cannot be written or renamed.
     """
-    # Processes of two hosts with a common file system, or of two containers, may have the same number.
+    # Processes of two hosts with a common file system, or of two containers, may have the same number: the host's name
+    # and a random word tell them apart.
     aside = path.with_name(f".{path.name}.{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}.part")
     sys.audit("vipetsc.write", str(path))
     # Renamed only when it is complete: a kill leaves the earlier file, and the temporary one for the next claim.
@@ -40,23 +40,26 @@ def atomic_write(path: Path) -> Iterator[Path]:
 def remove_abandoned(folder: Path) -> None:
     """Remove temporary files of ``atomic_write`` from ``folder`` whose processes on this host have ended.
 
-    For commands that hold no lock on the folder, so that others may write there at the same time.
+    It is for commands that hold no lock on the folder: other commands may be writing there at the same time.
     """
-    here = platform.node()
-    for path in folder.glob(f".*.{glob.escape(here)}-*.part"):
-        process = path.name.rpartition(f".{here}-")[2].partition("-")[0]
-        if process.isdigit() and not _is_running(int(process)):
+    # To its end: the name of another host may begin with that of this one and a number.
+    of_this_host = re.compile(rf"\..*\.{re.escape(platform.node())}-(\d+)-[0-9a-f]+\.part", re.DOTALL)
+    for path in folder.glob(".*.part"):
+        named = of_this_host.fullmatch(path.name)
+        if named and not _is_running(int(named[1])):
             path.unlink(missing_ok=True)
 
 
 def _is_running(process: int) -> bool:
     """Whether there is a ``process`` of that number on this host."""
     try:
+        # The signal 0 is not sent: the system only looks whether it could be.
         os.kill(process, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
-        pass  # another user's
+        # The process is another user's.
+        pass
     return True
 
 
@@ -65,54 +68,62 @@ def unwritten(path: Path, error: Exception) -> OSError:
     number = getattr(error, "errno", None) or 0
     in_text = re.search(r"errno = (\d+)", str(error))
     if not number and in_text:
-        # HDF5 says it in its message alone.
+        # HDF5 gives the number in its message alone.
         number = int(in_text[1])
+
     reason = str(error)
     if number:
         reason = os.strerror(number)
-    return OSError(
-        number, f"{path} could not be written: {reason}; after the cause is removed, the same command continues"
-    )
+    remedy = "after the cause is removed, the same command continues"
+    return OSError(number, f"{path} could not be written: {reason}; {remedy}")
 
 
 def discard(folder: Path) -> None:
     """Remove ``folder`` if it exists; a kill leaves it whole, or under a name that begins with a dot."""
     aside = folder.with_name(f".{folder.name}.old")
-    shutil.rmtree(aside, ignore_errors=True)  # of a call that was killed
+    # A call that was killed may have left one, onto which the folder could not be renamed.
+    shutil.rmtree(aside, ignore_errors=True)
     if folder.is_dir():
         os.replace(folder, aside)
         shutil.rmtree(aside, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write ``text`` whole or not at all."""
+    """Write ``text`` to ``path`` in UTF-8, whole or not at all; raises OSError as ``atomic_write``."""
     with atomic_write(path) as aside:
         aside.write_text(text, encoding="utf-8")
 
 
 def save_arrays(path: Path, arrays: Arrays) -> None:
-    """Write ``arrays`` as the fields of one record, in numpy's format; a zip file costs three times that."""
+    """Write ``arrays`` as the fields of one record in numpy's format (.npy); raises OSError as ``atomic_write``.
+
+    numpy's own format for several arrays, a zip file, takes three times as long.
+    """
     record = np.dtype([(name, values.dtype, values.shape) for name, values in arrays.items()])
     with atomic_write(path) as aside, aside.open("wb") as file:
-        # One record of all arrays: numpy has the header, and the values follow without being copied together.
+        # The header is numpy's. The values follow it one after another, without a copy of all in one array.
         header = {"descr": npy.dtype_to_descr(record), "fortran_order": False, "shape": ()}
         npy.write_array_header_2_0(file, header)
+
+        # Byte 6 is the version of the format. Version 3 differs from 2 in the header's encoding, UTF-8, and
+        # numpy 1.24 takes a header of version 2 apart into tokens, which takes longer than the rest of the reading.
         file.seek(6)
-        file.write(b"\3")  # version 3, in UTF-8: headers of the others numpy takes apart into tokens first
-        file.seek(0, 2)
-        # Through ``write``, whose error has a number; numpy's own writing to disk gives none.
+        file.write(b"\3")
+        file.seek(0, os.SEEK_END)
+
+        # By ``write``, whose error has a number; numpy's ``tofile`` gives none.
         for values in arrays.values():
             file.write(np.ascontiguousarray(values).data)
 
 
 def load_arrays(path: Path, wanted: Collection[str] | None = None, copy: bool = True) -> dict[str, np.ndarray]:
-    """Load the arrays ``wanted``, else all, that ``save_arrays`` wrote; without a ``copy`` each is read when used.
+    """Load the arrays ``wanted``, by default all, that ``save_arrays`` wrote, in the shapes that they had.
 
-    They have the shapes with which they were saved.
-
-    Raises OSError that names the file.
+    Without a ``copy`` they are parts of the file, read when they are used. Raises an OSError that names the file if it
+    cannot be read, or lacks an array.
     """
     try:
+        # numpy refuses headers of more than 10,000 letters, since a hostile one could stop it; this one is ours.
         record = npy.open_memmap(path, mode="r", max_header_size=2**32)  # type: ignore[call-arg]
         if wanted is None:
             wanted = record.dtype.names or ()

@@ -1,7 +1,7 @@
 """The kinds of branch files: orbits, condensed motions, responses; the attribute ``branch_kind`` of a file names it.
 
-All readers use `branch_kind`; the branch format of ``vipetsc.modes.branches`` writes the attribute. The module
-is in this folder because figures, which read branches, do not load PETSc.
+All readers use `branch_kind`; ``vipetsc.modes.branches``, which has the format of the files, writes the attribute. This
+module is not there but here because figures, which read branches, do not load PETSc.
 """
 
 import xarray as xr
@@ -33,7 +33,7 @@ def branch_kind(branch: xr.Dataset) -> str:
 
 def _kind_by_variables(branch: xr.Dataset) -> str:
     """Return the kind of a file without the attribute, by variables that only that kind has."""
-    # In this order: responses have harmonics, too.
+    # Responses come first because they have harmonics, too.
     if "share" in branch:
         return RESPONSES
     if "harmonics" in branch:

@@ -1,8 +1,12 @@
 """The variables of ``run.h5``, and their assembly from the chunks of a run.
 
-A chunk holds the samples between two checkpoints. Each rank stores a part of it, with its position: fields (sample,
-dof, cell) belong to the ranges ``columns`` of the recorded cells, losses (sample, site) to the ranges ``sites``;
-``impacts`` are episodes. The part of rank 0 also has ``SAMPLED``.
+A chunk holds the samples between two checkpoints. Each rank stores a part of it, arrays by name:
+
+- fields (sample, dof, cell) such as ``displacement``, whose cells are the half-open ranges ``columns`` (range, 2) of
+  the recorded cells, numbered from 0;
+- losses and forces (sample, site), whose sites are the half-open ranges ``sites`` (range, 2), from 0;
+- ``impacts`` (episode,), a record of each contact episode that ended in the chunk, in the last one of open ones too;
+- in the part of rank 0 what belongs to a sample as a whole (``SAMPLED``, ``DAMPING`` and ``MOTION``).
 """
 
 from __future__ import annotations
@@ -23,8 +27,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 # Variables of the file by name: dimensions, units, text.
-# Rank 0 has ``SAMPLED``, ``DAMPING`` and ``MOTION`` of every sample; ``GIVEN`` exists before the first one. ``LARGE``
-# are the fields, losses and forces and the log of contacts: of ranks that write together each holds only its part.
+# ``SAMPLED``, ``DAMPING`` and ``MOTION`` are known on rank 0 for every sample; ``GIVEN`` is known before the first one.
+# ``LARGE`` are the fields, losses and forces and the log of contacts: where ranks write together, each has a part.
 SAMPLED = {
     "time": ("time", "s", "time"),
     "field_time": ("field_time", "s", "time of the recorded fields"),
@@ -111,8 +115,8 @@ class Chunks(Protocol):
 
 
 def ranges(numbers: np.ndarray) -> np.ndarray:
-    """Half-open ranges (range, 2) of consecutive ``numbers``."""
-    # -2 is no cell's number, nor next to one: there is a break at both ends.
+    """Half-open ranges (range, 2) of consecutive integers in ``numbers`` (number,), which rise from 0 or more."""
+    # Neither -2 nor a neighbour of -2 is among the numbers: there is a break at both ends.
     breaks = np.diff(numbers, prepend=-2, append=-2) != 1
     return np.stack([numbers[breaks[:-1]], numbers[breaks[1:]] + 1], axis=1)
 
@@ -124,12 +128,15 @@ def joined(output: Chunks, names: Collection[str]) -> dict[str, np.ndarray]:
 
 
 def small_dataset(output: Chunks, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """The dataset of ``GIVEN`` and of all that rank 0 has of every sample, with the root ``attributes`` of the run."""
+    """The dataset of ``GIVEN`` and of all that rank 0 has of every sample, with the root ``attributes`` of the run.
+
+    The fields' own times are left out where the fields are of every sample.
+    """
     import xarray as xr
 
     arrays = {**joined(output, output.recording.sampled), **output.recording.given}
     if len(arrays["field_time"]) == len(arrays["time"]):
-        del arrays["field_time"]  # fields are of every sample
+        del arrays["field_time"]
     variables = tabulated(SAMPLED | DAMPING | MOTION | GIVEN, arrays)
     return xr.Dataset(variables, attrs={"case": output.case, **attributes})
 
@@ -142,7 +149,10 @@ class Description(NamedTuple):
 
 
 def described(name: str, data: xr.Dataset) -> Description:
-    """The description of a variable of ``LARGE`` in a file with ``data``, whose time may be that of the fields."""
+    """The description of the variable ``name`` of ``LARGE`` in a file that holds the small dataset ``data``.
+
+    Fields are over ``time`` if the file has no times of the fields alone.
+    """
     dims, units, text = LARGE[name]
     if "field_time" not in data:
         dims = dims.replace("field_time", "time")
@@ -157,12 +167,17 @@ def coordinates(name: str) -> dict[str, str]:
 
 
 def writers(output: Chunks) -> MPI.Comm:
-    """The ranks that write together, or this one."""
-    return output.comm if output.recording.together else MPI.COMM_SELF
+    """The ranks that write the file: all of them together, or this one alone."""
+    if output.recording.together:
+        return output.comm
+    return MPI.COMM_SELF
 
 
 def parts_to_copy(output: Chunks, number: int, wanted: Collection[str]) -> Iterator[Arrays]:
-    """Arrays ``wanted`` of the parts of chunk ``number`` that fall to this rank: the writers take them in turn."""
+    """Arrays ``wanted`` of those parts of chunk ``number`` that this rank copies to the file.
+
+    Parts are dealt out to the writers in turn, since other ranks, and more or fewer, may have stored them.
+    """
     comm = writers(output)
     for rank in output.ranks(number):
         if rank % comm.size == comm.rank:
@@ -170,14 +185,17 @@ def parts_to_copy(output: Chunks, number: int, wanted: Collection[str]) -> Itera
 
 
 def read_log(output: Chunks) -> np.ndarray:
-    """The episodes (episode,) in the parts that fall to this rank, in no order; fields as in ``impacts``."""
-    # Unsorted: episodes of several ranks are sorted once, when all are read.
+    """The episodes (episode,) in the parts that this rank copies, in no order; a record has the fields of ``impacts``.
+
+    There is a part for every writer: each rank of a run that ended has stored one in the last chunk.
+    """
+    # Episodes of all ranks are sorted together later.
     parts = [part for number in range(output.count) for part in parts_to_copy(output, number, ["impacts"])]
     return np.concatenate([part["impacts"] for part in parts])
 
 
 def log_columns(log: np.ndarray, first: int = 0) -> Arrays:
-    """The variables of the episodes ``log`` (episode,), which are in order and come after ``first`` others."""
+    """The variables (episode,) of the file for the episodes ``log`` (episode,), sorted, after ``first`` others."""
     names = log.dtype.names or ()
     columns: dict[str, np.ndarray] = {"episode": np.arange(first, first + len(log)) + 1}
     for name in names:
@@ -186,7 +204,10 @@ def log_columns(log: np.ndarray, first: int = 0) -> Arrays:
 
 
 def put_chunks(dataset: h5py.Dataset, output: Chunks, name: str) -> None:
-    """Copy what ``name`` is, of sites or a field, of all chunks to ``dataset``; each writer copies what it reads."""
+    """Copy the variable ``name``, a field or one over sites, from all chunks to ``dataset``.
+
+    Each writer copies the parts that it reads; a field becomes (sample, cell, dof), what is over sites (sample, site).
+    """
     time = "field_time"
     places = "columns"
     if name in output.recording.of_sites:
@@ -197,12 +218,13 @@ def put_chunks(dataset: h5py.Dataset, output: Chunks, name: str) -> None:
     for number in range(output.count):
         rows = output.read(number, 0, [time])[time].size
         for part in parts_to_copy(output, number, [name, places]):
-            # Parts have cells last, as the compiled engine fills them; the file has (sample, cell, dof).
+            # Parts have cells last, as the compiled engine fills them; the file has them after the samples.
             values = np.moveaxis(part[name], -1, 1)
             column = 0
             for start, stop in part[places].tolist():
+                width = stop - start
                 # h5py leaves out empty selections, on which writing together would hang.
                 if rows and start < stop:
-                    dataset[first : first + rows, start:stop] = values[:, column : column + stop - start]
-                column += stop - start
+                    dataset[first : first + rows, start:stop] = values[:, column : column + width]
+                column += width
         first += rows

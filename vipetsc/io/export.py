@@ -14,23 +14,25 @@ from vipetsc.io.chunks import FORCES, MOTION
 from vipetsc.io.read import field_time, open_results, open_run
 from vipetsc.wording import with_unit
 
-MOST_FRAMES = 5000  # of a run with more samples, every n-th; a frame takes about 1 kB of the text
-MOST_ROWS = 1_000_000  # of a table, as many as spreadsheets read
+# Samples that run.xdmf lists; of a run with more, every n-th. One takes about 1 kB, so that the text has 5 MB at most.
+MOST_FRAMES = 5000
+MOST_ROWS = 1_000_000  # of a table: spreadsheets read no more
 MOST_NUMBERS = 20_000_000  # of a table with a column for each point or site: 400 MB of text
 ANALYSIS = "analysis.h5"
 FIELDS = "displacement", "velocity"
-# Of the designs of a search, by the dimension whose labels say what each column is.
+# Variables of a search over (design, label), and the dimension of the labels, which name the columns of its table.
 OF_DESIGNS = {"parameter": "variable", "value": "objective", "constrained": "constraint"}
-# Of frequency responses, the dimensions whose labels name the columns of a table.
+# The second dimensions of variables of a frequency response, whose labels name the columns of its table.
 OF_RESPONSES = {"way", "site", "location", "pair", "wall"}
 HEAD = '<Xdmf Version="3.0"><Domain><Grid Name="run" GridType="Collection" CollectionType="Temporal">\n'
 TAIL = "</Grid></Domain></Xdmf>\n"
 
 
 def write_xdmf(folder: Path) -> Path | None:
-    """Write ``run.xdmf`` next to ``run.h5``; None for a run without fields. Raises as ``open_run``.
+    """Write ``run.xdmf`` next to ``run.h5`` in ``folder``, and return its path; None for a run without fields.
 
-    A regular mesh of nodes (cell, mass), and at every frame the fields as hyperslabs of the datasets in ``run.h5``.
+    The text describes a regular mesh of nodes (cell, mass), and for each frame says which hyperslabs of the datasets in
+    ``run.h5`` are the fields. Raises OSError or ValueError as ``open_run``, OSError if the text cannot be written.
     """
     with open_run(folder / "run.h5") as run:
         units = {name: run[name].attrs["units"] for name in FIELDS if name in run}
@@ -40,6 +42,7 @@ def write_xdmf(folder: Path) -> Path | None:
         cells = run["cell"].values
         shape = run[next(iter(units))].shape
 
+    # The XML is made once, since frames differ in two numbers only.
     frame = _frame(cells, shape, units)
     rows = range(0, shape[0], -(-shape[0] // MOST_FRAMES))
     frames = [frame.format(row=row, time=float(times[row])) for row in rows]
@@ -48,13 +51,16 @@ def write_xdmf(folder: Path) -> Path | None:
 
 
 def _frame(cells: np.ndarray, shape: tuple[int, ...], units: dict[str, str]) -> str:
-    """The grid of a frame, with ``{row}`` and ``{time}`` to be filled in, of fields (t, cell, dof) by their units."""
+    """The text of a frame's grid, in which ``{row}`` and ``{time}`` are to be filled in.
+
+    ``shape`` is that of the fields (t, cell, dof), ``units`` has their units by name, ``cells`` are those recorded.
+    """
     mesh = _words(shape[1:])
     grid = Xml.Element("Grid", Name="sample {row}", GridType="Uniform")
     _child(grid, "Time", Value="{time!r}")
     _child(grid, "Topology", TopologyType="2DCoRectMesh", Dimensions=mesh)
     geometry = _child(grid, "Geometry", GeometryType="ORIGIN_DXDY")
-    # Cells along the slow axis, as the datasets have them; a single cell has no spacing of its own.
+    # Cells are the slower axis, as in the datasets, and come first; a single cell has no spacing of its own.
     spacing = 1
     if len(cells) > 1:
         spacing = cells[1] - cells[0]
@@ -87,24 +93,28 @@ def _child(parent: Xml.Element, tag: str, text: str | None = None, **attributes:
 
 
 def _words(values: Iterable[float]) -> str:
-    """Numbers in all digits, separated by blanks."""
+    """Numbers separated by blanks, in 17 digits, which tell all doubles apart."""
     return " ".join(f"{value:.17g}" for value in values)
 
 
 def write_curves(path: Path) -> list[Path]:
-    """Write the curves of the results in ``path`` as CSV files to ``curves/`` in their folder.
+    """Write the curves of the results in ``path`` as CSV files to ``curves/`` in their folder; return the files.
 
-    Variables over the same dimensions are one table, with a row a point, their coordinates first, units in the head.
-    That of the designs of a search has a column for each variable, objective and constraint, that of a frequency
-    response one for each named mass, contact and wall.
-    Of a run with ``analysis.h5`` in the same folder there is a table of its numbers, ``analysis-measures.csv``, and
-    where they were recorded ``run-points.csv`` and ``run-forces.csv``, with a column for each point and site. Fields
-    and maps, over other dimensions than the axes of a sweep, are left out. Raises as ``open_results``.
+    Variables over one dimension, or over all axes of a sweep, are a table: a row for each point, coordinates first,
+    units in the head. Variables over the same dimensions share one. Some results have further columns or tables:
+
+    - designs of a search: a column for each variable, objective and constraint;
+    - a frequency response: a column for each named mass, contact and wall;
+    - a run with points or forces: ``run-points.csv`` and ``run-forces.csv``, a column for each point or site;
+    - a run or an analysis, where the folder has ``analysis.h5``: the numbers in it, ``analysis-measures.csv``.
+
+    Fields and maps are left out, and tables of more than ``MOST_ROWS`` rows or ``MOST_NUMBERS`` numbers. Raises OSError
+    or ValueError as ``open_results``, OSError if a file cannot be written.
     """
     written = []
     with open_results(path) as data:
         source = Path(data.encoding.get("source", path / "ensemble.h5"))
-        # Of a sweep: a status of each member.
+        # Only a sweep has a status, which each of its members has.
         axes: tuple[Any, ...] = ()
         if "status" in data:
             axes = data["status"].dims
@@ -119,7 +129,7 @@ def write_curves(path: Path) -> list[Path]:
             table = data[names].assign(_columns_of_designs(data, dims) | _columns_of_responses(data, dims))
             # CSV has no room for coordinates over other dimensions, such as the cells of sites.
             foreign = [name for name, item in table.coords.items() if not set(item.dims) <= set(dims)]
-            # The dimensions name the file: variables over other ones are another table.
+            # Each table has a file of its own, named by the dimensions.
             over = "-".join(dims)
             if dims == axes:
                 over = "members"
@@ -139,7 +149,10 @@ def write_curves(path: Path) -> list[Path]:
 
 
 def _columns_of_designs(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
-    """Variables, objectives and constraints over the designs of a search, by their labels; none of other ``dims``."""
+    """Columns (design,) for the variables, objectives and constraints of a search, by their labels.
+
+    None where ``data`` are not a search, or a table's ``dims`` are not those of its designs.
+    """
     columns = {}
     for name, label in OF_DESIGNS.items():
         if name not in data or data[name].dims != (*dims, label):
@@ -153,7 +166,10 @@ def _columns_of_designs(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr
 
 
 def _columns_of_responses(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
-    """Variables of a frequency response over its points by mass, contact or wall; none of other results or ``dims``."""
+    """Columns (point,) of a frequency response for each mass, contact or wall, by variable and label.
+
+    None where ``data`` are no response, or a table's ``dims`` are not those of its points.
+    """
     columns: dict[str, xr.DataArray] = {}
     if dims != ("point",) or data.attrs.get("branch_kind") != RESPONSES:
         return columns
@@ -165,7 +181,10 @@ def _columns_of_responses(data: xr.Dataset, dims: tuple[str, ...]) -> dict[str, 
 
 
 def _write_wide(run: xr.Dataset, source: Path) -> list[Path]:
-    """Write the motion of points and the forces of sites of a ``run`` over time, with a column for each of these."""
+    """Write the motion of points and the forces at sites over time, a column for each point or site.
+
+    None of results that are no ``run`` or recorded neither; the files are named after ``source``.
+    """
     columns: dict[str, dict[str, np.ndarray]] = {"points": {}, "forces": {}}
     for name in MOTION:
         if name in run:
@@ -185,7 +204,7 @@ def _write_wide(run: xr.Dataset, source: Path) -> list[Path]:
 
 
 def _numbers(analysis: xr.Dataset) -> dict[str, list[Any]]:
-    """Columns of a table of all numbers in an ``analysis``, a row each; those of parts of the frequency axis too."""
+    """Columns of a table with a row for each number in an ``analysis``, and for each part of the frequency axis."""
     rows = []
     for name, item in analysis.data_vars.items():
         unit = item.attrs.get("units", "1")
@@ -213,15 +232,14 @@ def _write_table(path: Path, table: xr.Dataset) -> Path:
 
 
 def _write_columns(path: Path, columns: Mapping[str, Any]) -> Path:
-    """Write a table of ``columns`` of one length, by what stands at their heads, as CSV."""
+    """Write a table of ``columns`` of one length as CSV; their names are its heads."""
     rows = xr.Dataset({head: ("row", np.asarray(values)) for head, values in columns.items()})
     return _write_frame(path, rows.to_dataframe())
 
 
 def _write_frame(path: Path, frame: Any) -> Path:
-    """Write a pandas ``frame`` as CSV."""
+    """Write a pandas ``frame`` as CSV, each number in the shortest text that reads back as the same."""
     path.parent.mkdir(exist_ok=True)
     with atomic_write(path) as aside:
-        # The shortest text that reads back as the same number.
         frame.to_csv(aside, index=False)
     return path

@@ -1,8 +1,10 @@
 """Output folders: their claim by one command, and the provenance that every output carries.
 
 Names that begin with a dot are not results: ``.lock`` while a command works in the folder, ``.new`` for results that
-will replace the present ones, ``.ready``, ``.moving`` and ``.*.old`` while they do, ``.*.part`` for a file being
-written.
+will replace the present ones, ``.*.part`` for a file being written. When new results are complete, they are swapped
+with the old ones in three steps, and after a kill the next command goes on from the step that was reached: ``.new``
+becomes ``.ready``; the old ones are moved to ``.replaced.old``, and ``.ready`` becomes ``.moving``; what is in
+``.moving`` is moved to the folder itself.
 """
 
 import os
@@ -37,15 +39,25 @@ MOST_NAMED = 6  # keys of another case that a message names: more do not help to
 NEW, READY, MOVING, OLD = ".new", ".ready", ".moving", ".replaced.old"
 
 Difference = Callable[[str], str | None]
+"""Takes the text of an earlier case; returns why its results are not the wanted ones, or None if they are."""
 
 
 @dataclass(frozen=True)
 class FolderKind:
-    """Kind of a folder of results; patterns of file names as for ``Path.glob``.
+    """Kind of a folder of results; patterns of names are those of ``Path.glob``.
 
-    ``noun``: name of one result in messages; ``results``: files that show that a folder holds results; ``companions``:
-    files that are replaced together with them; ``marker``: the file with the case of the results; ``free``: its section
-    that may change while the results stay valid.
+    Attributes
+    ----------
+    noun
+        What messages call one result.
+    results
+        Patterns of the files that show that a folder holds results of this kind.
+    companions
+        Patterns of the files that are replaced together with the results.
+    marker
+        Name of the file with the case of the results.
+    free
+        Section of the case that may change while the results stay valid; empty for none.
     """
 
     noun: str
@@ -61,24 +73,33 @@ RUN = FolderKind(
     companions=("summary.json", "analysis.h5", "run.xdmf", "curves", "figures"),
     free="analysis",
 )
-BRANCHES = FolderKind("branch", ("branch-*.h5",), ("branch-*.csv", "figures", "curves"))
-SEARCH = FolderKind("search", ("design.h5",))
-LAW = FolderKind("law", ("law.h5", "law-runs*.jsonl"))
-SWEEP = FolderKind("sweep", ("index.json", "members*.jsonl"), ("*/", "ensemble.h5", "backbone.h5"))
-PREDICTION = FolderKind("prediction", ("prediction.h5", "prediction-runs*.jsonl"))
-OPTIMUM = FolderKind("optimum", ("optimum.h5", "optimum-runs*.jsonl"), ("figures", "curves", "law", "best*.toml"))
-IDENTIFIED = FolderKind(
-    "identification", ("identified.h5", "identified-runs*.jsonl"), ("figures", "curves", "identified.toml")
+BRANCHES = FolderKind(noun="branch", results=("branch-*.h5",), companions=("branch-*.csv", "figures", "curves"))
+SEARCH = FolderKind(noun="search", results=("design.h5",))
+LAW = FolderKind(noun="law", results=("law.h5", "law-runs*.jsonl"))
+SWEEP = FolderKind(
+    noun="sweep",
+    results=("index.json", "members*.jsonl"),
+    # Every folder: members with fields, figures, curves, and others that are there (the manual says so).
+    companions=("*/", "ensemble.h5", "backbone.h5"),
 )
-PAPER = FolderKind("paper", ("plan.json",), (), "plan.json")
+PREDICTION = FolderKind(noun="prediction", results=("prediction.h5", "prediction-runs*.jsonl"))
+OPTIMUM = FolderKind(
+    noun="optimum", results=("optimum.h5", "optimum-runs*.jsonl"), companions=("figures", "curves", "law", "best*.toml")
+)
+IDENTIFIED = FolderKind(
+    noun="identification",
+    results=("identified.h5", "identified-runs*.jsonl"),
+    companions=("figures", "curves", "identified.toml"),
+)
+PAPER = FolderKind(noun="paper", results=("plan.json",), companions=(), marker="plan.json")
 KINDS = (RUN, BRANCHES, SEARCH, LAW, PREDICTION, SWEEP, OPTIMUM, IDENTIFIED, PAPER)
 
 
 class Claim:
-    """The right to work in an output folder; ``path`` is the folder itself.
+    """The right to work in the output folder ``path``, for results of ``kind``, on all ranks of ``comm``.
 
-    Results are written to ``folder``, which is ``path/.new`` while they are to replace others; ``going_on``: whether
-    the folder holds results of the same case.
+    Results are written to ``folder``, which is ``path/.new`` if they are to replace others that stay until then, and
+    ``path`` itself otherwise. ``going_on`` is whether ``folder`` holds earlier results of the same case.
     """
 
     def __init__(self, comm: MPI.Comm, path: Path, kind: FolderKind, folder: Path, going_on: bool) -> None:
@@ -92,6 +113,7 @@ class Claim:
         """Replace earlier results by the new ones, which are complete; all ranks must call it."""
 
         def swap() -> None:
+            # Results that an earlier swap has replaced, if a kill left any: new names must be free there.
             shutil.rmtree(self.path / OLD, ignore_errors=True)
             sys.audit("vipetsc.swap", str(self.path))
             # From this rename on the new results count: the next claim finishes a swap that a kill ends.
@@ -117,13 +139,25 @@ def claimed(
     """Claim the folder ``path`` for results of ``kind``: start new results, or continue those of the same case.
 
     All ranks must call it. A missing folder is created; leftovers of a killed command are removed, and a swap that it
-    began is finished. ``text``, a resolved case, is stored in the folder. ``force`` starts again: earlier results stay
-    until new ones are published; the next call without ``force`` continues the new ones. ``resume`` only continues
-    existing results. ``difference`` takes an earlier text and returns the reason why its results are not the
-    wanted ones, or None if they are; by default any change is a reason.
+    began is finished.
 
-    Raises FolderError if the path is a file, another process works in it, it holds anything but results of ``kind`` and
-    of this case, which ``force`` allows to differ, or there is nothing to ``resume``.
+    Parameters
+    ----------
+    text
+        The resolved case, which is stored in the folder.
+    force
+        Start again: earlier results, perhaps of another case, stay until the new ones are published. The next call
+        without ``force`` continues the new ones.
+    resume
+        Only continue existing results.
+    difference
+        What makes results those of another case; by default any key that changed, but for the section that is free.
+
+    Raises
+    ------
+    FolderError
+        If the path is a file, another process works in it, it holds files that are no results of ``kind``, or results
+        of another case without ``force``, or there is nothing to ``resume``.
     """
     path = Path(path)
     with locked(comm, path):
@@ -136,7 +170,8 @@ def _claim(
 ) -> tuple[Path, bool]:
     """The folder to work in, and whether it holds results of the same case; see ``claimed``."""
     sys.audit("vipetsc.claim", str(path))
-    # A swap that a kill has ended is finished first, unless the results are another verb's.
+
+    # A swap that was cut off is finished first, unless the results are another verb's.
     foreign = _holds_another_kind(path, kind)
     if not foreign:
         _finish_swap(path, kind)
@@ -149,7 +184,7 @@ def _claim(
     aside = path / NEW
     going_on = filled and not force
     if going_on:
-        # Results begun with --force are continued if they are of this case, otherwise those that they are to replace.
+        # Results begun with --force are continued if they are of this case, else those that they were to replace.
         folder = path
         if (aside / kind.marker).exists() and not _problem(aside, kind, text, difference):
             folder = aside
@@ -164,7 +199,7 @@ def _claim(
             folder = aside
         folder.mkdir(exist_ok=True)
 
-    # A key that may change while results stay valid is brought up to date.
+    # Of continued results keys may have changed with which they stay valid: the text is then the present one.
     if not going_on or _text_of(folder / kind.marker) != text:
         write_text(folder / kind.marker, text)
     remove_temporary_files(folder)
@@ -179,7 +214,7 @@ def _holds_another_kind(path: Path, kind: FolderKind) -> bool:
 
 
 def _results(folder: Path) -> list[Path]:
-    """The files and folders in ``folder`` that are results: their names do not begin with a dot."""
+    """The files and folders in ``folder`` whose names do not begin with a dot."""
     return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
 
 
@@ -190,6 +225,7 @@ def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference |
         return difference(earlier)
     if earlier == text:
         return None
+
     remedy = "replace it with --force, or choose another folder with --out"
     try:
         # Key by key: a reader cannot see in two files of a hundred lines which one has changed.
@@ -205,6 +241,7 @@ def _problem(folder: Path, kind: FolderKind, text: str, difference: Difference |
             differing.append(f"{key} = {values[0]} there, {values[1]} here")
     if not differing:
         return None
+
     shown = "; ".join(differing[:MOST_NAMED])
     if len(differing) > MOST_NAMED:
         shown += f"; and {len(differing) - MOST_NAMED} more"
@@ -234,11 +271,12 @@ def _keys(table: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _finish_swap(path: Path, kind: FolderKind) -> None:
-    """Finish a swap, at whichever step a kill has ended it: replace earlier results by ready ones, remove leftovers."""
+    """Finish a swap from the step at which a kill ended it, if one was begun; remove results that were replaced."""
     ready = path / READY
     moving = path / MOVING
     old = path / OLD
-    # Earlier results go first; once ``ready`` has become ``moving``, none of them is left in the new ones' place.
+    # Earlier results go first. Only when all are gone does ``ready`` become ``moving``: a kill before leaves them to be
+    # moved, and a kill after it leaves new results, which are not to be moved with them.
     if ready.is_dir():
         old.mkdir(exist_ok=True)
         for pattern in (kind.marker, *kind.results, *kind.companions):
@@ -256,7 +294,7 @@ def _finish_swap(path: Path, kind: FolderKind) -> None:
 
 
 def provenance(comm: MPI.Comm) -> dict[str, Any]:
-    """Record of versions, date, host and command of a result, which every output carries.
+    """Record of versions, date, host, command and number of ranks, as attributes that every output carries.
 
     Two runs of one command differ in it.
     """
@@ -266,7 +304,7 @@ def provenance(comm: MPI.Comm) -> dict[str, Any]:
 def origin() -> dict[str, Any]:
     """The record of ``provenance`` without the ranks, for results that one rank computes alone.
 
-    PETSc options are those of its database. A case has its own options in its text: both together are all options.
+    ``petsc_options`` are those of PETSc's database, given on the command line; those of a case are in the case's text.
     """
     options = PETSc.Options().getAll()
     given = " ".join(f"-{name} {value}".strip() for name, value in sorted(options.items()))

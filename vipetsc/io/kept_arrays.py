@@ -20,7 +20,7 @@ from vipetsc.io.atomic import Arrays, remove_abandoned, save_arrays
 from vipetsc.process import cache_folder
 
 # Bytes of all files together; those that were not used for the longest time go first. The modes of the built-in
-# lattice take 12 MB.
+# lattice take 12 MB, so that those of some twenty such lattices are kept.
 LARGEST = 2**28
 CHECKSUM = "checksum"
 
@@ -28,12 +28,22 @@ CHECKSUM = "checksum"
 def kept_arrays(kind: str, content: Iterable[bytes], compute: Callable[[], Arrays]) -> dict[str, np.ndarray]:
     """The arrays that ``compute`` gives, from an earlier call with the same ``content`` if they are still kept.
 
-    ``kind`` names what they are; shapes and bits are those of ``compute``. They are not taken over from other hosts and
-    other versions of this package, numpy and SciPy, whose last digits may differ. A cache that cannot be read or
-    written is no error.
+    Arrays from other hosts and from other versions of this package, numpy and SciPy are not used: their last digits may
+    differ. A cache that cannot be read or written is no error.
+
+    Parameters
+    ----------
+    kind
+        A word for what the arrays are, with which the file's name begins.
+    content
+        Everything that the arrays follow from, as bytes.
+    compute
+        Returns the arrays by name; called only if they are not kept. Shapes and bits are the same either way.
     """
     versions = f"{kind} {vipetsc.__version__} {np.__version__} {scipy.__version__} {platform.node()}"
     digest = hashlib.sha256(versions.encode())
+    # A hash of each part's hash, which has one length: two contents that differ only in where one part ends and the
+    # next begins are told apart.
     for part in content:
         digest.update(hashlib.sha256(part).digest())
 
@@ -50,14 +60,15 @@ def kept_arrays(kind: str, content: Iterable[bytes], compute: Callable[[], Array
 
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:
-    """The arrays in a file, of which this notes that they are used; None if it is absent or damaged."""
+    """The arrays in a file; None if it is absent or damaged."""
     try:
-        # Read rather than mapped: another process may remove the file meanwhile.
+        # Read whole rather than mapped: the checksums need all values, and another process may remove the file.
         record = np.load(path)
         arrays = {name: record[name] for name in record.dtype.names or ()}
+        # The time of the file says when it was used last, for ``_remove_oldest``.
         os.utime(path)
         checksum = arrays.pop(CHECKSUM)
-    # A damaged header gives numpy's ValueError, EOFError or SyntaxError, a lost name KeyError.
+    # For a damaged header numpy raises ValueError, EOFError or SyntaxError; a file without checksums is a KeyError.
     except (OSError, ValueError, EOFError, SyntaxError, KeyError):
         return None
     if not np.array_equal(checksum, _checksum(arrays)):
@@ -66,7 +77,7 @@ def _read(path: Path) -> dict[str, np.ndarray] | None:
 
 
 def _checksum(arrays: Arrays) -> np.ndarray:
-    """The checksums of ``arrays`` (array)."""
+    """The CRC-32 of each of ``arrays`` (array,)."""
     return np.array([zlib.crc32(np.ascontiguousarray(values).data) for values in arrays.values()])
 
 

@@ -19,7 +19,8 @@ from vipetsc.parallel import on_root
 logger = logging.getLogger(__name__)
 
 LOCK = ".lock"
-TOKEN = secrets.token_hex(8)  # this process: in two containers on one host, two may have the same number
+# The name of this process in a lock: two processes in containers on one host may have the same number.
+TOKEN = secrets.token_hex(8)
 # s. Where a rank is killed, mpirun returns before its other ranks are gone, and the same command may be typed at once:
 # it sends them SIGTERM and, a second later, SIGKILL, and one with much memory takes a moment more.
 PATIENCE = 5.0
@@ -30,10 +31,12 @@ LOOK_EVERY = 0.05  # s between two attempts while a holder may be ending
 def locked(comm: MPI.Comm, *paths: Path) -> Iterator[None]:
     """Keep other commands out of the folders ``paths`` within the block; those that are missing are created.
 
-    Rank 0 holds the lock on the file ``.lock`` in the folder. It ends with its process, so that none is left behind;
-    it may be taken again within the block by the same process. Folders that stay empty are removed again. Rank 0 waits
-    up to ``PATIENCE`` s for another process that has the lock, and says so. All ranks must call it. Raises FolderError
-    on all of them if the other process keeps the lock, and names it.
+    All ranks must call it. Rank 0 locks the file ``.lock`` in each folder; the system releases the lock when the
+    process ends, however it ends. The same process may take the lock again within the block. Folders that were created
+    for the lock and stay empty are removed at the end. Rank 0 waits up to ``PATIENCE`` s for another process that has
+    the lock, and logs a message. Where the file system has no locks, there is none, and no error.
+
+    Raises FolderError on all ranks if a path is no folder, or if another process, which it names, keeps the lock.
     """
     with ExitStack() as stack:
         on_root(comm, lambda: [stack.enter_context(_lock(path)) for path in paths])
@@ -45,6 +48,11 @@ def _lock(path: Path) -> Iterator[None]:
     """Hold the lock of one folder on this rank; folders that were created for it and stayed empty are removed."""
     if path.exists() and not path.is_dir():
         raise FolderError(f"{path}: is a file, not a folder; choose another --out")
+    for part in (path, *path.parents):
+        # No folder can be created there, and ``_acquire`` would try for ever.
+        if part.is_symlink() and not part.exists():
+            target = os.readlink(part)
+            raise FolderError(f"{path}: {part} is a link to {target}, which is missing; choose another --out")
 
     created: list[Path] = []
     descriptor = None
@@ -63,7 +71,8 @@ def _lock(path: Path) -> Iterator[None]:
 
 def _unlock(path: Path, descriptor: int) -> None:
     """Give back the lock of a folder that ``descriptor`` holds."""
-    # Removed while it is still locked: one that opens it from here on finds another file, and tries again.
+    # Removed while it is still locked: a process that has opened it by now gets the lock of a file without a name,
+    # notices that, and tries again.
     (path / LOCK).unlink(missing_ok=True)
     os.close(descriptor)
 
@@ -71,7 +80,8 @@ def _unlock(path: Path, descriptor: int) -> None:
 def remove_temporary_files(folder: Path) -> None:
     """Remove temporary files, and locks that nobody holds, which killed commands have left in ``folder`` and below it.
 
-    The caller has the lock of ``folder``. Another command may have that of a folder in it, as of a member of a sweep.
+    The caller has the lock of ``folder``. Another command may have the lock of a folder in it, for example of a member
+    of a sweep: files there are left alone.
     """
     for temporary in folder.glob(".*.part"):
         temporary.unlink(missing_ok=True)
@@ -91,8 +101,8 @@ def remove_temporary_files(folder: Path) -> None:
 def _acquire(path: Path, created: list[Path]) -> int | None:
     """Lock the folder ``path``, which is created where it is missing; the folders ``created`` are added to the list.
 
-    Returns the descriptor that holds the lock, or None where none is needed or possible: this process has it already,
-    or the file system has no locks. Raises FolderError if another process still has it after ``PATIENCE``.
+    Returns the descriptor of the file that is locked, or None if this process has the lock already or the file system
+    has no locks. Raises FolderError if another process still has the lock after ``PATIENCE``.
     """
     sys.audit("vipetsc.lock", str(path))
     deadline = None
@@ -122,20 +132,25 @@ def _acquire(path: Path, created: list[Path]) -> int | None:
 
 
 def _try_to_lock(path: Path) -> tuple[int | None, str | None]:
-    """The descriptor that holds the lock (None: none is needed or possible), and who else has it (None: nobody)."""
+    """The descriptor of the locked file, and the other process that has the lock; one of them or both are None.
+
+    Both are None if this process has the lock already, or the file system has no locks.
+    """
     while True:
         descriptor = os.open(path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            # This process holds it in an enclosing block, or the file system has no locks: work goes on without one.
+            # The last word in the file is the token of the process that has the lock.
             holder, _, token = os.read(descriptor, 1000).decode().strip().rpartition(" ")
             os.close(descriptor)
+            # Another error than that the file is locked: the file system has no locks, and work goes on without one.
             if token == TOKEN or not isinstance(error, BlockingIOError):
                 return None, None
             return None, holder or "another process"
 
-        # A holder that ended after the file was opened has removed it: a lock on a file without name is none.
+        # A holder that ended after the file was opened has removed it, and a lock on a file without a name keeps nobody
+        # out.
         if _is_file(descriptor, path / LOCK):
             os.ftruncate(descriptor, 0)
             os.write(descriptor, f"process {os.getpid()} on {platform.node()} {TOKEN}\n".encode())

@@ -1,7 +1,7 @@
 """Names of files between the system, which has bytes, and cases and files of results, which have text in UTF-8.
 
-Python decodes names in the encoding of the locale, and keeps bytes that are none of it as lone surrogates. UTF-8 has no
-such characters, and a locale (C, Latin-1) has not all characters of UTF-8.
+Python decodes names in the encoding of the locale, and turns bytes that are invalid there into lone surrogates (PEP
+383). These cannot be written as UTF-8; and some locales (C, Latin-1) lack characters that UTF-8 has.
 """
 
 import os
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def readable(name: str | Path) -> str:
-    """A ``name`` as Python has it from the system, as text; bytes that are no UTF-8 become replacement characters."""
+    """The ``name`` of a file, from the system, as text for a file; invalid bytes become replacement characters."""
     return str(name).encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 

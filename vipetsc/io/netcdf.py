@@ -30,9 +30,10 @@ if TYPE_CHECKING:
 Variables: TypeAlias = "dict[str, xr.Variable]"
 """Variables of a dataset by name."""
 
-# Attributes that describe dimensions, and the name of a dimension that no coordinate describes.
+# Attributes by which HDF5 and netCDF-4 describe dimensions: they are no attributes of a variable.
 OF_DIMENSIONS = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "DIMENSION_LABELS", "coordinates"}
 OF_DIMENSIONS |= {"_Netcdf4Dimid", "_Netcdf4Coordinates", "_nc3_strict", "_NCProperties"}
+# The attribute NAME of a dimension without a coordinate begins so.
 NO_COORDINATE = b"This is a netCDF dimension but not a netCDF variable"
 
 
@@ -57,7 +58,7 @@ def write_netcdf(path: str | Path, data: xr.Dataset) -> None:
 
     Raises OSError if the file cannot be written, ValueError if a dimension has no coordinate.
     """
-    # HDF5 crashes after a full disk: it works in memory, and Python writes what comes out.
+    # HDF5 crashes after a full disk. It makes the file in memory, and Python writes the bytes.
     with h5py.File(Path(path).name, "w", driver="core", backing_store=False) as file:
         put_dataset(file, data)
         file.flush()
@@ -67,36 +68,49 @@ def write_netcdf(path: str | Path, data: xr.Dataset) -> None:
 
 
 def put_dataset(file: h5py.File, data: xr.Dataset, write: bool = True) -> None:
-    """Lay out ``data`` in ``file``; all ranks that have it open must call it, and one of them has to ``write``."""
-    # Coordinates first: variables are attached to their scales.
+    """Add the variables and attributes of ``data`` to ``file``; an attribute that is a dict or a list becomes JSON.
+
+    All ranks that have the file open must call it with the same data; one of them has to ``write`` the values. Raises
+    ValueError if a dimension has no coordinate.
+    """
+    # Coordinates come first, because variables are attached to their scales.
     names = [*data.indexes, *(name for name in data.variables if name not in data.indexes)]
     for name in names:
         item = data.variables[name]
         values = item.values
-        # HDF5 has no type for numpy's text of fixed width.
-        dtype = h5py.string_dtype() if values.dtype.kind in "UO" else values.dtype
+        dtype = values.dtype
+        # HDF5 has no type for numpy's text of fixed width, and h5py takes texts of any length as objects.
+        if dtype.kind in "UO":
+            values = values.astype(object)
+            dtype = h5py.string_dtype()
         dataset = add_variable(file, name, item.dims, values.shape, dtype, item.attrs)
         if write and values.size:
-            dataset[...] = values.astype(object) if values.dtype.kind == "U" else values
+            dataset[...] = values
 
     for path, value in data.attrs.items():
         group, _, key = str(path).rpartition("/")
-        node = file.require_group(group) if group else file
-        # An attribute is a number, a text or an array of either.
-        node.attrs[key] = json.dumps(value) if isinstance(value, dict | list) else value
+        node = file
+        if group:
+            node = file.require_group(group)
+        # HDF5 has attributes that are a number, a text or an array of either.
+        if isinstance(value, dict | list):
+            value = json.dumps(value)
+        node.attrs[key] = value
 
 
 def add_variable(
     file: h5py.File, name: Hashable, dims: Sequence[Hashable], shape: Sequence[int], dtype: Any, attributes: Any
 ) -> h5py.Dataset:
-    """Add an empty dataset over coordinates added before; it is a coordinate itself if its one dimension has its name.
+    """Add an empty dataset over dimensions whose coordinates are in the file already; return it.
 
-    Its group gets soft links to coordinates outside it: programs that open the group alone find them there. Raises
-    ValueError if a dimension has no coordinate.
+    A dataset over one dimension of its own name is the coordinate of that dimension. In the group of a dataset there
+    are soft links to coordinates outside it, which programs need that open the group alone. Raises ValueError if a
+    dimension has no coordinate.
     """
     path = PurePosixPath(str(name))
     if name in file:
-        del file[str(name)]  # such a link
+        # A soft link to a coordinate of that name outside the group has its place.
+        del file[str(name)]
     dataset = file.create_dataset(str(name), tuple(shape), dtype)
     if tuple(dims) == (name,):
         dataset.make_scale(path.name)
@@ -133,13 +147,15 @@ def open_netcdf(path: str | Path, kind: str, needs: Sequence[str] = ()) -> xr.Da
     data = xr.Dataset(variables, attrs=attributes)
     data.set_close(files.close)
 
-    present: set[str] = set()  # variables and groups
+    # Variables, and the groups that hold any.
+    present: set[str] = set()
     for name in data.variables:
         path_in_file = PurePosixPath(str(name))
         present |= {str(part) for part in (path_in_file, *path_in_file.parents)}
     missing = [name for name in needs if name not in present and name not in data.attrs]
     if missing:
-        data.close()  # nobody else would
+        # The error leaves the caller without a dataset to close.
+        data.close()
     _refuse_other_kinds(path, kind, missing)
     return data
 
@@ -163,7 +179,9 @@ def root_attributes(path: str | Path, kind: str, needs: Sequence[str] = ()) -> d
 
 def _unreadable(path: str | Path, kind: str, error: Exception) -> UnreadableFileError:
     """The error that reports that a file cannot be opened as HDF5, because of ``error``."""
-    reason = "another program has it open for writing" if "unable to lock" in str(error) else error
+    reason = str(error)
+    if "unable to lock" in reason:
+        reason = "another program has it open for writing"
     return UnreadableFileError(f"{path} cannot be opened as a {kind}: {reason}")
 
 
@@ -193,7 +211,7 @@ def _contents(files: CachingFileManager) -> tuple[Variables, dict[str, Any]]:
                 continue
 
             dims = _dimensions(file, node, stored)
-            # Texts are short, and an array of numpy's has to know the longest.
+            # Texts are read at once: they are few, and the type of numpy's array depends on the longest.
             if h5py.check_string_dtype(node.dtype):
                 data = node.asstr()[...].astype(str)
             else:
@@ -208,14 +226,14 @@ def _path(*parts: str) -> str:
 
 
 def _nodes(group: h5py.Group) -> Iterator[h5py.Group | h5py.Dataset]:
-    """A ``group``, its datasets, and then the same of each group in it.
+    """A ``group``, its datasets, and then each group in it with its own datasets and groups.
 
-    Soft links lead to coordinates of other groups, and are left out.
+    Soft links are left out: they lead to coordinates of other groups.
     """
     yield group
     groups = []
-    # By h5py's functions of a lower level, since this is half of what it takes to open a file: by ``group[name]`` twice
-    # as long.
+    # By the functions on which h5py's ``group[name]`` is built, which take half the time: this is half of the time that
+    # it takes to open a file.
     for name in group.id:
         if group.id.links.get_info(name).type != h5py.h5l.TYPE_HARD:
             continue
@@ -230,17 +248,18 @@ def _nodes(group: h5py.Group) -> Iterator[h5py.Group | h5py.Dataset]:
 
 
 def _stored_attributes(node: h5py.Group | h5py.Dataset) -> dict[str, Any]:
-    """The attributes of a group or a dataset as h5py reads them, without a scale's list of what it is attached to.
+    """The attributes of a group or a dataset as h5py reads them, without the list of the datasets that a scale has.
 
-    All are read once: to look whether there is one takes as long as to read it.
+    All are read here, once: to ask h5py whether there is a certain one takes as long as to read it.
     """
     return {key: node.attrs[key] for key in node.attrs if key != "REFERENCE_LIST"}
 
 
 def _dimensions(file: h5py.File, dataset: h5py.Dataset, stored: Mapping[str, Any]) -> list[str]:
-    """The dimensions of a ``dataset`` with ``stored`` attributes: of each axis the path of the scale attached to it.
+    """The names of the dimensions of a ``dataset`` with ``stored`` attributes.
 
-    A scale is its own dimension; an axis without a scale is one of its own.
+    The dimension of an axis is named by the path of the scale that is attached to it; a scale has the dimension of its
+    own path. An axis without a scale is a dimension that no other dataset has.
     """
     if dataset.ndim == 1 and stored.get("CLASS") == b"DIMENSION_SCALE":
         return [_path(dataset.name)]
@@ -266,4 +285,6 @@ def _attribute(value: Any) -> Any:
         return value
     if value.dtype.kind in "SO":
         value = [_attribute(text) for text in value.flat]
-    return value[0] if len(value) == 1 else value
+    if len(value) == 1:
+        return value[0]
+    return value

@@ -1,8 +1,8 @@
 """Reading of results with xarray: a run, the ensemble of a sweep; names are paths in the file, as in ``io.netcdf``.
 
-``open_run`` gives ``run["velocity"]``, ``run["energy/kinetic"]``, ``run["impacts/onset"]``. ``open_ensemble`` gives
-measures over one dimension a swept axis; ``select`` picks members by the values of swept keys. Cells and sites count
-from 1, units stand in the attributes.
+``open_run`` gives a dataset with ``run["velocity"]``, ``run["energy/kinetic"]``, ``run["impacts/onset"]``.
+``open_ensemble`` gives the measures of a sweep with a dimension for each axis; ``select`` picks members by the values
+of swept keys. Cells and sites are counted from 1; each variable has its unit as an attribute.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vipetsc.lattice.chain import cells_between
 if TYPE_CHECKING:
     import xarray as xr
 
-# Files that are opened if a folder is given: the first one that exists.
+# Files that ``open_results`` opens if a folder is given: the first one that exists.
 FIRST = "run.h5", "optimum.h5", "identified.h5", "prediction.h5", "law.h5", "design.h5", "analysis.h5"
 # What the file of a run has at least.
 RUN_NEEDS = "time", "cell", "energy", "case"
@@ -39,8 +39,11 @@ def open_run(path: str | Path) -> xr.Dataset:
 
 
 def with_point_names(run: xr.Dataset) -> xr.Dataset:
-    """The ``run`` with the names of its points, which its case has, as their coordinate, so that ``sel`` takes them."""
-    # The points of a branch, over a dimension of the same name, have none.
+    """The ``run`` with the names of its points, from its case, as the coordinate ``point``, so that ``sel`` takes them.
+
+    Other results come back as they are.
+    """
+    # A branch has a dimension of this name too, over its own points, which have no names.
     if not any(str(name).startswith("points/") for name in run.variables):
         return run
     names = [point["name"] for point in tomllib.loads(run.attrs["case"])["output"]["points"]]
@@ -60,12 +63,15 @@ def open_results(path: str | Path) -> xr.Dataset:
     path = Path(path)
     if path.is_dir() and (path / "ensemble.h5").exists():
         return open_ensemble(path)
+
     files = [path]
     if path.is_dir():
         present = [path / name for name in FIRST if (path / name).exists()]
         files = present[:1] or sorted(path.glob("branch-*.h5"))
     if len(files) != 1:
-        raise ValueError(f"{path}: contains {', '.join(file.name for file in files) or 'no results'}; name a file")
+        contents = ", ".join(file.name for file in files) or "no results"
+        raise ValueError(f"{path}: contains {contents}; name a file")
+
     data = open_netcdf(files[0], "result")
     data = with_point_names(data)
     data.encoding["source"] = str(files[0])
@@ -73,14 +79,14 @@ def open_results(path: str | Path) -> xr.Dataset:
 
 
 def field_time(run: xr.Dataset) -> np.ndarray:
-    """Times (t) in s of the fields: ``time``, or every n-th of it."""
+    """Times (t,) in s of the fields of a ``run``: those of all samples, or of every n-th."""
     if "field_time" in run:
         return run["field_time"].values
     return run["time"].values
 
 
 def field_interval(run: xr.Dataset) -> float:
-    """Sampling interval of the fields in s; NaN for a single sample."""
+    """Interval in s between the fields of a ``run``; NaN for a single field."""
     time = field_time(run)
     if len(time) < 2:
         return np.nan
@@ -106,16 +112,17 @@ def nearest_cell(run: xr.Dataset, cell: int) -> int:
 def open_ensemble(folder: str | Path) -> xr.Dataset:
     """The ensemble of the sweep in ``folder``, read completely: measures with one dimension per swept axis.
 
-    A dimension is named after its axis' first key; further keys of a zipped axis are coordinates on it. ``number`` is
-    each member's, from 0; the attribute ``folder`` is the sweep's. Raises OSError if ``ensemble.h5`` cannot be read,
-    ValueError if it is no ensemble of ours, or one of an earlier version.
+    A dimension is named after the first key of its axis; further keys of a zipped axis are coordinates over it. The
+    variable ``number`` counts the members from 0, the attribute ``folder`` is the path of the sweep's. Raises OSError
+    if ``ensemble.h5`` cannot be read, ValueError if it is no ensemble, or the sweep is of an earlier version.
     """
     folder = Path(folder)
     reason = outdated(folder)
     if reason:
         raise ValueError(reason)
     with open_netcdf(folder / "ensemble.h5", "sweep's ensemble", ("status", "case")) as file:
-        data = file.assign_attrs(folder=str(folder)).load()  # before the file is closed
+        # All values at once: they are small, and the file is closed here.
+        data = file.assign_attrs(folder=str(folder)).load()
 
     zipped = [key for group in tomllib.loads(data.attrs["case"])["sweep"]["zip"] for key in group]
     further = [name for name, variable in data.data_vars.items() if variable.attrs.get("long_name") in zipped]
@@ -125,9 +132,9 @@ def open_ensemble(folder: str | Path) -> xr.Dataset:
 
 
 def over_samples(ensemble: xr.Dataset) -> xr.Dataset:
-    """The ensemble without its axis of samples, if it has one: means replace the measures of single samples.
+    """The ``ensemble`` without its axis of disorder samples, if it has one, its measures being means over the samples.
 
-    A measure without a mean is that of the first sample; ``statistics/<name>/quantiles`` stay.
+    A measure of which there is no mean is that of the first sample; ``statistics/<name>/quantiles`` stay.
     """
     if "statistics/samples" not in ensemble:
         return ensemble
@@ -142,7 +149,7 @@ def over_samples(ensemble: xr.Dataset) -> xr.Dataset:
 
 
 def outdated(folder: Path) -> str:
-    """Message about a sweep of an earlier version, which has a folder for every member; empty for one of this."""
+    """Message that the sweep in ``folder`` is of an earlier version, which made a folder for every member; or empty."""
     if not (folder / "linear").is_dir():
         return ""
     remedy = "repeat the sweep with --force, or in another folder with --out"
@@ -150,12 +157,13 @@ def outdated(folder: Path) -> str:
 
 
 def select(data: Selectable, **wanted: Any) -> Selectable:
-    """The first member of ``data`` with these values of swept keys, on each of their axes; other axes stay.
+    """The part of ``data`` at the ``wanted`` values of swept keys, the first of several; axes without a value stay.
 
-    ``select(ensemble, law="hertz", sites=5, cycles=30)["ibtet"]``. Keys of one zipped axis have to meet in one
-    member; numbers match to a relative 1e-5. Raises KeyError if a name is no coordinate, or no member has the values.
+    For example ``select(ensemble, law="hertz", sites=5, cycles=30)["ibtet"]``. Of keys that vary together, along one
+    axis, one member must have all values. Numbers match to a relative 1e-5. Raises KeyError if a name is no coordinate
+    over one dimension, or no member has the values.
     """
-    # Members that have all values so far, by dimension: keys of a zipped axis have their dimension in common.
+    # Which positions along a dimension have all values so far: keys of a zipped axis have a dimension in common.
     matches: dict[str, np.ndarray] = {}
     for name, value in wanted.items():
         if name not in data.coords or data[name].ndim != 1:
@@ -163,7 +171,7 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
 
         coordinate = data[name].values
         if np.issubdtype(coordinate.dtype, np.number):
-            # Five digits, as messages print them; amplitudes of one sweep lie further apart.
+            # To five digits, since a user types what messages print; amplitudes of one sweep lie further apart.
             match = np.isclose(coordinate, value, rtol=1e-5, atol=0)
         else:
             match = coordinate == value
@@ -174,7 +182,7 @@ def select(data: Selectable, **wanted: Any) -> Selectable:
             others = [n for n in wanted if n != name and n in data.coords and data[n].dims == data[name].dims]
             if others:
                 sought += f" at the given {', '.join(others)}"
-            raise KeyError(f"no member has {sought}; the values are {list(coordinate)}")
+            raise KeyError(f"no member has {sought}; the values are {coordinate.tolist()}")
 
     return data.isel({dimension: int(np.argmax(match)) for dimension, match in matches.items()})
 
@@ -185,14 +193,14 @@ def axes(ensemble: xr.Dataset) -> tuple[str, ...]:
 
 
 def member_folder(member: xr.Dataset) -> Path:
-    """Folder of one member (``run.h5``, ``analysis.h5``), if its fields were kept."""
+    """The folder that has the ``run.h5`` and ``analysis.h5`` of one member if its fields were kept."""
     return Path(member.attrs["folder"]) / str(member["member"].item())
 
 
 def curves(ensemble: xr.Dataset, along: str = "amplitude") -> Iterator[tuple[xr.Dataset, int]]:
-    """Curves over the axis ``along`` that have a member without failure, each with the number of the first such.
+    """Yield every curve of an ``ensemble`` over its axis ``along``, and the number of its first member that succeeded.
 
-    There are none if the sweep has no such axis.
+    A curve of which no member succeeded is left out; a sweep without that axis has no curves.
     """
     others = [name for name in axes(ensemble) if name != along]
     if len(others) == len(axes(ensemble)):

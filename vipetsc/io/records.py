@@ -14,12 +14,12 @@ from typing import Any, BinaryIO, NamedTuple, cast
 from vipetsc.io.atomic import atomic_write, unwritten
 
 Record = dict[str, Any]
-CHECK = b', "crc32": "%08x"}\n'  # how a line ends: CRC-32 of the record without it
+CHECK = b', "crc32": "%08x"}\n'  # the end of a line, with the CRC-32 of the record as JSON without this entry
 CHECK_LENGTH = len(CHECK % 0)
 
 
 class Line(NamedTuple):
-    """Place of a record: its file, and the first byte and the number of bytes in it."""
+    """Place of a record: the ``path`` of its file, its first byte there (``start``), and how many bytes it takes."""
 
     path: Path
     start: int
@@ -38,7 +38,7 @@ def _parsed(line: bytes) -> Record:
 
 
 class RecordFile:
-    """Appends records to the file ``path``, which is created with the first."""
+    """Appends records to the file ``path``, which is created with the first one."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -47,20 +47,21 @@ class RecordFile:
     def append(self, record: Record) -> None:
         """Write ``record`` after the last one; raises OSError that names the file."""
         text = json.dumps(record).encode()
-        # In one call of write, so that a kill leaves a line cut off rather than two lines mixed.
+        # The line in one call of ``write``: a kill leaves it whole, absent or cut off.
         line = memoryview(text[:-1] + CHECK % zlib.crc32(text))
         try:
             sys.audit("vipetsc.append", str(self.path))
             if self._file is None:
                 self._file = self.path.open("a+b", buffering=0)
                 self._end_last_line()
-            while line:  # a disk that is nearly full takes a part
+            # A disk that is nearly full takes a part of the line; the call for the rest then raises the error.
+            while line:
                 line = line[self._file.write(line) :]
         except OSError as error:
             raise unwritten(self.path, error) from error
 
     def _end_last_line(self) -> None:
-        """Begin a new line: one that was cut off must not spoil the next."""
+        """Begin a new line if the last one was cut off, which would spoil the record that is appended to it."""
         if not self._file.tell():
             return
         self._file.seek(-1, 2)
@@ -75,9 +76,10 @@ class RecordFile:
 
 
 def read_records(path: Path, damaged: Callable[[str], None]) -> Iterator[tuple[Record, Line]]:
-    """The records in ``path`` and where they stand; ``damaged`` is called with a message for a line that is not whole.
+    """Yield the records in ``path`` and their places in the file.
 
-    Raises OSError if the file cannot be read.
+    For a line that is cut off or damaged ``damaged`` is called with a message, and the line is passed over. Raises
+    OSError if the file cannot be read.
     """
     sys.audit("vipetsc.read", str(path))
     start = 0
@@ -91,7 +93,10 @@ def read_records(path: Path, damaged: Callable[[str], None]) -> Iterator[tuple[R
 
 
 def merge_records(path: Path, lines: Iterable[Line], merged: Iterable[Path]) -> None:
-    """Write the ``lines`` to ``path``, whole or not at all, and remove the files that were ``merged``."""
+    """Write the records at ``lines`` to ``path`` in that order, whole or not at all; then remove the ``merged`` files.
+
+    Raises OSError if a file cannot be read or written.
+    """
     with atomic_write(path) as aside, aside.open("wb") as file, ExitStack() as stack:
         sources: dict[Path, BinaryIO] = {}
         for line in lines:
@@ -100,6 +105,6 @@ def merge_records(path: Path, lines: Iterable[Line], merged: Iterable[Path]) -> 
             sources[line.path].seek(line.start)
             file.write(sources[line.path].read(line.length))
 
-    # Last: a kill before leaves some records in two files, where they count once, and loses none.
+    # Removed last: a kill before that leaves records in two files, of which readers use one, and loses none.
     for old in merged:
         old.unlink(missing_ok=True)

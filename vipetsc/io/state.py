@@ -10,10 +10,10 @@ from vipetsc.io.netcdf import open_netcdf
 
 
 class State(NamedTuple):
-    """Displacement (cell, dof) in m and velocity in m/s of some cells, which count from 1; others are at rest.
+    """``displacement`` (cell, dof) in m and ``velocity`` in m/s of the cells ``cell``, from 1; all others are at rest.
 
-    ``time`` in s is that of a run's sample, ``orbit`` the number of a branch's orbit, ``period`` in s that of an orbit;
-    ``case`` is the resolved case of a run. Each is None if the file does not contain it.
+    ``time`` in s is that of a run's sample, ``orbit`` the number of a branch's orbit, from 1, ``period`` in s its
+    period, ``case`` the resolved case (TOML) of a run. Each is None if the file does not contain it.
     """
 
     cell: np.ndarray
@@ -26,32 +26,41 @@ class State(NamedTuple):
 
     @classmethod
     def read(cls, path: str | Path, time: float | None = None, orbit: int | None = None) -> Self:
-        """The sample of a run that is nearest to ``time``, or its last; the ``orbit`` of a branch, or its last.
+        """Read a state from a file: a sample of a run, an orbit of a branch, or the only state that there is.
 
-        Raises OSError if the file cannot be opened, ValueError if it holds no state, or not that one.
+        Of a run it is the sample nearest to ``time`` (s), of a branch the one with the number ``orbit``, by default the
+        last; a key that the file has no use for is ignored. Raises OSError if the file cannot be opened, ValueError if
+        it holds no state, not that one, or numbers that are not finite.
         """
         with open_netcdf(path, "state") as file:
-            prefix = "states/" if "states/displacement" in file else ""
+            # A branch has its states in a group of their own.
+            prefix = ""
+            if "states/displacement" in file:
+                prefix = "states/"
             names = [prefix + name for name in ("displacement", "velocity", "cell")]
             missing = [name for name in names if name not in file]
             if missing:
                 raise ValueError(f"{path} contains no state: it lacks {', '.join(missing)}")
             u, v, cell = (file[name] for name in names)
 
-            origin: dict[str, Any] = {}  # which state of the file it is
+            # Which state of the file it is; a file may hold a single one.
+            origin: dict[str, Any] = {}
             if prefix:
                 row = _row(np.arange(1, len(u) + 1), orbit, 0.5, f"{path} has orbits")
                 origin = {"orbit": row + 1, "period": float(file["states/period"][row])}
             elif u.ndim == 3:
                 times = file[str(u.dims[0])].values
+                # Half an interval beyond the record, no sample is nearest to the time. A single one is it at any time.
                 interval = np.inf
                 if len(times) > 1:
                     interval = float(times[1] - times[0])
                 row = _row(times, time, 0.5 * interval, f"{path} has samples in s")
                 origin = {"time": float(times[row]), "case": file.attrs.get("case")}
-            if u.ndim == 3:  # read one state, not all
+            # Values are read when they are used: of all states only this one is.
+            if u.ndim == 3:
                 u = u[row]
                 v = v[row]
+
             state = cls(
                 cell=cell.values.astype(np.int64),
                 displacement=np.asarray(u, float),
@@ -64,7 +73,7 @@ class State(NamedTuple):
         return state
 
     def on(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
-        """Displacement and velocity (cell, dof) of cells ``start`` to ``stop`` (0-based, half open)."""
+        """Displacement in m and velocity in m/s, each (cell, dof), of cells ``start`` to ``stop`` - 1, from 0."""
         inside = (self.cell > start) & (self.cell <= stop)
         rows = self.cell[inside] - 1 - start
         u, v = np.zeros((2, stop - start, self.velocity.shape[1]))
@@ -78,7 +87,10 @@ class State(NamedTuple):
         return frozenset(self.cell[is_moving].tolist())
 
     def frequency(self) -> float | None:
-        """Frequency in rad/s of an orbit, of a run's drive or of the motion it began with; None for a state alone."""
+        """Frequency in rad/s of the orbit, of the run's drive or of the motion that it began with.
+
+        None for a state alone.
+        """
         if self.period:
             return 2 * np.pi / self.period
         if self.case:
@@ -87,16 +99,22 @@ class State(NamedTuple):
         return None
 
     def largest(self, frequency: float) -> tuple[float, int]:
-        """Largest displacement, or velocity over ``frequency`` in rad/s, in m, and the cell (1-based) that has it."""
+        """Largest amplitude in m of a motion with ``frequency`` in rad/s in this state, and its cell, from 1.
+
+        The amplitude of a mass is taken as |u| or |v| / frequency, the larger; 0 and cell 1 of a state without cells.
+        """
         if not self.cell.size:
             return 0.0, 1
-        # A velocity over the frequency is the displacement that the motion swings to.
+        # One of the two may vanish, at a turning point or in passing through rest.
         sizes = np.maximum(np.abs(self.displacement), np.abs(self.velocity) / frequency).max(axis=1, initial=0.0)
         return float(sizes.max()), int(self.cell[np.argmax(sizes)])
 
 
 def _row(values: np.ndarray, wanted: float | None, reach: float, text: str) -> int:
-    """The row of the value ``wanted``, within ``reach``, or the last one; raises ValueError, which ``text`` begins."""
+    """The row of ``values`` (row,) nearest to ``wanted``, by default the last one.
+
+    Raises ValueError, with a message that begins with ``text``, if none is within ``reach`` or there are none.
+    """
     if not len(values):
         raise ValueError(f"{text.split(' has ')[0]} contains no state: it is empty")
     if wanted is None:

@@ -1,10 +1,12 @@
 """Output of a run: a folder, which contains ``run.h5`` and ``summary.json`` at the end, or memory.
 
 During a run its samples are stored as chunks: chunk k holds the samples between the checkpoints k - 1 and k. A chunk
-and a checkpoint are named arrays; a rank writes its part of each into a file of its own, so that nothing is sent during
-a run. Every part names its cells and sites, so that another number of ranks can go on with it. When the run has ended,
-``io.chunks`` puts the parts together. Fields (t, cell, dof) and losses (t, site) are too large to be held whole: they
-are copied chunk by chunk, to a file of one rank or to a common file of all ranks; each writer holds a part of the log.
+and a checkpoint are arrays by name; each rank writes its part of them into a file of its own, so that ranks send each
+other nothing. Every part says which cells and sites it has, so that another number of ranks can go on with the run.
+
+When the run has ended, ``io.chunks`` puts the parts together. Fields (t, cell, dof) and losses (t, site) may be too
+large for the memory: they are copied chunk by chunk, by rank 0 alone or by all ranks into a common file. The log of
+contacts is sorted by onset, and each rank that writes holds a part of it.
 """
 
 from __future__ import annotations
@@ -36,15 +38,15 @@ from vipetsc.parallel import SortedRows, on_every_rank, on_root, sort_over_ranks
 if TYPE_CHECKING:
     import xarray as xr
 
-# Bytes of fields above which writer = "auto" has every rank write its own part. Below, one rank copies them in some
-# seconds, and a file that is written in parallel needs a file system that all ranks see.
+# Bytes of fields above which all ranks write the file together if output.writer is "auto". Fewer are copied by one rank
+# in some seconds, and a file that ranks write together needs a file system that all of them see.
 GATHER_LIMIT = 2 * 2**30
 
 
 class _Contents(NamedTuple):
-    """Contents of ``run.h5`` that this rank writes, without the fields and losses, which are copied from the chunks.
+    """Contents of ``run.h5`` but for fields, losses and forces, which are copied from the chunks.
 
-    ``small`` is rank 0's dataset, ``log`` this rank's part of all episodes in order.
+    ``small`` is the dataset whose values rank 0 writes, ``log`` this rank's part of all episodes in order.
     """
 
     small: xr.Dataset
@@ -54,8 +56,8 @@ class _Contents(NamedTuple):
 class RunFolder:
     """The folder of one run: ``case.toml``, ``parts/`` while it runs, ``run.h5`` and ``summary.json`` after.
 
-    It stores the ``count`` chunks of the run, on all ranks of ``comm``, and puts them together at the end;
-    ``recording`` describes their contents. A chunk has at most ``longest`` samples.
+    It stores the ``count`` chunks of the run, on all ranks of ``comm``, and puts them together at the end. The caller
+    sets ``recording``, which describes their contents, before the first one. A chunk has at most ``longest`` samples.
     """
 
     recording: Recording
@@ -76,14 +78,15 @@ class RunFolder:
     def ending(self) -> dict[str, Any] | None:
         """The root attributes of ``run.h5``; None if the run has not ended. All ranks must call it.
 
-        ``summary.json`` is written again where it is lost. Raises FolderError if ``run.h5`` cannot be read.
+        A ``summary.json`` that is missing is written again. Raises FolderError on all ranks if ``run.h5`` cannot be
+        read.
         """
         return on_root(self.comm, self._read_ending)
 
     def _read_ending(self) -> dict[str, Any] | None:
-        """The attributes on one rank, as ``ending``."""
+        """The attributes, on one rank; see ``ending``."""
         path = self.folder / "run.h5"
-        # Parts next to a run.h5 belong to a run that was begun anew.
+        # Chunks next to a run.h5 are those of a run that was begun anew, and has not ended.
         if not path.exists() or any(self._parts.glob("*")):
             return None
         try:
@@ -135,7 +138,8 @@ class RunFolder:
 
         def replace_oldest() -> None:
             save_arrays(path, state)
-            # The one before stays: until all ranks have written this one, it is the last that is complete.
+            # Of two checkpoints the older one goes. The one before this stays: until all ranks have written this one,
+            # it is the last that is complete.
             if self.comm.rank == 0:
                 for old in self._parts.glob(f"state-{number - 2:06d}-*"):
                     old.unlink()
@@ -143,9 +147,10 @@ class RunFolder:
         on_every_rank(self.comm, replace_oldest)
 
     def last_state(self) -> Sequence[Arrays] | None:
-        """Go back to the last complete checkpoint: set ``count`` to its chunks, and return the parts of all its ranks.
+        """Go back to the last complete checkpoint: return the parts of all ranks that wrote it; None if there is none.
 
-        Another number of ranks may have written it; None if there is no checkpoint. All ranks must call it.
+        ``count`` becomes the number of chunks before it. Another number of ranks may have written it. All ranks must
+        call it; raises OSError on all if one cannot read.
         """
         number, size = on_root(self.comm, self._last_complete_state)
         self.count = number + 1
@@ -155,16 +160,20 @@ class RunFolder:
         return on_every_rank(self.comm, lambda: [load_arrays(path, copy=False) for path in paths])
 
     def _last_complete_state(self) -> tuple[int, int]:
-        """Number and ranks of the last complete checkpoint, (-1, 0) if there is none; later files are removed."""
+        """Number of the last complete checkpoint, and of the ranks that wrote it; (-1, 0) if there is none.
+
+        Files of later chunks and checkpoints are removed.
+        """
         names = [path.stem.split("-") for path in self._parts.glob("state-*.npy")]
         counts = Counter((int(number), int(size)) for _, number, _, size in names)
-        # A checkpoint counts once as many parts are there as ranks wrote it.
+        # A checkpoint is complete when there are as many parts as ranks that wrote it.
         complete = [key for key, count in counts.items() if count == key[1]]
         number, size = max(complete, default=(-1, 0))
 
         for path in self._parts.glob("*-*-*.npy"):
+            # Another number of ranks, which goes on with the run, would not replace all of them.
             if int(path.stem.split("-")[1]) > number:
-                path.unlink()  # another number of ranks would not replace it
+                path.unlink()
         return number, size
 
     def _chunk(self, number: int, rank: int) -> Path:
@@ -180,10 +189,10 @@ class RunFolder:
         return [int(path.stem.split("-")[2]) for path in self._parts.glob(f"part-{number:06d}-*.npy")]
 
     def finish(self, attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
-        """Put the chunks together; all ranks must call it. Raises OSError on all ranks if one cannot write.
+        """Put the chunks together to ``run.h5``; all ranks must call it. Raises OSError on all if one cannot write.
 
         ``attributes``, the same on all ranks, become those of the root, with the case; ``summary.json`` holds them and
-        ``summary``. ``run.h5`` takes its name when it is complete, then the chunks go.
+        ``summary``. The file has a temporary name until it is complete; the chunks are removed after that.
         """
         target = self.folder / "run.h5"
         aside = self.folder / ".run.h5.part"
@@ -209,7 +218,8 @@ class RunFolder:
             discard(self._parts)
 
         try:
-            # A rank that cannot read must not leave the others creating a file.
+            # All ranks read before any creates the file: ranks create it together, and one that failed would leave the
+            # others waiting.
             read = on_every_rank(self.comm, read_chunks)
             if read:
                 small, log = read
@@ -232,7 +242,8 @@ class RunFolder:
         sizes = {**contents.small.sizes, "episode": log.total}
         with h5py.File(path, "w", **together) as file:
             put_dataset(file, contents.small, write=self.comm.rank == 0)
-            # All of them first: ranks create together, but each copies and may fail alone.
+            # All datasets are created before any is filled: ranks create them together, but each copies by itself, and
+            # may fail.
             large = {}
             for name in (*columns, *self.recording.of_sites, *self.recording.fields):
                 description = chunks.described(name, contents.small)
@@ -253,7 +264,8 @@ class RunFolder:
 class FieldMemory:
     """Memory for the fields of runs that follow one another; those of a run are lost when the next one begins.
 
-    The operating system fills new memory with zeros, which takes a tenth of the time of a member of a sweep.
+    It is used again because the operating system fills new memory with zeros, a tenth of the time that a member of a
+    sweep takes.
     """
 
     def __init__(self) -> None:
@@ -268,13 +280,27 @@ class FieldMemory:
 
 
 class RunMemory:
-    """Holds a run in memory: ``dataset`` on rank 0 of ``comm``, None on the others and before its end.
+    """Output of a run into memory instead of a ``RunFolder``, with the same methods; a run that is stopped is lost.
 
-    It is used as a ``RunFolder``. Fields are gathered whatever the case's writer is; a run that is stopped is lost.
-    Fields lie in memory as (t, dof, cell): on one rank the engine writes them where they stay. ``end`` are the
-    displacements and velocities (cell, 2 dof) at the last sample of a run that is complete; the dataset has them as
-    ``end/displacement`` and ``end/velocity``. With ``states_every`` so many samples, all ranks have the parts of the
-    checkpoints in ``states``. Fields are in the ``fields`` of runs before where these are given.
+    Rank 0 of ``comm`` has all fields, whatever ``output.writer`` is; they lie in memory as (t, dof, cell), and on one
+    rank the engine writes them where they stay.
+
+    Parameters
+    ----------
+    states_every
+        Samples between two checkpoints, which are then kept; by default there are none.
+    fields
+        Memory for the fields, which one run after another uses; by default each run has its own.
+
+    Attributes
+    ----------
+    dataset
+        The run as of ``open_run``, on rank 0; None on the others and before the end.
+    states
+        The parts of each checkpoint (checkpoint, rank), on all ranks.
+    end
+        Displacements and velocities (cell, 2 dof) at the last sample of a complete run, if the caller has set them; the
+        dataset then has ``end/displacement`` and ``end/velocity``.
     """
 
     folder = None
@@ -299,12 +325,13 @@ class RunMemory:
         self.states = []
         self._rows = 0
         self._chunks: list[Arrays] = []
-        vars(self).pop("_fields", None)  # of the run before
+        # The fields of the run before, kept by ``cached_property``.
+        vars(self).pop("_fields", None)
 
     @cached_property
     def _fields(self) -> np.ndarray:
-        """All fields (field, sample, dof, cell), allocated at first use."""
-        # Not in ``begin``: the recording, which has the shape, is set after it.
+        """All fields (field, sample, dof, cell), allocated when they are first used."""
+        # Not in ``begin``, since the recording, which has the shape, is set after it.
         dofs = len(self.recording.given["dof"])
         cells = len(self.recording.given["cell"])
         shape = (len(self.recording.fields), self.recording.rows, dofs, cells)
@@ -323,7 +350,8 @@ class RunMemory:
         arrays = dict(chunk or {})
         fields = [arrays.pop(name) for name in self.recording.fields if name in arrays]
         rows = slice(self._rows, self._rows + len(arrays.get("field_time", ())))
-        if self.comm.size > 1 and fields:  # on one rank they stand there already
+        # On one rank the engine has written them there, into the ``room`` that it asked for.
+        if self.comm.size > 1 and fields:
             self._fields[:, rows] = fields
         self._rows = rows.stop
         self._chunks.append(arrays)
@@ -334,7 +362,7 @@ class RunMemory:
         return [0]
 
     def read(self, number: int, rank: int, wanted: Collection[str]) -> Arrays:
-        """All arrays of chunk ``number``, the ``wanted`` ones among them: they are in memory anyhow."""
+        """All arrays of chunk ``number``, the ``wanted`` ones among them, without a copy."""
         return self._chunks[number]
 
     def save_state(self, state: Arrays) -> None:
@@ -359,7 +387,7 @@ class RunMemory:
             for name, values in large.items():
                 description = chunks.described(name, small)
                 variables[name] = (description.dims, values, description.attributes)
-            # Together, since xarray aligns all variables whenever some are added.
+            # Added in one call, since xarray compares the dimensions of all variables whenever some are added.
             self.dataset = with_point_names(small.assign(variables))
         self._chunks = []
 

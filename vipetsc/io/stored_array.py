@@ -9,9 +9,9 @@ from xarray.core import indexing
 
 
 class StoredArray(BackendArray):
-    """A ``dataset`` of an open file; what is indexed is read.
+    """A ``dataset`` of an HDF5 file, of which only what is indexed is read.
 
-    xarray closes files that were not used for long: ``files`` opens the file again.
+    xarray keeps few files open, and closes those that were not used for long: ``files`` opens the file again.
     """
 
     def __init__(self, files: CachingFileManager, dataset: h5py.Dataset) -> None:
@@ -22,7 +22,7 @@ class StoredArray(BackendArray):
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         """The values at ``key``, an array or a number."""
-        # HDF5 takes a list of positions along one axis at most.
+        # h5py takes an array of positions along one axis at most.
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER_1VECTOR, self._read)
 
     def _read(self, key: tuple[Any, ...]) -> Any:
