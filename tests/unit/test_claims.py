@@ -89,6 +89,12 @@ def test_a_growth_ends_at_the_first_value_that_is_high_enough():
     assert late.growth_ratio(0.1, 0.5) == 2.0
 
 
+def test_a_curve_that_stays_on_its_floor_does_not_grow():
+    # Ten times the floor is above all values, as of a sweep in which nothing touches.
+    floor = contactless_curve([1.0, 2.0, 4.0], [0.9, 1.0, 1.1])
+    assert np.isnan(floor.growth_ratio(10.0, 0.55))
+
+
 # The table of thresholds of SPEC.md, lines "claim | quantity | comparison | threshold"; * stands for both laws.
 
 SPECIFIED = """

@@ -195,26 +195,44 @@ def test_no_motion_misses_the_modal_energies_by_more_than_the_bound(monkeypatch)
         assert 0.015 < np.max(np.abs(found / total - 1)) <= bound < 1
 
 
-@pytest.mark.parametrize(("lam", "eta", "expected"), [(0.1, 0.5, HOLDS), (0.1, 0.8, IN_PART), (0.6, 0.8, IN_PART)])
-def test_the_design_is_that_of_a_coarse_grid(tmp_path, lam, eta, expected):
-    """The optimum on a grid of 0.1 counts, although the fine grid has a better one 0.045 lower in eta."""
-    folder = tmp_path / "design"
+def put_design(root, lam, eta, out_of_phase):
+    """Write a search on a grid of 0.05, the best cell at ``lam`` and 0.045 below ``eta``, if ``out_of_phase`` there."""
+    folder = root / "design"
     folder.mkdir()
     grid = np.arange(2, 19) * 0.05
     distance = np.hypot(grid[:, None] - lam, grid[None, :] - eta + 0.045)
+    best = {"optimum_lambda": lam, "optimum_eta": eta, "optimum_value": 1.0}
     with h5py.File(folder / "design.h5", "w") as file:
         file["reading"] = ["printed", "calibrated"]
         file["cost"] = ["deflection", "group_velocity", "weighted"]
         file["lambda"] = grid
         file["eta"] = grid
         file["weighted"] = np.stack([1 - distance] * 2)
-        file["out_of_phase"] = np.ones((2, 17, 17), np.int8)
-        file["optimum_lambda"] = np.full((2, 3), lam)
-        file["optimum_eta"] = np.full((2, 3), eta)
-        file["optimum_value"] = np.full((2, 3), 1.0)
+        file["out_of_phase"] = np.stack([out_of_phase] * 2).astype(np.int8)
+        for name, value in best.items():
+            file[name] = np.full((2, 3), value if out_of_phase.any() else np.nan)
         file["paper_value"] = np.full((2, 3), 0.9)
 
+
+@pytest.mark.parametrize(("lam", "eta", "expected"), [(0.1, 0.5, HOLDS), (0.1, 0.8, IN_PART), (0.6, 0.8, IN_PART)])
+def test_the_design_is_that_of_a_coarse_grid(tmp_path, lam, eta, expected):
+    """The optimum on a grid of 0.1 counts, although the fine grid has a better one 0.045 lower in eta."""
+    put_design(tmp_path, lam, eta, np.ones((17, 17)))
     for reading in READINGS:
         claim = measure("C10", tmp_path, reading)
         assert claim.verdict == expected
         assert claim.value["eta at the optimum of a grid of 0.1"] == pytest.approx(eta)
+
+
+@pytest.mark.parametrize("cells", ["none", "between the points of the coarse grid"])
+def test_a_design_without_cells_out_of_phase_has_no_optimum(tmp_path, cells):
+    """No number stands for an optimum on the coarse grid where none of its cells is out of phase."""
+    out_of_phase = np.zeros((17, 17))
+    if cells != "none":
+        out_of_phase[1::2] = 1
+    put_design(tmp_path, 0.1, 0.5, out_of_phase)
+
+    claim = measure("C10", tmp_path)
+    assert claim.verdict == FAILS
+    assert claim.value["lambda at the optimum of a grid of 0.1"] is None
+    assert claim.value["eta at the optimum of a grid of 0.1"] is None

@@ -46,6 +46,16 @@ def put_transfer(
 
 
 @pytest.mark.slow
+def test_transfer_that_never_sets_in_is_measured(tmp_path):
+    """Where nothing touches there is a floor, but neither an onset nor a maximum."""
+    put_transfer(tmp_path, maximum=0.0)
+    onset = measure("C11", tmp_path)
+    assert onset.verdict == IN_PART
+    assert onset.value["ratio of amplitudes from the floor to half the maximum, hertz"] is None
+    assert onset.value["maximum, hertz"] == pytest.approx(2e-6)
+
+
+@pytest.mark.slow
 def test_coordinates_of_a_zipped_axis_meet_in_one_member(tmp_path):
     put_transfer(tmp_path)
     with Evidence(tmp_path) as evidence:

@@ -92,10 +92,14 @@ class AmplitudeCurve:
         # Up to the peak: behind it the values fall again, and may be as low as before.
         value = self.value[: self.peak + 1]
         before = np.nonzero(value <= low)[0]
-        above = np.nonzero(value >= high)[0]
-        if not before.size or not above.size:
+        if not before.size:
             return float("nan")
-        return float(self.amplitude[above[above > before[-1]][0]] / self.amplitude[before[-1]])
+        last = before[-1]
+        after = np.nonzero(value[last + 1 :] >= high)[0]
+        # A curve that stays on its floor is low up to the peak.
+        if not after.size:
+            return float("nan")
+        return float(self.amplitude[last + 1 + after[0]] / self.amplitude[last])
 
     def interpolate(self, amplitude: float) -> float:
         """The value at ``amplitude`` in N, interpolated over its logarithm; NaN beyond the ends."""

@@ -48,11 +48,17 @@ def optimum(evidence: Evidence, reading: str, result: Measurement) -> None:
     rows = _on_grid(lam)
     columns = _on_grid(eta)
     coarse = np.where(out_of_phase, cost, -np.inf)[np.ix_(rows, columns)]
-    at_lam, at_eta = np.unravel_index(np.argmax(coarse), coarse.shape)
+    coarse_lam = np.nan
+    coarse_eta = np.nan
+    # Without a cell out of phase there is no optimum, and the argmax would be the first cell.
+    if np.isfinite(coarse).any():
+        at_lam, at_eta = np.unravel_index(np.argmax(coarse), coarse.shape)
+        coarse_lam = lam[rows][at_lam]
+        coarse_eta = eta[columns][at_eta]
     cell = (int(np.argmin(abs(lam - PAPER_CELL[0]))), int(np.argmin(abs(eta - PAPER_CELL[1]))))
     result.value |= {
-        f"lambda at the optimum of a grid of {GRID:g}": lam[rows][at_lam],
-        f"eta at the optimum of a grid of {GRID:g}": eta[columns][at_eta],
+        f"lambda at the optimum of a grid of {GRID:g}": coarse_lam,
+        f"eta at the optimum of a grid of {GRID:g}": coarse_eta,
         "u2 and u3 out of phase on band 2 at the paper's cell (1 = yes)": out_of_phase[cell],
         "weighted cost of the paper's cell over the optimum's": paper[weighted] / best[weighted],
     }
