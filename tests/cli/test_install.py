@@ -182,4 +182,9 @@ def test_recipes_and_citation_say_what_the_package_says():
     run = recipe.split("\n  run:\n")[1].split("\n\n")[0]
     names = {name.removesuffix("-base") for name in re.findall(r"^ +- ([\w-]+)", run, flags=re.M)}
     assert names - {"python", "petsc", "slepc4py"} == needed
+
+    # The recipe asks for no older version than the package, nor for a newer one.
+    oldest = {name.removesuffix("-base"): bound for name, bound in re.findall(r"- ([\w-]+) >=(\S+)", run)}
+    lines = [*project["dependencies"], *project["optional-dependencies"]["h5py"]]
+    assert {name: oldest[name] for name in needed} == dict(line.split(">=") for line in lines)
     assert "- petsc * real_*\n" in run

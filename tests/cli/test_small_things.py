@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -13,7 +14,12 @@ from tests.conftest import clean_environment, modified
 from tests.faults.scenarios import BRANCHES, DESIGN, RUN
 from vipetsc.case import NnmCase
 from vipetsc.case.design import DesignCase
+from vipetsc.cli.tables import duration
+from vipetsc.cli.verbs.bands_verb import damping_report, damping_table
+from vipetsc.cli.verbs.plot_verb import pictures_of
 from vipetsc.figures.registry import FIGURES
+from vipetsc.lattice import UnitCell
+from vipetsc.lattice.cell import Spring
 
 
 @pytest.mark.parametrize("kind", [NnmCase, DesignCase])
@@ -44,6 +50,36 @@ def test_branches_and_searches_need_not_be_drawn(in_process, monkeypatch, tmp_pa
     # The same case without it only draws.
     assert in_process(*words).returncode == 0
     assert any((out / "figures").glob("*.png"))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.0042, "0.0042 s"), (99.4, "99 s"), (112.0, "110 s"), (119.0, "120 s"), (74_040.0, "1230 min")],
+)
+def test_durations_are_written_without_powers_of_ten(seconds, text):
+    assert duration(seconds) == text
+
+
+def test_waves_that_do_not_decay_are_null_in_json():
+    """At frequency 0 a lattice that is held nowhere moves as a whole, without loss; JSON has no infinite numbers."""
+    springs = (Spring(0, 0, 1e4, next_cell=True, damping=0.1), Spring(0, 1, 5e3, damping=0.1))
+    cell = UnitCell(masses=(1e-3, 1e-3), springs=springs, host=0, resonator=1)
+    moving = damping_table(cell, 1000.0)
+    resting = damping_table(cell, 0.0)
+
+    assert 0 < moving["decay_length"]["cells"] < 1e6
+    assert resting["decay_length"]["cells"] is None
+    json.dumps(resting, allow_nan=False)
+    assert "at 0 rad/s waves do not decay" in damping_report(resting)
+
+
+@pytest.mark.parametrize("path", [".", "design.h5"])
+def test_the_folder_in_which_one_is_has_its_name_on_pages(tmp_path, monkeypatch, path):
+    (tmp_path / "design.h5").touch()
+    monkeypatch.chdir(tmp_path)
+    pictures, folders = pictures_of([Path(path)])
+    assert pictures.source == "design"
+    assert folders == [tmp_path]
 
 
 def test_columns_of_the_list_of_the_paper_are_apart(in_process, tmp_path):

@@ -105,8 +105,8 @@ def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
     """Damping of a cell as for JSON: of the fastest wave of each band, and the decay length at ``frequency`` in rad/s.
 
     ``damping`` has the damping ratio, the damped frequency in rad/s and the time in s to decay to 1/e of each wave,
-    ``decay_length`` the number of ``cells`` to 1/e of the wave that goes farthest. It is empty for a cell without
-    dashpots or without springs.
+    ``decay_length`` the number of ``cells`` to 1/e of the wave that goes farthest. A time or a length without end is
+    None, since JSON has no infinite numbers. The table is empty for a cell without dashpots or without springs.
     """
     if not (cell.is_damped and cell.springs):
         return {}
@@ -116,7 +116,7 @@ def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
         kappa = max_group_velocity(cell, band.number)[0]
         point = damped_bloch(cell, kappa)
         rate = point.rate[band.number - 1]
-        decay_time = np.inf
+        decay_time = None
         if rate.real:
             # Amplitudes go as exp(rate t), with a negative real part.
             decay_time = float(-1 / rate.real)
@@ -127,7 +127,11 @@ def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
             "frequency": float(rate.imag),
             "decay_time": decay_time,
         })  # fmt: skip
-    return {"damping": rows, "decay_length": {"frequency": frequency, "cells": decay_length(cell, frequency)}}
+
+    length: float | None = decay_length(cell, frequency)
+    if length == np.inf:
+        length = None
+    return {"damping": rows, "decay_length": {"frequency": frequency, "cells": length}}
 
 
 def damping_report(numbers: dict[str, Any]) -> str:
@@ -137,12 +141,19 @@ def damping_report(numbers: dict[str, Any]) -> str:
 
     lines = ["\nband  damping ratio  decays to 1/e in (s)   at: kappa/pi   rad/s"]
     for row in numbers["damping"]:
+        decay_time = "never"
+        if row["decay_time"] is not None:
+            decay_time = f"{row['decay_time']:.4g}"
         lines.append(
-            f"{row['band']:4d} {row['damping_ratio']:14.4g} {row['decay_time']:21.4g} "
+            f"{row['band']:4d} {row['damping_ratio']:14.4g} {decay_time:>21} "
             f"{row['wavenumber'] / np.pi:14.4f} {row['frequency']:8.2f}"
         )
+
     length = numbers["decay_length"]
-    lines.append(f"at {length['frequency']:.6g} rad/s waves decay to 1/e in {length['cells']:.4g} cells")
+    decay = "do not decay"
+    if length["cells"] is not None:
+        decay = f"decay to 1/e in {length['cells']:.4g} cells"
+    lines.append(f"at {length['frequency']:.6g} rad/s waves {decay}")
     return "\n".join(lines)
 
 

@@ -105,6 +105,9 @@ def pictures_of(paths: Sequence[Path]) -> tuple[Pictures, list[Path]]:
     for i, path in enumerate(paths):
         if path.name in files:
             folders[i] = path.parent
+        # Pages name branches of one name by their folders, and "." has no name.
+        if not folders[i].name:
+            folders[i] = folders[i].absolute()
     for pictures in by_source.values():
         if pictures.are_of(folders):
             return pictures, folders
