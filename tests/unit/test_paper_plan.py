@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from vipetsc.case import Case, case_id
 from vipetsc.io.folder import SEARCH, FolderError, claimed
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.paper import draw, make, steps
-from vipetsc.paper.build_record import read_record
+from vipetsc.paper.build_record import read_record, write_record
 from vipetsc.paper.cell_search import search_design
 from vipetsc.paper.paper_figures import TRANSFER, PaperFigure
 from vipetsc.paper.plan import BEGUN, DONE, FULL, MISSING, RELATION, STALE, PaperStep, Plan, fingerprint, paper_plan
@@ -262,6 +263,24 @@ def test_a_failed_step_is_reported_and_cut_files_are_computed_again(searched, tm
     (root / "plan.json").write_text("")
     with pytest.raises(FolderError, match=r"plan\.json cannot be read; remove it if the folder holds"):
         make.make_paper(plan, root)
+
+
+@pytest.mark.parametrize("end", ["another case", "removed"])
+def test_the_time_of_a_step_is_that_of_the_results_that_are_there(searched, tmp_path, end):
+    """Time spent on results that are gone does not count, whether another case replaced them or they were removed."""
+    plan = replace(searched[0], figures=[], measure=lambda root: [])
+    root = tmp_path / "paper"
+    make.make_paper(plan, root)
+    record = read_record(root)
+    record["cpu"]["steps"]["design"] = 1e6
+    write_record(root, record)
+
+    if end == "removed":
+        shutil.rmtree(root / "design")
+    else:
+        plan = replace(plan, steps=(replace(plan.steps[0], changes=(*SMALL, "design.eta.count=4")),))
+    assert make.make_paper(plan, root).new_steps == ("design",)
+    assert 0 < read_record(root)["cpu"]["steps"]["design"] < 1e5
 
 
 @pytest.mark.slow

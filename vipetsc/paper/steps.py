@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from vipetsc.io.errors import is_disk_full
 from vipetsc.paper.build_record import read_record, write_record
-from vipetsc.paper.plan import STALE, PaperStep, PartMaker, Plan
+from vipetsc.paper.plan import MISSING, STALE, PaperStep, PartMaker, Plan
 from vipetsc.parallel import StoppedError, StopRequest, on_root
 from vipetsc.studies.pool import TaskPool
 
@@ -45,7 +45,10 @@ def make_steps(
     and failures are added to ``notes``. Collective.
     """
     left = on_root(comm, lambda: plan.left(root))
-    stale = on_root(comm, lambda: {step.name for step in plan.steps if step.state(root) == STALE})
+    states = on_root(comm, lambda: {step.name: step.state(root) for step in plan.steps})
+    stale = {name for name, state in states.items() if state == STALE}
+    # Of these the time that is on record, if any is, was spent on results that are gone.
+    afresh = {name for name, state in states.items() if state in (STALE, MISSING)}
     missing = [step for step in plan.steps if step.name in left]
 
     def announce(*names: str) -> None:
@@ -56,7 +59,9 @@ def make_steps(
     parted = [step for step in missing if step.parts]
     if parted and not stop.agreed(comm):
         announce(*(step.name for step in parted))
-        finished += _make_parts(parted, stale, root, comm, stop, notes)
+        computed, cpu = _make_parts(parted, stale, root, comm, stop, notes)
+        finished += computed
+        _account(root, comm, cpu, afresh)
 
     # Then the steps on which all ranks work: after an interruption at most one of them is incomplete.
     for step in missing:
@@ -71,7 +76,7 @@ def make_steps(
             warnings = step.sweep(root, comm, stop, step.name in stale)
             notes += [f"warning: {step.name}: {warning}" for warning in warnings]
             finished.append(step.name)
-            _account(root, comm, {step.name: time.process_time() - begin}, step.name in stale)
+            _account(root, comm, {step.name: time.process_time() - begin}, afresh)
 
     return tuple(step.name for step in missing if step.name in finished)
 
@@ -86,10 +91,11 @@ class PartJob(NamedTuple):
 
 def _make_parts(
     steps: Sequence[PaperStep], stale: Collection[str], root: Path, comm: MPI.Comm, stop: StopRequest, notes: list[str]
-) -> list[str]:
-    """Compute all parts of ``steps`` on single ranks, the longest first; returns the names of steps without failures.
+) -> tuple[list[str], dict[str, float]]:
+    """Compute all parts of ``steps`` on single ranks, the longest first.
 
-    Earlier results of ``stale`` steps are replaced. Failures are added to ``notes``. Collective.
+    Earlier results of ``stale`` steps are replaced. Failures are added to ``notes``. Returns the names of the steps
+    without failures, and the CPU time in s that this rank has spent on each step. Collective.
     """
     cpu: dict[str, float] = {}
     reasons: dict[str, str] = {}
@@ -122,11 +128,10 @@ def _make_parts(
         if not (pool.stopped or stop.agreed(comm)):
             for name in finished:
                 makers[name].publish()
-    _account(root, comm, cpu, afresh=False)
-    return finished
+    return finished, cpu
 
 
-def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: bool) -> None:
+def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: Collection[str]) -> None:
     """Add the CPU time in s that each rank has spent on ``steps`` to the record in ``root``. Collective.
 
     Of steps that were computed ``afresh`` the record has this time alone.
@@ -140,7 +145,7 @@ def _account(root: Path, comm: MPI.Comm, steps: Mapping[str, float], afresh: boo
         record = read_record(root)
         steps = record["cpu"]["steps"]
         for name, seconds in spent.items():
-            if not afresh:
+            if name not in afresh:
                 seconds += steps.get(name, 0.0)
             steps[name] = seconds
         write_record(root, record)
