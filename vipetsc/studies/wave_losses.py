@@ -112,13 +112,15 @@ class WaveLosses:
                 of_third = self.rays.of_wave(cell, self.third.band, self.third.wavenumber)
                 remaining[self.third.band] += float(sent.third[number] @ of_third.remaining) * step
                 absorbed += float(sent.third[number] @ of_third.absorbed) * step
-        # Rounding may leave a negative energy where nothing is sent.
+        # The third harmonics may lie in the drive's band, whose change may be negative; the other bands have energies,
+        # of which rounding, or third harmonics that cancel each other, may leave less than nothing.
+        in_driven_band = remaining[self.driven.band]
         remaining = np.maximum(remaining, 0.0)
 
         # What the ends take without contacts is missing from the energy of the run without them already.
         in_ends = self._power_in_ends(amplitude, sent.force) - self._power_in_ends(amplitude)
         since = np.exp(-self.rate(self.driven) * self.rays.since)
-        remaining[self.driven.band] = -float((sent.given.sum(axis=0) + in_ends) @ since) * step
+        remaining[self.driven.band] = in_driven_band - float((sent.given.sum(axis=0) + in_ends) @ since) * step
         return EndEnergies(remaining=remaining, absorbed=absorbed + float(in_ends.sum()) * step)
 
     def absorbed_without_contacts(self) -> float:
