@@ -95,9 +95,12 @@ def test_a_whole_member_is_run_again_by_its_name_or_number(in_process, case, tmp
     # One scaled, one simulated.
     assert status.tolist() == [1, 0]
 
-    for number, name in enumerate((names[0], "1")):
+    # The sweep is named by its folder, and by a file beside which its linear run is not recorded.
+    file = tmp_path / "sweep.toml"
+    file.write_bytes((out / "case.toml").read_bytes())
+    for number, (sweep, name) in enumerate(((out, names[0]), (file, "1"))):
         run = tmp_path / f"run-{number}"
-        ended = in_process("run", out, "--member", name, "--out", run, "--set", "output.figures=false")
+        ended = in_process("run", sweep, "--member", name, "--out", run, "--set", "output.figures=false")
         assert ended.returncode == 0, ended.stderr
         found = datasets(run / "run.h5")
         measured = datasets(run / "analysis.h5")

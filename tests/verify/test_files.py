@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 from mpi4py import MPI
 
@@ -16,6 +17,7 @@ from vipetsc import Case, simulate
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.dynamics.ts import integrator
 from vipetsc.io.lock import FolderError
+from vipetsc.studies import reanalysis
 from vipetsc.studies.analysis import analyse
 from vipetsc.studies.analysis_options import is_measured
 from vipetsc.studies.reanalysis import measure_run, reanalyse_folders
@@ -145,6 +147,20 @@ def test_another_analysis_of_the_same_run(run_folder, folder):
             reanalyse_folders([folder / "run"], MPI.COMM_SELF, overrides)
     with pytest.raises(FolderError, match=r"drive\.amplitude"):
         simulate(small_case(drive={"amplitude": 2.0}), folder / "run")
+
+
+@pytest.mark.parametrize("named", [".", "run.h5", "../run"])
+def test_a_run_is_measured_from_its_own_folder(run_folder, folder, monkeypatch, named):
+    """The sweep that it may be a member of is in the folder around it, however the run is named."""
+    shutil.copytree(run_folder, folder / "run")
+    monkeypatch.chdir(folder / "run")
+    asked = []
+    monkeypatch.setattr(reanalysis, "read_linear", lambda sweep, case: asked.append(Path(sweep).resolve()))
+
+    (written,) = reanalyse_folders([Path(named)], MPI.COMM_SELF)
+    measure_run(Path("."))
+    assert written.resolve() == folder.resolve() / "run" / "analysis.h5"
+    assert asked == [folder.resolve()] * 2
 
 
 @pytest.mark.slow

@@ -12,10 +12,12 @@ import pytest
 from tests.conftest import assert_same_bits, datasets
 from vipetsc.case import Case, Sweep
 from vipetsc.io.read import open_ensemble
+from vipetsc.io.records import RecordFile, read_records
 from vipetsc.parallel import StopRequest
 from vipetsc.studies.ensemble import COMPLETE, SCALED
-from vipetsc.studies.linear_run import linear_case, linear_name
+from vipetsc.studies.linear_run import MEMBERS, linear_case, linear_name
 from vipetsc.studies.reanalysis import reanalyse_folders
+from vipetsc.studies.recorded_runs import RecordPaths
 from vipetsc.studies.sweep import run_sweep
 from vipetsc.studies.sweep_runs import SweepRuns
 
@@ -152,6 +154,28 @@ def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
     assert again.computed == 1
     assert "run.h5 cannot be read" in again.warnings[0]
     assert_same_bits(found, datasets(kept / "run.h5"))
+
+
+def test_new_measures_count_whichever_rank_recorded_the_old_ones(tmp_path):
+    """Records of ranks that were not merged, as after a kill, are older than those of a new analysis."""
+    folder = tmp_path / "sweep"
+    table = TABLE | {"sweep": {"fields": True, "drive": {"amplitude": [60.0]}}}
+    assert run_sweep(Sweep.from_table(table), folder).complete
+    right = open_ensemble(folder)["ibtet"].item()
+
+    paths = RecordPaths(folder, MEMBERS)
+    records = [record for record, _ in read_records(paths.merged, pytest.fail)]
+    paths.merged.unlink()
+    file = RecordFile(paths.for_rank(1))
+    for record in records:
+        if "measures" in record and "id" in record:
+            record["measures"]["ibtet"] = 2 * right
+        file.append(record)
+    file.close()
+
+    reanalyse_folders([folder], MPI.COMM_SELF)
+    assert open_ensemble(folder)["ibtet"].item() == right
+    assert paths.existing() == [paths.merged]
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from vipetsc.parallel import StopRequest
 from vipetsc.spectra import entropies
 from vipetsc.studies import linear_history
 from vipetsc.studies.analysis import analyse
-from vipetsc.studies.linear_history import LinearHistory, begins_linearly, history_bytes, opening_of
+from vipetsc.studies.linear_history import LinearHistory, MemberHistory, begins_linearly, history_bytes
 from vipetsc.studies.opening_entropies import OpeningEntropies
 from vipetsc.studies.sweep import run_sweep
 
@@ -196,7 +196,7 @@ def test_a_member_has_the_same_bits_in_every_sweep_and_alone(tmp_path):
 
     name = plan.ids()[0]
     case = plan.case(0)
-    simulate(case, tmp_path / "alone", opening=opening_of(plan, case, MPI.COMM_SELF, StopRequest()))
+    simulate(case, tmp_path / "alone", opening=MemberHistory(plan, case, MPI.COMM_SELF, StopRequest()).opening)
     alone = datasets(tmp_path / "alone" / "run.h5")
     assert_same_bits(alone, datasets(tmp_path / "fields" / name / "run.h5"))
     assert records["some"][name]["statistics"]["work"] == alone["energy/work"][-1]

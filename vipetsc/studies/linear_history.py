@@ -4,7 +4,7 @@ Whether members begin so depends on the sweep's case, not on which members are m
 member has the same bits in every sweep that has it, after an interruption, and where it is repeated alone.
 """
 
-from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 from mpi4py import MPI
@@ -18,11 +18,13 @@ from vipetsc.dynamics.engine_choice import PROPAGATOR
 from vipetsc.dynamics.opening import Opening
 from vipetsc.io.atomic import Arrays
 from vipetsc.io.store import RunMemory
-from vipetsc.parallel import StopRequest
+from vipetsc.parallel import StopRequest, on_root
 from vipetsc.studies.linear_run import (
     MARGIN,
+    LinearRun,
     envelope_squares,
     is_proportional,
+    leading_cell,
     linear_case,
     other_pairs,
     reached,
@@ -102,13 +104,38 @@ def begins_linearly(plan: Sweep, case: Case) -> bool:
     return members >= FEWEST_MEMBERS and history_bytes(case) <= MOST_BYTES
 
 
-def opening_of(plan: Sweep, case: Case, comm: MPI.Comm, stop: StopRequest) -> Callable[[], Opening | None]:
-    """A function that simulates the linear run of the member ``case`` of ``plan``, and returns the member's opening."""
+class MemberHistory:
+    """The linear run of the member ``case`` of ``plan``, which is repeated outside of its sweep.
 
-    def opening() -> Opening | None:
-        return LinearHistory.of(case, comm, stop).opening(case) if begins_linearly(plan, case) else None
+    It is simulated on all ranks of ``comm`` when it is first asked for; all ranks must call every method.
+    """
 
-    return opening
+    def __init__(self, plan: Sweep, case: Case, comm: MPI.Comm, stop: StopRequest) -> None:
+        self._plan = plan
+        self._case = case
+        self._comm = comm
+        self._stop = stop
+
+    def opening(self) -> Opening | None:
+        """The samples with which the member begins as in its sweep; None if it begins without any."""
+        if not begins_linearly(self._plan, self._case):
+            return None
+        return self._history.opening(self._case)
+
+    def arrival(self) -> float | None:
+        """The time in s at which the linear wave arrives at the member's first site; None without sites."""
+
+        def arrival() -> float | None:
+            linear = LinearRun.of(self._history.run, self._history.statistics, sites=(), names=())
+            return linear.arrival_at(leading_cell(self._case))
+
+        # Simulated by all ranks, taken from the dataset that the first one has.
+        _ = self._history
+        return on_root(self._comm, arrival)
+
+    @cached_property
+    def _history(self) -> LinearHistory:
+        return LinearHistory.of(self._case, self._comm, self._stop)
 
 
 def _keeps_linear_run(key: str, plan: Sweep, case: Case) -> bool:

@@ -1,7 +1,8 @@
 """New analyses of finished runs: of a single run, or of all members of a sweep whose fields are stored."""
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
@@ -72,11 +73,15 @@ def reanalyse_folders(paths: list[Path], comm: MPI.Comm, overrides: Sequence[str
 
 def _reassemble(folder: Path) -> Path:
     """Assemble the ensemble of the sweep in ``folder`` again; returns its path."""
-    results = Results(Sweep.load(folder / "case.toml"), folder)
+    plan = Sweep.load(folder / "case.toml")
+    results = Results(plan, folder)
     if (results.status == MISSING).any():
         raise FolderError(f"{folder}: the sweep is not finished; continue it with the verb sweep")
 
-    # New records come behind the old ones: of several records of a member the latest counts.
+    # Of several records of a member the latest counts, in the order of the files. All that are there go into the first
+    # file, so that new ones come behind those of every rank, also after a sweep that was killed before its end.
+    results.merge_files()
+    results = Results(plan, folder)
     file = RecordFile(results.paths.for_rank(0))
     for name in results.ids:
         path = folder / name / "analysis.h5"
@@ -84,7 +89,7 @@ def _reassemble(folder: Path) -> Path:
             with open_netcdf(path, "analysis") as analysis:
                 file.append(results.lines[name].record() | {"measures": measured(analysis)})
     file.close()
-    conclude(Results(results.plan, folder), afresh=True)
+    conclude(Results(plan, folder), afresh=True)
     return folder / "ensemble.h5"
 
 
@@ -107,12 +112,18 @@ def _measurable(path: Path) -> Iterator[MeasurableRun]:
         try:
             with open_run(file) as run:
                 if not sweep or keeps_all(Case.of(run)):
-                    yield MeasurableRun(file.parent, file.parents[1], measures)
+                    yield MeasurableRun(file.parent, _containing_folder(file.parent), measures)
         except FolderError:
             # The message says which file, and why.
             raise
         except (OSError, ValueError, KeyError) as error:
             raise FolderError(f"{file}: is not a run of vipetsc ({error})") from None
+
+
+def _containing_folder(folder: Path) -> Path:
+    """The folder that contains ``folder``."""
+    # Made absolute: "." has no parent of its own. Not resolved: a member may be a link to another disk.
+    return Path(os.path.abspath(folder)).parent
 
 
 def measure_run(
@@ -121,24 +132,30 @@ def measure_run(
     measures: Collection[str] = FULL,
     overrides: Sequence[str] = (),
     comm: MPI.Comm = MPI.COMM_SELF,
+    find_arrival: Callable[[], float | None] = lambda: None,
 ) -> Path:
     """Measure the run in ``folder`` and write its ``analysis.h5``; returns that file. Raises as ``open_run``.
 
     ``sweep`` is the folder of the sweep that the run may be a member of, by default the one in which ``folder`` lies:
-    its linear run says when the wave arrives at the first site. ``overrides`` change keys of ``[analysis]``. The ranks
-    of ``comm`` take different ones of the ``measures``, and all must call it.
+    its linear run says when the wave arrives at the first site. Without a record of that run, ``find_arrival`` returns
+    this time in s, or None for an estimate. ``overrides`` change keys of ``[analysis]``. The ranks of ``comm`` take
+    different ones of the ``measures``, and all must call it.
     """
 
-    def begin(stack: ExitStack) -> tuple[xr.Dataset, float | None, AnalysisTable]:
+    def begin(stack: ExitStack) -> tuple[xr.Dataset, AnalysisTable]:
         run = stack.enter_context(open_run(folder / "run.h5"))
-        case = Case.of(run)
-        linear = read_linear(sweep or folder.parent, case)
-        arrival = linear.arrival_at(leading_cell(case)) if linear else None
-        return run, arrival, options_of(run.attrs["case"], folder, overrides)
+        return run, options_of(run.attrs["case"], folder, overrides)
 
     # The run stays open while all ranks measure it, and is closed on each even where one fails.
     with ExitStack() as stack:
-        run, arrival, options = on_every_rank(comm, lambda: begin(stack))
+        run, options = on_every_rank(comm, lambda: begin(stack))
+        case = Case.of(run)
+        # One rank looks for the record: the others must simulate together or not at all.
+        linear = on_root(comm, lambda: read_linear(sweep or _containing_folder(folder), case))
+        if linear:
+            arrival = linear.arrival_at(leading_cell(case))
+        else:
+            arrival = find_arrival()
         analysis = analyse(run, measures, arrival, options, comm)
 
     def write() -> Path:

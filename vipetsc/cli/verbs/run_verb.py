@@ -57,13 +57,15 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     from vipetsc.dynamics.cost import estimate
     from vipetsc.io.export import has_xdmf, write_xdmf
     from vipetsc.studies.analysis_options import is_measured
-    from vipetsc.studies.linear_history import opening_of
+    from vipetsc.studies.linear_history import MemberHistory
     from vipetsc.studies.reanalysis import measure_run
 
+    # As in its sweep, a member begins from its linear run, and so has the same bits.
+    linear = None
     opening = None
     if work.options.member:
-        # As in the sweep, the member begins from its linear run, and so has the same bits.
-        opening = opening_of(_sweep_of(work.options), case, work.comm, work.stop)
+        linear = MemberHistory(_sweep_of(work.options), case, work.comm, work.stop)
+        opening = linear.opening
     result = simulate(case, work.folder, work.comm, opening=opening, **work.keywords)
     work.warn(result.warnings)
     faster = on_root(work.comm, lambda: estimate(case, work.comm.size).faster)
@@ -79,12 +81,16 @@ def simulate_and_measure(case: Case, work: Work) -> Outcome:
     if has_fields and work.helper:
         draw_unmeasured(PICTURES, work.folder, work.helper)
     if has_fields or (case.output.points and has_two_samples):
-        sweep = None
-        if work.options.member:
-            # The linear run of its sweep has the time at which the wave arrives at the sites of a member.
-            sweep = Path(work.options.case)
         if not on_root(work.comm, lambda: is_measured(work.folder)):
-            measure_run(work.folder, sweep, comm=work.comm)
+            if linear:
+                # As in its sweep, the member is measured from the arrival of the wave of its linear run, which the
+                # folder of the sweep has on record.
+                sweep = Path(work.options.case)
+                if sweep.is_file():
+                    sweep = sweep.parent
+                measure_run(work.folder, sweep, comm=work.comm, find_arrival=linear.arrival)
+            else:
+                measure_run(work.folder, comm=work.comm)
         on_root(work.comm, lambda: has_xdmf(work.folder) or write_xdmf(work.folder))
         measured, unsettled = on_root(work.comm, lambda: measures_of_points(case, work.folder))
         work.warn(unsettled)
