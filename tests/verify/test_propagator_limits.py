@@ -4,16 +4,19 @@ import re
 
 from mpi4py import MPI
 
+import numpy as np
 import pytest
 
 from tests.conftest import small_case
 from tests.faults.mutations import run_shortly
 from vipetsc.case import Case
+from vipetsc.dynamics import simulate
 from vipetsc.dynamics.engine import FillResult
 from vipetsc.dynamics.layout import Layout
 from vipetsc.dynamics.propagator.engine import Propagator
 from vipetsc.dynamics.propagator.step_choice import refusal
 from vipetsc.dynamics.propagator.unrecorded import unrecorded_samples
+from vipetsc.io.store import RunMemory
 
 
 def test_a_lattice_without_contacts_is_stepped():
@@ -43,6 +46,22 @@ def test_contacts_that_cannot_be_followed_end_the_run():
     time_of_stall = float(stalled.split()[-2])
     assert 0 < time_of_stall - engine.time < model.sample_interval
     engine.destroy()
+
+
+def test_the_last_sample_before_a_stall_has_its_own_energies():
+    """The step in which a rank alone stalls begins on a sample: what its forces did up to the stall is not in it."""
+    case = small_case(contacts={"sites": [1, 6], "law": "bilinear", "stiffness": 1e45}, time={"engine": "propagator"})
+    memory = RunMemory(MPI.COMM_SELF)
+    result = simulate(case, memory)
+    assert "stalled" in result.sentence
+    assert result.statistics["engine"] == "propagator"
+
+    run = memory.dataset
+    assert run is not None
+    work = run["energy/work"].values
+    held = sum(run[f"energy/{name}"].values for name in ("kinetic", "spring", "contact", "dissipated"))
+    assert work[-1] > 0
+    assert np.abs(work - held).max() < 1e-9 * np.abs(work).max()
 
 
 @pytest.mark.slow

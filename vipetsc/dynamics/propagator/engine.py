@@ -96,8 +96,8 @@ def take_steps(
 ) -> tuple[int, np.ndarray]:
     """Go on to the last step and take the ``samples`` on the way; returns PETSc's error code and the log of ``tracks``.
 
-    Several ranks go on to the end even if one fails, which then goes on without contacts: they do not ask one another
-    at each step.
+    Several ranks agree on failures at the block's end alone: a rank that fails goes on to it without contacts, and a
+    rank that has all cells stops at once.
     """
     rows = halo.columns.shape[0]
     owned = states.owned
@@ -154,9 +154,11 @@ def take_steps(
                 loss = loss_by_forces(step.by_forces, step.by_pairs, dofs, c, halo.columns)
                 lost[step.by_forces.leader[c]] += loss
 
-        # A rank alone stays at the step that failed, for its state to be shown; among others it must keep their pace.
-        if progress.failed > progress.last or halo.scatter != 0:
-            progress.steps += 1
+        # Among others a rank that failed must keep their pace. One alone stays at the step that failed, for its state
+        # to be shown, and takes no sample there again: its clusters have gone a part of that step.
+        if progress.failed <= progress.last and halo.scatter == 0:
+            break
+        progress.steps += 1
     return error, tracks.log
 
 
