@@ -154,6 +154,22 @@ def test_energies_beyond_all_scales_saturate_the_sums():
     assert sums[1].tolist() == [3 * int(LARGEST), 0]
 
 
+def test_a_long_lattice_that_is_nowhere_finite_is_beyond_the_sums():
+    """Energies that are cut off at ``LARGEST`` do not overflow: 2^14 of them are 2^64, which is 0 in 64 bits."""
+    model = small_case(lattice={"cells": 2**14, "damping": {"mass": 1.0}}).model()
+    layout = Layout(model, MPI.COMM_SELF, dashpots=True)
+    sums = EnergyMeter(model, layout).sums(np.full(layout.size, np.nan))
+    kinetic, spring, _, _, damping = sums[:, 0] >= LARGEST
+    assert kinetic
+    assert spring
+    assert damping
+
+    sums[:] = 0
+    for _ in range(2**14):
+        add_energy(sums, np.nan, 1.0)
+    assert sums[1, 0] >= LARGEST
+
+
 @pytest.mark.parametrize("size", [1, 31, 77, 640])
 @pytest.mark.parametrize("count", [1, 4, 7, 13])
 def test_stages_are_added_as_petsc_adds_them(size, count):

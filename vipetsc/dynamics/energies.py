@@ -22,9 +22,11 @@ from vipetsc.dynamics.site_dofs import relative_motion
 from vipetsc.dynamics.springs import CHUNK, add_nonlinear_energies, add_squares, displacement, is_varied
 
 _FINE = 2.0**40  # multiples of the finer remainder in one unit
-# Whole multiples from which on a sum counts as a runaway energy, and at which a cell's energy is cut off. An integer of
-# 64 bits holds the sum of 2^13 such energies.
+# Whole multiples from which on a sum counts as a runaway energy, and at which a cell's energy is cut off.
 LARGEST = 2.0**50
+# Whole multiples at which a sum is cut off. A chunk of cells adds 2^59 at most, so that a sum of 64 bits never
+# overflows, however many cells run away at once. (Remainders are 2^39 at most, and would need 2^24 cells of a rank.)
+SATURATED = 2**61
 _KINETIC, _SPRING, _CONTACT, _DISSIPATED, _DAMPING = range(5)
 ENERGY_SUMS = 5
 
@@ -42,21 +44,25 @@ def _multiples(energy: float, unit: float) -> tuple[np.int64, np.int64]:
 
 @kernel
 def _add(sums: np.ndarray, kind: int, energies: np.ndarray, unit: float) -> None:
-    """Add energies in J to row ``kind`` of ``sums`` (energy, 2), as multiples of ``unit`` and of unit/2^40."""
-    whole_sum = fine_sum = np.int64(0)
-    for i in range(energies.size):
-        whole, fine = _multiples(energies[i], unit)
-        whole_sum += whole
-        fine_sum += fine
-    sums[kind, 0] += whole_sum
-    sums[kind, 1] += fine_sum
+    """Add energies in J to row ``kind`` of ``sums`` (energy, 2), as multiples of ``unit`` and of unit/2^40.
+
+    Whole multiples are cut off at ``SATURATED``.
+    """
+    for first in range(0, energies.size, CHUNK):
+        whole_sum = fine_sum = np.int64(0)
+        for i in range(first, min(first + CHUNK, energies.size)):
+            whole, fine = _multiples(energies[i], unit)
+            whole_sum += whole
+            fine_sum += fine
+        sums[kind, 0] = min(sums[kind, 0] + whole_sum, SATURATED)
+        sums[kind, 1] += fine_sum
 
 
 @kernel
 def _add_one(sums: np.ndarray, kind: int, energy: float, unit: float) -> None:
     """Add one ``energy`` as ``_add`` does."""
     whole, fine = _multiples(energy, unit)
-    sums[kind, 0] += whole
+    sums[kind, 0] = min(sums[kind, 0] + whole, SATURATED)
     sums[kind, 1] += fine
 
 
@@ -164,9 +170,10 @@ def add_loss(sums: np.ndarray, energy: float, unit: float) -> None:
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies in J of samples, arrays (sample,): kinetic, spring and contact energy, work of the drives, dissipated.
+    """Energies in J of samples, arrays (sample,): kinetic, spring and contact energy, work of the drives, losses.
 
-    The work begins with the energy of the initial state. ``dissipated`` is that of contacts.
+    The work begins with the energy of the initial state. ``dissipated`` is what contacts have dissipated so far,
+    ``dissipated_by_damping`` what dashpots have.
     """
 
     kinetic: np.ndarray
@@ -183,7 +190,7 @@ class Energies:
 
     @property
     def residual(self) -> np.ndarray:
-        """Work - dissipated - total: zero for an exact solution."""
+        """Work less both losses and the total: zero for an exact solution."""
         return self.work - self.dissipated - self.dissipated_by_damping - self.total
 
 
