@@ -164,3 +164,30 @@ def test_a_checkpoint_at_an_onset_goes_on_to_the_same_bits():
     assert whole.tracker.contacts["mode"][0] != 0 or len(whole.take_episodes()) > 0
     np.testing.assert_array_equal(parts.state.array_r, whole.state.array_r)
     assert parts.counts == whole.counts
+
+
+def test_checkpoints_under_a_drive_of_pieces_go_on_to_the_same_bits():
+    """The drive acts on a mass of the site, and so on w'', by which the first step is searched for an onset."""
+    case = Case.from_table({
+        "lattice": {"preset": "four-band", "cells": 24},
+        "contacts": {"sites": [5], "clearance": 2e-4},
+        "drive": {"waveform": "harmonic", "amplitude": 20.0, "frequency": 1000.0, "cell": 5, "mass": 2},
+        "time": {"end": 0.03, "engine": "ts"},
+    })  # fmt: skip
+    model = case.model()
+    assert model.chain.cell.host == 1
+    layout = Layout(model, MPI.COMM_SELF)
+    whole = Integrator(model, layout)
+
+    for number in range(1, model.samples):
+        # A new engine each time, as a resumed run has: no piece of its drive is on.
+        parts = Integrator(model, layout)
+        parts.restore([whole.checkpoint()])
+        for engine in (whole, parts):
+            engine.advance(number * model.sample_interval)
+        np.testing.assert_array_equal(parts.state.array_r, whole.state.array_r)
+        np.testing.assert_array_equal(parts.tracker.start, whole.tracker.start)
+        parts.destroy()
+
+    assert len(whole.take_episodes()) > 5
+    whole.destroy()

@@ -79,12 +79,18 @@ def drive_force(drives: Drives, i: int, t: float) -> float:
 
 @kernel
 def select_piece(drives: Drives, i: int, t: float) -> float:
-    """Turn on the latest piece of drive ``i`` at time t in s; return when the next one begins, or the drive's end."""
+    """Turn on the latest piece of drive ``i`` at time t in s; returns the time in s at which that changes.
+
+    It is the beginning of the next piece or the drive's end, inf if the drive is over.
+    """
     drive = drives.rows[i]
-    # A burst has no pieces to turn on: its formula holds up to its end.
-    if drive.first >= drive.last or t >= drive.duration:
+    if t >= drive.duration:
         drive.piece = -1
-        return drive.duration if t < drive.duration else np.inf
+        return np.inf
+    # A burst has no pieces to turn on: its formula holds up to its end.
+    if drive.first >= drive.last:
+        drive.piece = -1
+        return drive.duration
 
     # The first piece that begins after t, by bisection: a measured drive has as many pieces as samples.
     low, high = drive.first, drive.last
@@ -94,8 +100,19 @@ def select_piece(drives: Drives, i: int, t: float) -> float:
             low = middle + 1
         else:
             high = middle
-    drive.piece = low - 1 if low > drive.first else -1
-    return drives.pieces[low].start if low < drive.last else drive.duration
+    # The piece before it is on, if there is one.
+    drive.piece = -1
+    if low > drive.first:
+        drive.piece = low - 1
+    if low < drive.last:
+        return drives.pieces[low].start
+    return drive.duration
+
+
+def select_pieces(drives: Drives, t: float) -> None:
+    """Turn on the latest piece of every one of ``drives`` at time t in s."""
+    for i in range(len(drives.rows)):
+        select_piece(drives, i, t)
 
 
 @kernel
@@ -110,7 +127,10 @@ def drive_end(drives: Drives, i: int, begin: float, interval: float, position: f
     t = begin + position * interval
     # A step that ends on a break reaches it to rounding only; without the margin the old piece would stay on.
     end = select_piece(drives, i, t + ROUNDED * (interval + abs(t)))
-    return (end - begin) / interval if end < np.inf or drive.piece >= 0 else -1.0
+    # Without an end and without a piece that is on the drive is over; a last piece that is held has no end either.
+    if end == np.inf and drive.piece < 0:
+        return -1.0
+    return (end - begin) / interval
 
 
 @kernel

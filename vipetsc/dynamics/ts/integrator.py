@@ -14,7 +14,7 @@ from vipetsc.contact.changes import ModeChange, first_change, stays_landed, swit
 from vipetsc.contact.search import LANDED, MISSED, RETRY, SEARCH, Landing, correct, shorten
 from vipetsc.contact.tracker import LIMITS, ImpactTracker
 from vipetsc.dynamics import log
-from vipetsc.dynamics.drives import select_piece
+from vipetsc.dynamics.drives import select_pieces
 from vipetsc.dynamics.engine import Engine, FillResult, StalledError
 from vipetsc.dynamics.lattice_record import create_record
 from vipetsc.dynamics.layout import Layout, join
@@ -24,6 +24,7 @@ from vipetsc.dynamics.ts.onset import onset_fraction
 from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs
 from vipetsc.dynamics.ts.sums import register_sums
 from vipetsc.dynamics.ts.time_stepper import TimeStepper
+from vipetsc.lattice.drive import Pieces
 from vipetsc.parallel import StopRequest
 
 # Measured on the built-in case up to 0.3 s, with Hertz's law (3,800 steps, 510 rejected) and the bilinear one (3,470,
@@ -38,8 +39,8 @@ STRETCH = 1.08
 MOST_TRIALS = 10_000
 # A time step below this many rounding units of the time does not advance it reliably.
 SHORTEST_STEP = 8 * np.finfo(float).eps
-# Steps in periods of the first drive's radian: the first one, and the one that the controller begins with, which any
-# number of this size serves for.
+# Steps in radians of the first drive's frequency: the first one, and the length with which the controller begins, for
+# which any number of this size serves.
 FIRST_STEP = 0.002
 FREE_STEP = 0.05
 # A burst rises as t^3: steps that grow with t keep even the first samples' energies in balance, to 1e-9 of the work so
@@ -59,7 +60,8 @@ class Integrator(Engine):
     model, layout
         The lattice and its distribution.
     stop
-        Looked at after every step; a request on any rank ends ``advance`` on all, at the time it goes to.
+        Looked at after every step. A request on any rank ends ``advance`` on all, at the time to which it goes or where
+        a drive has a kink before that.
 
     PETSc options with the prefix ``ts_`` are taken last: Runge-Kutta type, tolerances, adaptor, first step; with
     ``-ts_adapt_type none -ts_dt H`` all steps are H, or less where one must meet a sample or a contact change.
@@ -97,12 +99,13 @@ class Integrator(Engine):
         self._fixed_step = PETSc.Options().getString("ts_adapt_type", "basic") == "none"
         self._interval = model.sample_interval
         self._breaks = np.unique(np.concatenate([drive.waveform.breaks for drive in model.drives]))
+        self._has_pieces = any(isinstance(drive.waveform, Pieces) for drive in model.drives)
         self._most_trials = MOST_TRIALS * (len(model.chain.sites) + 1)
         self._onset_fraction = onset_fraction(model.used_laws, model.rtol)
         self.observe(self.tracker.start)
 
     def observe(self, motion: np.ndarray, time: float | None = None) -> None:
-        """Fill ``motion`` (sites, 3) from the state; it is taken at ``time``, else at the present one."""
+        """Fill ``motion`` (sites, 3) with w, w', w'' of the state at ``time`` in s, else at the present; collective."""
         if self.lattice.shape.exchange:
             self.state.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
         if time is None:
@@ -148,10 +151,10 @@ class Integrator(Engine):
 
     def _advance_smoothly(self, target: float) -> bool:
         """Go on as ``advance`` does, to a time before which no drive has a kink."""
-        drives = self.lattice.drives
-        if len(drives.pieces):
-            for i in range(len(drives.rows)):
-                select_piece(drives, i, self.time)
+        if self._has_pieces:
+            select_pieces(self.lattice.drives, self.time)
+            # The w'' with which the first step begins is that of the pieces that are on now.
+            self.observe(self.tracker.start)
 
         stopped = False
         trials = 0
