@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 import pytest
 
-from vipetsc.case import Case
-from vipetsc.dynamics.cost import estimate
+from vipetsc.case import Case, Model
+from vipetsc.dynamics.cost import estimate, expected_episodes
+
+CYCLES = 10
 
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
@@ -24,3 +30,45 @@ def test_ranks_are_advised_against_where_messages_cost_what_they_save(engine):
     assert "one rank" not in estimate(long, 2).faster
     assert estimate(long, 2).seconds < 0.75 * estimate(long, 2).alone
     assert estimate(long, 2).alone == estimate(long, 1).seconds
+
+
+def chain_with_a_stop(contacts: dict[str, Any], drive: dict[str, Any], over: float) -> Model:
+    """Equal masses on springs, whose frequency (k/m)^1/2 the drive has, and stops that ``over`` times less reaches.
+
+    There the relative displacement of neighbours is as large as the displacement: 2 sin(kappa/2) = 1.
+    """
+    spring = {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}
+    table = {
+        "lattice": {"cells": 200, "cell": {"masses": [0.01], "springs": [spring]}},
+        "contacts": {"stiffness": 1e6, "sites": [40], "clearance": 1e-4} | contacts,
+        "drive": {"amplitude": 1.0, "frequency": 1000.0} | drive,
+        "time": {"end": 0.2},
+    }
+    model = Case.from_table(table).model()
+    # Without gaps the one clearance is that of both sides.
+    gaps = np.array(model.gaps or [2 * model.chain.clearances])
+    gaps = np.where(np.isfinite(gaps), model.scale / over, np.inf)
+    return replace(model, gaps=tuple(map(tuple, gaps.tolist())))
+
+
+@pytest.mark.parametrize(
+    ("contacts", "stops"),
+    [
+        ({"pair": [0, 1], "side": "both"}, 2),
+        ({"pair": [0, 1], "side": "minus"}, 1),
+        ({"pair": [1, 1], "next_cell": True, "side": "both"}, 2),
+        ({"pair": [1, 1], "next_cell": True, "side": "plus"}, 1),
+    ],
+)
+def test_contacts_are_expected_of_every_pair_at_every_stop(contacts, stops):
+    """A burst of twice the clearance is beyond it for half of its cycles, and once in each at each stop."""
+    burst = {"cycles": CYCLES}
+    assert expected_episodes(chain_with_a_stop(contacts, burst, over=2.0)) == pytest.approx(stops * CYCLES / 2)
+    assert expected_episodes(chain_with_a_stop(contacts, burst, over=0.99)) == 0.0
+
+
+def test_a_sine_that_does_not_end_is_beyond_a_clearance_all_the_time():
+    sine = {"waveform": "harmonic"}
+    stop = {"pair": [0, 1], "side": "both"}
+    assert expected_episodes(chain_with_a_stop(stop, sine, over=1.01)) == pytest.approx(2 * 0.2 * 1000.0 / (2 * np.pi))
+    assert expected_episodes(chain_with_a_stop(stop, sine, over=0.99)) == 0.0

@@ -1,8 +1,8 @@
 """Cost of a run, estimated before it begins: its engine, the expected number of contacts, CPU time.
 
 The models of CPU time are fitted to the paper's lattices on one core, to about a factor of two. On another machine both
-engines differ by a common factor, so that their ratio remains. The contacts are those of the linear wave; if waves
-return to the sites, there are up to several times as many.
+engines take longer or shorter by about one factor, so that their ratio remains. The contacts are those of the linear
+wave on its first way along the lattice; if waves return to the sites, there are up to several times as many.
 """
 
 import functools
@@ -17,11 +17,12 @@ from vipetsc.dynamics.engine_choice import PROPAGATOR, choose_engine
 from vipetsc.dynamics.propagator.series import StepSeries
 from vipetsc.dynamics.propagator.step_choice import refusal, spring_cost, step_series
 from vipetsc.dynamics.ts_cost import RESOLVED, step_seconds
-from vipetsc.lattice import bloch, pass_bands, waves_at
+from vipetsc.lattice import UnitCell, bloch, pass_bands, waves_at
+from vipetsc.lattice.chain import Pair
 
-# Steps of ts that an episode costs.
+# Further steps of ts that an episode costs.
 EPISODE_STEPS = 60.0
-# Steps that end on samples, over those that are needed.
+# Steps of ts where each sample must be the end of one, over those that its tolerance alone needs.
 SAMPLED_STEPS = 1.3
 # Exchanges of ghosts in a step of 8vr, one for each stage and one for the contact search, and seconds that ranks on one
 # machine take for one: by it two ranks are a little slower than one at 1200 masses, as was measured.
@@ -76,10 +77,10 @@ class OwnRows(NamedTuple):
 class Cost:
     """The ``engine`` that simulates a run, and a note on it; contact ``episodes``; CPU times in s.
 
-    The ``note`` says why it is not the requested engine, or how many cells have separate rows.
-
-    ``seconds`` of this engine on each of the ``ranks``, of which ``contacts`` for the episodes; ``alone``: those on one
-    rank; ``propagator``: those of the engine that takes linear steps, None where it does not suit.
+    The ``note`` says why it is not the requested engine, or how many cells have separate rows; None if there is nothing
+    to say. ``seconds`` are those of this engine on each of the ``ranks``, of which it takes ``contacts`` for the
+    episodes; ``alone`` are those on one rank, ``propagator`` those of that engine on the ``ranks``, None where it does
+    not suit.
     """
 
     engine: str
@@ -133,14 +134,17 @@ def estimate(case: Case, ranks: int = 1) -> Cost:
     if engine == PROPAGATOR and exact is not None:
         cost_on = exact
     seconds = cost_on(ranks)
+    by_propagator = None
+    if exact is not None:
+        by_propagator = exact(ranks).total
     return Cost(
         engine=engine,
-        note=note if case.time.engine != "ts" else None,
+        note=note,
         episodes=episodes,
         seconds=seconds.total,
         contacts=seconds.contacts,
         alone=cost_on(1).total,
-        propagator=exact(ranks).total if exact else None,
+        propagator=by_propagator,
         ranks=ranks,
     )
 
@@ -167,27 +171,40 @@ def _propagator_seconds(model: Model, series: StepSeries, own_rows: OwnRows, epi
 
 
 def expected_episodes(model: Model) -> float:
-    """Contact episodes if each site meets the drive's linear wave: two a cycle while |w| is above the clearance.
+    """Contact episodes if each site meets the drive's linear wave: one a cycle at each stop that |w| goes beyond.
 
     The wave's largest displacement is ``model.scale``; the ratio of |w| to it is that of the Bloch wave.
     """
-    cell = model.chain.cell
+    chain = model.chain
     drive = model.drive
-    waves = waves_at(cell, drive.frequency)
-    if not (waves and drive.amplitude and model.chain.sites):
+    waves = waves_at(chain.cell, drive.frequency)
+    if not (waves and drive.amplitude and chain.sites):
         return 0.0
 
-    largest = 0.0
-    for band, kappa, _ in waves:
-        shape = bloch(cell, kappa).vectors[:, band - 1]
-        largest = max(largest, abs(shape[cell.resonator] - shape[cell.host]) / np.abs(shape).max())
-    gaps = np.min(model.gaps, axis=1) if model.gaps else np.asarray(model.chain.clearances)
+    # Of the waves at this frequency, the one that moves a pair most.
+    pairs = chain.contact_pairs
+    largest = {pair: max(_relative_amplitude(chain.cell, pair, wave) for wave in waves) for pair in set(pairs)}
+    amplitudes = model.scale * np.array([largest[pair] for pair in pairs])
+    gaps = np.array(model.gaps or [(gap, gap) for gap in chain.clearances])
     # Beads that touch have no clearance: any wave closes them.
-    z = model.scale * largest / np.maximum(gaps, 1e-300)
+    z = amplitudes[:, None] / np.maximum(gaps, 1e-300)
 
-    # The fraction of a burst in which its envelope sin^2 is above 1/z.
+    # A sine that does not end is above a clearance for the whole run, or never.
+    if drive.repeats:
+        cycles = model.end * drive.frequency / (2 * np.pi)
+        return float(cycles * np.count_nonzero(z > 1))
+
+    # The envelope of a burst is sin^2, above 1/z in this fraction of its time.
     above = np.where(z > 1, 1 - 2 / np.pi * np.arcsin(np.sqrt(1 / np.maximum(z, 1))), 0.0)
-    cycles = model.end * drive.frequency / (2 * np.pi)
-    if np.isfinite(drive.duration):
-        cycles = drive.cycles
-    return float(2 * cycles * above.sum())
+    return float(drive.cycles * above.sum())
+
+
+def _relative_amplitude(cell: UnitCell, pair: Pair, wave: tuple[int, float, float]) -> float:
+    """The amplitude of w of a ``pair`` in a ``wave`` of ``waves_at``, over that of the mass that moves most."""
+    band, kappa, _ = wave
+    shape = bloch(cell, kappa).vectors[:, band - 1]
+    w = shape[pair.resonator] * np.exp(1j * kappa * pair.next_cell)
+    # Ground, number -1, does not move.
+    if pair.host >= 0:
+        w -= shape[pair.host]
+    return float(abs(w) / np.abs(shape).max())
