@@ -18,11 +18,13 @@ from vipetsc.dynamics.matrices import LatticeMatrices
 ON_ONE_RANK = ("superlu", "petsc")
 ON_SEVERAL = ("superlu_dist", "mumps")
 TOLERANCE = 1e-11
-# Of each search, that for further copies of a mode too: it ends as soon as one mode has converged, mostly one farther
-# away. With 4 restarts it gave up near the edge of a band, where modes crowd, and copies of ring modes were missing.
+# Most restarts of a search, also of one for further copies of a mode, which ends as soon as one mode has converged,
+# mostly one farther away. With 4 restarts it gave up near the edge of a band, where modes crowd, and copies of ring
+# modes were missing.
 RESTARTS = 60
-# By how much of the largest Om^2 the number s differs from the square of the frequency asked, at most; and in a long
-# lattice as a part of the mean distance of its modes, so that those nearest to s are those nearest to the frequency.
+# The number s is less than the square of the frequency asked by this fraction of the largest Om^2 at most; in a long
+# lattice by the second fraction of the mean distance of its modes, so that those nearest to s are those nearest to the
+# frequency.
 LARGEST_SHIFT = 1e-6
 SHIFT_OF_SPACING = 1e-2
 
@@ -66,8 +68,9 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
     # The modes nearest in Om are not those nearest in Om^2, which are lower ones.
     eps.setWhichEigenpairs(eps.Which.USER)
     eps.setEigenvalueComparison(lambda one, other, *_: int(np.sign(distance(one) - distance(other))))
-    # The shifted matrix would be singular if the frequency were exactly that of a mode. The iterated matrix has the
-    # eigenvalues 1/(Om^2 - s): that mode's exceeds all others 1 / shift times, and so do rounding errors of the others.
+    # Without a shift K - s M would be singular where the frequency is exactly that of a mode. The shift must not be too
+    # small either: the iterated matrix has the eigenvalues 1/(Om^2 - s), in units of 1 / largest Om^2 up to 1 / shift
+    # of a mode at the frequency and about 1 of those far from it, whose relative errors by rounding grow by as much.
     shift = min(LARGEST_SHIFT, SHIFT_OF_SPACING / matrices.rows)
     eps.setTarget(near**2 - shift * matrices.largest)
     _solve_directly(eps.getST())
@@ -87,7 +90,7 @@ def modes_near(matrices: LatticeMatrices, count: int, near: float) -> NearModes:
         for i in range(min(eps.getConverged(), wanted)):
             vector = matrices.vector()
             value = eps.getEigenpair(i, vector).real
-            # Of later searches only what is nearer than the modes so far can be one that was missed.
+            # In a later search only a mode that is nearer than the farthest one so far can be one that was missed.
             if distance(value) < farthest:
                 pairs.append((value, vector))
         if not before and len(pairs) < count:

@@ -51,7 +51,7 @@ class Engine(ABC):
     def fill(self, samples: Samples) -> FillResult:
         """Advance through ``samples`` and take them with ``take_sample``; all ranks come equally far.
 
-        A stop on request is at a sample, as soon as that costs little.
+        On a request to stop the engine ends at one of the next samples, or where a drive is not smooth before it.
         """
 
     @abstractmethod

@@ -30,8 +30,9 @@ class Layout:
     and ``offsets`` are the cells and the first state component of every rank. This rank's part of the state has
     ``size`` components; the component of the first owned site's dissipated energy is ``dissipated``. ``sites`` are the
     numbers of the owned sites, ``contacts`` of all sites that act on its masses. A cell has ``rows`` components, and
-    ``ghost_rows`` as a ghost. With ``dashpots``, where their dissipation is wanted, a damped lattice has one more
-    component a cell, and velocities in the ghosts.
+    ``ghost_rows`` as a ghost. With ``dashpots`` a damped lattice has one more component a cell, for what they
+    dissipate, and velocities in the ghosts. The propagator needs that for the dissipation alone; the right-hand side of
+    ``ts`` has no dashpots without it.
     """
 
     def __init__(self, model: Model, comm: MPI.Comm, dashpots: bool = False) -> None:

@@ -11,15 +11,21 @@ from numba.extending import intrinsic
 
 from vipetsc.dynamics.petsc_library import petsc_library
 
+# PETSc's values of the InsertMode and of the ScatterMode with which cells are exchanged.
+INSERT_VALUES = 1
+FORWARD = 0
+
 external: Any = ExternalFunction
+# f(Vec, PetscScalar **), and f(Vec, PetscInt *) for the size.
 get_read, restore_read, get_write, restore_write, local_size = _vectors = [
     external(f"Vec{name}", int32(int64, int64))
     for name in ("GetArrayRead", "RestoreArrayRead", "GetArrayWrite", "RestoreArrayWrite", "GetLocalSize")
 ]
-# Then the modes of insertion and of direction.
+# f(Vec, InsertMode, ScatterMode).
 ghosts_begin, ghosts_end = _ghosts = [
     external(f"VecGhostUpdate{part}", int32(int64, int32, int32)) for part in ("Begin", "End")
 ]
+# f(VecScatter, Vec, Vec, InsertMode, ScatterMode).
 scatter_begin, scatter_end = _scatters = [
     external(f"VecScatter{part}", int32(int64, int64, int64, int32, int32)) for part in ("Begin", "End")
 ]

@@ -20,11 +20,13 @@ from vipetsc.dynamics.samples import Block
 from vipetsc.io.store import RunOutput
 from vipetsc.progress import Progress
 
-# A ledger that misses by this fraction of the largest work is no longer a solution but an instability.
+# A run whose energy balance misses by this fraction of the largest work so far is no longer a solution.
 RUNAWAY = 0.1
-# ... where the lattice has more energy than rounding of the sums, as a fraction of the largest that they hold.
+# ... as long as the lattice has more energy than this fraction of ``EnergyMeter.largest``, about 1e-8 of the run's
+# scale of energy. In a lattice with less, one that nothing has moved yet, rounding may exceed all work.
 NEGLIGIBLE = 1e-12
-# Errors of the ledger over the largest work that are as expected: in relative tolerances, and bounds of that.
+# Error of the energy balance over the largest work above which a run warns: so many relative tolerances, 1e-8 at the
+# default tolerance of 1e-10; never less than the second number, nor more than the third.
 LEDGER_PER_RTOL = 100.0
 LEAST_LEDGER = 1e-8
 MOST_LEDGER = 1e-4
@@ -85,7 +87,7 @@ class Observer:
         return {key: np.array(getattr(self, key)) for key in self.saved}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on from ``state``, the arrays () of ``checkpoint`` by name; the engine has been restored before."""
+        """Go on from ``state``, the arrays that ``checkpoint`` returned; the engine has been restored before."""
         for key in self.saved:
             setattr(self, key, state[key].item())
 

@@ -60,7 +60,8 @@ class Opening(NamedTuple):
                     scaled[name] = values.copy()
                     scaled[name]["energy"] *= self.factor**2
                 elif values.dtype.kind == "f":
-                    # What dashpots dissipated, and what observers keep: energies, and an indentation, which is zero.
+                    # Energies: what dashpots dissipated, and what observers keep. The one length among these, the
+                    # deepest indentation, is zero before the first contact.
                     scaled[name] = values * self.factor**2
                 else:
                     scaled[name] = values

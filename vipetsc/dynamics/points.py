@@ -96,18 +96,24 @@ class PointMotion:
             is_inside = 0 <= other < chain.cells
             if chain.ends == "free" and not is_inside:
                 continue
+            column = -1
+            if is_inside:
+                column = int(np.searchsorted(self.cells, other))
+
             # A spring between cells belongs to the left one.
             owner = 1 + min(coupling.offset, 0)
             spring = chain.spring(cell - 1 + owner, coupling.spring)
-            is_start = coupling.offset > 0 or (coupling.offset == 0 and spring.start == mass)
+            direction = -1
+            if coupling.offset > 0 or (coupling.offset == 0 and spring.start == mass):
+                direction = 1
             springs.append(
                 _SpringAtPoint(
-                    column=int(np.searchsorted(self.cells, other)) if is_inside else -1,
+                    column=column,
                     mass=coupling.other,
                     stiffness=spring.stiffness,
                     damping=spring.damping,
                     spring=spring,
-                    direction=1 if is_start else -1,
+                    direction=direction,
                 )
             )
 

@@ -1,4 +1,4 @@
-"""Recorded cells of a run, the ranks that write them, and samples in a chunk: computed without any kernel."""
+"""Recorded cells of a run, the ranks that write them, and samples in a chunk: asked before kernels are loaded."""
 
 import h5py
 

@@ -37,8 +37,13 @@ from vipetsc.process import compiling
 ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Propagator, Integrator)}
 # Cells times samples between two looks at requests to stop: a fraction of a second.
 BLOCK_CELLS = 1_000_000
-NOTICED = 1.0  # s of the compiler's clock, in which kernels that are there may be loaded
-COMPLETE, STOPPED, FAILED = "complete", "stopped", "failed"
+# Seconds of the compiler's clock from which on a run reports them. The clock also runs while a stored kernel is loaded,
+# which takes less.
+NOTICED = 1.0
+# How a run ends.
+COMPLETE = "complete"
+STOPPED = "stopped"
+FAILED = "failed"
 
 
 class Failure(NamedTuple):
@@ -49,7 +54,7 @@ class Failure(NamedTuple):
 
 
 class Begin(NamedTuple):
-    """Readings in s, when a run begins, of the clocks of the wall, of this process, of its compiler."""
+    """Readings in s, when a run begins, of the wall's clock, of this process's CPU time, of the compiler's clock."""
 
     wall: float
     cpu: float
@@ -103,6 +108,7 @@ def simulate(
     # In a script under mpirun a rank that raises would leave the others waiting; a hook of the script's own stays.
     if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
         install_abort_hook()
+
     memory = RunMemory(comm)
     target: str | Path | RunOutput = memory
     if folder is not None:
@@ -112,6 +118,8 @@ def simulate(
     ranks = comm
     if isinstance(target, RunOutput):
         ranks = target.comm
+
+    # What is wrong with the case is refused before anything is allocated or written.
     on_every_rank(ranks, case.import_plugins)
     case = with_database(case)
     check_options(case)
@@ -123,8 +131,10 @@ def simulate(
     watching: list[type[Observer]] = [Guard, *observers, Ledger]
     if progress:
         watching.append(ProgressReport)
+    # A further observer wants to see every sample, also those that an opening would bring.
     if observers or not issubclass(ENGINES[choice.name], OpeningEngine):
         opening = None
+
     simulation = Simulation(case, model, choice, stop, watching, opening)
     if isinstance(target, RunOutput):
         result = simulation.make(target)
@@ -180,14 +190,19 @@ class Simulation:
                 set_in_motion(run.setup)
             with log.SAMPLES:
                 ending, sentence = run.advance()
+            note = {}
+            if self.engine.refused:
+                note["engine_note"] = self.engine.refused
             with log.ENDING:
-                note = {"engine_note": self.engine.refused} if self.engine.refused else {}
                 return run.finish(ending, sentence, begin, note)
 
 
 @contextmanager
 def released(engine: Engine, comm: MPI.Comm) -> Iterator[None]:
-    """Free ``engine`` at the end, which all ranks do together; one that leaves alone by an error must not wait."""
+    """Free ``engine`` at the end of the block, on all ranks together.
+
+    A rank that leaves the block alone, by an error of its own, does not free it: it would wait for the others.
+    """
     try:
         yield
     except BaseException as error:
@@ -198,9 +213,9 @@ def released(engine: Engine, comm: MPI.Comm) -> Iterator[None]:
 
 
 class Run:
-    """The samples of one run: its engine goes through a block of them, its observers look at it, the recorder last.
+    """One run: its engine goes through blocks of samples, and its observers look at each block, the recorder last.
 
-    A sample that one of them refuses is not seen by those behind it, nor recorded.
+    A sample that one observer refuses is not seen by the observers behind it, nor recorded.
     """
 
     def __init__(self, setup: Setup, observers: Sequence[type[Observer]]) -> None:
@@ -252,7 +267,8 @@ class Run:
                 self.last = float(block.times[-1])
 
             if failure:
-                # Engines go through a block in one piece: episodes may have begun after the failure.
+                # Engines go through a block in one piece: episodes may have begun after the failure. The propagator
+                # stalls within a step, at whose beginning it stands then: contacts of that step count, too.
                 self.recorder.end = failure.time + setup.model.sample_interval
                 good = "none"
                 if self.last is not None:
@@ -328,8 +344,11 @@ class Run:
         compiled = compiling.seconds - begin.compiled
         if compiled > NOTICED:
             statistics["compile_seconds"] = round(compiled, 3)
+
         about = {"status": sentence, "complete": ending == COMPLETE, "statistics": statistics, "warnings": warnings}
         attributes = comm.bcast(provenance(comm) | about)  # what rank 0 states counts
+
+        # The dataset of a run in memory also has the motion of its cells at the end.
         if ending == COMPLETE and isinstance(output, RunMemory):
             motions = comm.gather(self.setup.layout.motion(engine.state.array_r))
             output.end = np.concatenate(motions) if motions else None

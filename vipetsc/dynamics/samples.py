@@ -84,7 +84,10 @@ def take_sample(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, r
 
 @kernel
 def _take_clipped(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> None:
-    """Take from the losses of sample ``k`` what clipped sites still have; contacts and their rows as above."""
+    """Subtract from the losses of sample ``k`` the elastic energy that clipped sites still have.
+
+    They lose it up to their separation. ``contacts`` and their ``rows`` are as in ``take_sample``.
+    """
     lattice = samples.lattice
     for i in range(lattice.site_dofs.size):
         column = lattice.site_dofs[i].ledger - lattice.shape.dissipated
@@ -121,7 +124,7 @@ def _record_fields(y: np.ndarray, number: int, samples: Samples) -> None:
 
 @kernel
 def _record_forces(y: np.ndarray, k: int, samples: Samples, contacts: np.ndarray, rows: np.ndarray) -> None:
-    """Record the contact forces of sample ``k``; contacts and their rows as in ``take_sample``."""
+    """Record the contact forces of sample ``k``; ``contacts`` and their ``rows`` are as in ``take_sample``."""
     lattice = samples.lattice
     for i in range(lattice.site_dofs.size):
         column = lattice.site_dofs[i].ledger - lattice.shape.dissipated

@@ -19,9 +19,10 @@ SITE_DOFS = np.dtype([("host", END), ("resonator", END), ("ledger", np.int64)])
 
 
 def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
-    """Sites (site,) of dtype ``SITE``, free or held together, of those ``numbers`` (site,) in the lattice, from 0.
+    """Records (site,) of dtype ``SITE`` of the sites with these ``numbers`` (site,) in the lattice, from 0.
 
-    A number below 0 is a site without stops.
+    Sites are free, or of the mode ``PERMANENT`` where they touch or are pressed at rest. A number below 0 stands for a
+    site without stops.
     """
     numbers = np.maximum(np.asarray(numbers, np.int64), -1)
     chain = model.chain
@@ -39,7 +40,9 @@ def site_records(model: Model, numbers: ArrayLike) -> np.ndarray:
     sites = create_contacts(laws, gaps, masses, model.scale)
 
     least = gaps.min(axis=1)
-    # Beads that touch or are pressed part and meet all the time: no change is landed on, and the force has a kink.
+    # Contacts that are pressed at rest, and beads of neighbouring cells that touch and do not dissipate, part and meet
+    # all the time: no such change is landed on, and the force has a kink. With loss a contact needs an onset, at which
+    # its approach velocity is taken.
     permanent = (least < 0) | ((least == 0) & joins_next_cell & (sites["damping"] == 0))
     hold(sites, laws, permanent, speed=model.scale * model.drive.frequency)
     return sites
@@ -68,8 +71,9 @@ def create_site_dofs(model: Model, layout: Layout, ghosts: tuple[int, int]) -> n
     for row, i in zip(site_dofs, layout.contacts, strict=True):
         pair = pairs[i]
         cell = chain.sites[i]
+        # The last cell of a ring is the one before the first: so the rank that owns the first cells counts it.
         if cell == chain.cells - 1 and layout.start == 0 and n < chain.cells:
-            cell = -1  # of a ring, as its first cells see it
+            cell = -1
         row["host"] = end(cell, pair.host)
         row["resonator"] = end(cell + pair.next_cell, pair.resonator)
 

@@ -2,8 +2,8 @@
 
 A mass m feels from each spring of the stiffness k, with a dashpot c parallel to it, the force k (u_other - u) + c
 (v_other - v), and from its dashpot to the ground -c_g v; ``spring_accelerations`` divides the sum by m. ``add_squares``
-sums k z^2 and c z'^2 over the elongations z, twice the energy and the power, and springs beyond their linear part have
-functions of their own (``dynamics.spring_law``).
+sums k z^2, twice the energy, and c z'^2, the power, over the elongations z. The parts of springs that are not linear
+have functions of their own (``dynamics.spring_law``).
 
 A cell's sums run over its springs in the cell's order, whichever rank owns it and wherever in the loop it falls: the
 result does not depend on the partition, to the last bit. Where all cells are alike and undamped, a mass and a spring

@@ -11,7 +11,10 @@ from vipetsc.parallel import on_every_rank
 
 
 class _Torn(NamedTuple):
-    """A spring beyond the elongation ``limit`` in m at which its force vanishes: how many times, where, and its z."""
+    """A spring whose ``elongation`` z in m is beyond the ``limit`` at which its force vanishes, and where it is.
+
+    ``ratio``, z over the limit, comes first: the largest of several records is the spring that is farthest beyond.
+    """
 
     ratio: float
     cell: int

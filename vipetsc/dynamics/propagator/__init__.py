@@ -7,16 +7,16 @@ of constants (Hochbruck and Ostermann 2010, sec. 2) gives the state
     y(t_0 + H) = P(H) y(t_0) + integral over the step of P(H - t + t_0) (0, M^-1 f(t)) dt,   y = (u, u').
 
 **1. The propagator** (``series``, ``stencil``). P(H) takes a state through H of free motion, without f. With
-A = H^2 M^-1 K, whose powers bear all of H but the one with a velocity, free motion is the series
+A = H^2 M^-1 K, which contains the square of H, free motion is the series
 
     u(s) = sum_m (-A)^m [u_0 s^2m / (2m)! + H u'_0 s^(2m+1) / (2m+1)!].
 
-Each power of K reaches one cell further, so that P is banded up to what the series has lost by then. With theta =
-omega_max H, omega_max from Gershgorin's circles of M^-1/2 K M^-1/2, the terms from m on are at most theta^(2m-1)
-(1 + theta)/(2m-1)! of the velocity's amplitude; ``reach`` r is the distance in cells beyond which the rows of P sum to
-less than the tolerance. Both bounds and the entries dropped within the band make up ``truncation``. Since theta <= 3.2,
-no term exceeds the result by much, and the series is as good as rounding allows (Moler and Van Loan 2003). Cells at
-least r from an end have one stencil in common; the others have rows of their own.
+Each power of K reaches one cell further, and its factor falls like 1/(2m)!: P is banded, but for entries so small that
+they are left out. With theta = omega_max H, omega_max from Gershgorin's circles of M^-1/2 K M^-1/2, the terms from m on
+are at most theta^(2m-1) (1 + theta)/(2m-1)! of the velocity's amplitude; ``reach`` r is the distance in cells beyond
+which the rows of P sum to less than the tolerance. Both bounds and the entries dropped within the band make up
+``truncation``. Since theta <= 3.2, no term exceeds the result by much, and the series is as good as rounding allows
+(Moler and Van Loan 2003). Cells at least r from an end have one stencil in common; the others have rows of their own.
 
 **2. Free motion of the contact DoFs** (``series``, ``clusters``). A DoF x = c u is a driven mass's displacement or the
 relative displacement w of a site, of two masses in one cell or in neighbouring ones, or of a mass to ground: c has an
@@ -77,14 +77,16 @@ lattice each of whose entries of K M^-1 and C M^-1 has the largest magnitude tha
 **10. What dashpots dissipate** (``dashpots``, ``free_losses``, ``loss_tables``, ``losses``) is the integral of v^T C v
 over the step, computed from the motion and not from the other energies, so that the balance of these is a check. With
 v = V(s) y + sum_l integral of r_l F_l dt, V the rows of 7 and r_l the velocities after an impulse on DoF l, it has
-three parts. That of free motion is y^T S y, S = H integral of V^T C V ds, by Gauss's rule: banded, symmetric, one
-number of each cell. Let a and b >= a remain of the step after two impulses. The force at the later one then adds
+three parts. That of free motion is y^T S y, with S = H integral of V^T C V ds by Gauss's rule: S is symmetric and
+banded, and y^T S y a sum over cells. Let the fractions a and b >= a of the step remain after two impulses. The force at
+the later one then adds
 
     2 F_l(a) [ f_l(a) y + sum_m integral of Psi_lm(a, b) F_m dt ],
     f_l(a) = H integral_0^a r_l(x)^T C V(x + 1 - a) dx,   Psi_lm(a, b) = H integral_0^a r_l(x)^T C r_m(x + b - a) dx,
 
-the sum over forces up to then. All are smooth in a and b: Legendre coefficients are tabulated, and forces enter by
-their moments with these polynomials, of the substeps before, and within a substep at its nodes.
+the sum over forces up to then. All are smooth in a and b: their coefficients in Legendre's polynomials are tabulated,
+and a force enters by its moments with these polynomials, those of the substeps before and, up to each node, that of the
+substep itself.
 
 **11. Springs that are not linear** (``groups``, ``collocation``) have the force k z + k_2 z^2 + k_3 z^3 at their
 elongation z, of which k belongs to K. The rest is a force on the DoF z = c u, with c as for the w of a site,

@@ -242,8 +242,7 @@ def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.
     """Expand the free motion of the DoFs of cluster ``c`` in powers of t/H; whether a force may act on one of them.
 
     A force may act on a site or spring that reaches its clearance. Coefficients in m go into ``taylor`` (dof,
-    coefficient), by powers of t/H;
-    ``columns`` (2 mass, column) hold the lattice's state at the beginning of the step.
+    coefficient); ``columns`` (2 mass, column) hold the lattice's state at the beginning of the step.
     """
     _, masses, width, terms = dofs.rows.shape
     # With dashpots there are rows for displacements and rows for velocities, as many as ``columns`` has; without, the

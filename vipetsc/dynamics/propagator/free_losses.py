@@ -25,7 +25,8 @@ class _Gramian:
 
     def __init__(self, dashpots: DashpotRows) -> None:
         self._dashpots = dashpots
-        # The products of rates have twice the degree that so many nodes are needed for.
+        # The product of two rates has the degrees below ``mode_count``, but for what is left out, and Gauss's rule with
+        # n nodes integrates degrees up to 2 n - 1: half as many nodes as modes are enough.
         count = -(-mode_count(dashpots.series.omega_max_h) // 2)
         nodes, weights = gauss(count)
         seconds = weights * dashpots.series.interval
@@ -51,8 +52,10 @@ class _Gramian:
             from_cell = rates[:, :, column].T
             to_right = rates[:, :, column:].reshape(len(rates), -1)
             out[:, :, : width - column] += (from_cell @ to_right).reshape(rows, rows, -1)
-        # The pairs' other halves. Within a cell, too, masses of a block that is summed together multiply those of later
-        # blocks alone.
+
+        # Each pair of cells counts once, with twice its entry. So do pairs of masses of one cell that lie in different
+        # blocks of the stencil (``sparse_rows``): the earlier block has them, with the factor 2, the later one with 0.
+        # Within a block both orders of a pair are there.
         out[:, :, 1:] *= 2
         block = np.arange(rows) % (rows // 2) // 2
         out[:, :, 0] *= 1 + np.sign(block - block[:, None])
@@ -74,13 +77,16 @@ def create_loss_stencil(dashpots: DashpotRows, layout: Layout, halo: HaloRegions
     gramian = _Gramian(dashpots)
     # One more, so that a rank without cells has a window, too.
     kinds = dashpots.kinds(np.arange(layout.start - reach - 1, layout.stop + reach + 1))
-    # Which of the cells up to each one are not interior, and which have dashpots: a window's number is a difference.
+    # How many cells before each one are not interior, and how many have dashpots: the number in a window of cells is a
+    # difference of two entries.
     others = np.append(0, np.cumsum((kinds != dashpots.interior) | (kinds == NO_DASHPOTS)))
     damped = np.append(0, np.cumsum(kinds != NO_DASHPOTS))
     width = dashpots.width
     is_interior = (others[width:] == others[:-width])[: layout.owned]
     is_damped = (damped[width:] > damped[:-width])[: layout.owned]
 
+    # Cells whose windows have interior cells alone, and whose stencil stays among the rank's own. Vectors of cells need
+    # so many in a row; the others have dense rows, if there is a dashpot near them.
     cells = np.arange(layout.start, layout.stop)
     interior = gramian.table(np.full(width, dashpots.interior))
     columns_read = _columns(interior)

@@ -115,7 +115,7 @@ def _fill_springs(dofs: np.ndarray, lattice: Chain, springs: np.ndarray) -> None
 def group_dofs(model: Model, reach: int) -> Groups:
     """Divide ``contact_dofs`` into groups, in the lattice's order.
 
-    DoFs within ``reach`` cells of each other are in one group, and so are those that are in one with a third.
+    DoFs within ``reach`` cells of each other are in one group, and so are those that others link in this way.
     """
     lattice = model.chain
     dofs = contact_dofs(model)

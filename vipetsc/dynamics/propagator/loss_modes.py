@@ -19,8 +19,8 @@ SMALLEST_MODE = 1e-13
 def mode_count(theta: float) -> int:
     """Number of polynomials that a function whose rates turn by 2 ``theta`` over the step needs.
 
-    They are those whose coefficients, over the first one, are not below ``SMALLEST_MODE``, by the bound of the module's
-    docstring. Factorials outgrow powers, so that the loop ends and AssertionError is never raised.
+    They are those whose bound ``theta``^p/(2 p + 1)!! of the module's docstring is not below ``SMALLEST_MODE``.
+    Factorials outgrow powers, so that the loop ends and AssertionError is never raised.
     """
     bound = 1.0
     for p in count(1):
@@ -42,7 +42,8 @@ def overlaps(modes: int, powers: int) -> np.ndarray:
 
     The first mode is that of a, the second that of b.
     """
-    # Higher degrees than the modes' are small in what these are multiplied by; a few more nodes keep them apart.
+    # The coefficients of a, and of b, by Gauss's rule. With ``modes`` nodes the first degrees left out would be taken
+    # for the last ones kept; a few nodes more keep them apart.
     nodes, weight = gauss(modes + 4)
     degrees = np.arange(modes)
     to_modes = (2 * degrees + 1)[:, None] * (legvander(2 * nodes - 1, modes - 1) * weight[:, None]).T

@@ -31,8 +31,9 @@ from numpy.typing import ArrayLike
 from vipetsc.dynamics.propagator.rows import Bounds, bounds_of, local_recursion, power_rows
 from vipetsc.lattice.chain import Chain
 
-# The engine's longest step, omega H = 3.2, needs 15 terms at its finest tolerance, 1e-15; so many reach omega H = 8.
-# Longer steps, which the engine refuses, are cut off here, and ``truncation`` has the larger remainder.
+# The engine's longest step, omega H = 3.2, needs 15 terms at its finest tolerance, 1e-15; these 24 reach omega H = 8 at
+# that tolerance. The series of a longer step, which the engine refuses, is cut off here, and ``truncation`` has the
+# larger remainder.
 MOST_TERMS = 24
 # Cells whose rows are computed together: they take about 100 kB each, too much for all cells at once.
 BATCH = 64

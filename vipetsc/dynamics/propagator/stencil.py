@@ -95,8 +95,10 @@ def exchange(halo: Halo, which: int, state: np.ndarray) -> int:
     Returns PETSc's error code.
     """
     if halo.scatter != 0:
-        error = native.scatter_begin(halo.scatter, halo.states[which], halo.vector, 1, 0)
-        return error or native.scatter_end(halo.scatter, halo.states[which], halo.vector, 1, 0)
+        insert = native.INSERT_VALUES
+        forward = native.FORWARD
+        error = native.scatter_begin(halo.scatter, halo.states[which], halo.vector, insert, forward)
+        return error or native.scatter_end(halo.scatter, halo.states[which], halo.vector, insert, forward)
     for row in range(state.shape[0]):
         for column in range(halo.cells.size):
             halo.columns[row, column] = state[row, halo.cells[column]]

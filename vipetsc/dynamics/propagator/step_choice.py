@@ -32,7 +32,8 @@ CELL_COST = 0.03  # of a cell in a step
 SITE_COST = 10.0  # of a sample's contacts, for each site of a cluster
 SPRING_COST = 3.0  # of a nonlinear spring in a step
 PAIR_COST = 0.8  # of a nonlinear spring in a step for each one that it feels, itself among them
-# The series is cut off at this fraction of the run's relative tolerance, or where rounding makes it as large.
+# The series of a step is cut off at this fraction of the run's relative tolerance: the errors of 10^4 steps then add up
+# to the tolerance at most. Below the second number the rounding of a step is as large.
 SERIES_TOLERANCE = 1e-4
 LEAST_TOLERANCE = 1e-15
 

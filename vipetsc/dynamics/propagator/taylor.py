@@ -76,7 +76,10 @@ def _onset_on_side(series: np.ndarray, site: Any, side: int, curvature: float, l
         # never meets it: the step is then infinite, or NaN if the site rests, and both end the loop.
         gap += tolerance
         root = np.sqrt(max(closing * closing + 2.0 * curvature * gap, 0.0))
-        step = 2.0 * gap / (closing + root) if closing > 0.0 else (root - closing) / curvature
+        if closing > 0.0:
+            step = 2.0 * gap / (closing + root)
+        else:
+            step = (root - closing) / curvature
         s += max(step, ROUNDING)
     return 2.0
 

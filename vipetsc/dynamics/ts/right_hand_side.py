@@ -163,7 +163,9 @@ def _callback(ts: int, t: float, u: int, f: int, address: int) -> int:
     shape = context.shape
     error = 0
     if shape.exchange:
-        error = native.ghosts_begin(u, 1, 0) or native.ghosts_end(u, 1, 0)
+        insert = native.INSERT_VALUES
+        forward = native.FORWARD
+        error = native.ghosts_begin(u, insert, forward) or native.ghosts_end(u, insert, forward)
     error = error or native.get_read(u, address)
     if error != 0:
         return error

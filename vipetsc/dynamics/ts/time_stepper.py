@@ -66,7 +66,7 @@ class TimeStepper:
     def try_step(self, time: float, h: float, after_onset: bool) -> StepOutcome:
         """Try a step of ``h`` s from the state at ``time`` in s; a rejected one is undone.
 
-        ``after_onset`` of a contact the step goes as the root of time: see ``ONSET``.
+        With ``after_onset``, at the onset of a contact, the step is one in the root of the time since: see ``ONSET``.
         """
         self._state.copy(self._saved)
         return self._try(time, h, after_onset)
