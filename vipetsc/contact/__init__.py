@@ -4,7 +4,7 @@ A site is a pair of masses, host and resonator, with the relative displacement w
 clearance D on both sides. ``law`` contains the compiled force, ``search`` the guaranteed root search and the landing on
 a root, ``changes`` the changes of a site's mode within a step, ``tracker`` the modes and the log.
 
-**Law.** With the indentation x = sigma w - D on the side sigma = +1 or -1, the force on the host is
+**Law.** With the indentation x = sigma w - D on the side sigma = +1 or -1, the force on the host in contact is
 
     F = sigma kc x^n g,    g = 1 + c w'/w'_minus,    c = 3 (1 - r)/2,
 
@@ -14,32 +14,37 @@ larger on the way in than on the way out, and the contact dissipates the power
 
     P = sigma kc x^n (g - 1) w' = c kc x^n w'^2 / |w'_minus| >= 0.
 
-For the reduced mass m, m w'' = -F gives w' dw'/(1 + c w'/w'_minus) = -kc x^n dx/m. The right side vanishes over a whole
-contact, hence the rebound e = -w'_plus/w'_minus solves e + log(1 - c e)/c = log(1 + c)/c - 1, whose expansion is e = r
-+ O((1 - r)^2): r is the restitution of a nearly elastic impact. The exact damping is the c that solves it for e = r. A
-fast separation makes g < 0, a pull; ``adhesion = "clip"`` then sets the force to zero. A floor of |w'_minus| bounds g
-at a grazing onset.
+For the reduced mass m, m w'' = -F gives w' dw'/(1 + c w'/w'_minus) = -kc x^n dx/m. Over a whole contact, from x = 0 to
+x = 0, the right side integrates to zero, hence the rebound e = -w'_plus/w'_minus solves
+e + log(1 - c e)/c = log(1 + c)/c - 1. Its expansion is e = r + O((1 - r)^2): r is the restitution of a nearly elastic
+impact. The exact damping is the c that solves it for e = r. A fast separation makes g < 0, a pull; ``adhesion =
+"clip"`` then sets the force to zero. A floor of |w'_minus| bounds g at a grazing onset.
 
-**Modes.** A site is free, closed (in contact), clipped or at rest in contact. Within a time step its mode is frozen and
-the law is continued as an odd function through x = 0: the force is smooth, so that no kink spoils the order of the
-method. Every change of mode is a switching function that crosses zero upwards: sigma w - D (onset), D - sigma w
-(separation), -g and g (clipping begins and ends).
+**Modes.** A site is free, closed (in contact), clipped, permanent or at rest in contact. Within a time step the modes
+are frozen, and the law of a closed site is continued as an odd function through x = 0: the force is smooth, so that no
+kink spoils the order of the method. Every change of mode is a switching function that crosses zero upwards:
+sigma w - D (onset), D - sigma w (separation), -g and g (clipping begins and ends). A contact without loss that is
+pressed at rest, or in which the masses of two cells touch, is permanent: its force is that of max(x, 0) at all times,
+kink included, and its mode never changes.
 
-**Rest.** A site whose stop has no clearance may touch it at rest. As the front of a wave arrives, the motion passes
-through all magnitudes below the tolerance of a landing, with many roots and useless landings. A site that would land
-again without having left the tolerance therefore rests: its force is that of max(x, 0), without loss, and there are no
-landings until it is a hundred tolerances away. There it is free, or closed as after an onset from rest, which has no
-approach velocity: w'_minus is then the floor, without which only c = 0 has a limit.
+**Rest.** A site whose stop has no clearance may touch it at rest. As the front of a wave arrives, the motion grows
+from below the tolerance of a landing, where it has many roots on each of which a landing would be useless. A site that
+would land again without having left the tolerance therefore rests: its force is that of max(x, 0), without loss, and
+nothing is landed on until it is a hundred tolerances away. There it becomes free or closed. A contact that closes from
+rest has no approach velocity: w'_minus is the floor. Contacts with loss and without a floor do not rest, since their
+force has no limit as w'_minus vanishes.
 
 **Search.** w on a step of length h is the quintic Hermite interpolant of (w, w', w'') at both ends, in Bernstein
-form: w(s h) = sum_i b_i B_i(s). The coefficients bound the polynomial, and the number of their changes of sign bounds
-the number of its roots, of which it differs by an even number (Descartes' rule). No sign change means no root, one
-means exactly one, which bisection finds; otherwise de Casteljau's scheme halves the interval, and the left half comes
-first. The first crossing is found even when a second one follows within the step (Lane and Riesenfeld 1981).
+form: w(s h) = sum_i b_i B_i(s). The coefficients bound the polynomial. Its roots in the step are as many as the
+changes of sign from one coefficient to the next, or fewer by an even number (Descartes' rule). No change of sign means
+no root; one means exactly one root, which bisection finds. Otherwise de Casteljau's scheme halves the interval, and
+the left half comes first: the first crossing is found even when a second one follows within the step (Lane and
+Riesenfeld 1981).
 
 **Landing.** The step is repeated so that it ends on the change: Newton's method on the switching function, evaluated
-on the trajectory itself and not on the interpolant, as long as it halves the distance; where it does not, the search
-is repeated on the shorter step. An apparent change may turn out to be a near miss.
+on the trajectory itself and not on the interpolant, as long as each iteration halves the distance; where one does not,
+the search is repeated on the shorter step. It may find nothing there: the interpolant of the first step crossed zero
+where the trajectory only came near. The step is then taken as it is.
 
 References
 ----------

@@ -17,15 +17,18 @@ from vipetsc.compiled import allocating, kernel
 from vipetsc.contact.law import CLIPPED, CLOSED, FREE, PERMANENT, RESTING, contact_force, gap_of, resting_side, side_of
 from vipetsc.contact.search import bernstein, evaluate, first_upcrossing, first_upcrossing_after_start
 
-# A site has landed on its clearance when |side w - D| is within this fraction of D (of its ``scale``).
+# A site has landed on its clearance when |side w - D| is within this fraction of its ``scale``, which is D. The
+# rounding of w is 1e-16 of the displacements: they may be 1e5 times D, and a landing is still reached.
 LANDED_W = 1e-10
-# ... and on g = 0 when |g| is within this.
+# A site has landed on g = 0 when |g| is within this.
 LANDED_G = 1e-9
-# A site at rest in contact has opened or closed when it is this fraction of its scale away from D: the many landings
-# by which it came to rest are over, and it lands at D again.
+# A site at rest in contact has opened or closed when it is this fraction of its scale away from D. So far beyond the
+# tolerance a return to D is a motion of its own, on which the site may land again.
 MOVED_W = 100 * LANDED_W
 
-# The largest force in a step is sampled at the ends of so many intervals, then narrowed by golden sections.
+# The largest force in a step is sampled at the ends of so many intervals, then sought by golden sections between the
+# neighbours of the largest sample. These are a quarter of the step apart; 24 sections leave 2e-6 of the step, over
+# which a force next to its maximum changes by less than 1e-11 of itself.
 _INTERVALS = 8
 _GOLDEN = 0.6180339887498949
 _SECTIONS = 24
@@ -34,8 +37,8 @@ _SECTIONS = 24
 class AffineForm(NamedTuple):
     """A switching function ``factor`` d^k w/dt^k + ``offset`` with k = ``order``, 0 or 1.
 
-    ``tolerance`` is that of a landing, ``mode`` the one it leads to. The offset is -inf where the site's mode has no
-    such function: it never crosses zero.
+    ``tolerance`` is that of a landing on its zero, ``mode`` the mode of the site from there on. The offset is -inf
+    where the site's mode has no such function, so that it never crosses zero.
     """
 
     order: int
@@ -55,7 +58,10 @@ class Switching(NamedTuple):
 
 
 class ModeChange(NamedTuple):
-    """The first change in a step: its ``position`` in the step, from 0 to 1 (2 if there is none), site and function."""
+    """The first change in a step: ``position`` in it, from 0 to 1 (2 if there is none), ``site`` and its ``function``.
+
+    ``function`` is the number, 0 or 1, of the switching function that crosses zero.
+    """
 
     position: float
     site: int
@@ -63,7 +69,10 @@ class ModeChange(NamedTuple):
 
 
 class Extremes(NamedTuple):
-    """Extremes of a contact in a step: indentation in m, largest and smallest force in N, positive when it pushes."""
+    """Extremes of a contact in a step: largest ``indentation`` in m, largest and smallest force on the host in N.
+
+    Forces are positive where the contact pushes.
+    """
 
     indentation: float
     force: float
@@ -72,49 +81,61 @@ class Extremes(NamedTuple):
 
 @kernel
 def _affine_form(contacts: np.ndarray, i: int, function: int) -> AffineForm:
-    """Switching function 0 or 1 of site ``i`` in its mode."""
+    """The switching ``function``, 0 or 1, of site ``i`` of ``contacts`` (site,) in its mode."""
     site = contacts[i]
     tolerance = LANDED_W * site.scale
     if site.mode == FREE:
+        # Function 0 is the onset on the side 1, function 1 that on the side -1.
         side = 1 - 2 * function
-        return AffineForm(0, float(side), -gap_of(site, side), tolerance, side * CLOSED)
+        gap = gap_of(site, side)
+        return AffineForm(order=0, factor=float(side), offset=-gap, tolerance=tolerance, mode=side * CLOSED)
+
     side = side_of(site.mode)
+    gap = gap_of(site, side)
     if abs(site.mode) == PERMANENT:
-        # Its force has a kink at D, where the masses meet (function 0) or part.
+        # Its force has a kink at D, where the masses meet (function 0) or part (function 1).
         rises = 1 - 2 * function
         near = MOVED_W * site.scale
-        return AffineForm(0, float(rises * side), -rises * gap_of(site, side), near, site.mode)
+        return AffineForm(order=0, factor=float(rises * side), offset=-rises * gap, tolerance=near, mode=site.mode)
 
     if abs(site.mode) == RESTING:
-        # Not on D itself: there the many landings would begin again by which the site came to rest.
+        # Not on D itself, where the motion has as many roots as before the site came to rest.
         moved = MOVED_W * site.scale
         if function == 0:
-            return AffineForm(0, float(-side), gap_of(site, side) - moved, tolerance, FREE)
-        return AffineForm(0, float(side), -gap_of(site, side) - moved, tolerance, side * CLOSED)
+            return AffineForm(order=0, factor=float(-side), offset=gap - moved, tolerance=tolerance, mode=FREE)
+        return AffineForm(order=0, factor=float(side), offset=-gap - moved, tolerance=tolerance, mode=side * CLOSED)
+
+    # Closed or clipped: function 0 is the separation.
     if function == 0:
-        return AffineForm(0, float(-side), gap_of(site, side), tolerance, FREE)
+        return AffineForm(order=0, factor=float(-side), offset=gap, tolerance=tolerance, mode=FREE)
     if not site.clip:
-        return AffineForm(1, 0.0, -np.inf, 0.0, site.mode)
+        return AffineForm(order=1, factor=0.0, offset=-np.inf, tolerance=0.0, mode=site.mode)
 
     # g = 1 + c w'/w'_minus falls through zero where clipping begins, and rises through it where it ends.
     slope = site.damping / site.approach
     if abs(site.mode) == CLIPPED:
-        return AffineForm(1, slope, 1.0, LANDED_G, side * CLOSED)
-    return AffineForm(1, -slope, -1.0, LANDED_G, side * CLIPPED)
+        return AffineForm(order=1, factor=slope, offset=1.0, tolerance=LANDED_G, mode=side * CLOSED)
+    return AffineForm(order=1, factor=-slope, offset=-1.0, tolerance=LANDED_G, mode=side * CLIPPED)
 
 
 @kernel
 def switching(contacts: np.ndarray, i: int, function: int, motion: np.ndarray) -> Switching:
-    """Switching function 0 or 1 of site ``i`` at ``motion`` (3,); the value is -inf if it does not apply."""
+    """The switching ``function``, 0 or 1, of site ``i`` of ``contacts`` (site,) at its ``motion`` (3,): w, w', w''.
+
+    The value is -inf if the site's mode has no such function.
+    """
     form = _affine_form(contacts, i, function)
     value = form.factor * motion[form.order] + form.offset
     rate = form.factor * motion[form.order + 1]
-    return Switching(value, rate, form.tolerance, form.mode)
+    return Switching(value=value, rate=rate, tolerance=form.tolerance, mode=form.mode)
 
 
 @kernel
 def _stays_free(site: Any, b: np.ndarray) -> bool:
-    """Whether a free site is within both clearances all through a step with the Bernstein form ``b`` of w."""
+    """Whether a free ``site`` is within both clearances all through a step with the Bernstein form ``b`` (6,) of w.
+
+    False for a site in another mode.
+    """
     if site.mode != FREE:
         return False
     plus = site.clearance - LANDED_W * site.scale
@@ -129,7 +150,7 @@ def _stays_free(site: Any, b: np.ndarray) -> bool:
 def stays_landed(site: Any, start: np.ndarray, end: np.ndarray, h: float, b: np.ndarray) -> bool:
     """Whether a site that can rest stays within the tolerance of a landing in the step from ``start`` to ``end`` (3,).
 
-    ``b`` (6,) is overwritten.
+    The step has ``h`` seconds; ``b`` (6,) is overwritten. A site that can rest has its stop at w = 0.
     """
     if resting_side(site) == 0:
         return False
@@ -142,7 +163,7 @@ def stays_landed(site: Any, start: np.ndarray, end: np.ndarray, h: float, b: np.
 
 @kernel
 def _passes_kink(site: Any, b: np.ndarray) -> bool:
-    """Whether a permanent ``site`` may open or close in a step with the Bernstein form ``b`` of w, before its end."""
+    """Whether a permanent ``site`` may open or close inside a step with the Bernstein form ``b`` (6,) of w."""
     side = side_of(site.mode)
     gap = gap_of(site, side)
     near = MOVED_W * site.scale
@@ -151,16 +172,16 @@ def _passes_kink(site: Any, b: np.ndarray) -> bool:
     for w in b:
         lowest = min(lowest, side * w - gap)
         highest = max(highest, side * w - gap)
-    # A step that ends on the kink has it not inside; near the kink the force is no force.
+    # A step that ends on the kink does not have it inside. Depths up to ``near`` do not count: their force, and the
+    # kink in it, is below the errors of a step.
     return highest > near and lowest < 0.0 and abs(side * b[5] - gap) > near
 
 
 @kernel
 def _next_kink(site: Any, motion: np.ndarray) -> int:
-    """The switching function of a permanent ``site`` that crosses zero next.
+    """The switching function of a permanent ``site`` that crosses zero next: 0, the masses meet, or 1, they part.
 
-    It is 0 where the masses will meet and 1 where they will part. ``motion`` (3,) are w, w', w''; on the kink itself
-    the direction decides.
+    ``motion`` (3,) are w, w', w'' at present. Where the masses just touch, w' decides.
     """
     side = side_of(site.mode)
     depth = side * motion[0] - gap_of(site, side)
@@ -176,10 +197,10 @@ def first_change(
 ) -> ModeChange:
     """The first change of any site's mode in the step of ``h`` seconds from motion ``start`` to ``end`` (sites, 3).
 
-    With ``kinks`` also where a permanent contact opens or closes, which changes no mode. ``room`` (2, 6) is
+    With ``kinks`` a permanent contact that opens or closes counts as well, although its mode stays. ``room`` (2, 6) is
     overwritten.
     """
-    first = ModeChange(2.0, -1, 0)
+    first = ModeChange(position=2.0, site=-1, function=0)
     b = room[0]
     c = room[1]
     for i in range(contacts.size):
@@ -199,15 +220,16 @@ def first_change(
             form = _affine_form(contacts, i, function)
             if form.offset == -np.inf:
                 continue
+            # The coefficients of w' are 5 (b_k+1 - b_k)/h; an offset adds to every coefficient.
             for k in range(6 - form.order):
                 if form.order == 0:
                     c[k] = form.factor * b[k] + form.offset
                 else:
                     c[k] = form.factor * 5.0 * (b[k + 1] - b[k]) / h + form.offset
             position = first_upcrossing_after_start(c[: 6 - form.order], form.tolerance)
-            # Strictly: of changes at one time the first site's is landed on, and the others land with it.
+            # Strictly less: of changes at one time that of the first site is landed on, and the others land with it.
             if position < first.position:
-                first = ModeChange(position, i, function)
+                first = ModeChange(position=position, site=i, function=function)
     return first
 
 
@@ -229,7 +251,8 @@ def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h
         d[k] = 5.0 * (b[k + 1] - b[k]) / h
     side = side_of(contacts[i].mode)
 
-    # Deepest at an end, or where side w' falls through zero inside.
+    # The site is deepest at an end, or where side w' falls through zero inside. The first such place is enough: steps
+    # in contact are a fraction of an impact, too short for a contact to turn twice.
     deepest = max(side * b[0], side * b[5])
     recoil = np.empty(5)
     for k in range(5):
@@ -239,6 +262,7 @@ def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h
         if turn <= 1.0:
             deepest = max(deepest, side * evaluate(b, turn, room))
 
+    # The smallest force only tells whether the contact has pulled: samples are exact enough.
     largest = smallest = _push(contacts, i, b, d, 0.0, room)
     best = 0.0
     for k in range(1, _INTERVALS + 1):
@@ -259,4 +283,4 @@ def extremes(contacts: np.ndarray, i: int, start: np.ndarray, end: np.ndarray, h
         else:
             low = left
     largest = max(largest, _push(contacts, i, b, d, 0.5 * (low + high), room))
-    return Extremes(deepest - gap_of(contacts[i], side), largest, smallest)
+    return Extremes(indentation=deepest - gap_of(contacts[i], side), force=largest, smallest_force=smallest)

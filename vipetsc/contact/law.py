@@ -2,7 +2,8 @@
 
 The docstring of the package derives the formulas. ``vipetsc.lattice.Contact`` is the same law on arrays: force, slope
 and energy of a shipped elastic law are defined there and here, and nowhere else. A law that a user's module registers
-is called by the addresses of its compiled functions, which its record holds in this process.
+is called by the addresses of its compiled functions, which are part of the site's record and valid in this process
+alone.
 """
 
 from collections.abc import Sequence
@@ -17,9 +18,11 @@ from vipetsc.lattice.contact import PHASES, SHALLOWEST, registered_law
 from vipetsc.lattice.registered_law import call_address, compiled_law
 from vipetsc.register import MOST_PARAMETERS
 
-# Smallest approach speed in m/s for an impact's duration: the energy of a slower impact underflows.
+# Smallest approach speed in m/s for an impact's duration. Squares below 1e-154 m/s underflow: this is far from it, so
+# that masses and stiffnesses of any size may multiply the square.
 SLOWEST = 1e-100
-# Modes of a site; the sign is the side. Those from PERMANENT on have the force of max(x, 0), without loss.
+# Modes of a site, see the package's docstring. A site in contact has its mode times the side, 1 or -1. Modes from
+# PERMANENT on have the force of max(x, 0), without loss.
 FREE, CLOSED, CLIPPED, PERMANENT, RESTING = 0, 1, 2, 3, 4
 
 PARAMETERS = ("first", "second", "third", "fourth")  # of a registered law
@@ -30,11 +33,12 @@ ELASTIC = np.dtype(
 )
 """Parameters of an elastic law: kc in N/m^n, the power n with which the force begins, ``Contact.duration_factor``.
 
-``force``, ``slope`` and ``energy`` are the addresses of a registered law's functions in this process, 0 of a shipped
-one, and what follows are its parameters.
+``force``, ``slope`` and ``energy`` are the addresses of a registered law's functions in this process, 0 for a shipped
+law; ``first`` to ``fourth`` are the parameters of a registered law.
 
-``speed_exponent`` is that of the speed in an impact's energy, 2: from a record, no compiler makes a product of the
-power. Its last bit differs from the library's now and then, and with it the steps of a chaotic run.
+``speed_exponent`` is always 2, the exponent of the speed in an impact's energy. It is stored because a compiler
+replaces a power with the constant exponent 2 by a product, or does not, as its version pleases. The product and the
+library's power differ in their last bit now and then, and with it differ the steps of a chaotic run.
 """
 
 SITE = np.dtype(
@@ -53,10 +57,10 @@ SITE = np.dtype(
     ],
     align=True,
 )
-"""A site: its mode times its side, the clearances in m on the sides + and - (inf: no stop there), the length in m that
-landings are measured by, the signed approach velocity w'_minus in m/s; its elastic law, the damping c of the factor g,
-the smallest |w'_minus| in m/s, whether g is kept from becoming negative; the reduced mass of its two masses in kg.
-``preload`` in N is its force at w = 0, which a static load balances.
+"""A site: its mode times its side, the clearances in m on the sides + and - (inf: no stop there), the ``scale`` in m to
+which tolerances of landings are relative, the signed ``approach`` velocity w'_minus in m/s; its elastic law, the
+damping c of the factor g, the ``floor`` of |w'_minus| in m/s, whether g is kept from becoming negative; the reduced
+mass of its two masses in kg. ``preload`` in N is the force of a permanent contact at w = 0: a static load balances it.
 """
 
 
@@ -97,7 +101,7 @@ def create_contacts(
 
     sites = np.zeros(len(gaps), SITE)
     sites["clearance"], sites["clearance_minus"] = gaps.T
-    # Landings are as exact as the smaller stop needs; one without clearance has no size of its own.
+    # The smaller clearance asks for the more exact landing. A stop without clearance has no length of its own.
     sizes = np.where((gaps != 0) & np.isfinite(gaps), np.abs(gaps), np.inf).min(axis=1)
     sites["scale"] = np.where(np.isfinite(sizes), sizes, scale)
     sites["approach"] = 1.0
@@ -110,16 +114,19 @@ def create_contacts(
 
 
 def hold(sites: np.ndarray, laws: Sequence[Contact], which: np.ndarray, speed: float) -> None:
-    """Make the sites ``which`` permanent, without changes of mode: no loss, and touching at w = 0 or pressed there.
+    """Make the sites ``which`` (site,) permanent (see the package's docstring); they touch or are pressed at w = 0.
 
-    ``laws`` (site,) are those of all ``sites``; ``speed`` in m/s is that of relative motion, for what is small
-    compared with it.
+    ``laws`` (site,) are those of all ``sites``. ``speed`` in m/s, that of the relative motion to be expected, takes the
+    place of w'_minus: errors of steps in contact are relative to it.
     """
-    # A contact that is pressed at rest has one stop: that of the smaller clearance, which is negative.
+    # A contact that is pressed at rest has one stop, that of the smaller clearance. The clearance is negative: minus
+    # it is the indentation at rest.
     side = np.where(sites["clearance"] < sites["clearance_minus"], 1, -1)
     pressed = np.maximum(-np.minimum(sites["clearance"], sites["clearance_minus"]), 0.0)
     sites["mode"][which] = (side * PERMANENT)[which]
     sites["approach"][which] = side[which] * speed
+
+    # Law by law, since the force of a law is computed for arrays.
     load = np.zeros(len(sites))
     sites_of_law: dict[Contact, list[int]] = {}
     for i, law in enumerate(laws):
@@ -145,7 +152,8 @@ def gap_of(site: Any, side: int) -> float:
 def resting_side(site: Any) -> int:
     """The side on which a ``SITE`` may rest in contact, that of a stop without clearance; 0 if it cannot rest.
 
-    The damping of a contact that is pressed from rest has no limit without a floor of the approach velocity.
+    A contact with loss that closes from rest needs a floor of the approach velocity, without which its force has no
+    limit.
     """
     if site.damping != 0.0 and site.floor == 0.0:
         return 0
@@ -159,7 +167,7 @@ def resting_side(site: Any) -> int:
 @kernel
 def _registered(function: int, law: Any, x: float) -> float:
     """The value of a registered law's ``function``, an address, at the indentation x in m."""
-    # The type of an intrinsic does not show its first argument.
+    # ``call_address`` is an intrinsic of the compiler, which hands it its first argument itself: mypy counts one more.
     return call_address(function, x, law.stiffness, law.first, law.second, law.third, law.fourth)  # type: ignore[call-arg]
 
 
@@ -210,7 +218,12 @@ def begins_linearly(law: Any) -> bool:
 
 @kernel
 def impact_time(site: Any, speed: float) -> float:
-    """Contact time in s of an isolated conservative impact on a ``SITE`` at ``speed`` in m/s: see ``Contact``."""
+    """Contact time in s of a conservative impact of two masses alone on a ``SITE``, at ``speed`` in m/s.
+
+    ``Contact.impact_time`` is the same on arrays; m is the reduced mass. Where the force is a power of the indentation,
+    the deepest one is x_m = ((n + 1) m speed^2/(2 kc))^(1/(n + 1)), and the time a factor times x_m/speed (Johnson
+    1985, sec. 11.4). For a registered law both are found numerically.
+    """
     law = site.elastic
     speed = max(speed, SLOWEST)
     if law.duration_factor > 0.0:
@@ -218,7 +231,8 @@ def impact_time(site: Any, speed: float) -> float:
         depth = (inertia * speed**law.speed_exponent / law.stiffness) ** (1.0 / (law.exponent + 1.0))
         return law.duration_factor * depth / speed
 
-    # Newton's method from beyond the turning point comes down on it: the energy of a hardening force is convex.
+    # The deepest indentation stores the whole energy. The stored energy is convex, since forces grow with the
+    # indentation: Newton's method from beyond the root comes down to it without a bracket.
     energy = 0.5 * site.reduced_mass * speed * speed
     depth = SHALLOWEST
     while elastic_energy(law, depth) < energy:
@@ -228,7 +242,8 @@ def impact_time(site: Any, speed: float) -> float:
         step = (elastic_energy(law, depth) - energy) / elastic_force(law, depth)
         depth -= step
 
-    # With x = depth sin(phase) the integrand stays finite where the speed falls to zero.
+    # The time is twice the integral of dx/x' from 0 to the depth. With x = depth sin(phase) the integrand stays finite
+    # where x' falls to zero, and the midpoint rule does.
     width = 0.5 * np.pi / PHASES
     total = 0.0
     for k in range(PHASES):
@@ -240,10 +255,10 @@ def impact_time(site: Any, speed: float) -> float:
 
 @kernel
 def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[float, float]:
-    """Force on the host in N and power in W that leaves the ledger, of site ``i`` in its mode at w in m, w' in m/s.
+    """Force on the host in N and dissipated power in W of site ``i`` in its mode, at ``w`` in m and ``rate`` w' in m/s.
 
-    The power is what the contact dissipates; of a clipped one it is 0: see ``clipped_energy``. ``contacts`` (site,) are
-    of dtype ``SITE``; ``rate`` is w'.
+    ``contacts`` (site,) are of dtype ``SITE``. The power of a clipped contact is given as 0: what it dissipates is the
+    change of its ``clipped_energy``.
     """
     site = contacts[i]
     if site.mode == FREE:
@@ -252,11 +267,10 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
     side = side_of(site.mode)
     x = side * w - gap_of(site, side)
     if abs(site.mode) >= PERMANENT:
-        # No change of mode at x = 0 is looked for: the force itself has the kink where the masses part.
+        # The mode stays while the masses part and meet: the force itself has the kink at x = 0.
         return side * elastic_force(site.elastic, max(x, 0.0)), 0.0
 
     if abs(site.mode) == CLIPPED:
-        # The loss is that of the elastic energy, a function of w: ``clipped_energy``.
         return 0.0, 0.0
     elastic = elastic_force(site.elastic, x)
     g = 1.0 + site.damping * rate / site.approach
@@ -265,7 +279,10 @@ def contact_force(contacts: np.ndarray, i: int, w: float, rate: float) -> tuple[
 
 @kernel
 def clipped_energy(site: Any, w: float) -> float:
-    """Elastic energy in J that a ``CLIPPED`` ``SITE`` still has at w in m, and loses up to its separation; else 0."""
+    """Elastic energy in J at w in m of a ``SITE`` whose mode is ``CLIPPED``; 0 in any other mode.
+
+    No force gives this energy back to the masses: the contact dissipates all of it up to its separation.
+    """
     if abs(site.mode) != CLIPPED:
         return 0.0
     side = side_of(site.mode)

@@ -1,9 +1,9 @@
-"""The guaranteed search for the first root of a polynomial in Bernstein form, and the landing on one of a trajectory.
+"""The guaranteed search for the first root of a polynomial in Bernstein form, and landing on roots of a trajectory.
 
-Method and references: the package's docstring. The trajectory is known at the end of a step only, and each engine takes
-its own kind of step. Both use the safeguarded Newton iteration on the switching function at the end of the repeated
-step. (``vipetsc.modes.shooting.landing`` keeps a bracket instead: it lands to the rounding of the time, where
-a residual no longer halves.)
+Method and references: the package's docstring. A trajectory is known at the ends of steps alone, and each engine has
+steps of its own kind. An engine repeats a step until it ends on the root, and asks ``correct`` after each attempt what
+to do next: that is Newton's iteration on the switching function, with safeguards. (``vipetsc.modes.shooting.landing``
+keeps a bracket instead: it lands to the rounding of the time, where residuals no longer halve.)
 """
 
 from typing import NamedTuple
@@ -12,9 +12,10 @@ import numpy as np
 
 from vipetsc.compiled import allocating, kernel
 
-# Two roots that are nearer to each other, as fractions of the step, count as one. Halvings of [0, 1] end at
-# 2^-44 = 6e-14, each leaves one half to be searched later: the stack is deep enough.
+# An interval of this length, as a fraction of the step, that may still hold a root counts as one: it holds two roots
+# near each other, or the polynomial comes as near to zero as its rounding. It is a thousand roundings of a position.
 _NARROWEST = 1e-13
+# Intervals that wait to be searched. Halvings of [0, 1] end after 44, at 2^-44 = 6e-14, and each leaves one half.
 _DEPTH = 64
 # Newton steps for one landing before the search is repeated on a shorter step, and all attempts.
 NEWTON_STEPS = 8
@@ -51,9 +52,9 @@ def evaluate(b: np.ndarray, s: float, room: np.ndarray) -> float:
 
 @kernel
 def _bisect(c: np.ndarray, room: np.ndarray) -> float:
-    """Root in [0, 1] of a polynomial that turns from negative to positive once."""
+    """Root in [0, 1] of a polynomial ``c`` (n,) that turns from negative to positive once; ``room`` (6,) is scratch."""
     low, high = 0.0, 1.0
-    # 53 halvings: the interval is then one rounding unit of 1.
+    # The interval is then 2^-53 long, half the rounding unit of 1.
     for _ in range(53):
         s = 0.5 * (low + high)
         if evaluate(c, s, room) > 0.0:
@@ -82,16 +83,20 @@ def _copy(source: np.ndarray, target: np.ndarray) -> None:
 
 @kernel
 def _may_turn_positive(c: np.ndarray) -> bool:
-    """Whether a coefficient is positive, or no number: a polynomial is no larger than the largest of them."""
+    """Whether any coefficient ``c`` (n,) is positive or NaN; a polynomial nowhere exceeds its largest coefficient."""
     may_turn = False
     for coefficient in c:
+        # Not "coefficient > 0", which is false for NaN: a motion that is no number must not pass for one without roots.
         may_turn |= not coefficient <= 0.0
     return may_turn
 
 
 @kernel
 def _count_changes(c: np.ndarray) -> int:
-    """Changes of sign from one coefficient to the next, that of zero being negative: at least as many as roots."""
+    """Changes of sign from one coefficient ``c`` (n,) to the next: at least as many as roots in ]0, 1[.
+
+    Zero counts as negative, since a polynomial that touches zero from below has not crossed it.
+    """
     changes = 0
     for i in range(c.size - 1):
         changes += (c[i] <= 0.0) != (c[i + 1] <= 0.0)
@@ -110,6 +115,7 @@ def first_upcrossing(b: np.ndarray) -> float:
     if not _may_turn_positive(b):
         return 2.0
 
+    # Intervals that wait to be searched, the leftmost on top: the coefficients on each, its beginning and its width.
     n = b.size
     stack = np.empty((_DEPTH + 2, n))
     low = np.empty(_DEPTH + 2)
@@ -127,10 +133,10 @@ def first_upcrossing(b: np.ndarray) -> float:
         size = width[top]
         top -= 1
 
-        if c[0] > 0.0:
-            return begin
+        # No interval begins above zero: in the one before it, which ends there, a crossing would have been found.
         if not _may_turn_positive(c):
             continue
+        # One change of sign and opposite signs at the ends: one root.
         if c[n - 1] > 0.0 and _count_changes(c) == 1:
             return begin + size * _bisect(c, room)
         if size < _NARROWEST:
@@ -151,14 +157,15 @@ def first_upcrossing(b: np.ndarray) -> float:
 
 @allocating
 def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
-    """Smallest s in [0, 1] at which a polynomial turns positive, but for its start; 2 if it never does.
+    """Smallest s in [0, 1] at which a polynomial turns positive; 2 if it never does.
 
-    ``b`` (n,), n <= 6, are its Bernstein coefficients. A start within ``tolerance`` of zero has just been landed on,
-    and is itself no crossing.
+    ``b`` (n,), n <= 6, are its Bernstein coefficients. A start within ``tolerance`` of zero is the root that was landed
+    on last: it is a crossing, s = 0, only if the polynomial rises from there.
     """
     if abs(b[0]) > tolerance:
         return first_upcrossing(b)
-    # The polynomial without its value at 0, divided by s: the root at the start is gone, all others stay.
+    # With b_0 = 0 the polynomial is s q(s): q has the other roots, and its value at 0 has the sign of the slope there.
+    # By s B_i,n-1(s) = (i + 1)/n B_i+1,n(s) its coefficients are b_i+1 n/(i + 1).
     n = b.size - 1
     quotient = np.empty(n)
     for i in range(n):
@@ -167,9 +174,10 @@ def first_upcrossing_after_start(b: np.ndarray, tolerance: float) -> float:
 
 
 class Landing(NamedTuple):
-    """An attempt: the step's ``length``, the ``longest`` allowed, the ``residual`` before it, the attempts so far.
+    """An attempt to end a step on a change: the step's ``length``, in the engine's unit of time, at most ``longest``.
 
-    The first one ends where a search of the longest step found the change; its residual is infinite.
+    ``residual`` is the magnitude of the switching function at the end of the attempt before. The first attempt ends
+    where a search of the longest step found the change; its residual is infinite. ``attempts`` came before this one.
     """
 
     length: float
@@ -183,10 +191,15 @@ def correct(landing: Landing, value: float, rate: float, tolerance: float, goal:
     """Judge an attempt that ended at the ``value`` and ``rate`` (per unit of length) of the switching function.
 
     It has landed when |value| is within ``goal``, or within ``tolerance`` >= goal and Newton's method no longer
-    halves it. Returns the next attempt and LANDED, RETRY, SEARCH (``shorten`` it by what a search on the attempt's
-    step finds, or take that step as it is if it finds nothing), or MISSED (no attempts are left; take the step).
+    halves it. Returns the next attempt and what to do:
+
+    - LANDED: the step ends on the change.
+    - RETRY: repeat the step at the new length.
+    - SEARCH: search the attempt's step for a change, and ``shorten`` the attempt to it; without one take the step.
+    - MISSED: no attempts are left; take the step as it is.
     """
     distance = abs(value)
+    # Newton's method squares the distance where it converges: one that does not even halve it has left its root.
     better = distance < 0.5 * landing.residual
     if distance <= goal or (distance <= tolerance and not better):
         return landing, LANDED
@@ -196,15 +209,18 @@ def correct(landing: Landing, value: float, rate: float, tolerance: float, goal:
     if rate != 0.0:
         newton = landing.length - value / rate
     if landing.attempts < NEWTON_STEPS and 0.0 < newton <= landing.longest and better:
-        return Landing(newton, landing.longest, distance, attempts), RETRY
+        return Landing(length=newton, longest=landing.longest, residual=distance, attempts=attempts), RETRY
     if distance <= tolerance:
         return landing, LANDED
     if attempts >= MOST_ATTEMPTS:
         return landing, MISSED
-    return Landing(landing.length, landing.longest, landing.residual, attempts), SEARCH
+    # The length stays until a search has found another one, and the residual with it.
+    return Landing(length=landing.length, longest=landing.longest, residual=landing.residual, attempts=attempts), SEARCH
 
 
 @kernel
 def shorten(landing: Landing, position: float) -> Landing:
-    """The attempt at a change at the ``position``, from 0 to 1, in the last one's step."""
-    return Landing(landing.length * position, landing.longest, landing.residual, landing.attempts)
+    """The attempt that ends at a ``position``, from 0 to 1, in the step of the attempt ``landing``."""
+    return Landing(
+        length=landing.length * position, longest=landing.longest, residual=landing.residual, attempts=landing.attempts
+    )

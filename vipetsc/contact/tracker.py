@@ -1,8 +1,8 @@
 """Modes of sites over time, compiled: switching at located changes, and the log of impacts.
 
 Engines locate the instants at which a contact opens or closes (``contact.changes``) and end a step there. The tracker
-then gives the site its new mode, and keeps the log: an episode begins where a site closes, has the largest indentation
-and force of its steps, and is written to the log where the site opens.
+then gives the site its new mode, and keeps the log of contact episodes. An episode begins where a site closes; the
+largest indentation and force of every step update it; where the site opens it is written to the log.
 """
 
 from collections.abc import Sequence
@@ -28,12 +28,17 @@ from vipetsc.contact.law import (
     side_of,
 )
 
-# Limits of the contact law, of which it is counted how often they acted.
+# What is counted of each site: landings on the clearance without an onset, onsets below the floor of the approach
+# velocity, contacts that were clipped, and contacts that pulled.
 LIMITS = ("grazes", "floored", "clipped", "pulled")
 COUNTS = np.dtype([(name, np.int64) for name in LIMITS])
 _REALS = ("onset", "approach_velocity", "separation", "indentation", "force", "loss")
 EPISODE = np.dtype([("site", np.int64), ("side", np.int64), *((name, np.float64) for name in _REALS)])
-"""One contact of one site: 0-based site, side (+1, -1), times in s, velocity in m/s, depth in m, N, J."""
+"""One contact of one site: 0-based site, side (+1, -1), times of ``onset`` and ``separation`` in s.
+
+The ``approach_velocity`` is in m/s, the largest ``indentation`` in m, the largest ``force`` in N; ``loss`` is the
+energy in J that the contact has dissipated.
+"""
 TRACKED = np.dtype(
     [
         ("number", np.int64),
@@ -44,10 +49,11 @@ TRACKED = np.dtype(
         ("episode", EPISODE),
     ]
 )
-"""A site: its ``number`` in the log, ``counts`` of limits, and its open ``episode``, whose separation is NaN.
+"""A site: its ``number`` in the log, its ``counts`` of ``LIMITS``, and its open ``episode``, whose separation is NaN.
 
-``pulls`` says whether the contact has pulled in this episode: it is counted once. ``mode`` and ``approach`` (w'_minus
-in m/s) are set in a checkpoint alone; a running simulation has them in its ``SITE``. A free site has no open episode.
+``pulls`` says whether the contact has pulled in this episode, since an episode is counted once. ``mode`` and
+``approach`` (w'_minus in m/s) are set in a checkpoint alone; a running simulation has them in its ``SITE``. The
+``episode`` of a free site is the last one, and means nothing.
 """
 
 
@@ -61,7 +67,7 @@ class Tracks(NamedTuple):
 
 @kernel
 def in_episode(mode: int) -> bool:
-    """Whether a site of this mode is in a contact that is logged: neither free nor at rest without load."""
+    """Whether a site of this ``mode`` is in a contact that is logged: neither free nor at rest in contact."""
     return mode != FREE and abs(mode) != RESTING
 
 
@@ -89,7 +95,8 @@ def update_episode(contacts: np.ndarray, tracks: Tracks, i: int, reached: Extrem
     episode.force = max(episode.force, reached.force)
 
     # A landing ends within a tolerance of w = D or g = 0. There the law, continued beyond its limit, has a small force
-    # that pulls, and is the error of the landing: only a larger one counts.
+    # that pulls, which is the error of the landing. Only a larger one counts: at x = -tolerance the pull is at most
+    # f(tolerance) (1 + c), since g is at most 1 + c; at g = -tolerance it is at most f(depth) times that.
     pull = -reached.smallest_force
     before_onset = (1.0 + site.damping) * elastic_force(site.elastic, LANDED_W * site.scale)
     beyond_clipping = LANDED_G * elastic_force(site.elastic, episode.indentation)
@@ -105,8 +112,8 @@ def update_episodes(contacts: np.ndarray, tracks: Tracks, start: np.ndarray, end
         side = side_of(contacts[i].mode)
         turns = side * start[i, 1] > 0.0 > side * end[i, 1]
         if abs(contacts[i].mode) == PERMANENT and not turns:
-            # The depth has no largest value inside the step: the step's end is enough. A search for extremes would cost
-            # as much as the step where thousands of beads touch all the time.
+            # The depth is largest at an end of the step, and its start was the end of the last step. A search for
+            # extremes would cost as much as the step where thousands of beads touch all the time.
             episode = tracks.sites[i].episode
             episode.indentation = max(episode.indentation, side * end[i, 0] - gap_of(contacts[i], side))
             episode.force = max(episode.force, side * contact_force(contacts, i, end[i, 0], end[i, 1])[0])
@@ -119,10 +126,10 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
     """Switch every site that has landed at time ``t`` in s; returns how many. The log must have room.
 
     ``motion`` (sites, 3) holds w, w', w''. ``energies`` (sites,) in J are what the ledger has of each site: the energy
-    that it has dissipated so far, to which the ``clipped_energy`` of a clipped site is added. That sum is constant in a
-    clipped phase, and this function changes it at both ends of the phase. The loss in that phase is not integrated:
-    its power vanishes at the separation as the power 3/2 of time, and would need short steps where the motion, which
-    feels no force, needs none.
+    that it has dissipated so far, and of a clipped site the ``clipped_energy`` in addition. While a site is clipped
+    this sum is constant, since all of that energy is dissipated; this function changes it at both ends of the phase.
+    The loss of the phase is not integrated: by Hertz's law its power vanishes at the separation as the power 3/2 of the
+    time, which would take short steps where the motion, free of force, needs none.
     """
     switched = 0
     for i in range(contacts.size):
@@ -133,7 +140,7 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
             value, rate, tolerance, mode = switching(contacts, i, function, motion[i])
             if value < -tolerance:
                 continue
-            # At a landing |w - D| is rounding: the rate tells on which side the site goes on.
+            # Within the tolerance the value's sign is an error of the landing: the rate tells where the site goes.
             if rate <= 0.0 and value <= tolerance:
                 if contacts[i].mode == FREE:
                     tracks.sites[i].counts.grazes += 1
@@ -146,11 +153,11 @@ def switch_sites(contacts: np.ndarray, tracks: Tracks, motion: np.ndarray, energ
 
 @njit(error_model="numpy")
 def rest_site(contacts: np.ndarray, tracks: Tracks, i: int, motion: np.ndarray, energies: np.ndarray, t: float) -> bool:
-    """Let site ``i`` rest in contact if it touches a stop without clearance; whether it does. The log must have room.
+    """Let site ``i`` rest in contact if it touches a stop without clearance; returns whether it does.
 
     ``contacts`` (site,) are of dtype ``SITE``; ``motion`` (site, 3) has w, w' and w'' at the time ``t`` in s, and
-    ``energies`` (site,) in J are the ledger's, which change as in ``switch_sites``. Motion below the tolerance of a
-    landing can ask for one landing after the other at the same time: the force of a site at rest needs none.
+    ``energies`` (site,) in J are the ledger's, which change as in ``switch_sites``. The log must have room. Why sites
+    rest: see the package's docstring.
     """
     site = contacts[i]
     side = resting_side(site)
@@ -162,12 +169,13 @@ def rest_site(contacts: np.ndarray, tracks: Tracks, i: int, motion: np.ndarray, 
 
 @kernel
 def _begin_episode(site: Any, track: Any, rate: float, t: float, rested: bool) -> None:
-    """Begin the episode of a ``site`` whose contact begins at w' = ``rate``, from rest in contact if it ``rested``."""
-    # What is pressed from rest has no approach velocity but the floor, which only a law with loss needs.
+    """Begin the episode of a ``site`` that closes at w' = ``rate`` in m/s and ``t`` in s; ``rested``: from rest."""
+    # A contact that closes from rest has no approach velocity. With rate = 0 the floor takes its place below. A law
+    # without loss does not use it: there w' serves for the duration of the impact.
     if rested and site.damping != 0.0:
         rate = 0.0
     side = side_of(site.mode)
-    # A grazing onset would make the factor g unbounded.
+    # Without the floor a grazing onset would make the factor g unbounded.
     track.counts.floored += abs(rate) < site.floor
     site.approach = side * max(abs(rate), site.floor)
 
@@ -185,7 +193,10 @@ def _begin_episode(site: Any, track: Any, rate: float, t: float, rested: bool) -
 
 @kernel
 def _end_episode(site: Any, track: Any, tracks: Tracks, energy: float, t: float) -> None:
-    """Write the episode of a ``site`` whose contact has ended to the log, if it was an impact."""
+    """Write the episode of a ``site`` whose contact has ended at ``t`` in s to the log, if it was an impact.
+
+    ``energy`` in J is what the site has dissipated from the run's beginning to its separation.
+    """
     track.pulls = False
     episode = track.episode
     # A site that comes to rest where it had landed has had no impact.
@@ -201,18 +212,23 @@ def _end_episode(site: Any, track: Any, tracks: Tracks, energy: float, t: float)
 def _set_mode(
     contacts: np.ndarray, tracks: Tracks, i: int, mode: int, motion: np.ndarray, energies: np.ndarray, t: float
 ) -> None:
-    """Give site ``i`` its new mode at its ``motion`` (3,); begin or end its episode; ``energies`` as a ledger's."""
+    """Give site ``i`` its new ``mode`` at its ``motion`` (3,) and the time ``t`` in s; begin or end its episode.
+
+    ``energies`` (site,) in J are the ledger's, as in ``switch_sites``.
+    """
     site = contacts[i]
     track = tracks.sites[i]
     had_episode = in_episode(site.mode)
     rested = abs(site.mode) == RESTING
+
+    # What the site has dissipated; the energy of a clipped phase depends on the mode, before and after.
     energy = energies[i] - clipped_energy(site, motion[0])
     site.mode = mode
     energies[i] = energy + clipped_energy(site, motion[0])
 
     if not had_episode and in_episode(mode):
         _begin_episode(site, track, motion[1], t, rested)
-        # What the site will have dissipated by the episode's end is added to this.
+        # The loss of an episode is the difference of ``energy`` between its end and its beginning.
         track.episode.loss = -energy
     elif had_episode and not in_episode(mode):
         _end_episode(site, track, tracks, energy, t)
@@ -239,10 +255,7 @@ def shortest_beginning(contacts: np.ndarray, motion: np.ndarray) -> float:
 
 @kernel
 def shortest_impact(contacts: np.ndarray) -> float:
-    """The smallest ``impact_time`` in s of the ``contacts`` (site,) that are closed; inf if none is.
-
-    Each has the time of an impact at its approach velocity.
-    """
+    """The smallest ``impact_time`` in s of closed ``contacts`` (site,) at their approach velocities; inf if none is."""
     shortest = np.inf
     for i in range(contacts.size):
         if abs(contacts[i].mode) in (CLOSED, CLIPPED):
@@ -272,11 +285,11 @@ class ImpactTracker:
         episodes["separation"][held] = np.nan
 
     def begin(self, motion: np.ndarray) -> np.ndarray:
-        """Close the sites that begin beyond their clearance at t = 0; returns their indices.
+        """Close the sites that begin beyond their clearance at t = 0; returns their indices (closed site,).
 
-        ``motion`` (site, 2) has w and w' of all numbered sites. The onsets of these contacts lie before the run:
-        w'_minus is the speed with which two masses alone come to w at w' without loss, so that
-        mu (w'_minus^2 - w'^2)/2 is the elastic energy.
+        ``motion`` (site, 2) has w in m and w' in m/s of all sites by their numbers in the log. The onsets of these
+        contacts lie before the run: w'_minus is the speed with which two masses alone come to w at w' without loss, so
+        that mu (w'_minus^2 - w'^2)/2 is the elastic energy, mu the reduced mass.
         """
         sites = self.contacts
         tracked = self.tracks.sites
@@ -287,7 +300,7 @@ class ImpactTracker:
         side = np.where(plus < minus, -1, 1)
         deep = np.maximum(plus, minus)
 
-        # On the clearance, to the tolerance of a landing, the rate decides.
+        # On the clearance itself, to the tolerance of a landing, w' decides.
         near = LANDED_W * sites["scale"][numbered]
         touching = (deep > near) | ((deep >= -near) & (side * rate > 0))
         closing = touching & (sites["mode"][numbered] == FREE)
@@ -301,8 +314,9 @@ class ImpactTracker:
         speed = np.sqrt(rate**2 + 2 * stored / law["reduced_mass"])
         sites["approach"][closed] = side * np.maximum(speed, law["floor"])
         sites["mode"][closed] = side * CLOSED
+        # Where g < 0 the law would pull.
         clipped = law["clip"] & (1 + law["damping"] * rate / sites["approach"][closed] < 0)
-        sites["mode"][closed[clipped]] *= CLIPPED
+        sites["mode"][closed[clipped]] = side[clipped] * CLIPPED
 
         episodes = tracked["episode"]
         episodes["site"][closed] = tracked["number"][closed]
@@ -344,7 +358,7 @@ class ImpactTracker:
         return switch_sites(self.contacts, self.tracks, self.start, energies, t)
 
     def rest(self, number: int, t: float, energies: np.ndarray) -> None:
-        """Let the site of that ``number`` in the log rest in contact at ``t`` in s, if it is here.
+        """Let the site of that ``number`` in the log rest in contact at ``t`` in s, if this rank has it.
 
         ``energies`` (sites,) are the ledger's in J, and change as in ``switch_sites``; the motion is that in ``start``.
         """
@@ -353,14 +367,15 @@ class ImpactTracker:
             rest_site(self.contacts, self.tracks, i, self.start, energies, t)
 
     def take_episodes(self, energies: np.ndarray, unfinished: bool = False) -> np.ndarray:
-        """Episodes (episode,) of dtype ``EPISODE`` closed since the last call, and ``unfinished`` ones as they are.
+        """Episodes (episode,) of dtype ``EPISODE`` that ended since the last call; if ``unfinished``, open ones too.
 
-        ``energies`` (sites,) are what the sites have dissipated in J.
+        ``energies`` (sites,) are what the sites have dissipated so far, in J. The separation of an open one is NaN.
         """
         closed = self.tracks.log[: self.tracks.closed[0]].copy()
         self.tracks.closed[:] = 0
         if not unfinished:
             return closed
+
         modes = self.contacts["mode"]
         in_contact = np.flatnonzero((modes != FREE) & (np.abs(modes) != RESTING))
         still_open = self.tracks.sites["episode"][in_contact]
