@@ -1,8 +1,8 @@
 """Energies of the pass bands, the gaps and the region above, by frequency filters over all wavenumbers.
 
-A filter that lets every wavenumber through acts along time alone, so no transform in space is needed. The
-record is continued by its mirror image (a cosine transform): it then has no jump where its end meets its
-start, which would leak about 1e-4 of the driven band's energy into all the others.
+A filter that lets every wavenumber through acts along time alone, so no transform in space is needed. The record is
+continued by its mirror image (a cosine transform), which has no jump. A Fourier transform repeats the record instead:
+the jump from its end to its start would leak about 1e-4 of the driven band's energy into all the other parts.
 """
 
 import itertools
@@ -29,8 +29,8 @@ COLUMNS = 32
 class Parts:
     """A partition of all frequencies: ``edges`` (part + 1) in rad/s from 0 to infinity, a name for each part.
 
-    ``bands`` names for each part the pass bands in it (1-based numbers), () for a gap and for the region
-    above the top band; pass bands that overlap are one part.
+    ``bands`` (part,) are the numbers, from 1, of the pass bands in each part: () for a gap and for the region above
+    the top band. Pass bands that overlap are one part.
     """
 
     edges: np.ndarray
@@ -42,7 +42,8 @@ class Parts:
         """The partition that ``bands``, lowest first, make of the frequency axis."""
         edges: list[float] = [0.0]
         inside: list[tuple[int, ...]] = []  # the bands of each part
-        # Rounding leaves the first band of a free lattice a hair above zero; nothing is below it.
+        # The first band of a free lattice begins at zero, as the root of an eigenvalue with a rounding of 1e-16 of the
+        # largest one: at 1e-8 of the highest frequency. No gap lies below it.
         tiny = 1e-6 * max(band.high for band in bands)
         for band in sorted(bands, key=lambda b: (b.low, b.high)):
             if inside and band.low <= edges[-1]:
@@ -74,8 +75,8 @@ class Parts:
 class PartEnergies(NamedTuple):
     """Kinetic energies in J of parts of the frequency axis, by frequency filters.
 
-    ``total`` (part, t) are summed over the cells, ``maps`` (mapped part, t', cell') means over blocks of samples and
-    cells, in single precision.
+    ``total`` (part, t) are sums over the cells at every sample. ``maps`` (mapped part, t', cell') are those of cells:
+    means over blocks of samples and cells, in single precision.
     """
 
     total: np.ndarray
@@ -94,27 +95,30 @@ def part_energies(
 ) -> PartEnergies:
     """Kinetic energies of every part, from ``velocity`` (t, cell, dof) in m/s; maps of the parts ``mapped``.
 
-    Energies follow at every sample from as few values as the width of a part needs (see ``cosine_squares``). A last
-    part that is wide, the region above the bands, is taken at every ``stride``-th sample or so and interpolated; it has
-    no map. ``velocity`` may be stored; no more than ``memory`` bytes of it are read at once. Maps are means over blocks
-    of ``sizes`` (samples, cells).
+    ``masses`` (dof,) are in kg, the ``interval`` of samples in s, ``edges`` (part + 1) in rad/s. Energies follow at
+    every sample from as few values as the width of a part needs (see ``cosine_squares``). With a ``stride`` above 1 the
+    last part, the region above the bands, is taken at every ``stride``-th sample or so and interpolated if it is wide;
+    it has no map then. ``velocity`` may be a dataset; no more than ``memory`` bytes of it are read at once. Maps are
+    means over blocks of ``sizes`` (samples, cells).
     """
     nt, cells, dofs = velocity.shape
     last = nt - 1
     bounds = np.searchsorted(np.pi * np.arange(nt) / (last * interval), edges)
     exact = [CosineSquares.zeros(int(low), int(high) - 1) for low, high in itertools.pairwise(bounds)]
     strided = None
+    # Wide: a third of all cosines or more, whose exact energy takes transforms of two thirds of the record or more.
     if stride > 1 and 3 * (exact[-1].high - exact[-1].low) >= last:
         strided = _StridedSquares(exact.pop().low, last, stride)
 
     maps = np.empty((len(mapped), -(-nt // sizes[0]), -(-cells // sizes[1])), np.float32)
+    # A signal is the sum of its transform times cosines, over ``last``: of this the square, times m/2.
     weights = np.asarray(masses) / (2 * last**2)
     transform = CosineTransform(nt, min(COLUMNS, cells))
     # Blocks hold whole columns of the maps.
     for block in blocks(maps.shape[2], 8 * dofs * nt * sizes[1], memory):
         held = np.asarray(velocity[:, block.start * sizes[1] : block.stop * sizes[1]])
         of_cells = {number: exact[number].of_columns(held.shape[1]) for number in mapped}
-        # Mass by mass: the cells of one lie together where runs in memory hold them.
+        # Mass by mass: in a run's memory the cells of one mass lie next to each other.
         for mass, first in itertools.product(range(dofs), range(0, held.shape[1], COLUMNS)):
             together = slice(first, first + COLUMNS)
             spectrum = transform(held[:, together, mass])
@@ -139,9 +143,10 @@ def part_energies(
 
 
 class _StridedSquares:
-    """Sums of squares of signals that have all cosines from ``low`` on, at about every ``stride``-th of the samples.
+    """Sums over signals of their squares, at about every ``stride``-th sample.
 
-    ``last`` is the number of the last sample.
+    Signals have the cosines from ``low`` half waves in the record on; ``last`` is the number of the last sample. The
+    squares are taken at the ends of ``_steps`` equal intervals, a number that has a fast transform.
     """
 
     def __init__(self, low: int, last: int, stride: int) -> None:
@@ -156,13 +161,17 @@ class _StridedSquares:
         self._sums += weight * np.einsum("tn,tn->t", signals, signals)
 
     def _signals(self, spectrum: np.ndarray) -> np.ndarray:
-        """The signals (t', signal) at ``steps`` + 1 even times, where many cosines look alike and are added up."""
+        """The signals (t', signal) with amplitudes ``spectrum`` (wave from 0, signal) at ``_steps`` + 1 even times.
+
+        At these times cosines whose numbers of half waves differ by twice the steps have the same values, as have
+        those whose numbers add up to it: their amplitudes are added up ("folded") before the transform.
+        """
         steps = self._steps
         folded = np.zeros((steps + 1, spectrum.shape[1]))
         for start in range(self._low - self._low % steps, len(spectrum), steps):
             piece = spectrum[max(start, self._low) : start + steps]
             first = max(self._low - start, 0)
-            if start // steps % 2:  # every second piece runs backwards
+            if start // steps % 2:  # every second piece runs backwards: its last number has the least alias
                 piece = piece[::-1]
                 first = steps - first - len(piece) + 1
             folded[first : first + len(piece)] += piece
@@ -178,7 +187,8 @@ def _at_samples(energies: Sequence[Cosines], last: int) -> np.ndarray:
     """The values (energy, sample) of ``energies`` of one column each at ``last`` + 1 even times, from 0 on."""
     amplitudes = np.zeros((last + 1, len(energies)))
     for column, energy in enumerate(energies):
-        # Waves look alike at the samples if they differ by a multiple of twice ``last``, or in their direction.
+        # At the samples a cosine has the values of all others whose half waves differ from its own, or from minus its
+        # own, by a multiple of twice ``last``. Of these one has ``last`` half waves at most.
         aliases = last - np.abs(energy.wave % (2 * last) - last)
         amplitudes[:, column] = np.bincount(aliases, energy.amplitude[:, 0], last + 1)
     amplitudes[1:-1] *= 0.5
@@ -186,12 +196,16 @@ def _at_samples(energies: Sequence[Cosines], last: int) -> np.ndarray:
 
 
 def _means_over_samples(energy: Cosines, last: int, samples: int, cells: int) -> np.ndarray:
-    """Means of an ``energy`` (wave, cell) over blocks of ``samples``, of ``last`` + 1, and of ``cells``."""
+    """Means (t', cell') of an ``energy`` (wave, cell) over blocks of ``samples`` and ``cells``.
+
+    The record has ``last`` + 1 samples; its last block may be shorter.
+    """
     amplitude = block_means(energy.amplitude, cells, 1)
     radians = np.pi * energy.wave / last  # of a wave in a sample
     first = np.arange(0, last + 1, samples)
     counts = np.minimum(samples, last + 1 - first)
-    # The mean of a cosine over even times is its value at their middle times Dirichlet's kernel.
+    # The mean of a cosine over n even times is its value in their middle times sin(n x/2)/(n sin(x/2)), Dirichlet's
+    # kernel, with x radians from one time to the next.
     middles = np.cos(np.outer(first + (counts - 1) / 2, radians))
     means = middles * diric(radians, samples)
     means[-1] = middles[-1] * diric(radians, counts[-1])
@@ -204,11 +218,11 @@ def front_arrival(energy: np.ndarray) -> int:
 
 
 def ibtet(energy: np.ndarray, above: np.ndarray, start: int = 0) -> float:
-    """Inter-band targeted energy transfer: fraction of energy in the parts ``above`` (part), mean from ``start`` on.
+    """Inter-band targeted energy transfer: mean fraction of the energy in the parts ``above`` (part) the driven one.
 
-    ``energy`` (part, t) in J. The fraction is that of the sum of all parts at every sample, as the paper's
-    (E_3 + E_4)/E_total of the four-band lattice driven on band 2; for any other cell the bands above the
-    driven one take the place of 3 and 4. NaN when there are none, or no energy.
+    ``energy`` (part, t) is in J; the mean is over the samples from ``start`` on at which anything moves. At a sample
+    the fraction is that of the sum over all parts: the paper's (E_3 + E_4)/E_total for the four-band lattice driven on
+    band 2. NaN if no part is above, or nothing moves.
     """
     total = energy[:, start:].sum(axis=0)
     moving = total > 0

@@ -1,14 +1,14 @@
-"""Squares of sums of neighbouring cosines, as functions of time, from as few values as determine them.
+"""Squares of sums of cosines of neighbouring frequencies, as functions of time, from as few values as determine them.
 
 The sum v of a_k cos((l + k) theta) over k from 0 to W, with theta = pi t/T in a record of length T, is the real part of
 exp(i l theta) g, with g the sum of a_k exp(i k theta). Hence
 
     v^2 = |g|^2 / 2 + Re[exp(2 i l theta) g^2] / 2,
 
-where |g|^2 has the frequencies from -W to W, and g^2 those from 0 to 2 W. Both follow from g at 2 W + 1 even points of
-the circle or more, wherever l lies: from one real transform of that length, since the a_k are real and half of the
-points are conjugates of the others. Sums over many signals are taken at these points; one transform of the sums gives
-the cosines of which the sum of all v^2 consists.
+where |g|^2 has the frequencies from -W to W, and g^2 those from 0 to 2 W. Both are determined by the values of g at
+2 W + 1 or more even points of the circle, whatever l is. One real transform of that length gives these values: the a_k
+are real, so that half of the values are conjugates of the others. |g|^2 and g^2 are summed over all signals at these
+points; transformed back once, the sums are the amplitudes of the cosines of which the sum of all v^2 consists.
 """
 
 from typing import NamedTuple, Self
@@ -18,17 +18,21 @@ from scipy import fft
 
 
 class Cosines(NamedTuple):
-    """A sum of cosines: ``wave`` (wave) in half waves in the record, and ``amplitude`` (wave, ...) of each."""
+    """A sum of cosines with ``wave`` (wave,) half waves in the record, each with its ``amplitude`` (wave, ...).
+
+    A number of half waves may occur twice.
+    """
 
     wave: np.ndarray
     amplitude: np.ndarray
 
 
 class CosineSquares(NamedTuple):
-    """Weighted sums of squares of signals that have the cosines ``low`` to ``high``, in half waves in the record.
+    """Weighted sums of squares of signals whose cosines have ``low`` to ``high`` half waves in the record.
 
-    ``square`` and ``product`` (point, column) are the sums of |g|^2 and of g^2 at the points of half a circle of
-    ``length`` points. There is one column for all signals, or one for each. Without a cosine, high < low, all is 0.
+    ``square`` and ``product`` (point, column) are the sums of |g|^2 and of g^2, g as in the module's docstring, at the
+    first half of ``length`` points of the circle. There is one column for all signals, or one for each. With high < low
+    there is no cosine, and the sums are those of nothing.
     """
 
     low: int
@@ -73,7 +77,7 @@ class CosineSquares(NamedTuple):
     def cosines(self) -> Cosines:
         """The cosines (wave, column) of the sums."""
         width = self.high - self.low
-        # Directions of |g|^2 are added up, but for 0, which is its own opposite.
+        # Of |g|^2/2 = c_0/2 + sum of c_n cos(n theta) the c_n are real, and c_-n = c_n: only c_0 is halved.
         of_squares = fft.irfft(self.square, self.length, axis=0)[: width + 1]
         of_squares[:1] *= 0.5
         of_products = fft.irfft(self.product, self.length, axis=0)[: max(2 * width + 1, 0)]

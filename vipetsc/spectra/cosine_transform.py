@@ -8,8 +8,8 @@ The first term is even about N/2 and has a real transform, the second is odd and
 
     sum of y_j e^(-2 pi i j k/N) over all j = F_(2k) + i (F_(2k-1) - F_(2k+1)),
 
-so that the odd F follow one from another, from F_1 on, which is summed. Their rounding grows as the square root of N
-(Press et al., Numerical Recipes, 3rd ed., 12.4.2).
+so that each odd F follows from the one before; F_1 is summed. Their rounding grows as the square root of N (Press et
+al., Numerical Recipes, 3rd ed., 12.4.2).
 
 The y of two columns are the real and imaginary parts of one complex column with the transform Z; their transforms are
 (Z_k + conj Z_(N-k))/2 and (Z_k - conj Z_(N-k))/2i. That takes as long as a real transform of each where N has small
@@ -34,8 +34,8 @@ class CosineTransform:
     def __init__(self, rows: int, most: int) -> None:
         self._waves = _half_waves(rows - 1)
         shape = rows, most + most % 2
-        # Whole arrays, which are contiguous, are the only ones that the kernels get: for each layout of an array
-        # there would be one more of them to compile.
+        # The kernels get whole arrays alone, which are contiguous: for arrays of another layout they would be compiled
+        # once more.
         self._columns = np.zeros(shape)
         self._combined = np.zeros((rows - 1, shape[1]))
         self._out = np.zeros(shape)
@@ -67,7 +67,10 @@ def _half_waves(last: int) -> np.ndarray:
 
 @kernel
 def _combine(columns: np.ndarray, waves: np.ndarray, width: int, combined: np.ndarray, out: np.ndarray) -> None:
-    """Fill ``width`` columns of ``combined`` (j, column) with y, and of row 1 of ``out`` with twice F_1."""
+    """Fill ``width`` columns of ``combined`` (j, column) with the y of ``columns`` (t, column).
+
+    Row 1 of ``out`` (m, column) gets twice F_1. ``waves`` (2, j) are those of ``_half_waves``.
+    """
     last = columns.shape[0] - 1
     for c in range(width):
         out[1, c] = columns[0, c] - columns[last, c]
@@ -84,9 +87,9 @@ def _combine(columns: np.ndarray, waves: np.ndarray, width: int, combined: np.nd
 
 @kernel
 def _separate(transformed: np.ndarray, width: int, out: np.ndarray) -> None:
-    """Fill ``width`` columns of ``out`` from the transform (k, column) of y.
+    """Fill ``width`` columns of ``out`` (m, column), whose row 1 is there, from the transform Z of pairs of columns.
 
-    Of each pair of columns it has the real and the imaginary part.
+    ``transformed`` (k, column) has the real and the imaginary part of the Z of a pair in its two columns.
     """
     last = out.shape[0] - 1
     for k in range(last // 2 + 1):
@@ -94,7 +97,8 @@ def _separate(transformed: np.ndarray, width: int, out: np.ndarray) -> None:
         for c in range(width):
             out[2 * k, c] = transformed[k, c] + transformed[opposite, c]
         if k > 0 and 2 * k < last:
-            # Of the first column of a pair the imaginary part is in the second one, and the other way round.
+            # The imaginary parts of the transforms of y: of the first column (Im Z_k - Im Z_(N-k))/2, of the second
+            # one (Re Z_(N-k) - Re Z_k)/2.
             for c in range(0, width, 2):
                 out[2 * k + 1, c] = out[2 * k - 1, c] - (transformed[k, c + 1] - transformed[opposite, c + 1])
                 out[2 * k + 1, c + 1] = out[2 * k - 1, c + 1] + (transformed[k, c] - transformed[opposite, c])

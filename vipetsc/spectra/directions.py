@@ -6,10 +6,11 @@ amplitudes are q = e_b* M u^ and p = e_b* M v^, of which
 
     a_b(kappa) = omega_b q + i p
 
-is the part that goes as exp(-i omega t); the other part belongs to -kappa. The wave travels as its group velocity
-d omega_b/d kappa says, with the energy |a_b|^2/(2 N). The sum over all waves is the kinetic and spring energy of the
-lattice (Parseval), and each term is constant as long as no contact is closed. So directions are separated while waves
-still overlap.
+is 2 omega_b times the part of q that goes as exp(-i omega_b t). The part that goes as exp(i omega_b t) is that of a
+wave with the wavenumber -kappa. A wave travels to higher or to lower cells by the sign of its group velocity
+d omega_b/d kappa, with the energy |a_b|^2/(2 N) in J for N cells. The sum over all waves is the kinetic and spring
+energy of the lattice (Parseval), and each term is constant as long as no contact is closed. So directions are told
+apart even where waves overlap.
 """
 
 from functools import lru_cache
@@ -28,7 +29,7 @@ def wave_energies(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray
     cells = len(displacement)
     # A copy: the array is kept between calls.
     speed = _waves(cell, cells).group_velocity.copy()
-    # Standing waves: 0 and pi are their own opposites.
+    # The wavenumbers 0 and pi are their own opposites, so that their waves stand.
     speed[0] = 0.0
     if cells % 2 == 0:
         speed[cells // 2] = 0.0
@@ -36,11 +37,11 @@ def wave_energies(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray
 
 
 def band_envelopes(cell: UnitCell, displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Energies (band, cell) in J of the waves' envelopes, which sum over the cells to the energies of the bands.
+    """Energies (band, cell) in J of the envelopes of each band's waves, whose sums over the cells are its energies.
 
-    ``displacement`` in m and ``velocity`` in m/s are (cell, dof). The waves that go as exp(-i omega t) put together
-    again are complex fields of the masses, psi_b(x); a cell has the energy |psi_b|^2/2, without the swing of kinetic
-    and spring energy within a period.
+    ``displacement`` in m and ``velocity`` in m/s are (cell, dof). The inverse transform of m^(1/2) a_b e_b is a complex
+    field of the masses, psi_b(x). A cell has the energy |psi_b|^2/2, summed over its masses: it does not oscillate
+    within a period as kinetic and spring energy do.
     """
     point = _waves(cell, len(displacement))
     masses = np.asarray(cell.masses)

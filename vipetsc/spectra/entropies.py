@@ -7,11 +7,12 @@ With the Morlet transform X (kappa, x) of a snapshot (``vipetsc.spectra.wavelet`
     joint over kappa and x   H_j(t) = H(t) - sum_x Q log2 Q                                            (c)
     masked   the mean of H over the points (x, t) with W > 0.01 max W                                   (d)
 
-A filtered snapshot holds positive wavenumbers alone, so its spectrum folded onto every n-th wavenumber of the padded
-line gives it at every n-th cell without loss; only the sums over x are then sums over fewer cells.
+X is often needed at every n-th cell alone. There, exp(i kappa x) is the same for wavenumbers that differ by 2 pi/n: a
+filtered spectrum is added up over these ("folded") before its inverse transform, which is n times shorter. The values
+of X are exact; only the sums over x have fewer cells.
 
-Averages are taken from the linear wave's arrival on. A plain mean over all points shows no trend: cells at rest would
-count in it as much as the others.
+Averages are taken from the linear wave's arrival on. They are weighted by the energy, or leave out cells at rest: in a
+plain mean over all points these would count as much as the others, and the mean shows no trend with the amplitude.
 """
 
 from collections.abc import Iterator
@@ -26,17 +27,18 @@ from scipy.ndimage import uniform_filter1d
 from vipetsc.compiled import kernel, njit
 from vipetsc.spectra.wavelet import padded_length, transform_filters
 
-# The paper's: wavenumbers of the nodes, and centre wavenumber of the wavelets.
+# The paper's number of wavenumbers at which wavelets are taken, and their centre wavenumber.
 NODES = 60
 KC = 12.0
-# Snapshots that are transformed together, and nodes that are filtered together: of 300 cells such an array just fits
-# into a core's cache. With 8 snapshots 10 % slower, with 32 the same; with 16 nodes and 32 snapshots half as fast.
+# Snapshots that are transformed together, and nodes that are filtered together: for 300 cells such an array just fits
+# into a core's cache. 8 snapshots take 10 % more time, 32 the same; 16 nodes and 32 snapshots take twice the time.
 CHUNK = 16
 GROUP = 8
-# Operations of a matrix product that take as long as one of a fast transform, taken from below: 4 were measured.
+# Operations that a matrix product does while a fast transform does one: 4 were measured. With 3 an octave for which
+# both would take the same time is transformed.
 PRODUCT_GAIN = 3
-# Snapshots in which the largest weight is sought, those of most energy over as many cells. In the built-in run 2 and 32
-# find the same one.
+# The largest weight of a run is sought in so many snapshots: those with the largest energy in any window of so many
+# cells. In the built-in run 2 and 32 find the same weight.
 STRONGEST = 8
 FLOOR = 0.01
 """Points below this fraction of the largest weight are masked, Eq. (d)."""
@@ -72,10 +74,10 @@ def entropy(
 ) -> Entropy:
     """Entropy of ``velocity`` (t, cell) in m/s with wavelets at the NODES wavenumbers i pi/NODES, i = 1, 2, ...
 
-    ``velocity`` may be an HDF5 dataset: a few snapshots at a time are read. ``start`` is the sample of the linear
-    wave's arrival at the first site. Every ``every``-th sample is transformed, and every ``stride``-th cell averaged
-    over; the largest weight of Eq. (d) is sought in the other samples too. ``first`` are the entropies of the first
-    snapshots, where they are known. Raises ValueError if no sample comes from ``start`` on, or one is not finite.
+    ``start`` is the sample of the linear wave's arrival at the first site. Every ``every``-th sample is transformed (a
+    snapshot), and every ``stride``-th cell averaged over; the largest weight of Eq. (d) is sought in the other samples
+    too. ``first`` are the entropies of the first snapshots if these are known already. Raises ValueError if ``start``
+    is no sample, or one is not finite.
     """
     nt = len(velocity)
     if not 0 <= start < nt:
@@ -87,6 +89,8 @@ def entropy(
         rest = local_entropy(snapshots[len(first.local) :], stride)
         local = np.concatenate([first.local, rest.local])
         weight = np.concatenate([first.weight, rest.weight])
+
+    # The threshold of Eq. (d) should not depend on which samples are snapshots.
     largest = 0.0
     if every > 1:
         energy = uniform_filter1d(np.square(velocity[start:]), STRONGEST, axis=1).max(axis=1)
@@ -102,15 +106,16 @@ def averages(local: np.ndarray, weight: np.ndarray, start: int, stride: int, lar
 
     ``largest`` is the largest weight of samples that are not among them.
     """
-    # Eqs. (b) and (c) over the cells of each snapshot. Divided by their peak first, weights do not underflow.
+    # Q of Eqs. (b) and (c) over the cells of each snapshot. Weights are divided by their peak first: they then neither
+    # overflow nor underflow in a sum.
     peak = weight.max(axis=1, keepdims=True)
     fraction = np.divide(weight, peak, out=np.zeros_like(weight), where=peak > 0)
-    # Over its peak a moving snapshot sums to 1 or more, and one at rest to 0.
+    # The sum over the cells is 1 or more if anything moves, and 0 at rest, where Q is 0.
     fraction /= np.maximum(fraction.sum(axis=1, keepdims=True), 1.0)
     snapshot = np.einsum("tc,tc->t", fraction, local)
     log_fraction = np.log2(fraction, out=np.zeros_like(fraction), where=fraction > 0)
     position = -np.sum(fraction * log_fraction, axis=1)
-    # Cells left out would have had as much entropy each: log2(stride) more bits of position.
+    # Each cell stands for ``stride`` cells of equal weight, which have log2(stride) bits of position more.
     joint = snapshot + np.where(peak[:, 0] > 0, position + np.log2(stride), 0.0)
 
     # Eq. (d), of all cells and of each.
@@ -164,17 +169,21 @@ def local_entropy(velocity: np.ndarray, stride: int = 1) -> LocalEntropy:
 
 
 class _FilterPart(NamedTuple):
-    """The ``values`` (kappa, k) of filters in a band of the wavenumbers of a transform, from its ``first`` one on."""
+    """The ``values`` (kappa, k) of the filters of some nodes at consecutive wavenumbers k of a transform.
+
+    ``first`` is the number of the first of these wavenumbers.
+    """
 
     first: int
     values: np.ndarray
 
 
 class _FastOctave(NamedTuple):
-    """An octave of nodes whose wavelet transforms are fast Fourier transforms.
+    """An octave of nodes whose wavelet transforms are computed by fast Fourier transforms.
 
-    ``padded`` and ``length`` are the lengths of the transforms of signals, and of those at every ``stride``-th cell;
-    the filters of the nodes are in ``groups``, each cut into parts.
+    A signal is transformed with the length ``padded``; the inverse transform, at every ``stride``-th cell, has the
+    ``length`` padded/stride. ``groups`` of nodes are filtered together; each has its filters as a list of parts, no
+    one of which crosses a multiple of ``length``.
     """
 
     padded: int
@@ -187,8 +196,7 @@ class _FastOctave(NamedTuple):
         for group in self.groups:
             x = np.zeros((len(signal), len(group[0].values), self.length), dtype=complex)
             for part in group:
-                # Folded onto the length: wavenumbers a whole number of lengths apart look the same at every
-                # ``stride``-th cell.
+                # Folded onto the length: see the module's docstring.
                 _filter(spectrum, part.first, part.values, x, part.first % self.length)
             yield fft.ifft(x, overwrite_x=True)
 
@@ -197,8 +205,8 @@ class _NarrowOctave(NamedTuple):
     """An octave of nodes that let so few wavenumbers through that matrix products take less time than transforms.
 
     ``waves`` (cell, 2 k) are the real and imaginary parts of exp(-i k x) in turn, ``filters`` (kappa, k) those of the
-    nodes, ``waves_back`` (k, cell) are exp(i k x) at every ``stride``-th cell. The wavenumbers k are those of the
-    padded line, so that the sums are its Fourier transforms.
+    nodes, and ``waves_back`` (k, cell) are exp(i k x) at every ``stride``-th cell. The wavenumbers k are those of the
+    padded line at which any filter is not zero: the products are the Fourier transforms of that line.
     """
 
     waves: np.ndarray
@@ -209,7 +217,7 @@ class _NarrowOctave(NamedTuple):
     def of(cls, filters: np.ndarray, padded: int, cells: int, stride: int) -> Self:
         """The octave with these ``filters`` (kappa, k) on a line of ``padded`` cells."""
         inside = np.flatnonzero(_lets_through(filters))
-        # Of whole turns nothing is left, so that no digits are lost in them.
+        # Whole turns are left out in integers: in k x itself they would cost digits of the phase.
         turns = np.outer(np.arange(cells), inside) % padded / padded
         waves = np.exp(-2j * np.pi * turns)
         return cls(
@@ -220,8 +228,8 @@ class _NarrowOctave(NamedTuple):
 
     def transforms(self, signal: np.ndarray) -> Iterator[np.ndarray]:
         """X (t, kappa, cell) at every ``stride``-th cell of the ``signal`` (t, cell), of all nodes."""
-        # The rounding of a product depends on the number of its rows. It has always as many, so that snapshots have the
-        # same bits among any others.
+        # The rounding of a matrix product depends on the number of its rows. There are always ``CHUNK`` of them, so
+        # that the bits of a snapshot do not depend on how many are transformed with it.
         rows = np.zeros((CHUNK, signal.shape[1]))
         rows[: len(signal)] = signal
         spectrum = (rows @ self.waves)[: len(signal)].view(complex)
@@ -231,17 +239,18 @@ class _NarrowOctave(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _octaves(cells: int, stride: int) -> list[_FastOctave | _NarrowOctave]:
-    """The octaves of the nodes; a transform's length is the padded one, which the lowest node sets, over ``stride``."""
+    """The octaves of the nodes for lattices of ``cells``, of which every ``stride``-th one is needed."""
     kappa = np.pi * np.arange(1, NODES + 1) / NODES
     octaves: list[_FastOctave | _NarrowOctave] = []
-    # Wavelets of higher nodes are shorter: the transforms of an octave need the room of its lowest node alone.
+    # Wavelets of higher nodes are shorter: the padding of an octave is that of its lowest node.
     for number in range(int(np.log2(NODES)) + 1):
         nodes = kappa[2**number - 1 : 2 ** (number + 1) - 1]
         length = fft.next_fast_len(-(-padded_length(cells, KC, nodes[0]) // stride))
         padded = length * stride
         filters = transform_filters(nodes, KC, padded) / stride
 
-        # Additions and multiplications for one snapshot, by products and by transforms.
+        # Additions and multiplications for one snapshot, by products (real times complex, then complex times complex)
+        # and by transforms, 5/2 n log2 n of a real and 5 n log2 n of a complex signal of length n.
         width = np.count_nonzero(_lets_through(filters))
         in_products = 4 * width * cells + 8 * width * len(nodes) * -(-cells // stride)
         in_transforms = 2.5 * padded * np.log2(padded) + 5 * len(nodes) * length * np.log2(length)
@@ -254,12 +263,12 @@ def _octaves(cells: int, stride: int) -> list[_FastOctave | _NarrowOctave]:
 
 
 def _lets_through(filters: np.ndarray) -> np.ndarray:
-    """Whether any of the ``filters`` (kappa, k) lets something through, by wavenumber (k)."""
+    """At which wavenumbers (k,) any of the ``filters`` (kappa, k) exceeds the rounding of their largest value."""
     return np.asarray(filters.max(axis=0) > np.finfo(float).eps * filters.max())
 
 
 def _parts(filters: np.ndarray, length: int) -> list[_FilterPart]:
-    """The bands where any of the ``filters`` (kappa, k) lets something through, cut at multiples of ``length``."""
+    """The ``filters`` (kappa, k) where any lets something through, cut at multiples of ``length``."""
     inside = np.flatnonzero(_lets_through(filters))
     parts = []
     for cut in range(inside[0] // length * length, inside[-1] + 1, length):
@@ -273,8 +282,8 @@ def _parts(filters: np.ndarray, length: int) -> list[_FilterPart]:
 def _filter(spectrum: np.ndarray, first: int, values: np.ndarray, x: np.ndarray, start: int) -> None:
     """Add a ``spectrum`` (t, k) times the ``values`` (kappa, k) of filters to ``x`` (t, kappa, k).
 
-    The first of the values belongs to ``first`` in the spectrum, and to ``start`` in ``x``. Whole arrays are
-    contiguous: for views of them there would be one more kernel to compile.
+    The first of the values belongs to the column ``first`` of the spectrum, and to ``start`` of ``x``. The kernel gets
+    whole arrays, which are contiguous: for views of them it would be compiled once more.
     """
     width = values.shape[1]
     for t in range(x.shape[0]):
@@ -290,16 +299,16 @@ def _filter(spectrum: np.ndarray, first: int, values: np.ndarray, x: np.ndarray,
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _accumulate(x: np.ndarray, weight: np.ndarray, s_log_s: np.ndarray) -> None:
-    """Add the sums of Eq. (a), S and S log2 S of the nodes of ``x`` (t, kappa, x), to arrays (t, cell).
+    """Add the sums of Eq. (a) over the nodes of ``x`` (t, kappa, cell), of S and of S log2 S, to arrays (t, cell).
 
-    The logarithm is written out so that the loop is vectorised, four times as fast as calls of log2: S = 2^e m
-    with sqrt(1/2) <= m < sqrt(2), ln m = 2 u + u z R(z), u = (m - 1)/(m + 1), z = u^2, with the minimax R of
-    fdlibm's e_log.c (error below 2^-58).
+    The logarithm is written out so that the loop is vectorised, which is four times as fast as calls of log2: with
+    S = 2^e m, sqrt(1/2) <= m < sqrt(2), u = (m - 1)/(m + 1) and z = u^2 it is e + (2 u + u z R(z))/ln 2, with the
+    minimax polynomial R of fdlibm's e_log.c (error below 2^-58).
     """
     cells = weight.shape[1]
     power = np.empty(cells)
     mantissa = np.empty(cells)
-    # The words of the same doubles, whose exponents are integers.
+    # The same memory as integers, whose upper bits are the exponents of the numbers.
     bits = power.view(np.int64)
     mantissa_bits = mantissa.view(np.int64)
     for t in range(x.shape[0]):
@@ -308,7 +317,7 @@ def _accumulate(x: np.ndarray, weight: np.ndarray, s_log_s: np.ndarray) -> None:
                 z = x[t, k, c]
                 power[c] = z.real * z.real + z.imag * z.imag + 1e-300  # S log2 S is 0 at S = 0
             for c in range(cells):
-                e = (bits[c] - 0x3FE6A09E667F3BCD) >> 52  # the word of sqrt(1/2)
+                e = (bits[c] - 0x3FE6A09E667F3BCD) >> 52  # the bits of sqrt(1/2)
                 mantissa_bits[c] = bits[c] - (e << 52)
                 u = (mantissa[c] - 1.0) / (mantissa[c] + 1.0)
                 z = u * u
@@ -325,7 +334,10 @@ def _accumulate(x: np.ndarray, weight: np.ndarray, s_log_s: np.ndarray) -> None:
 
 @njit
 def _entropies(weight: np.ndarray, s_log_s: np.ndarray, local: np.ndarray) -> None:
-    """Write H of Eq. (a) to ``local`` (t, cell), kept from rounding below zero; W and H are 0 where S is its floor."""
+    """Write H of Eq. (a) to ``local`` (t, cell), at least 0, from the sums ``weight`` and ``s_log_s`` (t, cell).
+
+    Where nothing moves the weight has only the numbers 1e-300 that ``_accumulate`` adds: H and W are set to 0 there.
+    """
     for t in range(weight.shape[0]):
         for c in range(weight.shape[1]):
             w = weight[t, c]

@@ -12,8 +12,8 @@ import scipy
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-LEVEL = 0.95  # of confidence
-FEWEST = 4  # points of a power law: three lie near some of them by chance
+LEVEL = 0.95  # confidence of intervals
+FEWEST = 4  # points of a power law: by chance three often lie near the curve of some power law
 
 Method = Literal["log-log", "nonlinear"]
 
@@ -32,13 +32,13 @@ class PowerLaw:
 
 
 def doubt(points: float, r2: float) -> str:
-    """Reason not to call a fit over ``points`` with the adjusted R^2 ``r2`` a power law; empty if it is one."""
+    """Reason not to call a fit over so many ``points`` a power law, empty if it is one; ``r2`` is its adjusted R^2."""
     if points < FEWEST:
         return f"too few points ({points:g})"
     if np.isnan(r2):
         return "no fit"
+    # A constant fits better.
     if r2 < 0:
-        # A constant fits better.
         return f"adjusted R² {r2:.2g}"
     return ""
 
@@ -46,12 +46,12 @@ def doubt(points: float, r2: float) -> str:
 def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:
     """1 - (1 - R^2)(n - 1)/(n - 2) of values ``fitted`` (n,) to ``y`` (n,) with two parameters; NaN if y is constant.
 
-    One of the parameters must be a constant or a factor, so that R^2 is measured against the mean of y.
+    R^2 compares the squared residuals with those of the mean of y: the model must include constants.
     """
     y = np.asarray(y, dtype=float)
     fitted = np.asarray(fitted, dtype=float)
     scatter = np.sum((y - y.mean()) ** 2)
-    # A constant explains nothing: no fit is better or worse than the mean.
+    # The mean of constant values has no residuals with which a fit could be compared.
     if scatter == 0:
         return float("nan")
     return float(1 - np.sum((y - fitted) ** 2) / scatter * (len(y) - 1) / (len(y) - 2))
@@ -61,8 +61,9 @@ def r2_adjusted(y: ArrayLike, fitted: ArrayLike) -> float:
 def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLaw:
     """Fit y = a x^b to points ``x`` (n,) and ``y`` (n,), positive both.
 
-    The log-log line minimises relative errors, the nonlinear fit errors, starting from the line. A nonlinear fit
-    without a minimum, whose exponent runs away to leave a single point standing, is all NaN.
+    The log-log line minimises the squares of relative errors, the nonlinear fit those of the errors, from the line's
+    parameters on. A nonlinear fit need not have a minimum: where the squares keep falling as the exponent grows and
+    the curve vanishes at all points but the last, all results are NaN.
 
     Raises
     ------
@@ -78,7 +79,7 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
     if not (np.all(x > 0) and np.all(y > 0) and np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
         raise ValueError("power law: x and y must be positive and finite")
 
-    # Centred and scaled, v = b u and w = c exp(b u), so that neither fit depends on the units of x and y.
+    # Centred and scaled the law is v = b u or w = c exp(b u): neither fit depends on the units of x and y.
     lx = np.log(x)
     ly = np.log(y)
     cx = lx.mean()
@@ -87,7 +88,7 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
     v = ly - cy
     w = y / np.exp(cy)
 
-    # The line passes through the centre of the logarithms: there v = b u has no constant, and c = 1.
+    # The line of least squares passes through the means of the logarithms: v = b u has no constant, and c = 1.
     freedom = len(x) - 2
     c = 1.0
     b = float(u @ v / (u @ u))
@@ -95,13 +96,13 @@ def power_law(x: ArrayLike, y: ArrayLike, method: Method = "log-log") -> PowerLa
         r2 = r2_adjusted(v, b * u)
         variance = float(np.sum((v - b * u) ** 2)) / freedom / (u @ u)
     else:
-        # As far as rounding allows.
+        # A fit of a few numbers costs little: it ends where rounding ends it.
         tolerances = {"ftol": 1e-14, "xtol": 1e-14, "gtol": 1e-14, "maxfev": 2000}
         try:
             (c, b), covariance = scipy.optimize.curve_fit(_exponential, u, w, p0=(c, b), jac=_gradient, **tolerances)
             r2 = r2_adjusted(w, _exponential(u, c, b))
             variance = covariance[1, 1]
-        except RuntimeError:  # no convergence: the squares keep falling as the exponent runs away
+        except RuntimeError:  # no convergence within ``maxfev`` evaluations: the squares have no minimum
             c = b = r2 = variance = float("nan")
 
     half = float(stdtrit(freedom, 0.5 + LEVEL / 2) * np.sqrt(variance))
@@ -124,12 +125,15 @@ def _gradient(u: np.ndarray, c: float, b: float) -> np.ndarray:
 
 
 def normalised(y: ArrayLike, low: float = 0.01, high: float = 1.0) -> np.ndarray:
-    """A curve ``y`` (n,) scaled linearly to run from ``low`` to ``high``; NaN stays. Raises ValueError if constant."""
+    """A curve ``y`` (n,) scaled linearly to the range from ``low`` to ``high``; NaN stays NaN.
+
+    Raises ValueError if the curve is constant.
+    """
     y = np.asarray(y, dtype=float)
     least = np.nanmin(y)
     most = np.nanmax(y)
     if not most > least:
         raise ValueError(f"normalised: the curve is constant, {least:g}")
-    # Not low + (high - low) position: so both ends are exact.
+    # Exact at both ends, which low + (high - low) position is not.
     position = (y - least) / (most - least)
     return np.asarray(low * (1 - position) + high * position)

@@ -38,7 +38,10 @@ class Dispersion:
         return Dispersion(self.wavenumber[zero:], self.frequency, energy)
 
     def pooled(self, wavenumbers: int, frequencies: int) -> "Dispersion":
-        """Dispersion with bins ``wavenumbers`` and ``frequencies`` times as wide, at their middles."""
+        """Dispersion in bins ``wavenumbers`` and ``frequencies`` times as wide: sums of energies, at the bins' middles.
+
+        The last bin of either axis may be narrower.
+        """
         return Dispersion(
             wavenumber=block_means(self.wavenumber, wavenumbers, 0),
             frequency=block_means(self.frequency, frequencies, 0),
@@ -64,7 +67,7 @@ def wavenumber_content(velocity: np.ndarray, masses: ArrayLike) -> tuple[np.ndar
     for j, mass in enumerate(np.asarray(masses)):
         spectrum = fft.rfft(np.asarray(velocity[..., j]), axis=1)
         content += 0.5 * mass / cells * (spectrum.real**2 + spectrum.imag**2)
-    content[:, 1 : (cells + 1) // 2] *= 2  # -kappa; 0 and pi are their own opposites
+    content[:, 1 : (cells + 1) // 2] *= 2  # -kappa has as much; 0 and pi are their own opposites
     kappa = 2 * np.pi * np.arange(cells // 2 + 1) / cells
     return kappa, content
 
@@ -76,7 +79,7 @@ def taper(length: int, fraction: float) -> np.ndarray:
     window = np.ones(length)
     if fraction > 0:
         window = 0.5 * (1 - np.cos(2 * np.pi * np.minimum(flank / fraction, 0.5)))
-    # So that the energy of a stationary signal stays what it is on the average.
+    # With a mean square of 1 the window leaves the energy of a stationary signal as it is on the average.
     return window / np.sqrt(np.mean(window**2))
 
 
@@ -111,16 +114,15 @@ def dispersions(
     rows: slice = slice(None),
     memory: float = np.inf,
 ) -> list[Dispersion]:
-    """Energy over wavenumber and frequency in each of ``windows``, by 2-D FFT of mass-weighted velocities.
+    """Kinetic energy over wavenumber and frequency in each of ``windows``, by 2-D Fourier transforms of velocities.
 
-    ``velocity`` (t, cell, dof) in m/s every ``interval`` s; ``masses`` (dof) in kg, ones for a plain velocity spectrum;
-    energies are added over the masses. ``in_time``: the fraction of the record under cosine flanks at its two ends
-    together. ``lengths``: of the transforms (time, space), zero-padded; by default the next that are fast. Frequencies
-    above ``highest`` (rad/s) are dropped; of the others those ``rows`` are returned. No more than ``memory`` bytes of
-    the velocity are read at once.
+    ``velocity`` (t, cell, dof) is in m/s every ``interval`` s, ``masses`` (dof) in kg, ones for a plain velocity
+    spectrum; energies are added over the masses. Cosine flanks cover the fraction ``in_time`` of the record, half of it
+    at either end. ``lengths`` (time, space) are those to which records are padded with zeros, by default the next that
+    have fast transforms. Of the frequencies up to ``highest`` (rad/s) those ``rows`` are returned. No more than
+    ``memory`` bytes of the velocity are read at once.
 
-    Returns the energies on kappa in (-pi, pi] and omega >= 0; both halves of the real signal's frequencies are added
-    up.
+    Returns the energies on kappa in (-pi, pi] and omega >= 0, where those of omega and -omega are added up.
     """
     t, x = velocity.shape[:2]
     nt, nx = lengths or (fft.next_fast_len(t, real=True), fft.next_fast_len(x))
@@ -129,8 +131,8 @@ def dispersions(
     flanks = taper(t, in_time)[:, None]
 
     energies = [np.zeros((len(taken), nx)) for _ in windows]
-    # Time first, of blocks of cells: frequencies that are dropped are never held for all cells. Windows only weight
-    # cells, so that they have this transform in common.
+    # Over time first, block of cells by block: frequencies that are dropped are never held for all cells. Windows only
+    # weight cells: this transform is the same for all of them.
     spectrum = np.empty((len(taken), x), dtype=complex)
     for j, mass in enumerate(np.asarray(masses)):
         for block in blocks(x, 8 * t, memory):
@@ -148,22 +150,23 @@ def dispersions(
     order = np.roll(np.arange(nx), (nx - 1) // 2)
     wavenumber = 2 * np.pi * np.where(order > nx // 2, order - nx, order) / nx
     for energy in energies:
-        # Parseval over both padded transforms; half of m v^2; the mean over the samples.
+        # Half of m v^2, its mean over the t samples, and Parseval's theorem for both transforms of padded lengths.
         energy /= 2 * t * nt * nx
         energy[has_opposite] *= 2
     return [Dispersion(wavenumber, frequency[taken], energy.T[order]) for energy in energies]
 
 
 def ridge(spectrum: Dispersion, floor: float = 1e-2) -> tuple[np.ndarray, np.ndarray]:
-    """Ridge of a dispersion: energetic wavenumbers (k) and the frequency (k) in rad/s of each one's peak.
+    """Ridge of a dispersion: energetic wavenumbers (k) in rad per cell, and the frequency (k) in rad/s of their peaks.
 
-    A wavenumber counts when its peak exceeds ``floor`` times the largest; the peak is refined by the
-    parabola through the logarithms of itself and its two neighbours, which is exact for a Gaussian line.
+    A wavenumber is energetic if its peak exceeds ``floor`` times the largest energy of a bin. The frequency of the peak
+    is that of the parabola through the logarithms of the peak and its two neighbours, which is exact for a Gaussian
+    line.
     """
     energy = spectrum.energy
     frequency = spectrum.frequency
     rows = np.arange(len(energy))
-    peak = np.argmax(energy[:, 1:-1], axis=1) + 1  # with a neighbour on either side
+    peak = np.argmax(energy[:, 1:-1], axis=1) + 1  # not at an end: a peak needs a neighbour on either side
     energetic = np.nonzero(energy[rows, peak] > floor * energy.max())[0]
 
     neighbours = energy[energetic[:, None], peak[energetic, None] + np.array([-1, 0, 1])]

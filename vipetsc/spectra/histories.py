@@ -7,11 +7,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy import fft
 
-WINDOWS = 3  # that are compared: two may agree where a slow beat turns
-HARMONICS = 5  # of the drive that are fitted at most: contacts on both sides send the third and the fifth
-RESOLVED = 0.8  # of the samples' Nyquist frequency: nearer to it sines and cosines at the samples are nearly parallel
-FADING = 0.2  # of a record, over which a vibration fades out that does not end
-SILENT = 1e-12  # of a mean square: a part of the frequencies with less than that holds rounding
+# Windows whose amplitudes are compared. Two may agree by chance, one on either side of the extreme of a slow beat.
+WINDOWS = 3
+# Harmonics of the drive that are fitted at most: equal stops on both sides excite the third and the fifth.
+HARMONICS = 5
+# Highest frequency of a fitted harmonic over the samples' Nyquist frequency. Near 1, the samples of its sine and its
+# cosine are nearly proportional to one another.
+RESOLVED = 0.8
+# Fraction of a record, at its end, over which a vibration is faded out that goes on beyond the record.
+FADING = 0.2
+# Fraction of a mean square below which the part in a range of frequencies is rounding.
+SILENT = 1e-12
 
 
 class History(NamedTuple):
@@ -37,7 +43,7 @@ class SteadyDrive(NamedTuple):
 
 
 class SteadyAmplitude(NamedTuple):
-    """Amplitude at the drive's frequency in the last window, and by how much windows differ, over it."""
+    """The ``amplitude`` at the drive's frequency in the last window; ``drift``, the difference of windows over it."""
 
     amplitude: float
     drift: float
@@ -54,13 +60,13 @@ def rms(values: np.ndarray) -> float:
 
 
 def steady_amplitude(time: np.ndarray, values: np.ndarray, drive: SteadyDrive, periods: int) -> SteadyAmplitude:
-    """The amplitude of ``values`` (t,) at the frequency of ``drive``, and its drift, as a lock-in amplifier has it.
+    """The amplitude of ``values`` (t,) at the frequency of ``drive``, as a lock-in amplifier has it, and its drift.
 
-    Of each of the last three windows of so many whole ``periods`` of the drive, a constant and sines of up to five
-    harmonics are fitted by least squares, so that neither samples per period nor a static part matter. The amplitude is
-    that of the first harmonic in the last window. The drift is the largest distance of its phasor, phase and all, from
-    those of the two windows before, over its amplitude. Both are NaN where the drive is steady for less than the three
-    windows, or where the samples do not resolve it.
+    In each of the last three windows of so many ``periods`` of the drive, a constant and sines of up to five harmonics
+    are fitted to the samples, at ``time`` (t,) in s, by least squares. The amplitude is that of the first harmonic in
+    the last window. The drift is the largest distance of its phasor, amplitude and phase, from those of the two windows
+    before, over its amplitude. Both are NaN where the drive is steady for less than the three windows, or where the
+    samples do not resolve it.
     """
     window = periods * drive.period
     end = min(drive.stop, float(time[-1]))
@@ -68,7 +74,7 @@ def steady_amplitude(time: np.ndarray, values: np.ndarray, drive: SteadyDrive, p
     if len(time) > 1:
         interval = float(time[1] - time[0])
     harmonics = min(HARMONICS, int(RESOLVED * np.pi / (interval * drive.frequency)))
-    # Rounding of the times must not lose a window.
+    # The steady part may be exactly as long as the windows: the rounding of times must not make it too short.
     if harmonics < 1 or end - WINDOWS * window < drive.start * (1 - 1e-12) - 1e-12 * window:
         return SteadyAmplitude(np.nan, np.nan)
 
@@ -84,12 +90,15 @@ def steady_amplitude(time: np.ndarray, values: np.ndarray, drive: SteadyDrive, p
 
 
 def _phasor(time: np.ndarray, values: np.ndarray, frequency: float, harmonics: int) -> complex:
-    """The complex amplitude A of the part Re(A exp(i w t)) of ``values`` with the ``frequency`` w in rad/s."""
+    """The complex amplitude A of the part Re(A exp(i w t)) of ``values`` (t,) with the ``frequency`` w in rad/s.
+
+    Sines of so many ``harmonics`` are fitted with it.
+    """
     columns = [np.ones(len(time))]
     for harmonic in range(1, harmonics + 1):
         phase = harmonic * frequency * time
         columns += [np.cos(phase), -np.sin(phase)]
-    # Least squares rather than a Fourier sum: the window need not hold a whole number of samples a period.
+    # Least squares rather than a Fourier sum, which is exact only for a whole number of samples a period.
     solution = np.linalg.lstsq(np.column_stack(columns), values, rcond=None)[0]
     return complex(solution[1], solution[2])
 
@@ -112,10 +121,10 @@ def transmission_by_part(
 ) -> np.ndarray:
     """Transmission (part,) of the frequencies between the ``edges`` (part + 1) in rad/s, samples ``interval`` s apart.
 
-    Records are continued by their mirror image (cosine transform), without a jump at their ends; the mean square of a
-    record is the sum of those of its parts. A vibration that ``goes_on`` beyond the record fades out over the last
-    fifth of it, because its kink at the end would be in all parts. NaN for parts in which the source has less than
-    1e-12 of its mean square.
+    ``source`` and ``receiver`` (t,) are continued by their mirror images (cosine transform), without a jump; the mean
+    square of a record is the sum of those of its parts. A vibration that ``goes_on`` beyond the record is faded out
+    over the last fifth of it: the mirror image would make a kink at the end, which has energy in all parts. NaN for
+    parts in which the source has less than 1e-12 of its mean square.
     """
     window = np.ones(len(source))
     if goes_on:

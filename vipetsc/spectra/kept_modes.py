@@ -15,8 +15,8 @@ LEAST_DOFS = 400  # of a lattice whose modes are kept; those of smaller ones are
 def kept_modes(chain: Chain) -> Modes:
     """The modes of ``chain`` as `vipetsc.lattice.modes.linear_modes`, to the last bit, from an earlier run if possible.
 
-    Raises ValueError as that does. Those of lattices whose cells differ are not kept: of a sweep over samples each has
-    its own.
+    Modes of lattices whose cells differ are not kept: in a sweep over samples of such lattices each has its own. Raises
+    ValueError as ``linear_modes`` does.
     """
     chain = chain.linearised()
     dofs = chain.cells * chain.cell.dofs
@@ -31,7 +31,8 @@ def _kept(chain: Chain) -> Modes:
 
     def compute() -> dict[str, np.ndarray]:
         computed = linear_modes(chain)
-        # Transposed, they are in the file as LAPACK leaves them: products have the same bits.
+        # LAPACK leaves vectors column by column, a file holds arrays row by row. Read in another order, products with
+        # them would differ in their last bits.
         return {"frequency": computed.frequency, "wavenumber": computed.wavenumber, "vectors": computed.vectors.T}
 
     stiffness = chain.stiffness_matrix()

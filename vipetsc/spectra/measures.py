@@ -104,11 +104,11 @@ class RunMeasure(NamedTuple):
     """A number that a run leaves, or one for each of its points or pairs of points (``over``).
 
     ``of(record)``, ``of(record, point)`` or ``of(record, source, receiver)`` gives it, in ``unit``, from a
-    ``RunRecord``; None where the run has no such thing, NaN where it has but no value. Measures without ``of`` are
-    variables of that name of the run's analysis or its statistics. ``dimension``: "" for a number, ``PART`` for one of
-    each part of the frequency axis, "snapshot". Until something touches, it is proportional to the amplitude to the
-    ``power``; if a measure has none, sweeps simulate every member, instead of scaling a linear run. ``group`` says what
-    a run must be measured for.
+    ``RunRecord``: None where the run cannot have it, as a steady amplitude without a steady drive, NaN where it could
+    have it but has no value. A measure without ``of`` is a variable of its name in the run's analysis or statistics.
+    ``dimension``: "" for a number, ``PART`` for one of each part of the frequency axis, "snapshot". As long as nothing
+    touches, the measure is proportional to the drive's amplitude to the ``power``: sweeps scale a linear run. If any
+    has no ``power``, they simulate every member. ``group``: the measures that are computed together.
     """
 
     name: str
@@ -126,7 +126,10 @@ class RunMeasure(NamedTuple):
         return self.dimension, self.unit, self.text
 
     def at(self, *points: str) -> RunMeasure:
-        """The measure of these ``points``: its name, text and function without them."""
+        """The measure of these ``points``: named after them, it has a function of the record alone.
+
+        A measure of a run is returned as it is.
+        """
         if self.over == "run":
             return self
         if self.over == "point":
@@ -144,7 +147,10 @@ class RunMeasure(NamedTuple):
 
 
 def every_measure() -> dict[str, RunMeasure]:
-    """The shipped measures by name, and those that modules register: of the case that is read, else of all imported."""
+    """The shipped measures by name, and those that users' modules register.
+
+    While a case is read, these are the modules that it names; else all that are imported.
+    """
     measures = dict(MEASURES)
     for name in registered(MEASURE):
         part = PARTS[MEASURE][name]
@@ -170,7 +176,7 @@ def measures_of(points: Sequence[str], pairs: Sequence[Sequence[str]]) -> dict[s
 
 
 def _expanded(measure: RunMeasure, points: Sequence[str], pairs: Sequence[Sequence[str]]) -> Iterator[RunMeasure]:
-    """A ``measure`` for each of the things that it is of."""
+    """A ``measure`` of a run; one of points or of pairs for each of them."""
     if measure.over == "run":
         yield measure
     elif measure.over == "point":
@@ -182,7 +188,7 @@ def _expanded(measure: RunMeasure, points: Sequence[str], pairs: Sequence[Sequen
 
 
 def row_of(name: str) -> tuple[str, str, str]:
-    """Dimension, unit and text of the measure ``name``, perhaps of points; raises KeyError if there is none."""
+    """Dimension, unit and text of the measure ``name``, with points or without; raises KeyError if there is none."""
     measures = every_measure()
     if name in measures:
         return measures[name].row
@@ -191,13 +197,13 @@ def row_of(name: str) -> tuple[str, str, str]:
 
 
 def is_measure(name: str) -> bool:
-    """Whether ``name`` is a measure, perhaps of points."""
+    """Whether ``name`` is a measure of a run, or of points: ``peak_velocity/tip``."""
     base, _, points = name.partition("/")
     return name in every_measure() or (bool(points) and base in MEASURES and MEASURES[base].over != "run")
 
 
 def _of_name(name: str) -> RunMeasure:
-    """The measure ``name``, perhaps of points, for all of them."""
+    """The measure ``name`` in the registry, where a measure of points stands without their names."""
     return every_measure().get(name) or MEASURES[name.partition("/")[0]]
 
 

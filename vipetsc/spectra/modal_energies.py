@@ -22,7 +22,8 @@ BLOCK = 2**26  # bytes of fields that are transformed together; from a 16th to f
 class ModalParts:
     """Modes of a lattice, sorted into ``parts`` (bands, gaps, above) and ``BINS`` wavenumber bins.
 
-    ``part`` and ``bin`` (mode) are the numbers, from 0, of each mode's. Modes in a gap are those of the lattice's ends.
+    ``part`` and ``bin`` (mode) are the numbers, from 0, of the part and the bin in which each mode lies. Modes in a gap
+    are localised at the lattice's ends.
     """
 
     modes: Modes
@@ -61,7 +62,7 @@ class ModalParts:
     ) -> np.ndarray:
         """Energies (part, bin, row) in J at the samples ``rows`` of fields (t, cell, dof) in m and m/s.
 
-        Fields may be stored; no more than ``memory`` bytes of both are read at once.
+        Fields may be datasets of a file; no more than ``memory`` bytes of both are read at once.
         """
         energies = [np.zeros((len(self.parts.names), BINS, 0))]
         for block in blocks(len(rows), 16 * np.prod(velocity.shape[1:]), min(memory, BLOCK)):
@@ -71,13 +72,14 @@ class ModalParts:
         return np.concatenate(energies, axis=-1)
 
     def driven_change(self, state: np.ndarray, drives: Sequence[Drive], span: np.ndarray) -> np.ndarray:
-        """Change, by ``drives``, of the energies (part) in J of a lattice without contacts within a ``span`` in s.
+        """Change, by ``drives``, of the energies (part) in J of a lattice without contacts within a ``span`` (2,) in s.
 
-        ``state`` are the amplitudes (mode) at the beginning of the span. The result is exact.
+        ``state`` (mode,) are the amplitudes at the beginning of the span. The result is exact.
         """
         begin, end = span
         later = self.modes.later(state, end - begin)
         for drive in drives:
+            # The force of a moved wall is its displacement times the stiffness of its spring; a force has no spring.
             force = self.modes.force(drive.cell, drive.mass) * (drive.stiffness or 1.0)
             later += force * self.modes.driven(drive.waveform, begin, end)
         change = 0.5 * (np.abs(later) ** 2 - np.abs(state) ** 2)
@@ -89,9 +91,9 @@ def cluster_samples(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Clusters of contact episodes that overlap between samples, from ``onset`` and ``separation`` (episode) in s.
 
-    Returns the numbers (cluster, 2) of the samples between which each cluster lies, and the cluster (episode) of every
-    episode, from 0. Samples are those at ``time`` whose number ``stride`` divides, and the last one. An episode without
-    an end (NaN) lasts to the last sample.
+    Returns the numbers (cluster, 2) of the samples between which each cluster lies, and the number (episode,), from 0,
+    of the cluster that each episode is in. Samples are those at ``time`` whose number is a multiple of ``stride``, and
+    the last one. An episode without an end (NaN) lasts to the last sample.
     """
     # Rounded down to the sample before and up to the one after: the cluster must enclose its episodes.
     first = np.maximum(np.searchsorted(time, onset, side="right") - 1, 0) // stride * stride
@@ -99,7 +101,8 @@ def cluster_samples(
     # An episode between two neighbouring samples is bounded by both.
     stop = np.minimum(np.maximum(stop, first + stride), len(time) - 1)
 
-    # In the order of their beginnings, a cluster begins where all earlier episodes have ended.
+    # In the order of their beginnings, a cluster begins where all earlier episodes have ended. (Slices to the number of
+    # episodes make empty arrays of those with one element where there is no episode.)
     order = np.argsort(first, kind="stable")
     reach = np.maximum.accumulate(stop[order])
     begins = np.flatnonzero(np.append(True, first[order][1:] >= reach[:-1])[: len(order)])
@@ -111,16 +114,16 @@ def cluster_samples(
 
 
 def _index(edges: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    """The parts (mode) between whose ``edges`` the frequencies lie."""
+    """The numbers (mode,), from 0, of the parts between whose ``edges`` (part + 1) each ``frequency`` (mode,) lies."""
     return np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, len(edges) - 2)
 
 
 def upper_fraction(chain: Chain, drive: Waveform, displacement: np.ndarray, velocity: np.ndarray, work: float) -> float:
     """Energy of the pass bands above the driven one over the drive's ``work`` in J, at one instant.
 
-    Fields (cell, dof) in m and m/s are of all cells. NaN if there is no such band, or no work.
+    After the last impact it is the same at every instant. ``displacement`` in m and ``velocity`` in m/s are (cell, dof)
+    of all cells. NaN if there is no such band, or no work.
     """
-    # Energies of modes are constant between impacts: one instant is enough.
     parts = ModalParts.of(chain)
     above = parts.parts.above(drive.frequency)
     if not above.any() or work == 0:

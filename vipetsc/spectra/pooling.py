@@ -1,4 +1,4 @@
-"""Blocks of an array's rows: those that fit into memory together, and those that are one row of a map."""
+"""Blocks of an array's rows: as many as fit into memory together, or as many as make one row of a map."""
 
 from collections.abc import Iterator
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def blocks(count: int, size: float, memory: float) -> Iterator[slice]:
-    """Slices that divide ``count`` items of ``size`` bytes each so that none takes more than ``memory`` bytes."""
+    """Slices of ``count`` items of ``size`` bytes each: one item, or as many as take ``memory`` bytes at most."""
     together = int(max(min(memory / size, count), 1))
     return (slice(first, min(first + together, count)) for first in range(0, count, together))
 

@@ -29,7 +29,7 @@ LAYOUT = {
     "harmonics": Stored("site order", "m", "harmonics Z of w = Re sum Z exp(i k Om t), real part"),
     "harmonics_imaginary": Stored("site order", "m", "harmonics of w, imaginary part"),
 }
-"""What every curve of steady states has."""
+"""The measures that every file of a curve of steady states has."""
 
 OUTPUTS = {
     "parameter": Stored("", "", "value of the key that varies along the curve, see the attribute over"),
@@ -54,13 +54,13 @@ OUTPUTS = {
     "first_wall_force": Stored("wall", "N", "first harmonic of the force on the wall"),
     "wall_force_lag": Stored("wall", "degree", "phase of the first harmonic of the force on the wall behind the drive"),
 }
-"""What ``[output]`` asks for, and a key that varies; a file has those that its case asked for."""
+"""The measures that a file has if its case asks for them in ``[output]``, and the ``parameter``, if a key varies."""
 
 
 class CurvePart(NamedTuple):
     """A part of a curve (point,): the ``parameter`` that varies, the ``values`` of a response, the ``length`` along it.
 
-    ``is_regular`` are points of the continuation itself, whose distances vary slowly.
+    ``is_regular`` are the points that continuation steps led to; between them lie special points, such as folds.
     """
 
     parameter: np.ndarray
@@ -69,20 +69,23 @@ class CurvePart(NamedTuple):
     is_regular: np.ndarray
 
 
-# Between points whose distances differ by more a parabola may overshoot.
+# Largest ratio r of the distances from the middle of three points to the others for a parabola through them. Where only
+# the nearer point is lower, the vertex exceeds the middle value by r^2/(4 (1 + r)) of that drop: by an eighth for even
+# distances, by 0.8 with r = 4, and without bound as r grows.
 UNEVEN = 4.0
 
 
 def largest_response(parts: list[CurvePart], low: float, high: float) -> float:
     """The largest value at parameters from ``low`` to ``high`` of all ``parts`` of a curve; NaN if none lies there.
 
-    Between points it is that of the parabola over the length through the largest value and its two neighbours.
+    Between points it is the vertex of the parabola, over the length, through the largest value and its two neighbours.
     """
     largest = -np.inf
     for part in parts:
         inside = (part.parameter >= low) & (part.parameter <= high)
         largest = max(largest, part.values[inside].max(initial=-np.inf), *_at_ends(part, low, high))
 
+        # Special points lie so near to others that a parabola through them would be that of their errors.
         regular = part.is_regular & inside
         s = part.length[regular]
         y = part.values[regular]
@@ -95,7 +98,10 @@ def largest_response(parts: list[CurvePart], low: float, high: float) -> float:
 
 
 def _at_ends(part: CurvePart, low: float, high: float) -> list[float]:
-    """Values where a curve passes the ends of a range, linear between points; and -inf, for a part that passes none."""
+    """Values where a ``part`` passes the parameters ``low`` and ``high``, linear between points, and -inf.
+
+    The last is the largest one of a part that passes neither.
+    """
     values = [-np.inf]
     for end in (low, high):
         beyond = part.parameter - end
@@ -106,24 +112,29 @@ def _at_ends(part: CurvePart, low: float, high: float) -> list[float]:
 
 
 def _vertex(s: np.ndarray, y: np.ndarray) -> float:
-    """The largest value of the parabola through three points, of which the middle one is the largest; or its value."""
+    """The largest value of the parabola through three points with the values ``y`` (3,) at the lengths ``s`` (3,).
+
+    The value in the middle where it is not the largest, or the distances are too uneven for a parabola.
+    """
     before, after = np.diff(s)
     if not (y[1] >= y[0] and y[1] >= y[2] and 0 < max(before, after) < UNEVEN * min(before, after)):
         return float(y[1])
     rise = (y[1] - y[0]) / before
     fall = (y[2] - y[1]) / after
     bend = (fall - rise) / (before + after)
-    # Three equal values, of which a parabola has no vertex.
+    # Three equal values, whose parabola has no vertex.
     if bend == 0:
         return float(y[1])
+    # At the middle point, from which the parabola is y_1 + slope x + bend x^2.
     slope = rise + bend * before
     return float(y[1] - slope**2 / (4 * bend))
 
 
 def widest_gap(parts: list[CurvePart], level: float, low: float, high: float) -> float:
-    """The width of the widest range of the parameter, from ``low`` to ``high``, in which responses are below a level.
+    """The width of the widest range of the parameter, from ``low`` to ``high``, with responses below a ``level``.
 
-    Between points responses are linear. Where a curve has several states, the largest one counts.
+    Between points responses are linear. Where a curve has several states, the largest one counts. A range in which it
+    has none counts as below: the ``parts`` must cover all from ``low`` to ``high``.
     """
     above: list[tuple[float, float]] = []
     for part in parts:
@@ -132,6 +143,7 @@ def widest_gap(parts: list[CurvePart], level: float, low: float, high: float) ->
             excess = part.values[i : i + 2] - level
             if max(excess) < 0:
                 continue
+            # Above the level at one end only: from there to where the line between the points crosses it.
             if min(excess) < 0:
                 crossing = ends[0] + (ends[1] - ends[0]) * excess[0] / (excess[0] - excess[1])
                 ends = np.array([ends[int(np.argmax(excess))], crossing])

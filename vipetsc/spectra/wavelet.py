@@ -1,8 +1,9 @@
 """Morlet wavelets in space: transform, inverse per wavenumber bin, the equivalent bank of FFT filters, bin energies.
 
-The paper's Eqs. (A4)-(A7), corrected to be consistent: the wavelet of the node kappa is Psi(kc eta/kappa), Psi(s) =
-exp(-(s - kc)^2 / 2), over the wavenumbers 0 < eta <= pi alone. A real signal is twice the real part of its
-components of positive wavenumber; eta = pi belongs to both signs and counts half on either.
+The paper's Eqs. (A4)-(A7), corrected to be consistent: in the space of the wavenumbers eta the wavelet of the node
+kappa is Psi(kc eta/kappa) with Psi(s) = exp(-(s - kc)^2 / 2), over 0 < eta <= pi alone. In space it is a wave exp(i
+kappa x) in a Gaussian envelope, of which one standard deviation holds kc radians of the wave. A real signal is twice
+the real part of its components of positive wavenumber; eta = pi belongs to both signs and counts half on either.
 """
 
 from dataclasses import dataclass
@@ -19,8 +20,8 @@ LOWEST = np.pi / 60
 """Lowest node in rad per cell; wavenumbers below it belong to the first bin."""
 
 BINS = 12  # wavenumber bins of equal width in [0, pi]
-# Nodes an octave. Bins begin between nodes: with 256 the filters differ from those of a grid without end by 0.8 % next
-# to the bounds of the bins, with 128 by 1.1 %, with 64 by 2.4 %. Filters are computed once, in 0.01 s.
+# Nodes an octave. Bins begin between nodes: next to the bounds of the bins the filters differ from those of ever more
+# nodes by 0.8 % with 256, by 1.1 % with 128, by 2.4 % with 64. Filters are computed once, in 0.01 s.
 VOICES = 256
 CHUNK = 16  # snapshots that are partitioned together: with 4 a fifth slower, with 64 a tenth, in twice the memory
 
@@ -36,7 +37,8 @@ class Nodes:
     def log(cls, kc: float, voices: float = VOICES) -> Self:
         """Nodes from pi/60 to pi (1 + 4/kc), both included, ``voices`` an octave or a few more.
 
-        Raises ValueError below 0.65 kc voices, where the sum over the nodes would ripple.
+        Higher nodes would add less than 0.1 % to the sum of the filters at eta = pi (kc = 6). Raises ValueError below
+        0.65 kc voices, where the sum over the nodes would ripple.
         """
         if voices < 0.65 * kc:
             raise ValueError(f"voices = {voices}: kc = {kc} needs at least {0.65 * kc:.3g} an octave")
@@ -47,7 +49,7 @@ class Nodes:
 
     @property
     def bins(self) -> np.ndarray:
-        """Bin (node) of every node, from 0: edges k pi/BINS, all nodes above pi in the last."""
+        """Number (node,), from 0, of the bin of every node; the edges are k pi/BINS, nodes above pi are in the last."""
         return np.minimum((self.kappa * BINS / np.pi).astype(int), BINS - 1)
 
 
@@ -65,8 +67,12 @@ def wavelet_spectrum(kappa: ArrayLike, kc: float, eta: ArrayLike) -> np.ndarray:
 
 @lru_cache
 def constant(kc: float) -> float:
-    """C = integral of |Psi(kc e^x)|^2 over x, to rounding (the trapezoidal rule on a smooth bell)."""
-    # The integrand has fallen to exp(-49) at the upper end, and to exp(-kc^2) at the lower one.
+    """C = integral of |Psi(kc e^x)|^2 over x from log(1e-3) on, by the trapezoidal rule.
+
+    The rule is exact to rounding for a smooth bell that has fallen to nothing at both ends. At the upper end the
+    integrand is exp(-49). At the lower one, and on to x = -infinity, it is exp(-kc^2): 2e-16 for the kc = 6 of the
+    partition, 1e-11 for the smallest kc that is allowed.
+    """
     x = np.linspace(np.log(1e-3), np.log(1 + 7 / kc), 4001)
     return float(np.sum(np.exp(-((kc * np.exp(x) - kc) ** 2))) * (x[1] - x[0]))
 
@@ -75,16 +81,16 @@ def padded_length(cells: int, kc: float, lowest: float = LOWEST) -> int:
     """Transform length that keeps ``cells`` apart from their periodic images, the next that is fast.
 
     Room is left for the wavelet of the node ``lowest`` (rad per cell), until its Gaussian envelope
-    exp(-(lowest x / kc)^2 / 2) is below rounding. Within the first ``cells`` the transform is then that of the
-    lattice with rest on either side. Nodes whose band meets pi are cut there and fall off as 1/x only: their
-    tails, below 1/(pi x), go round.
+    exp(-(lowest x / kc)^2 / 2) is below rounding. Within the first ``cells`` the transform is then that of the lattice
+    with rest on either side. Wavelets that are cut at eta = pi fall off as 1/x only: their tails, below 1/(pi x), do
+    reach the images.
     """
     reach = np.sqrt(-2 * np.log(np.finfo(float).eps)) * kc / lowest
     return fft.next_fast_len(cells + int(np.ceil(reach)), real=True)
 
 
 def wavenumbers(length: int) -> np.ndarray:
-    """Wavenumbers (k) in rad per cell of a real transform of ``length``."""
+    """Wavenumbers (k) in rad per cell of a real Fourier transform of so many cells (``length``)."""
     return 2 * np.pi * np.arange(length // 2 + 1) / length
 
 
@@ -100,8 +106,9 @@ def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | Non
     """Complex wavelet transform X (..., kappa, x), Eq. (A5), of real signals (..., cell); X in the signal's unit.
 
     X = sqrt(kc/kappa) IFFT[FFT(signal) Psi(kc eta/kappa)] on the line padded to ``length``, by default
-    ``padded_length`` of the lowest node. The lattice is its first ``cells`` columns; the rest is needed to
-    invert it: columns from the end on count backwards from cell 0. Raises ValueError if ``length`` is less than that.
+    ``padded_length`` of the lowest node. The first columns over x are those of the cells; the inverse needs the others
+    as well, which stand for places beyond the lattice: counted from the last column backwards, those before cell 0.
+    Raises ValueError if ``length`` is less than the number of cells.
     """
     kappa = np.asarray(kappa, dtype=float)
     cells = signal.shape[-1]
@@ -116,7 +123,7 @@ def transform(signal: np.ndarray, kappa: ArrayLike, kc: float, length: int | Non
 
 
 def inverse(x: np.ndarray, nodes: Nodes, kc: float) -> np.ndarray:
-    """Parts (bin, ..., x), Eq. (A7), of the signals whose transform at ``nodes`` is ``x`` (..., kappa, x), uncropped.
+    """Parts (bin, ..., x), Eq. (A7), of the signals whose ``transform`` at ``nodes`` is ``x`` (..., kappa, x), not cut.
 
     u_b = 2 Re (1/C) sum over the nodes of bin b of (dkappa/kappa) sqrt(kappa/kc) IFFT[FFT(X) Psi(kc eta/kappa)].
     The parts sum to the signal but for its mean and the wavenumbers near and below pi/60 (see ``Bank``).
@@ -133,11 +140,12 @@ def inverse(x: np.ndarray, nodes: Nodes, kc: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Bank:
-    """Bank of FFT filters to which transform, binning and inverse amount: a mask of bins does not vary along x.
+    """Filters of the wavenumber bins that do in one step what transform, choice of a bin's nodes and inverse do.
 
-    ``transfer`` (bin, k) over the wavenumbers of the padded ``length``:
+    Each of these steps multiplies every wavenumber eta by a number, and so do all three together: ``transfer`` (bin, k)
+    over the wavenumbers of the padded ``length``,
     T_b(eta) = (1/C) sum over the nodes of bin b of (dkappa/kappa) |Psi(kc eta/kappa)|^2. The sum over b is at most 1:
-    over the nodes of an endless grid it would be 1. It is 0.99 at least from 1.3 pi/60 to pi, 0.56 at pi/60 and 0 at
+    over nodes from 0 to infinity it would be 1. It is 0.99 at least from 1.3 pi/60 to pi, 0.56 at pi/60 and 0 at
     eta = 0 (kc = 6).
     """
 
@@ -145,7 +153,7 @@ class Bank:
     length: int
 
     def split(self, signal: np.ndarray) -> np.ndarray:
-        """Parts (bin, ..., cell) of real signals (..., cell), on the lattice alone."""
+        """Parts (bin, ..., cell) of real signals (..., cell), without the padding."""
         spectrum = fft.rfft(signal, self.length)
         cells = signal.shape[-1]
         return np.stack([fft.irfft(transfer * spectrum, self.length)[..., :cells] for transfer in self.transfer])
@@ -156,11 +164,10 @@ def filter_bank(cells: int, kc: float = 6.0) -> Bank:
     """The bank of filters of all bins for lattices of ``cells``."""
     length = padded_length(cells, kc)
     nodes = Nodes.log(kc)
+    # The factors sqrt(kc/kappa) of the transform and sqrt(kappa/kc) of its inverse cancel.
     gain = nodes.weight / constant(kc) * wavelet_spectrum(nodes.kappa, kc, wavenumbers(length)) ** 2
-    # Masking bins in the wavelet domain and inverting is linear in each wavenumber: one factor for each bin has all
-    # of it.
     transfer = np.stack([gain[nodes.bins == b].sum(axis=0) for b in range(BINS)])
-    transfer.flags.writeable = False  # all who ask get the same array
+    transfer.flags.writeable = False  # the cache hands out the same array again
     return Bank(transfer=transfer, length=length)
 
 
@@ -168,10 +175,11 @@ def filter_bank(cells: int, kc: float = 6.0) -> Bank:
 class Partition:
     """Kinetic energies in J of the parts v_b of a velocity field.
 
-    ``energy`` (bin, t) summed over the lattice, ``field`` (bin, t, cell') or None, ``kinetic`` (t) of the velocities
-    themselves, ``reconstructed`` (t): KE_rec = 1/2 sum m (sum_b v_b)^2. Both 0 at rest: ``error`` (t) =
-    |KE_rec - KE| / KE, the paper's Eq. (A8), and ``cross_share`` (t) = 1 - sum_b KE_b / KE, the energy in products of
-    different parts.
+    ``energy`` (bin, t) KE_b are sums over the lattice, ``field`` (bin, t, cell') means over some cells, or None.
+    ``kinetic`` (t) KE is that of the velocities themselves, ``reconstructed`` (t) KE_rec = 1/2 sum m (sum_b v_b)^2.
+    ``error`` (t) = |KE_rec - KE|/KE is the paper's Eq. (A8), and ``cross_share`` (t) = 1 - sum_b KE_b/KE the fraction
+    of energy that parts do not have by themselves: that of products of different parts, and of what no part has. Both
+    are 0 at rest.
     """
 
     energy: np.ndarray
