@@ -13,7 +13,7 @@ from tests.identified import identify_table, lattice_table
 from vipetsc.case import Case, CaseError
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import RecordTable, read_measured
-from vipetsc.studies.identified import _start_values, parameter_lines
+from vipetsc.studies.identified import _start_values, _warnings_of_parameters, parameter_lines
 
 SENSOR = {"quantity": "velocity", "column": "v", "cell": 2, "mass": 1}
 
@@ -299,3 +299,36 @@ def test_columns_of_the_printed_table_stand_below_their_headings():
     assert ends == [heading.index("value") + len("value")] * 2
     ends = [lines[1].index("1.2e-12") + len("1.2e-12"), lines[2].index("0.013") + len("0.013")]
     assert ends == [heading.index("error") + len("error")] * 2
+
+
+def test_the_error_that_a_sensor_would_leave_has_the_scale_of_its_parameter(tmp_path):
+    """A fraction of a positive parameter, but a fraction of the range between the bounds on a linear scale."""
+    plan = IdentifyCase.from_table(identify_table(lattice_table(), record_in(written(tmp_path))))
+    columns = {
+        "parameter": [parameter.name for parameter in plan.parameters],
+        "at_least": [np.nan] * 4,
+        "determined": [0, 1, 1, 0],
+        "sensor/cell": [2] * 4,
+        "sensor/mass": [1] * 4,
+        "sensor/relative_error": [0.2] * 4,
+    }
+    data = xr.Dataset({name: ("parameter", values) for name, values in columns.items()}, attrs={"case": plan.to_toml()})
+    clearance, restitution = _warnings_of_parameters(data)
+    assert clearance.startswith("clearance 1:")
+    assert clearance.endswith("with a sensor at mass 1 of cell 2 its error would be 20 %")
+    assert restitution.startswith("restitution:")
+    assert restitution.endswith("its error would be 20 % of the range between its bounds")
+
+
+def test_the_force_of_a_moved_wall_is_no_sensor(tmp_path):
+    """The drive acts as stiffness times its motion, which no load cell measures; of a force the sensor is as before."""
+    sensors = [SENSOR, {"quantity": "force", "column": "v"}]
+    wall = {"waveform": "harmonic", "end": "left", "amplitude": 1e-4, "frequency": 300.0}
+    record = record_in(written(tmp_path), sensors=sensors)
+    IdentifyCase.from_table(identify_table(lattice_table(), record))
+
+    with pytest.raises(CaseError) as caught:
+        IdentifyCase.from_table(identify_table(lattice_table() | {"drive": wall}, record))
+    (problem,) = caught.value.problems
+    assert problem.key == "identify.records[1].sensors[2].quantity"
+    assert "drive 1 moves a wall" in problem.remedy

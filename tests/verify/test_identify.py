@@ -10,6 +10,7 @@ from tests.identified import identify_table, lattice_table, measured_table
 from vipetsc.case import Case
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.identification.clearance_search import other_contacts
+from vipetsc.identification.growing_windows import Fit, GrowingWindows, Window
 from vipetsc.identification.precision import Precision
 from vipetsc.identification.uncertainty import errors_with_sensor, quantile, uncertainty_of
 from vipetsc.identification.whiteness import ljung_box
@@ -134,6 +135,41 @@ def test_clearances_and_restitution_come_back_without_noise(tmp_path):
     # Residuals are those of rounding: nothing is said of their whiteness.
     assert found.attrs["warnings"] == "[]"
     assert found["windows/impacts"].values[-1] > 5
+
+
+def test_windows_of_two_records_grow_as_those_of_one(tmp_path, monkeypatch):
+    """Contacts are counted record by record: a record that is given twice has the windows of one that is given once."""
+    monkeypatch.setattr(GrowingWindows, "solve", lambda self, z, *_: z)
+    table = lattice_table()
+    record = measured_table(tmp_path, table)
+    ends = []
+    for records in ([record], [record, record]):
+        identification = fits_of(identify_table(table, records, impacts=1, growth=1.3))
+        fits = identification.windows()
+        truth = [5e-4, 4e-4, 3e-4, 0.7]
+        z = np.array([p.to_coordinate(value) for p, value in zip(identification.plan.parameters, truth, strict=True)])
+        ends.append([window.end for window in fits.fit(z).windows])
+
+    assert len(ends[0]) > 6
+    assert ends[0] == pytest.approx(ends[1], rel=1e-6)
+
+
+def test_a_start_has_the_misfit_of_its_better_pass(tmp_path, monkeypatch):
+    """A second pass that ends in a higher valley is not taken, nor its misfit."""
+    fits = fits_of(identify_table(lattice_table(), measured_table(tmp_path, lattice_table())))
+    start = fits.starts()[0]
+    passes = iter([(10.0, 1.1), (20.0, 2.2)])
+
+    def one_pass(self, z, windows):
+        deviance, misfit = next(passes)
+        windows.append(Window(end=1.0, impacts=1, most_impacts=1, misfit=misfit, coordinates=z))
+        return Fit(coordinates=z, deviance=deviance, misfit=misfit, windows=windows, noise=self.misfit.noise)
+
+    monkeypatch.setattr(GrowingWindows, "_pass", one_pass)
+    record = fits.fit(0)
+    assert record["coordinates"] == start.tolist()
+    assert [row["misfit"] for row in record["windows"]] == [1.1, 2.2]
+    assert record["misfit"] == 1.1
 
 
 @pytest.mark.slow

@@ -118,3 +118,16 @@ def test_the_marginal_jacobian_has_the_inverse_of_the_covariance():
     marginal = marginal_jacobian(jacobian, 3)
     assert np.linalg.inv(marginal.T @ marginal) == pytest.approx(covariance[:3, :3], rel=1e-10)
     assert uncertainty_of(marginal).errors == pytest.approx(uncertainty_of(jacobian).errors[:3], rel=1e-10)
+
+
+def test_fewer_data_than_parameters_leave_some_of_them_undetermined():
+    """One datum that depends on one of two parameters determines it alone; random ones none of five by three data."""
+    one = uncertainty_of(np.array([[10.0, 0.0]]))
+    assert one.errors == pytest.approx([0.1, 1e11], rel=1e-12)
+    assert one.determined.tolist() == [True, False]
+    assert one.correlation == pytest.approx(np.eye(2), abs=1e-12)
+    assert one.singular == pytest.approx([10.0, 0.0])
+
+    few = uncertainty_of(1e3 * np.random.default_rng(3).standard_normal((3, 5)))
+    assert not few.determined.any()
+    assert few.directions @ few.directions.T == pytest.approx(np.eye(5), abs=1e-12)

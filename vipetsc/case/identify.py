@@ -29,6 +29,7 @@ from vipetsc.case.sought import (
 from vipetsc.case.study import StudyCase
 from vipetsc.case.trial import TrialCases
 from vipetsc.case.warnings import loss_warnings, unit_warnings
+from vipetsc.lattice import Drive
 from vipetsc.lattice.contact import LAWS
 
 DASHPOTS = ("dashpot", "grounding")
@@ -42,10 +43,10 @@ Each has two unknowns, by which the motion is differentiated: 400 columns of 400
 class IdentifyTable(Section):
     """Parameters are fitted to ``records`` over windows that grow, from one or several starts.
 
-    The first window ends with the model's contact number ``impacts``, and each has ``growth`` times as many as the
-    one before. ``starts``: the first one is that of the unknowns, the others are drawn between their bounds by Latin
-    hypercube sampling with ``seed``. ``steps``: evaluations of a window. ``confidence`` is that of the intervals;
-    ``profile``: values of each parameter for which all others are fitted.
+    The first window ends with the model's contact number ``impacts`` in each record, and each has ``growth`` times as
+    many as the one before. ``starts``: the first one is that of the unknowns, the others are drawn between their bounds
+    by Latin hypercube sampling with ``seed``. ``steps``: evaluations of a window. ``confidence`` is that of the
+    intervals; ``profile``: values of each parameter for which all others are fitted.
     """
 
     records: list[RecordTable] = Field([], min_length=1)
@@ -289,11 +290,13 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
         if record.initial == "estimate" and all(sensor.quantity == "force" for sensor in record.sensors):
             yield Problem(f"{at}.initial", "estimate", "needs a sensor of motion; a drive's force says nothing of it")
         try:
-            base.varied(**_varied_sections(record))
+            drives = base.varied(**_varied_sections(record)).model().drives
         except CaseError as error:
             for problem in error.problems:
                 # Named by the record's key: the case itself is valid.
                 yield replace(problem, key=f"{at}.{problem.key}")
+        else:
+            yield from _wall_problems(record, drives, at)
 
     # Without contact the misfit does not depend on them, and the fit would be singular.
     if not any(record.contact for record in options.records):
@@ -301,6 +304,16 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             if unknown.quantity in OF_SITES:
                 remedy = "no record has contact: a lattice that does not touch says nothing about its contacts"
                 yield Problem(f"identify.unknowns[{index}].quantity", unknown.quantity, remedy)
+
+
+def _wall_problems(record: RecordTable, drives: Sequence[Drive], at: str) -> Iterator[Problem]:
+    """Problems of sensors for the force of a wall that moves; ``drives`` are those of the ``record``."""
+    for number, sensor in enumerate(record.sensors, 1):
+        drive = sensor.drive or 1
+        if sensor.quantity == "force" and drive <= len(drives) and drives[drive - 1].stiffness:
+            # What a load cell at the wall measures is the force of the spring, by the motion of wall and mass.
+            remedy = f"drive {drive} moves a wall, whose force depends on the lattice's motion; measure that of a mass"
+            yield Problem(f"{at}.sensors[{number}].quantity", "force", remedy)
 
 
 def _with_hashes(options: IdentifyTable) -> tuple[IdentifyTable, list[Problem]]:

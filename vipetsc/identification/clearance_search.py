@@ -1,8 +1,8 @@
-"""Search for contacts that the model lacks or has too many, by other values of the clearances.
+"""Search, by other values of the clearances, for contacts that the model lacks or should not have.
 
-No derivative leads from a stop that is not met to one that is, nor out of a contact that the lattice did not have: the
-misfit does not depend on a clearance beyond the motion, and has a valley of its own on either side of it. Clearances
-are therefore tried one by one at some fractions of the largest motion without their stop.
+The misfit does not depend on a clearance that is larger than the motion, and its valley of values without contact is
+apart from those of values with contact: no derivative leads from one to the other. Clearances are therefore tried one
+by one at some fractions of the largest motion without their stop.
 """
 
 from collections.abc import Sequence
@@ -16,17 +16,19 @@ from vipetsc.identification.misfit import Misfit
 from vipetsc.identification.motion import MotionError
 from vipetsc.identification.precision import EXACT, Tolerances
 
-# Clearances that are tried, over the motion without the stop: out of reach, where the lattice may not have touched,
-# just within it, where derivatives begin, and further in.
+# Clearances that are tried, over the largest motion without the stop: out of reach, where the lattice would not have
+# touched; just within reach, where the first impact grazes; and further in, where a valley may begin that a fit from a
+# graze does not reach.
 OF_REACH = (1.02, 0.98, 0.8, 0.6, 0.4)
-# Sides, 0 of w > 0, on which a clearance has its stops.
+# Sides on which a clearance has its stops: 0 is that of w > 0, 1 that of w < 0.
 SIDES = {"clearance": [0], "clearance_minus": [1]}
 
 
 def reached_by(misfit: Misfit, z: np.ndarray, ends: Sequence[float], tolerances: Tolerances = EXACT) -> np.ndarray:
     """The largest w and -w (site, 2) in m of any record in the model up to ``ends``; NaN where a stop is met.
 
-    ``z`` (coordinate,) are the model's coordinates, ``ends`` (record,) times of the records' clocks in s.
+    ``z`` (coordinate,) are the model's coordinates, ``ends`` (record,) times of the records' clocks in s. Raises
+    CaseError, MotionError.
     """
     largest = np.zeros((len(misfit.plan.base.model().chain.sites), 2))
     for number, (table, end) in enumerate(zip(misfit.plan.options.records, ends, strict=True)):
@@ -51,7 +53,8 @@ def largest_towards(plan: IdentifyCase, parameter: SoughtParameter, reached: np.
     if parameter.quantity == "clearance" and not differs_by_side(base):
         sides = [0, 1]  # one clearance for both
 
-    # A site with a stop on one side has an infinite gap on the other. One stop that is met makes the result NaN.
+    # A site with a stop on one side has an infinite gap on the other. The largest of values with a NaN is NaN: one stop
+    # that is met is enough.
     towards = [reached[i, side] for i in parameter.members for side in sides if np.isfinite(gaps[i, side])]
     return float(np.max(towards, initial=0.0))
 
@@ -59,7 +62,7 @@ def largest_towards(plan: IdentifyCase, parameter: SoughtParameter, reached: np.
 def other_contacts(
     misfit: Misfit, z: np.ndarray, ends: Sequence[float], highest: np.ndarray, tolerances: Tolerances = EXACT
 ) -> np.ndarray | None:
-    """Coordinates with a clearance within the motion or out of its reach, if that lowers the misfit; else None.
+    """The coordinates (coordinate,) with those clearances, of the ones tried, that lower the misfit; None if none does.
 
     The search begins at ``z`` (coordinate,), with windows up to ``ends`` (record,) in s; ``highest`` (coordinate,) are
     the upper bounds.
@@ -69,6 +72,7 @@ def other_contacts(
     for number, parameter in enumerate(misfit.plan.parameters):
         if parameter.quantity not in SIDES:
             continue
+        # As far away as it may be: the motion without this stop.
         free = z.copy()
         free[number] = highest[number]
         for moved in _clearances_tried(misfit, z, free, number, ends, tolerances):
@@ -85,15 +89,19 @@ def other_contacts(
 def _clearances_tried(
     misfit: Misfit, z: np.ndarray, free: np.ndarray, number: int, ends: Sequence[float], tolerances: Tolerances
 ) -> list[np.ndarray]:
-    """The coordinates ``z`` with other values of the clearance ``number``, by the motion at ``free``, without stops."""
+    """The coordinates ``z`` (coordinate,) with other values of the clearance ``number``, a list of arrays.
+
+    The values are fractions of the motion at ``free`` (coordinate,), where the clearance is at its upper bound.
+    """
     parameter = misfit.plan.parameters[number]
+    # A case or a motion that is impossible without this stop says nothing of other clearances.
     try:
         reached = reached_by(misfit, free, ends, tolerances)
     except (CaseError, MotionError):
         return []
 
-    # NaN for a stop that is met even at its upper bound: how far the motion without it would go is unknown, and no
-    # comparison holds.
+    # A stop that is met even at its upper bound has NaN: how far the motion without it would go is unknown. Comparisons
+    # with NaN are false, and nothing is tried.
     beyond = largest_towards(misfit.plan, parameter, reached)
     tried = []
     for fraction in OF_REACH:

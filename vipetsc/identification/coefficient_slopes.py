@@ -1,8 +1,9 @@
 """Derivatives of the coefficients of a record's motion with respect to parameters, by differences of trial cases.
 
 Masses, stiffnesses, gaps and so on follow from a case. The case is therefore built at two values of a parameter, and
-its coefficients are differenced: no quantity needs a formula of its own. Where all coefficients are affine in the value
-of a parameter, one difference serves the whole fit, and is scaled to the coordinate (a logarithm, for instance).
+the difference of its coefficients is taken: no quantity needs a formula of its own. Where all coefficients are affine
+in the value of a parameter, one difference serves the whole fit. It is multiplied by the derivative of the value by the
+coordinate, which may be the value's logarithm.
 """
 
 from collections.abc import Sequence
@@ -18,19 +19,19 @@ from vipetsc.identification.initial_state import state_of
 from vipetsc.identification.motion import MotionCoefficients, scaled_slopes, slopes_between
 from vipetsc.identification.motion_rates import Slopes
 
-# Half the distance of the coordinates between which coefficients of the motion are differenced. The error of the
-# difference, h^2/6, and that of rounding, 1e-16/h, are then both about 1e-11.
+# Half the distance h of the coordinates between which differences of coefficients are taken. The error of the central
+# difference, h^2/6 of the third derivative, and that of rounding, 1e-16/h, are then both about 1e-11.
 HALF_WIDTH = 1e-5
 AFFINE = ("clearance", "clearance_minus", "stiffness", "mass", "spring", "quadratic", "cubic", "dashpot", "grounding")
-"""Quantities in which coefficients of the motion are affine: their derivatives by the value are always the same."""
+"""Quantities in which coefficients of the motion are affine: derivatives by their values are the same everywhere."""
 FOLLOWING_CELL = ("mode", "packet")
-"""Initial motions whose displacements and velocities depend on the cell."""
+"""Initial motions whose displacements and velocities depend on masses and springs of the cell."""
 
 
 class ParameterSlope(NamedTuple):
-    """Derivatives by a parameter: of the ``coefficients`` of the motion, without an axis of parameters.
+    """Derivatives by one parameter: of the ``coefficients`` of the motion, and of the ``state`` in which it begins.
 
-    ``state`` (2n,) is that of the state in which the motion begins, 0 where it does not depend on the parameter.
+    ``coefficients`` have no axis of parameters; ``state`` (2n,) is 0.0 if the parameter does not change that state.
     """
 
     coefficients: Slopes
@@ -38,7 +39,7 @@ class ParameterSlope(NamedTuple):
 
 
 def values_at(parameters: Sequence[SoughtParameter], z: np.ndarray) -> np.ndarray:
-    """The values (parameter,) at the coordinates ``z`` (coordinate,), of which those of parameters are the first."""
+    """The values (parameter,) at the coordinates ``z`` (coordinate,), which begin with those of ``parameters``."""
     first = z[: len(parameters)]
     return np.array([parameter.from_coordinate(x) for parameter, x in zip(parameters, first, strict=True)])
 
@@ -52,9 +53,9 @@ class CoefficientSlopes:
         self._by_value = lru_cache(maxsize=None)(self._new_by_value)
 
     def at(self, z: np.ndarray, p: int, model: Model, middle: MotionCoefficients) -> ParameterSlope:
-        """Derivatives of ``middle``, the coefficients of the ``model`` at ``z`` (coordinate,), by parameter number p.
+        """Derivatives of ``middle``, the coefficients of the ``model`` at ``z`` (coordinate,), by coordinate number p.
 
-        Raises CaseError.
+        Raises CaseError if a neighbouring case is impossible.
         """
         parameter = self._parameters[p]
         if parameter.quantity in AFFINE:
@@ -65,13 +66,16 @@ class CoefficientSlopes:
         below, above = self._neighbours(z, p)
         low, high = (self._trials.case(self._values_with(z, p, x)).model() for x in (below, above))
         slopes = slopes_between(low, high, above - below, model, middle)
-        # Of all beginnings only modes and packets depend on the cell.
+        # Other initial motions are given in numbers: no parameter changes them.
         if model.initial is not None and model.initial.kind in FOLLOWING_CELL:
             return ParameterSlope(slopes, (state_of(high) - state_of(low)) / (above - below))
         return ParameterSlope(slopes)
 
     def _neighbours(self, z: np.ndarray, p: int) -> tuple[float, float]:
-        """Coordinates below and above ``z`` (coordinate,) in parameter ``p``; at a bound one of them is that of z."""
+        """Coordinates below and above that of parameter ``p`` in ``z`` (coordinate,), within the bounds.
+
+        Where z is at a bound, one of them is that of z, and the difference between them is one-sided.
+        """
         parameter = self._parameters[p]
         below = max(z[p] - HALF_WIDTH, parameter.to_coordinate(parameter.low))
         above = min(z[p] + HALF_WIDTH, parameter.to_coordinate(parameter.high))
@@ -84,11 +88,11 @@ class CoefficientSlopes:
         return values
 
     def _new_by_value(self, p: int) -> Slopes | None:
-        """Derivatives of a record's coefficients by the value of parameter ``p``, where they are the same everywhere.
+        """Derivatives of a record's coefficients by the value of parameter ``p``; None if they depend on the values.
 
-        They are those at the start of the case, so that a fit which goes on after a stop has the same. None where
-        they are not the same, or where there is no such case.
+        None also if no case has the values at the start.
         """
+        # Taken at the start of the case, wherever the fit is: one that goes on after a stop has the same bits.
         z = np.array([each.to_coordinate(each.start) for each in self._parameters])
         below, above = self._neighbours(z, p)
         low, high = (self._values_with(z, p, x) for x in (below, above))
@@ -102,7 +106,8 @@ class CoefficientSlopes:
             return None
 
         slopes = slopes_between(lower, upper, float(high[p] - low[p]), model, MotionCoefficients.of(model))
-        # A moved wall acts by the stiffness of its spring: its force is a product of what is sought.
+        # The force of a moved wall is proportional to the stiffness k of its spring. Derivatives of drives are relative
+        # to their forces: that by k is 1/k, which is not constant.
         if slopes.drives.any():
             return None
         return slopes

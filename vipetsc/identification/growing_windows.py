@@ -1,9 +1,13 @@
 """The fit over windows that grow, from one start.
 
-The order of the fits is: parameters of the linear lattice over records without contact; all parameters over windows
-with more and more of the model's contacts, the last of which are the whole records; twice more over the whole records
-with noise that is estimated from the residuals, where it is not given; and all windows once more from there. Section 2
-of the package's docstring says why windows grow, section 3 why clearances are also tried.
+A window is the beginning of every record up to some time; the last one is all of the records. The fits are:
+
+1. parameters of the linear lattice, to windows of the records without contact;
+2. all parameters, to windows with more and more of the model's contacts;
+3. all parameters, to the whole records with noise that is estimated from the residuals where none is given, twice;
+4. steps 2 and 3 once more from there.
+
+Section 2 of the package's docstring says why windows grow, section 3 why clearances are also tried.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,15 +23,15 @@ from vipetsc.identification.misfit import Misfit
 from vipetsc.identification.motion import MotionError
 from vipetsc.identification.precision import EXACT, FINAL, GROWING, Precision, Tolerances
 
-# While windows grow, parameters that the data do not determine yet stay near their last values: a change of one in a
-# coordinate weighs as one datum that misses by its noise. The last fit has no such rows.
+# While windows grow, parameters that the data do not determine yet stay near their last values: a change of a
+# coordinate by PRIOR weighs as one datum that misses by its noise. The last fit has no such rows.
 PRIOR = 1.0
-# Noise that is not given, over the size of a channel, until residuals tell.
+# Noise that is not given, over the size of a channel, until residuals show it.
 ASSUMED_NOISE = 0.01
-# Smallest noise over the size of a channel.
+# Smallest noise over the size of a channel: computed records have none, and residuals over it must stay finite.
 LEAST_NOISE = 1e-9
-# Least weight of the prior over the size of the Jacobian. Where a clearance is not reached, a column is zero; without
-# full rank, SciPy makes every step as long as the trust region is, and does not converge.
+# Least weight of the prior over the norm of the Jacobian. Where a clearance is not reached, a column of the Jacobian is
+# zero; without full rank, SciPy makes every step as long as the trust region is, and does not converge.
 RIDGE = 1e-10
 # A window is repeated at half its growth if its misfit is so many times that of the one before, and that of noise,
 # until it grows by less than this fraction of the record. In eight fits (5 % noise, starts up to 2.3 times off, records
@@ -35,47 +39,54 @@ RIDGE = 1e-10
 # are up to 73 of them instead of 19, at seven times the CPU. With 4, one fit has a window less than with 2.
 RISE = 2.0
 SHORTEST = 0.01
-# First window of records without contact, and of those whose initial state is estimated, over the last one.
+# Length over that of the record of the first window of a record without contact, or whose initial state is estimated.
 FIRST = 0.1
-# Samples of a window, at least; every record has as many.
+# Samples of a window, at least; every record has twice as many.
 LEAST_SAMPLES = 4
 # Data of a first window, at least, for each number that is unknown: with one for each, noise would be fitted exactly.
 # In four records that begin in an unknown motion 0.75 and 3 give the same windows, whose ends are those of contacts.
 DATA_EACH = 1.5
+# Fits with noise that is estimated from the fit before.
 REWEIGHTINGS = 2
 # Further passes through all windows.
 REPETITIONS = 1
 
 
 class Window(NamedTuple):
-    """A fit over one window: the largest time of the records' clocks in s, the model's contacts, the misfit.
+    """A fit over one window: its latest ``end`` by the records' clocks in s, and the model's contacts in it.
 
-    ``misfit`` is the root of the mean square of the residuals over the noise; ``coordinates`` (parameter,).
+    ``impacts`` are those of all records together, ``most_impacts`` those of the record with the most. ``misfit`` is the
+    root mean square of the residuals over the noise, ``coordinates`` (coordinate,) are the solution.
     """
 
     end: float
     impacts: int
+    most_impacts: int
     misfit: float
     coordinates: np.ndarray
 
 
 class Fit(NamedTuple):
-    """The fit from one start: ``coordinates`` (parameter,), ``deviance``, and the ``windows`` in their order.
+    """The fit from one start: ``coordinates`` (coordinate,), their ``deviance``, and the ``windows`` in their order.
 
-    ``noise`` has one array (sensor,) a record: given, or estimated from the residuals.
+    ``misfit`` is that of the whole records, as of a ``Window``. ``windows`` are those of all passes, also of one that
+    did not lead to these coordinates. ``noise`` has one array (sensor,) a record, in SI units: given, or estimated from
+    the residuals.
     """
 
     coordinates: np.ndarray
     deviance: float
+    misfit: float
     windows: list[Window]
     noise: list[np.ndarray]
 
 
 class GrowingWindows:
-    """Fits of a ``misfit`` over windows; ``check`` is called before every evaluation, and may raise.
+    """Fits of a ``misfit`` over windows; ``check`` is called before every evaluation, and may raise to end the fit.
 
-    ``keep`` is called with the solution (coordinate,) of every window. A fit that is given them as ``solved`` takes
-    the first ones as they are and goes on with the next window, to the same bits.
+    ``keep`` is called with the number and the solution (coordinate,) of every least-squares problem. A later fit that
+    is given the solutions as ``solved`` takes them as they are and goes on with the next problem, to the same bits. The
+    ``noise`` of the misfit is set here, and stays that of the fit.
     """
 
     def __init__(
@@ -92,7 +103,7 @@ class GrowingWindows:
         self._solutions = 0
         self.last = [float(record.times[-1]) for record in misfit.records]
 
-        # The misfit begins with the sizes of channels for their noise. What no sensor states is a fraction of them.
+        # A new misfit has the sizes of channels, root mean squares, in the place of their noise.
         self._sizes = misfit.noise
         tables = misfit.plan.options.records
         self._is_given = [np.array([sensor.noise is not None for sensor in table.sensors]) for table in tables]
@@ -101,18 +112,18 @@ class GrowingWindows:
             noise = [sensor.noise or ASSUMED_NOISE * size for sensor, size in zip(table.sensors, sizes, strict=True)]
             misfit.noise.append(np.array(noise))
 
-        # Initial states have no bounds, only a prior.
+        # Coordinates of initial states have no bounds, only a prior.
         bounds = [(p.to_coordinate(p.low), p.to_coordinate(p.high)) for p in misfit.plan.parameters]
         bounds += [(-np.inf, np.inf)] * (misfit.size - misfit.count)
         self.low, self.high = np.array(bounds).T
 
     def fit(self, z: np.ndarray) -> Fit:
-        """Fit from the coordinates ``z`` (coordinate,) on."""
+        """Fit from the coordinates ``z`` (coordinate,) on. Raises CaseError, MotionError, and what ``check`` raises."""
         z = np.clip(z, self.low, self.high)
         windows: list[Window] = []
         best = self._pass(self._fit_linear_parts(z, windows), windows)
-        # Where noise has led the first windows into a valley next to the right one, they now begin near the right one,
-        # with weights that are those of the noise.
+        # Noise may have led the first windows into a valley next to the right one. Now they begin nearer to the right
+        # one, and residuals are weighted by the noise that was found. The better of both fits counts.
         for _ in range(REPETITIONS):
             repeated = self._pass(best.coordinates, windows)
             if repeated.deviance < best.deviance:
@@ -121,17 +132,31 @@ class GrowingWindows:
         return best._replace(windows=windows)
 
     def _pass(self, z: np.ndarray, windows: list[Window]) -> Fit:
-        """Fit all parameters over growing windows, then over all data with the noise that they show."""
+        """Fit all coordinates from ``z`` (coordinate,) on over growing windows, then with the noise of the residuals.
+
+        The windows are appended to ``windows``.
+        """
         z = self._fit_contacts(z, windows)
         if not all(map(all, self._is_given)):
             for _ in range(REWEIGHTINGS):
                 self._estimate_noise(z)
                 z = self.solve(z, self.last, self._every())
-        windows.append(self._window(z, self.last, FINAL))
-        return Fit(z, self.deviance(z), windows, self.misfit.noise.copy())
+        window = self._window(z, self.last, FINAL)
+        windows.append(window)
+        return Fit(
+            coordinates=z,
+            deviance=self.deviance(z),
+            misfit=window.misfit,
+            windows=windows,
+            noise=self.misfit.noise.copy(),
+        )
 
     def deviance(self, z: np.ndarray) -> float:
-        """Minus twice the log-likelihood at ``z`` (coordinate,) but for a constant, by which fits can be compared."""
+        """Minus twice the log-likelihood at ``z`` (coordinate,) but for a constant: of two fits the lower is better.
+
+        It is the sum of squared residuals over the noise, plus 2 log(noise) for every datum, plus the initial states'
+        prior.
+        """
         total = self.misfit.cost(z, self.last)
         for record, noise in zip(self.misfit.records, self.misfit.noise, strict=True):
             total += 2 * len(record.times) * float(np.sum(np.log(noise)))
@@ -142,7 +167,10 @@ class GrowingWindows:
         return list(range(self.misfit.size))
 
     def _fit_linear_parts(self, z: np.ndarray, windows: list[Window]) -> np.ndarray:
-        """Fit what motion without contact depends on to the records without contact, if there are any."""
+        """Fit what motion without contact depends on to the records without contact, if there are any.
+
+        Returns the coordinates (coordinate,); windows are appended to ``windows``.
+        """
         plan = self.misfit.plan
         silent = [not record.contact for record in plan.options.records]
         active = []
@@ -156,22 +184,30 @@ class GrowingWindows:
         if not any(silent) or not active:
             return z
 
+        # Windows grow here as well: over many periods of a wrong frequency the misfit has many valleys, too.
         fraction = FIRST
-        while fraction:
+        while True:
             ends = []
-            for record, end, is_silent in zip(self.misfit.records, self.last, silent, strict=True):
-                first = float(record.times[0])
-                ends.append(first + fraction * (end - first) if is_silent else -np.inf)
+            for first, last, is_silent in zip(self._first(), self.last, silent, strict=True):
+                # An end before all samples leaves a record out.
+                end = -np.inf
+                if is_silent:
+                    end = first + fraction * (last - first)
+                ends.append(end)
             precision = FINAL
             if fraction < 1:
                 precision = GROWING
             z = self.solve(z, ends, active, precision)
             windows.append(self._window(z, ends, precision))
-            fraction = 0.0 if fraction == 1 else min(fraction * plan.options.growth, 1.0)
-        return z
+            if fraction == 1:
+                return z
+            fraction = min(fraction * plan.options.growth, 1.0)
 
     def _fit_contacts(self, z: np.ndarray, windows: list[Window]) -> np.ndarray:
-        """Fit all parameters over windows with more and more of the model's contacts."""
+        """Fit all coordinates from ``z`` (coordinate,) on over windows with more and more of the model's contacts.
+
+        Returns the coordinates (coordinate,); windows are appended to ``windows``.
+        """
         options = self.misfit.plan.options
         impacts = float(options.impacts)
         begin = self._first()
@@ -183,14 +219,14 @@ class GrowingWindows:
             fitted = self.solve(z, ends, self._every(), precision)
             window = self._window(fitted, ends, precision)
             other = None
+            # Below 1 the misfit is explained by the noise alone, and no contact is missing.
             if window.misfit > 1 or is_last:
-                # A smaller misfit is explained by the noise alone, and no contact is missing.
                 other = other_contacts(self.misfit, fitted, ends, self.high, self.tolerances(precision))
             if other is not None:
                 fitted = self.solve(other, ends, self._every(), precision)
                 window = self._window(fitted, ends, precision)
 
-            # A misfit that rises shows that the window has grown past the reach of the last fit: it is shortened.
+            # A misfit that rises shows that the window has grown beyond the valley in which the fit began.
             shorter = [(a + b) / 2 for a, b in zip(begin, ends, strict=True)]
             grown = max((b - a) / (c - a0) for a, b, c, a0 in zip(begin, ends, self.last, self._first(), strict=True))
             if window.misfit > RISE * least and grown > SHORTEST:
@@ -203,9 +239,11 @@ class GrowingWindows:
             if is_last:
                 return z
             begin = ends
-            impacts = max(options.growth * window.impacts, window.impacts + 1)
+            # Contacts of each record, as ``_ends`` counts them; at least one more, if the growth does not give one.
+            impacts = max(options.growth * window.most_impacts, window.most_impacts + 1)
             lengths = [options.growth * (end - first) for first, end in zip(self._first(), ends, strict=True)]
             ends = [max(a, b) for a, b in zip(ends, self._ends(z, int(impacts), lengths), strict=True)]
+            # The next contact lies beyond the window, so that an end moves; should none do so, the fit still ends.
             if ends == begin:
                 ends = self.last
 
@@ -214,7 +252,10 @@ class GrowingWindows:
         return [float(record.times[0]) for record in self.misfit.records]
 
     def _first_lengths(self) -> list[float]:
-        """The longest first windows in s of the records, with enough data for the initial states that are estimated."""
+        """The longest first windows in s of the records: longer if an initial state that is estimated needs the data.
+
+        They bind records whose initial state is estimated (``_ends``).
+        """
         lengths = []
         for number, record in enumerate(self.misfit.records):
             unknowns = self.misfit.count
@@ -226,9 +267,10 @@ class GrowingWindows:
         return lengths
 
     def _ends(self, z: np.ndarray, impacts: int, lengths: Sequence[float]) -> list[float]:
-        """Times in s of the records' clocks before the model's contact number ``impacts`` + 1, or their last times.
+        """Times in s of the records' clocks at the model's contact number ``impacts`` + 1, or the last times.
 
-        Where the initial state is estimated, the model may not yet move, and a window has no more than its length in s.
+        A window of a record whose initial state is estimated has its length of ``lengths`` (record,) in s at most: as
+        long as that state is not found, the model has few contacts or none.
         """
         ends = []
         for number, (first, last, length) in enumerate(zip(self._first(), self.last, lengths, strict=True)):
@@ -237,12 +279,15 @@ class GrowingWindows:
             onsets = self.onsets(z, number, self.last[number], self.tolerances(GROWING))
             if len(onsets) > impacts:
                 last = min(last, float(onsets[impacts]) + self.misfit.offset(z, number))
-            # However soon contacts follow each other, a window has data.
+            # Contacts may follow each other within a sample: a window must have data.
             ends.append(max(last, float(self.misfit.records[number].times[LEAST_SAMPLES - 1])))
         return ends
 
     def onsets(self, z: np.ndarray, number: int, end: float, tolerances: Tolerances = EXACT) -> np.ndarray:
-        """The onsets (episode,) in s of the model's contacts in a record, from its first sample to its time ``end``."""
+        """The onsets (episode,) in s of the model's contacts in record ``number``, since the beginning of its drive.
+
+        They are those from the record's first sample to its time ``end``; none where the model has no motion.
+        """
         try:
             onsets = self.misfit.alone(z, number, end, tolerances).episodes["onset"]
         except (CaseError, MotionError):
@@ -251,19 +296,29 @@ class GrowingWindows:
         return np.asarray(onsets[onsets > first])
 
     def _window(self, z: np.ndarray, ends: Sequence[float], precision: Precision) -> Window:
-        """The window up to ``ends`` with its misfit, in a motion as exact as ``precision``'s."""
+        """The window up to ``ends`` (record,) in s with its misfit at ``z``, by motions as exact as the fit's."""
         tolerances = self.tolerances(precision)
-        impacts = 0
+        impacts = []
         for number, (record, end) in enumerate(zip(self.misfit.records, ends, strict=True)):
             if end >= record.times[0]:
-                impacts += len(self.onsets(z, number, end, tolerances))
+                impacts.append(len(self.onsets(z, number, end, tolerances)))
         residuals = self.misfit.residuals(z, ends, tolerances)
-        return Window(max(ends), impacts, float(np.sqrt(np.mean(residuals**2))), z.copy())
+        return Window(
+            end=max(ends),
+            impacts=sum(impacts),
+            most_impacts=max(impacts),
+            misfit=float(np.sqrt(np.mean(residuals**2))),
+            coordinates=z.copy(),
+        )
 
     def solve(
         self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision = FINAL
     ) -> np.ndarray:
-        """The coordinates (coordinate,) with the least squares over a window, by a trust region within the bounds."""
+        """The coordinates (coordinate,) with the least squares over a window, by a trust region within the bounds.
+
+        The fit begins at ``z`` (coordinate,), of which the ``active`` coordinates are fitted, to data up to ``ends``
+        (record,) in s. Raises CaseError, MotionError, and what ``check`` raises.
+        """
         number = self._solutions
         self._solutions += 1
         if number < len(self._solved):
@@ -273,7 +328,7 @@ class GrowingWindows:
         return solution
 
     def _solve(self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision) -> np.ndarray:
-        """The coordinates with the least squares over a window, computed."""
+        """What ``solve`` returns, computed."""
         active = list(active)
         start = z[active].copy()
         # While windows grow, parameters have a prior about the start of this fit; states always have one about rest.
@@ -297,7 +352,8 @@ class GrowingWindows:
 
         def jacobian(x: np.ndarray) -> np.ndarray:
             data = self.misfit.jacobian(whole(x), ends, active, tolerances)
-            # The first is at the start, where the residuals of the prior are zero with any weight.
+            # The first Jacobian sets the weights: it is asked for at the start, where the residuals of the prior are
+            # zero with any weight.
             weights[is_parameter] = np.maximum(weights[is_parameter], RIDGE * np.linalg.norm(data))
             return np.concatenate([data, np.diag(weights)])
 
@@ -306,12 +362,13 @@ class GrowingWindows:
         return whole(least_residuals(residuals, jacobian, start, bounds, precision, steps))
 
     def tolerances(self, precision: Precision) -> Tolerances:
-        """The tolerances of motions in a fit of that ``precision``, by the noise of the channels."""
+        """The tolerances of motions in a fit of that ``precision``, by the least noise of a channel over its size."""
         ratios = [np.min(noise / sizes) for noise, sizes in zip(self.misfit.noise, self._sizes, strict=True)]
         return precision.tolerances(float(min(ratios)))
 
     def _estimate_noise(self, z: np.ndarray) -> None:
-        """Estimate the noise of the channels for which none is given from their residuals."""
+        """Estimate the noise of the channels for which none is given from their residuals at ``z`` (coordinate,)."""
+        # A fit of m numbers to n data makes the mean square of the residuals smaller by 1 - m/n.
         count = sum(record.values.size for record in self.misfit.records)
         free = max(count - self._fitted(z), 1.0) / count
         for number, record in enumerate(self.misfit.records):
@@ -321,10 +378,14 @@ class GrowingWindows:
             self.misfit.noise[number] = np.where(self._is_given[number], self.misfit.noise[number], estimated)
 
     def _fitted(self, z: np.ndarray) -> float:
-        """How many data the coordinates use up: one a parameter, and less of a state that the prior holds in part."""
+        """How many numbers are fitted to the data at ``z``: one a parameter, less than one a coordinate of a state.
+
+        The prior holds a state in part.
+        """
         if not self.misfit.states:
             return float(self.misfit.count)
-        # The trace of the projection on the columns of J, with prior, over the rows of data.
+        # In the linear problem fitted data are H times data. With J = Q R, which has the rows of the prior too, H is
+        # Q_d Q_d^T, Q_d being the rows of data, and its trace is the number that is sought.
         jacobian = self.misfit.whole_jacobian(z, self.last)
         orthogonal, _ = np.linalg.qr(jacobian)
         return float(np.sum(orthogonal[: len(jacobian) - len(self.misfit.prior())] ** 2))

@@ -1,16 +1,17 @@
 r"""Coordinates of an initial state that is estimated with the parameters.
 
-A lattice of n masses has 2n numbers in its state. With the modes phi_k (mass-normalised) and frequencies W_k of the
-lattice without contacts,
+The state of a lattice of n masses has 2n numbers. With the modes phi_k (mass-normalised) and frequencies W_k in rad/s
+of the lattice without contacts they are written as
 
     u = sqrt(e) sum_k a_k phi_k/W_k,    u' = sqrt(e) sum_k b_k phi_k,
 
-e(a_k^2 + b_k^2)/2 is the energy of mode k. With a_k and b_k normal of variance 1, a sensor of the derivative of order
-r of u_i has the mean square e sum_k (phi_ki W_k^(r-1))^2. The scale e in J is the largest for which a sensor's mean
-square is the measured one, so that coordinates are numbers of order one wherever in the lattice the energy is.
+so that e(a_k^2 + b_k^2)/2 is the energy of mode k in J. The coordinates of the fit are the a_k, then the b_k. If they
+were independent and normal with variance 1, the derivative of order r of u_i would have the mean square
+e sum_k (phi_ki W_k^(r-1))^2. Each sensor thus has an e with which this is the mean square that it measured; the scale e
+in J is the largest of them. Coordinates are then numbers of order one wherever in the lattice the energy is.
 
 A few sensors may not determine all coordinates. A weak prior, normal with a standard deviation of ``WIDTH``, keeps the
-others finite: no mode has more than some hundred times the energy that was measured.
+others finite: no mode has more than some hundred times e, the energy of a mode that was measured.
 """
 
 from collections.abc import Sequence
@@ -27,18 +28,21 @@ from vipetsc.identification.motion import MotionCoefficients
 
 # Standard deviation of the prior of a coordinate.
 WIDTH = 10.0
-# ... and while windows grow, when data are few: modes as lively as the liveliest sensor.
+# Standard deviation while windows grow and data are few: that of modes with the energy that was measured.
 NARROW = 1.0
-# A mode without stiffness has an infinite 1/W: this fraction of the lowest elastic frequency takes the place of W. Its
-# displacement may then be ten times that of the slowest elastic mode.
+# A mode without stiffness has W = 0, and 1/W is infinite. This fraction of the lowest elastic frequency takes the place
+# of W: with the same coordinate the mode's displacement is ten times that of the slowest elastic mode.
 SLOW = 0.1
-# Frequencies below this fraction of the highest one are those of modes without stiffness: rounding of squared
-# frequencies, 1e-16, leaves them 1e-8.
+# Frequencies below this fraction of the highest one are those of modes without stiffness. Squared frequencies are
+# rounded at 1e-16 of the highest one's square: zero comes out as 1e-8 of the highest frequency.
 RIGID = 1e-6
 
 
 class InitialState(NamedTuple):
-    """The state is ``matrix`` (2n, 2n) times the coordinates, of which the first has the index ``first``."""
+    """A state (2n,) that is estimated: ``matrix`` (2n, 2n) times its coordinates.
+
+    Among all coordinates of the fit they have the indices from ``first`` on.
+    """
 
     first: int
     matrix: np.ndarray
@@ -55,12 +59,12 @@ class InitialState(NamedTuple):
 
 
 def initial_state(model: Model, first: int, sensors: Sequence[tuple[int, int, float]]) -> InitialState:
-    """Coordinates from index ``first`` on of the initial state of ``model``.
+    """The initial state of ``model`` in coordinates that have the indices from ``first`` on.
 
-    ``sensors`` are the mass (0-based), the order of the derivative of its displacement that is measured, and the root
-    mean square of what was measured.
+    A sensor is the mass (0-based), the order of the derivative of its displacement that is measured, and the root mean
+    square of what was measured.
     """
-    # Modes of the lattice whose contacts are open.
+    # Modes of the lattice without contacts.
     coefficients = MotionCoefficients.of(model)
     n = len(coefficients.masses)
     rows = np.repeat(np.arange(n), np.diff(coefficients.first))
@@ -70,12 +74,15 @@ def initial_state(model: Model, first: int, sensors: Sequence[tuple[int, int, fl
     squares, vectors = scipy.linalg.eigh(stiffness / np.outer(roots, roots))
     frequencies = np.sqrt(np.maximum(squares, 0.0))
 
+    # Without any spring the drive sets the scale of the frequencies.
     elastic = frequencies > RIGID * frequencies[-1]
-    slowest = SLOW * (frequencies[elastic].min() if elastic.any() else model.drive.frequency)
-    frequencies = np.maximum(frequencies, slowest)
+    lowest = model.drive.frequency
+    if elastic.any():
+        lowest = frequencies[elastic].min()
+    frequencies = np.maximum(frequencies, SLOW * lowest)
     shapes = vectors / roots[:, None]
 
-    # sqrt(e), from the sensor that needs the largest.
+    # sqrt(e), the largest of the sensors'.
     scale = 0.0
     for mass, order, size in sensors:
         deviation = np.sqrt(np.sum((shapes[mass] * frequencies ** (order - 1)) ** 2))
@@ -84,7 +91,10 @@ def initial_state(model: Model, first: int, sensors: Sequence[tuple[int, int, fl
 
 
 def state_of(model: Model) -> np.ndarray:
-    """The state (2n,) in m and m/s in which ``model`` begins, that of rest without an initial motion."""
+    """The state (2n,) in m and m/s in which ``model`` begins: rest, if it has no initial motion.
+
+    Raises CaseError if the file of an initial state is gone or has changed.
+    """
     chain = model.chain
     if model.initial is None:
         return np.zeros(2 * chain.cells * chain.cell.dofs)

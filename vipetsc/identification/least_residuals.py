@@ -1,7 +1,8 @@
-"""Least squares by SciPy's trust region within bounds, which ends before derivatives that nothing uses.
+"""Least squares by SciPy's trust region within bounds, without the derivatives at the end of the fit.
 
-SciPy asks for the Jacobian behind every step that is taken, and looks only then whether the fit ends with this step. Of
-a fit with two or three steps these are a third of all derivatives, which cost several times as much as a motion.
+SciPy asks for the Jacobian after every step that is taken, and checks only then whether the fit ends with that step. A
+fit of two or three steps computes a third of its Jacobians for nothing, and each costs several times as much as a
+motion. Here the same check comes first, and ends the fit.
 """
 
 from collections.abc import Callable
@@ -12,8 +13,8 @@ from scipy.optimize import least_squares
 
 from vipetsc.identification.precision import TOLERANCE, Precision
 
-# Least reduction of the cost over the one expected, as SciPy's: with a smaller one the model of the step is a bad one,
-# and a small reduction says nothing of how near the end is.
+# Least reduction of the cost in a step, over the one expected from the Jacobian, for a small reduction to end the fit.
+# SciPy has the same number: below it the linear model of the step is bad, and the next step may reduce the cost more.
 LEAST_RATIO = 0.25
 
 Function = Callable[[np.ndarray], np.ndarray]
@@ -29,8 +30,8 @@ def least_residuals(
 ) -> np.ndarray:
     """The coordinates (active,) with the least squares of ``residuals`` (datum,), from ``start`` (active,) on.
 
-    ``jacobian`` gives derivatives (datum, active); ``bounds`` are the lowest and highest coordinates. The fit has
-    ``steps`` evaluations at most.
+    ``jacobian`` gives derivatives (datum, active); ``bounds`` are the lowest and the highest coordinates (active,). The
+    residuals are evaluated ``steps`` times at most. Raises what ``residuals`` and ``jacobian`` raise.
     """
     latest = np.zeros(0)
     taken: list[_Step] = []
@@ -41,7 +42,7 @@ def least_residuals(
         return latest
 
     def differentiate(x: np.ndarray) -> np.ndarray:
-        # Asked for at the start and behind every step that is taken, whose residuals are the latest.
+        # SciPy calls this at the start and after every step that is taken: the latest residuals are those at x.
         if taken and taken[-1].ends_at(x, latest, precision):
             raise _FitEnd(x.copy())
         slopes = jacobian(x)
@@ -52,7 +53,7 @@ def least_residuals(
     try:
         solution = least_squares(
             evaluate,
-            # A start on a bound is moved inside by the method, and a start outside is refused.
+            # SciPy moves a start on a bound inside and refuses one outside, where rounding may have put it.
             np.clip(start, low, high),
             jac=differentiate,
             bounds=bounds,
@@ -84,13 +85,18 @@ class _Step(NamedTuple):
     slopes: np.ndarray
 
     def ends_at(self, x: np.ndarray, residuals: np.ndarray, precision: Precision) -> bool:
-        """Whether a fit ends with the step to ``x`` (active,), where ``residuals`` (datum,) are, as SciPy does."""
+        """Whether a fit ends with the step to ``x`` (active,), where the residuals are ``residuals`` (datum,).
+
+        The conditions are SciPy's for a small step and for a small reduction of the cost, the latter without the terms
+        by which its trust region keeps away from the bounds.
+        """
         moved = x - self.x
         if np.linalg.norm(moved) < precision.step * (precision.step + np.linalg.norm(x)):
             return True
 
         cost = float(self.residuals @ self.residuals)
         gain = cost - float(residuals @ residuals)
+        # The reduction that the Jacobian at the beginning of the step let expect.
         linear = self.residuals + self.slopes @ moved
         expected = cost - float(linear @ linear)
         return gain < precision.cost * cost and gain > LEAST_RATIO * expected

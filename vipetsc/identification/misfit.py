@@ -25,14 +25,16 @@ from vipetsc.identification.precision import EXACT, Tolerances
 
 # Rows of a response, by the quantity of a sensor; the derivative with respect to time is in the row after it.
 ROWS = {"displacement": 0, "velocity": 1, "acceleration": 2}
-# Residual of a motion that cannot be computed: a step that leads there is rejected.
+# Residual of a motion that cannot be computed, in units of the noise: a step that leads there is rejected. Residuals as
+# large as the data themselves are less than this as long as the noise is more than 1e-8 of the data.
 REJECTED = 1e8
 # Derivatives of a record are integrated in so many parts at most, of so many coordinates at least. The parts do not
-# depend on the number of ranks that work on them, and so the steps, and all bits, do not. Each part has the motion of
-# its own: seven derivatives in two parts cost 1.3 times as much as in one.
+# depend on the number of ranks that share them, and with the parts all steps and bits are the same on any number. Each
+# part integrates the motion again: seven derivatives in two parts cost 1.3 times as much as in one.
 MOST_PARTS = 8
 LEAST_PART = 8
-# Motions without derivatives that are kept: residuals, contacts and cost at the end of a fit are those of one motion.
+# Motions without derivatives that are kept: at the end of a fit the residuals, the contacts and the cost are asked for
+# of the same motion.
 KEPT = 8
 
 Job = Callable[[], np.ndarray]
@@ -44,11 +46,12 @@ def one_by_one(jobs: Sequence[Job]) -> list[np.ndarray]:
 
 
 class Misfit:
-    """Residuals of the ``records`` of a ``plan`` over what is allowed, (model - measured)/``noise``.
+    """Residuals of the ``records`` of a ``plan`` over their noise, (model - measured)/``noise``.
 
-    ``noise`` has one array (sensor,) a record, in SI units. Coordinates z (coordinate,) are those of the parameters,
-    then those of the initial states that are estimated, ``states`` by the number of the record; there are ``size``.
-    ``compute`` returns the values of jobs that do not depend on each other: ranks may divide them.
+    ``noise`` has one array (sensor,) a record, in SI units; a new misfit has the root mean squares of the channels
+    there. The ``size`` coordinates z (coordinate,) are those of the parameters, then those of the initial states that
+    are estimated, ``states`` by the number of the record. ``watched`` (record) are the masses (sensor,) at which the
+    sensors are. ``compute`` returns the values of jobs that do not depend on each other: ranks may share them.
     """
 
     def __init__(
@@ -94,7 +97,7 @@ class Misfit:
         return len(self.plan.parameters)
 
     def model(self, z: np.ndarray, number: int) -> Model:
-        """The model of record ``number`` at ``z`` (coordinate,); raises CaseError if it is impossible."""
+        """The model of record ``number`` (from 0) at ``z`` (coordinate,); raises CaseError if it is impossible."""
         return self._trials[number].case(self.values(z)).model()
 
     def values(self, z: np.ndarray) -> np.ndarray:
@@ -124,7 +127,7 @@ class Misfit:
         return inner, [p for p in active if state and p in state.indices]
 
     def alone(self, z: np.ndarray, number: int, end: float, tolerances: Tolerances = EXACT) -> RecordedMotion:
-        """The motion of record ``number`` at its sensors up to its time ``end``, without derivatives.
+        """The motion of record ``number`` at its sensors up to the time ``end`` in s of its clock, without derivatives.
 
         Raises CaseError, MotionError.
         """
@@ -132,7 +135,7 @@ class Misfit:
         return self._alone(tuple(z.tolist()), number, samples, tolerances)
 
     def _new_alone(self, z: tuple[float, ...], number: int, samples: int, tolerances: Tolerances) -> RecordedMotion:
-        """The motion over so many ``samples``."""
+        """The motion of ``alone`` at ``z`` (coordinate,) over so many ``samples``; a cache needs a tuple of numbers."""
         end = float(self.records[number].times[samples - 1])
         return self.respond(np.array(z), number, end, tolerances=tolerances)
 
@@ -146,10 +149,11 @@ class Misfit:
         stride: int = 1,
         tolerances: Tolerances = EXACT,
     ) -> RecordedMotion:
-        """The motion of record ``number`` up to its time ``end``, with derivatives by its ``columns`` of ``active``.
+        """The motion of record ``number`` up to the time ``end`` in s of its clock, at ``z`` (coordinate,).
 
-        It is that of the masses ``watched`` (mass,), by default those of the sensors, at every ``stride``-th sample.
-        Raises CaseError, MotionError.
+        It has derivatives by those of the ``active`` coordinates that ``columns`` names, in that order. It is that of
+        the masses ``watched`` (mass,), by default those of the sensors, at every ``stride``-th sample. Raises
+        CaseError, MotionError.
         """
         table = self.plan.options.records[number]
         model = self.model(z, number)
@@ -176,9 +180,9 @@ class Misfit:
     def _begin(
         self, z: np.ndarray, number: int, model: Model, by_parameter: Sequence[ParameterSlope], estimated: Sequence[int]
     ) -> MotionBegin | None:
-        """The beginning of the motion of record ``number``; None for rest.
+        """The beginning of the motion of record ``number`` at ``z`` (coordinate,); None for rest.
 
-        ``by_parameter`` are derivatives; those by the ``estimated`` coordinates of the initial state follow.
+        Its derivatives are those ``by_parameter``, then those by the ``estimated`` coordinates of the initial state.
         """
         state = self.states.get(number)
         if state is not None:
@@ -196,10 +200,10 @@ class Misfit:
         return MotionBegin(0.0, begin, slopes)
 
     def _earliest(self, number: int) -> float:
-        """The time in s since the beginning of the drive of the state that is estimated for record ``number``.
+        """The time in s, since the drive's beginning, at which the state that is estimated for a record is taken.
 
-        That is the first sample's, and of an unknown offset the earliest that it can have: the state does not then
-        depend on the offset.
+        It is the time of the first sample of record ``number``. If the offset is unknown, it is the earliest that this
+        sample may have: what the state stands for does not then depend on the offset.
         """
         offset = self.plan.options.records[number].offset
         if isinstance(offset, list):
@@ -216,7 +220,8 @@ class Misfit:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Values of the model at the sensors of a record (sample, sensor), and derivatives (sample, sensor, active).
 
-        Raises CaseError, MotionError.
+        ``z`` (coordinate,) are the model's coordinates, ``end`` in s is a time of the record's clock. Raises CaseError,
+        MotionError.
         """
         if active:
             response = self.respond(z, number, end, active, tolerances=tolerances)
@@ -237,10 +242,11 @@ class Misfit:
                 values[:, k] = motion[:, k, row, 0]
                 rate = motion[:, k, row + 1, 0]
 
+            # The amplitude that is sought is the first drive's, unless the record has one of its own.
             is_of_amplitude = sensor.drive in (None, 1) and "amplitude" not in table.drive
             for column, p in enumerate(active):
                 if self._is(p, "offset"):
-                    # A later beginning of the drive shifts the whole motion.
+                    # A later beginning of the drive shifts the whole motion to later times.
                     parameter = self.plan.parameters[p]
                     is_own = parameter.members == (number,)
                     slopes[:, k, column] = -rate * parameter.slope(z[p]) * is_own
@@ -257,7 +263,7 @@ class Misfit:
         return p < self.count and self.plan.parameters[p].quantity == quantity
 
     def _force(self, z: np.ndarray, number: int, end: float, drive: int) -> tuple[np.ndarray, np.ndarray]:
-        """The force (sample,) in N of a ``drive`` and its rate in N/s."""
+        """The force (sample,) in N of the ``drive`` of that number (from 0), and its rate in N/s."""
         model = self.model(z, number)
         drives = create_drives(model.drives, range(len(model.drives)))
         times = self.times(z, number, end)
@@ -268,9 +274,10 @@ class Misfit:
         return force * started, (after - before) / (2 * short) * started
 
     def residuals(self, z: np.ndarray, ends: Sequence[float], tolerances: Tolerances = EXACT) -> np.ndarray:
-        """Residuals (datum,) up to the time ``ends`` of each record's clock; REJECTED where there is no motion.
+        """Residuals (datum,) over the noise at ``z`` (coordinate,), up to times ``ends`` (record,) in s of the records.
 
-        Data are ordered by record, sample, sensor; a record with an end of -inf is left out.
+        Data are ordered by record, sample, sensor; a record with an end of -inf is left out. Residuals of a record are
+        ``REJECTED`` where the model is impossible or its motion cannot be followed.
         """
 
         def residuals_of(number: int) -> np.ndarray:
@@ -293,6 +300,7 @@ class Misfit:
             _, slopes = self.predicted(z, number, ends[number], part, tolerances)
             return np.asarray(slopes / self.noise[number][:, None]).reshape(-1, len(part))
 
+        # By which coordinates each part of each record is differentiated; initial states act on their records alone.
         parts = []
         for number in self._used(ends):
             relevant = [p for p in active if p < self.count or p in self.columns(number, active)[1]]
@@ -312,7 +320,10 @@ class Misfit:
         return np.concatenate(blocks)
 
     def cost(self, z: np.ndarray, ends: Sequence[float], tolerances: Tolerances = EXACT) -> float:
-        """The sum of squares at ``z`` (coordinate,) of residuals over the noise, and of the initial states' prior."""
+        """The sum of squares at ``z`` (coordinate,) of residuals over the noise and of the initial states' prior.
+
+        The residuals are those up to ``ends`` (record,) in s.
+        """
         data = self.residuals(z, ends, tolerances)
         return float(np.sum(data**2)) + float(np.sum((self.prior() @ z) ** 2))
 
@@ -321,7 +332,10 @@ class Misfit:
         return [n for n, (record, end) in enumerate(zip(self.records, ends, strict=True)) if record.times[0] <= end]
 
     def prior(self) -> np.ndarray:
-        """The slopes (state coordinate, coordinate) of residuals that keep initial states finite: coordinate/WIDTH."""
+        """The slopes (state coordinate, coordinate) of the prior's residuals, which are coordinates over ``WIDTH``.
+
+        They keep initial states finite.
+        """
         return np.eye(self.size)[self.count :] / WIDTH
 
     def whole_jacobian(self, z: np.ndarray, ends: Sequence[float]) -> np.ndarray:

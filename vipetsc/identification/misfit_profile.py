@@ -1,8 +1,8 @@
 """Profiles of the misfit: one parameter is held at some values, and all others are fitted to each of them.
 
-The fits of one side follow each other outwards, each from the one before. In the direction of the covariance alone the
-model may lose a contact that only grazes its stop. The misfit then jumps, and no derivative leads back to a motion with
-that contact, though the least misfit may have it.
+The fits of one side follow each other outwards, each from the one before. If all began at the middle and only moved in
+the direction of the covariance, the model might lose a contact that just grazes its stop. The misfit then jumps, and no
+derivative leads back to a motion with that contact, though the least misfit may have it.
 """
 
 from typing import Literal, NamedTuple
@@ -15,10 +15,11 @@ from vipetsc.identification.uncertainty import uncertainty_of
 
 # Distance in standard errors of the outermost values of a profile.
 REACH = 3.0
-# A profile rises by about ten over its reach. The tolerance is relative to the cost, which is about the number of data.
+# The cost, about the number of data, rises by about ten over the reach of a profile (by 9 where the problem is linear).
+# The relative tolerance of 1e-5 is one of 0.01 for a thousand data.
 PRECISION = Precision(steps=30, cost=1e-5, derivatives=1e-5, is_rough=True)
-# Where a step to the next value changes the contacts it is halved, down to this part of the distance: four halvings.
-# Contacts that change within a smaller step are taken to do so in the motion of the least misfit, too.
+# A step to the next value that changes the contacts is halved, down to this fraction of the distance: four halvings.
+# Contacts that change within a smaller step are taken to change in the motion of the least misfit, too.
 SMALLEST_STEP = 1 / 16
 # Coordinates, numbers of order one, count as equal within their rounding.
 SAME = 1e-12
@@ -30,16 +31,17 @@ SIDES: tuple[Side, ...] = ("below", "above")
 class MisfitProfile(NamedTuple):
     """Coordinates ``places`` (parameter, place) at which each parameter is held.
 
-    All coordinates move ``along`` (parameter, coordinate) with it, by the covariance.
+    ``along`` (parameter, coordinate) is how far each coordinate moves, by the covariance, with a parameter that is held
+    at a coordinate larger by 1.
     """
 
     places: np.ndarray
     along: np.ndarray
 
     def outwards(self, number: int, middle: float, side: Side) -> np.ndarray:
-        """The numbers (place,) of a parameter's places on one ``side`` of the coordinate ``middle``, nearest first.
+        """Numbers (place,) of the places of parameter ``number`` on one ``side`` of the coordinate ``middle``.
 
-        A place at the middle itself counts as one above it.
+        The nearest comes first. A place at the middle itself counts as one above it.
         """
         places = self.places[number]
         if side == "above":
@@ -52,10 +54,12 @@ def profile_about(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitP
     uncertainty = uncertainty_of(windows.misfit.whole_jacobian(z, windows.last))
     errors = uncertainty.errors
     sought = range(windows.misfit.count)
+    # A parameter that is not determined is held at values between its bounds.
     reach = np.where(uncertainty.determined, REACH * errors, np.inf)
     low = np.maximum(z - reach, windows.low)[sought]
     high = np.minimum(z + reach, windows.high)[sought]
-    # The covariance says where the others go, as long as the problem is nearly linear.
+    # Of a linear problem the least misfit with one coordinate held at a distance of 1 moves coordinate j by
+    # cov_ij/cov_ii.
     along = (uncertainty.correlation * errors / errors[:, None])[sought]
     along = np.where(uncertainty.determined[sought, None], along, 0.0)
     return MisfitProfile(np.linspace(low, high, count, axis=1), along)
@@ -64,7 +68,10 @@ def profile_about(windows: GrowingWindows, z: np.ndarray, count: int) -> MisfitP
 def profile_costs(
     windows: GrowingWindows, z: np.ndarray, profile: MisfitProfile, number: int, side: Side
 ) -> list[float]:
-    """The least costs at a parameter's places on one ``side`` of the fit ``z`` (coordinate,), nearest place first."""
+    """The least costs at the places of parameter ``number`` on one ``side`` of the fit ``z`` (coordinate,).
+
+    The nearest place comes first. Raises CaseError, MotionError.
+    """
     held = z.copy()
     slope = profile.along[number]
     costs = []
@@ -77,9 +84,10 @@ def profile_costs(
 def _follow(
     windows: GrowingWindows, z: np.ndarray, slope: np.ndarray, number: int, value: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The fit with coordinate ``number`` held at ``value``, from the fit ``z``, and the ``slope`` of all coordinates.
+    """The fit (coordinate,) with coordinate ``number`` held at ``value``, from the fit ``z`` on, and its slope there.
 
-    The slopes are those over the coordinate that is held. Steps in which a contact comes or goes are halved.
+    The ``slope`` (coordinate,) of all coordinates, over the one that is held, predicts the fit. Steps in which a
+    contact comes or goes are halved.
     """
     others = [other for other in range(len(z)) if other != number]
     contacts = _contacts(windows, z)

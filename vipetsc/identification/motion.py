@@ -23,9 +23,9 @@ from vipetsc.lattice import Chain, UnitCell, nonlinear_places
 from vipetsc.lattice.chain import Ends
 from vipetsc.modes.shooting.dop853 import STAGES
 
-# Errors are relative to the largest value so far, and to this fraction of the linear wave at least. Derivatives by a
-# clearance are zero up to an onset; behind it their acceleration grows as the root of time, by Hertz's law, and no step
-# would resolve that relative to values near zero.
+# Errors are relative to the largest value so far, and to this fraction of the linear wave's size at least. Derivatives
+# by a clearance are zero up to an onset. After it their acceleration grows, by Hertz's law, as the root of the time:
+# relative to values near zero no step would resolve that.
 FLOOR = 1e-2
 
 
@@ -34,10 +34,11 @@ class MotionError(RuntimeError):
 
 
 class MotionCoefficients(NamedTuple):
-    """The coefficients of a model's equations of motion, in arrays that can be differenced.
+    """The coefficients of a model's equations of motion, in arrays of which differences can be taken.
 
-    ``masses`` (n,) in kg; ``stiffness`` and ``damping`` (entry,) in N/m and N s/m, over the pattern ``first`` (n + 1,)
-    and ``columns`` (entry,) of both; ``sites`` (site,) of dtype ``SITE``; ``gains`` (drive,) of the drives, in N.
+    ``masses`` (n,) in kg. The matrices of ``stiffness`` in N/m and ``damping`` in N s/m have one pattern: the entries
+    (entry,) of row i have the numbers ``first[i]`` to ``first[i + 1]``, and ``columns`` (entry,) their columns.
+    ``sites`` (site,) are of dtype ``SITE``; ``gains`` (drive,) are the amplitudes of the drives' forces, in N.
     """
 
     masses: np.ndarray
@@ -52,8 +53,9 @@ class MotionCoefficients(NamedTuple):
     def of(cls, model: Model) -> "MotionCoefficients":
         """The coefficients of a ``model``."""
         chain = model.chain
-        # Trial cases differ in their contacts more often than in their cells. Cells that vary are never sought, and
-        # arrays that vary cannot be looked up.
+        # Trial cases differ in their contacts more often than in their cells: the matrices of equal cells are kept. A
+        # lattice whose cells differ is described by arrays, by which nothing can be looked up; its cells are never
+        # sought.
         matrices = _matrices(chain)
         if chain.variation is None:
             matrices = _matrices_of_equal_cells(chain.cell, chain.cells, chain.ends)
@@ -61,7 +63,7 @@ class MotionCoefficients(NamedTuple):
 
 
 class MatrixEntries(NamedTuple):
-    """Masses, stiffness and damping of a lattice, as of ``MotionCoefficients``."""
+    """Masses, stiffness and damping of a lattice, as in ``MotionCoefficients``."""
 
     masses: np.ndarray
     first: np.ndarray
@@ -76,15 +78,14 @@ def _matrices(chain: Chain) -> MatrixEntries:
     masses = chain.masses()
     n = len(masses)
 
-    # One pattern for both matrices: places are numbered row by row, and the springs have every place of a dashpot
-    # between masses.
+    # One pattern for both matrices, their places numbered row by row: those of springs, dashpots and the diagonal.
     diagonal = np.arange(n) * (n + 1)
     places = [matrix.rows * n + matrix.columns for matrix in matrices]
     pattern = np.unique(np.concatenate([*places, diagonal]))
     values = []
     for matrix, place in zip(matrices, places, strict=True):
         sums = np.bincount(np.searchsorted(pattern, place), matrix.values, len(pattern))
-        # Sums of no entries, as of a cell without springs, are integers.
+        # NumPy sums no entries at all, as those of a cell without springs, to integers.
         values.append(sums.astype(float))
     return MatrixEntries(
         masses=masses,
@@ -102,12 +103,12 @@ def _matrices_of_equal_cells(cell: UnitCell, cells: int, ends: Ends) -> MatrixEn
 
 
 def gains_of(model: Model) -> np.ndarray:
-    """The amplitudes (drive,) in N of the drives, those of a wall's motion times the stiffness of its spring."""
+    """The amplitudes (drive,) in N of the drives' forces: that of a moved wall times the stiffness of its spring."""
     return np.array([drive.waveform.amplitude * (drive.stiffness or 1.0) for drive in model.drives])
 
 
 def no_slopes(model: Model, middle: MotionCoefficients) -> Slopes:
-    """The derivatives of ``middle``, the coefficients of ``model``, by a parameter on which none of them depends.
+    """The derivatives of ``middle``, the coefficients of ``model``, by a parameter on which none depends: zeros.
 
     Arrays have no axis of parameters.
     """
@@ -125,10 +126,10 @@ def no_slopes(model: Model, middle: MotionCoefficients) -> Slopes:
 
 
 def slopes_between(low: Model, high: Model, width: float, model: Model, middle: MotionCoefficients) -> Slopes:
-    """Derivatives of ``middle``, the coefficients of ``model``, by central differences between two models.
+    """Derivatives of ``middle``, the coefficients of ``model``, by the difference between two other models.
 
-    ``width`` is the distance of the parameter, or of its coordinate, in ``low`` and ``high``. Coefficients are affine
-    in most parameters and smooth in the others, so that no truncation is seen. Arrays have no axis of parameters.
+    ``width`` is the distance of the parameter, or of its coordinate, in ``low`` and ``high``. Arrays have no axis of
+    parameters.
     """
     slopes = no_slopes(model, middle)
     # Matrices take most of the time, and contacts have no part in them.
@@ -143,7 +144,7 @@ def slopes_between(low: Model, high: Model, width: float, model: Model, middle: 
             slopes.curves[:, k] = (laws[1][name] - laws[0][name]) / width
         slopes.linear[...] = True
 
-    # Forces of drives are multiplied by a factor, so that their derivatives are relative to it.
+    # Derivatives of a drive's force are that force times these numbers: they are relative to the amplitude.
     gains = gains_of(high) - gains_of(low)
     slopes.drives[:] = gains / width / np.where(middle.gains != 0, middle.gains, 1.0)
     sites = [site_records(at, np.arange(len(at.chain.sites))) for at in (low, high)]
@@ -158,15 +159,15 @@ def slopes_between(low: Model, high: Model, width: float, model: Model, middle: 
 
 
 def scaled_slopes(slopes: Slopes, factor: float) -> Slopes:
-    """Derivatives by a parameter, ``factor`` times those of ``slopes``."""
+    """Derivatives by a parameter that are ``factor`` times ``slopes``; ``linear``, which is no number, stays."""
     scaled = {name: factor * array for name, array in slopes._asdict().items() if name != "linear"}
     return slopes._replace(**scaled)
 
 
 def stacked_slopes(rows: Sequence[Slopes], none: Slopes) -> Slopes:
-    """The derivatives ``rows`` of each parameter in arrays with an axis of parameters.
+    """The derivatives ``rows``, one for each parameter, in arrays whose first axis is that of parameters.
 
-    ``none`` are those of ``no_slopes``, which give the arrays their shapes where there is no parameter.
+    ``none`` are those of ``no_slopes``: without a parameter they give the arrays their shapes.
     """
     stacked = (np.stack(arrays) for arrays in zip(none, *rows, strict=True))
     return Slopes(*(array[1:] for array in stacked))
@@ -175,9 +176,9 @@ def stacked_slopes(rows: Sequence[Slopes], none: Slopes) -> Slopes:
 class RecordedMotion(NamedTuple):
     """A motion at samples.
 
-    ``motion`` (sample, watched, 4, column): u, u', u'' in m, m/s, m/s^2, and u''' in column 0; column 0 is the motion,
-    column 1 + p its derivative with respect to parameter p. ``episodes`` are the contacts, of dtype ``EPISODE``;
-    ``reached`` (site, 2) the largest |w| in m on the sides + and -.
+    ``motion`` (sample, watched mass, 4, column): u, u', u'' in m, m/s, m/s^2, and in column 0 also u''' in m/s^3.
+    Column 0 is the motion, column 1 + p its derivative with respect to parameter p. ``episodes`` (episode,) are the
+    contacts, of dtype ``EPISODE``; ``reached`` (site, 2) the largest w and -w in m at ends of steps, at least 0.
     """
 
     motion: np.ndarray
@@ -197,10 +198,12 @@ def respond(
 ) -> RecordedMotion:
     """The motion of ``model`` and its derivatives at the rising ``times`` (sample,) in s.
 
-    ``coefficients`` are the model's. The motion starts as ``begin`` says, by default from rest at t = 0. ``watched``
-    are masses (0-based, cell by cell); without ``touches`` no site ever closes. Raises MotionError.
+    ``coefficients`` are the model's, ``slopes`` their derivatives by the parameters. The motion starts as ``begin``
+    says, by default from rest at t = 0. ``watched`` (mass,) are the masses that are sampled, 0-based and cell by cell.
+    Without ``touches`` no site ever closes. Raises MotionError if it cannot be followed to the last time.
     """
     chain = model.chain
+    # A copy: the motion sets the modes of its sites, and the coefficients stay as they are.
     sites = coefficients.sites.copy()
     if not touches:
         sites["clearance"] = sites["clearance_minus"] = np.inf
@@ -238,7 +241,8 @@ def respond(
         state.state[:, 0] = begin.state
         state.state[:, 1:] = begin.slopes
         begin_contacts(lattice, state, tracker)
-    # Kernels are compiled once for each layout of their arguments.
+    # Times of every n-th sample are not contiguous, and for arrays of another layout the kernels would be compiled
+    # once more.
     instants = np.ascontiguousarray(times)
     outcome, tracks, motion, reached = integrate(
         lattice, state, tracker.tracks, fastest(coefficients), instant, instants, watched
@@ -251,7 +255,7 @@ def respond(
 
 
 def _curved_springs(chain: Chain, slopes: Slopes) -> CurvedSprings:
-    """The springs of ``chain`` that have a quadratic or cubic part, or in which one is sought that is zero now."""
+    """The springs of ``chain`` with a quadratic or cubic part, or whose quadratic or cubic part is sought."""
     has_slope = slopes.curves.any(axis=(0, 2))
     places = nonlinear_places(chain, also=np.flatnonzero(has_slope).tolist())
     return CurvedSprings(
@@ -262,7 +266,10 @@ def _curved_springs(chain: Chain, slopes: Slopes) -> CurvedSprings:
 
 
 def create_motion(rows: int, columns: int, sites: int, scale: float, tolerances: Tolerances = EXACT) -> MotionState:
-    """The state of rest and the workspace of so many ``rows``, 2n, and ``columns``; ``scale`` in m is that of waves."""
+    """The state of rest and the workspace of a motion with so many ``rows``, 2n, ``columns`` and ``sites``.
+
+    ``scale`` in m is the size of the linear wave.
+    """
     return MotionState(
         state=np.zeros((rows, columns)),
         end=np.zeros((rows, columns)),
@@ -279,7 +286,9 @@ def create_motion(rows: int, columns: int, sites: int, scale: float, tolerances:
 
 
 def fastest(coefficients: MotionCoefficients) -> float:
-    """A bound in rad/s of the fastest mode's frequency, by Gershgorin's circles."""
+    """An upper bound in rad/s of the frequencies of the lattice without contacts."""
+    # No eigenvalue of a symmetric matrix exceeds the largest sum of magnitudes in a row (Gershgorin). The matrix is
+    # K_ij/(m_i m_j)^(1/2), whose eigenvalues are the squared frequencies.
     rows = np.repeat(np.arange(len(coefficients.masses)), np.diff(coefficients.first))
     inverse = 1 / coefficients.masses
     weights = abs(coefficients.stiffness) * np.sqrt(inverse[rows] * inverse[coefficients.columns])

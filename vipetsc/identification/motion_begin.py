@@ -8,13 +8,13 @@ from vipetsc.contact.law import CLIPPED, FREE, elastic_energy, elastic_force, ga
 from vipetsc.contact.tracker import ImpactTracker
 from vipetsc.identification.motion_rates import Lattice, MotionState, difference
 
-# Half the distance of exponents between which the elastic energy is differenced: h^2 of it is the error of the formula,
-# 1e-16/h that of rounding, both below what a fit sees of an exponent.
+# Half the distance h of the exponents between which a difference of the elastic energy is taken. Over the energy, the
+# error of the formula is about h^2, 1e-12, and that of rounding 1e-16/h, 1e-10: both less than a fit sees.
 SHORT = 1e-6
 
 
 class MotionBegin(NamedTuple):
-    """A ``time`` in s, the ``state`` (2n,) in m and m/s then, and its derivatives ``slopes`` (2n, parameter)."""
+    """The ``state`` (2n,) in m and m/s at a ``time`` in s, and its derivatives ``slopes`` (2n, parameter)."""
 
     time: float
     state: np.ndarray
@@ -25,11 +25,13 @@ def begin_contacts(lattice: Lattice, motion: MotionState, tracker: ImpactTracker
     """Close the sites that the state of ``motion`` holds beyond their clearances, with the derivatives of w'_minus.
 
     As in ``ImpactTracker.begin``, mu (w'_minus^2 - w'^2)/2 is the elastic energy E(x): the impact had no loss before
-    the motion begins. Hence w'_minus dw'_minus = w' dw' + d(E/mu).
+    the motion begins. Hence w'_minus dw'_minus = w' dw' + d(E/mu), where E depends on the indentation x = sigma w - D,
+    on the contact stiffness, to which it is proportional, and on the exponent of the law.
     """
     contacts = lattice.contacts
     n = len(lattice.inverse_mass)
     rows = range(len(contacts))
+    # w and w' of each site: rows of the state from 0 on are displacements, from n on velocities.
     w = [[difference(motion.state, lattice.ends, i, first, 0) for first in (0, n)] for i in rows]
     closed = tracker.begin(np.array(w).reshape(-1, 2))
 
@@ -38,7 +40,7 @@ def begin_contacts(lattice: Lattice, motion: MotionState, tracker: ImpactTracker
         side = int(np.sign(site["mode"]))
         which = 0 if side > 0 else 1
         speed = abs(float(site["approach"]))
-        # At the floor w'_minus is constant; in the other modes there is no force that depends on it.
+        # At the floor w'_minus is constant; free and clipped sites have no force.
         if speed <= site["floor"] or abs(site["mode"]) in (FREE, CLIPPED):
             continue
 

@@ -12,8 +12,8 @@ from vipetsc.contact.law import CLIPPED, FREE, elastic_force_and_slope, gap_of, 
 from vipetsc.dynamics.drives import Drives, drive_force
 from vipetsc.dynamics.spring_law import nonlinear_force, nonlinear_slope
 
-# Half the time, in 1/omega of a drive's highest frequency, over which its force is differenced for a rate. The error of
-# the difference is 1e-12/6, that of rounding 1e-10.
+# Half the time, over 1/omega of a drive's highest frequency, between whose ends a difference of its force gives the
+# rate. The relative error of the difference is 1e-12/6, that of rounding 1e-10.
 SHORT = 1e-6
 
 
@@ -49,10 +49,11 @@ class CurvedSprings(NamedTuple):
 
 
 class Lattice(NamedTuple):
-    """A lattice: its rows of K and C have the entries ``first[i]`` to ``first[i + 1]`` in ``columns`` (entry,).
+    """A lattice of n masses: ``inverse_mass`` (n,) in 1/kg, the matrices K and C, contacts, drives, their ``slopes``.
 
-    ``ends`` (site, 2): host, -1 for the ground, and resonator of the ``contacts`` (site,) of dtype ``SITE``; the
-    ``target`` of each row of ``drives`` is a mass.
+    Row i of K and C has the entries ``first[i]`` to ``first[i + 1]`` of ``stiffness`` and ``damping`` (entry,), in the
+    columns ``columns`` (entry,). ``ends`` (site, 2) are the host, -1 for the ground, and the resonator of the
+    ``contacts`` (site,) of dtype ``SITE``; the ``target`` of each row of ``drives`` is a mass.
     """
 
     inverse_mass: np.ndarray
@@ -70,12 +71,15 @@ class Lattice(NamedTuple):
 class MotionState(NamedTuple):
     """State and workspace. Column 0 is the motion, column 1 + p its derivative with respect to parameter p.
 
-    A coordinate of the initial state is such a parameter: its column begins with the derivative of that state.
+    A coordinate of the initial state is such a parameter: its column begins with the derivative of that state. Rows are
+    the displacements of all masses, then the velocities.
 
-    ``state`` and ``end`` (2n, column), ``stages`` (stage, 2n, column), ``rates`` (2n, column) at the end; ``estimates``
-    (2, 2n, column) are those of errors, ``approach`` (site, column) derivatives of w'_minus; ``before`` and ``after``
-    (site, 3) hold w, w', w'' at both ends of a step, ``largest`` (column,) the largest values so far; ``tolerances``
-    (2,) are the errors allowed per step, relative to the largest motion and the largest derivative so far.
+    ``state`` and ``end`` (2n, column) are those at both ends of a step, ``rates`` (2n, column) the time derivatives at
+    its end, ``stages`` (stage, 2n, column) those of the method, of which the first belongs to ``state``. ``estimates``
+    (2, 2n, column) are those of errors, of orders 3 and 5; ``approach`` (site, column) has the derivatives of w'_minus
+    in columns from 1 on. ``before`` and ``after`` (site, 3) hold w, w', w'' at both ends of a step, ``largest``
+    (column,) the largest displacements, and velocities over the highest frequency, so far. ``tolerances`` (2,) are the
+    errors allowed per step, relative to these, of the motion and of its derivatives; ``room`` (2, 6) is scratch.
     """
 
     state: np.ndarray
@@ -126,8 +130,10 @@ def _add_contact(lattice: Lattice, i: int, y: np.ndarray, approach: np.ndarray, 
     g = 1.0 + site.damping * rate / site.approach
     by_rate = side * elastic * site.damping / site.approach
     by_approach = -by_rate * rate / site.approach
-    # The derivative of k x^n by n is k x^n log x. It vanishes at the onset; a landing may end at an x just below zero.
-    by_exponent = elastic * np.log(x) if x > 0.0 else 0.0
+    # The derivative of k x^n by n is k x^n log x, which vanishes at the onset. A landing may end at x just below zero.
+    by_exponent = 0.0
+    if x > 0.0:
+        by_exponent = elastic * np.log(x)
 
     host = lattice.ends[i, 0]
     resonator = lattice.ends[i, 1]
@@ -148,7 +154,10 @@ def _add_contact(lattice: Lattice, i: int, y: np.ndarray, approach: np.ndarray, 
 
 @kernel
 def _add_springs(lattice: Lattice, y: np.ndarray, out: np.ndarray) -> None:
-    """Add the forces of springs and dashpots and their derivatives to ``out``, in the rows of velocities."""
+    """Add the forces of linear springs and dashpots and their derivatives to ``out`` (2n, column), in rows from n on.
+
+    ``y`` (2n, column) are the motion and its derivatives.
+    """
     n = lattice.inverse_mass.size
     slopes = lattice.slopes
     for i in range(n):
@@ -161,6 +170,7 @@ def _add_springs(lattice: Lattice, y: np.ndarray, out: np.ndarray) -> None:
             if damping != 0.0:
                 for j in range(y.shape[1]):
                     out[n + i, j] -= damping * y[n + c, j]
+            # -K_p u - C_p u' of the parameters on which K and C depend.
             for p in range(slopes.linear.size):
                 if slopes.linear[p]:
                     out[n + i, 1 + p] -= slopes.stiffness[p, e] * y[c, 0] + slopes.damping[p, e] * y[n + c, 0]
@@ -168,7 +178,10 @@ def _add_springs(lattice: Lattice, y: np.ndarray, out: np.ndarray) -> None:
 
 @kernel
 def _add_curved_springs(lattice: Lattice, y: np.ndarray, out: np.ndarray) -> None:
-    """Add what springs have beyond their linear parts, and its derivatives, to ``out``, in the rows of velocities."""
+    """Add the forces of springs beyond their linear parts, and their derivatives, to ``out``, in rows from n on.
+
+    With N = q z^2 + c z^3 of an elongation z, the derivative is N_z dz + q_p z^2 + c_p z^3.
+    """
     n = lattice.inverse_mass.size
     ends = lattice.curved.ends
     for k in range(lattice.curved.numbers.size):
@@ -190,16 +203,19 @@ def _add_curved_springs(lattice: Lattice, y: np.ndarray, out: np.ndarray) -> Non
 
 @kernel
 def rates_of(lattice: Lattice, t: float, y: np.ndarray, approach: np.ndarray, out: np.ndarray) -> None:
-    """Time derivatives ``out`` of the motion and its derivatives in ``y`` (2n, column) at time t in s."""
+    """Time derivatives ``out`` (2n, column) of the motion and its derivatives ``y`` (2n, column) at time ``t`` in s.
+
+    ``approach`` (site, column) are the derivatives of w'_minus in columns from 1 on.
+    """
     n = lattice.inverse_mass.size
     slopes = lattice.slopes
     for i in range(n):
         for j in range(y.shape[1]):
             out[i, j] = y[n + i, j]
             out[n + i, j] = 0.0
+    # Until masses divide them, the rows of accelerations are sums of forces.
     _add_springs(lattice, y, out)
     _add_curved_springs(lattice, y, out)
-
     for d in range(lattice.drives.rows.size):
         force = drive_force(lattice.drives, d, t)
         target = n + lattice.drives.rows[d].target
@@ -214,7 +230,7 @@ def rates_of(lattice: Lattice, t: float, y: np.ndarray, approach: np.ndarray, ou
     for i in range(n):
         for j in range(y.shape[1]):
             out[n + i, j] *= lattice.inverse_mass[i]
-        # (M + dM) u'' = f + df: dM times the acceleration acts as a force.
+        # From M du'' = df - dM u'': dM times the acceleration acts as a force.
         for p in range(slopes.linear.size):
             if slopes.linear[p]:
                 out[n + i, 1 + p] -= slopes.masses[p, i] * lattice.inverse_mass[i] * out[n + i, 0]
@@ -222,7 +238,7 @@ def rates_of(lattice: Lattice, t: float, y: np.ndarray, approach: np.ndarray, ou
 
 @kernel
 def observe(lattice: Lattice, y: np.ndarray, rates: np.ndarray, motion: np.ndarray) -> None:
-    """Put w, w' and w'' of every site into ``motion`` (site, 3)."""
+    """Put w, w' and w'' of every site into ``motion`` (site, 3), from ``y`` (2n, column) and its ``rates``."""
     n = lattice.inverse_mass.size
     for i in range(lattice.contacts.size):
         motion[i, 0] = difference(y, lattice.ends, i, 0, 0)
@@ -232,7 +248,10 @@ def observe(lattice: Lattice, y: np.ndarray, rates: np.ndarray, motion: np.ndarr
 
 @kernel
 def jerk(lattice: Lattice, motion: MotionState, t: float, i: int) -> float:
-    """Rate of the acceleration in m/s^3 of mass ``i`` in the state, whose rates are the first stage."""
+    """Rate of the acceleration in m/s^3 of mass ``i`` at the state of ``motion``, ``t`` in s.
+
+    It is the time derivative of the equation of motion; the state's rates are the first stage.
+    """
     n = lattice.inverse_mass.size
     rates = motion.stages[0]
     total = 0.0
@@ -249,7 +268,7 @@ def jerk(lattice: Lattice, motion: MotionState, t: float, i: int) -> float:
             change = slope * difference(rates, ends, k, 0, 0)
             total += change if ends[k, 0] == i else -change
 
-    # A drive has no formula of its rate: its force is differenced.
+    # Drives have no formula for the rate of their force: a difference takes its place.
     for d in range(lattice.drives.rows.size):
         row = lattice.drives.rows[d]
         if row.target == i and row.highest > 0.0:
@@ -257,7 +276,7 @@ def jerk(lattice: Lattice, motion: MotionState, t: float, i: int) -> float:
             change = drive_force(lattice.drives, d, t + short) - drive_force(lattice.drives, d, t - short)
             total += change / (2.0 * short)
 
-    # Closed contacts on this mass; what acts on the resonator acts on its host with the other sign.
+    # Closed contacts on this mass: the force F on the host is -F on the resonator.
     for c in range(lattice.contacts.size):
         site = lattice.contacts[c]
         is_host = lattice.ends[c, 0] == i
@@ -267,7 +286,7 @@ def jerk(lattice: Lattice, motion: MotionState, t: float, i: int) -> float:
         side = side_of(site.mode)
         x = side * motion.before[c, 0] - gap_of(site, side)
         elastic, slope = elastic_force_and_slope(site.elastic, x)
-        # The force is elastic(x) g(w'), the rate has a term of each factor.
+        # The rate of F = sigma f(x) g(w') is f' g w' + sigma f c w''/w'_minus.
         g = 1.0 + site.damping * motion.before[c, 1] / site.approach
         change = slope * g * motion.before[c, 1]
         change += side * elastic * site.damping / site.approach * motion.before[c, 2]

@@ -1,7 +1,7 @@
 """Compiled motion of a lattice from an initial state together with its derivatives with respect to parameters.
 
-Runge and Kutta's method is Dormand and Prince's pair of order 8(5,3) (Hairer, Norsett and Wanner 1993, sec. II.10),
-whose steps end on every sample, on every kink of a drive and on every change of a contact's mode: inside a step all
+The method is the Runge-Kutta pair of order 8(5,3) of Dormand and Prince (Hairer, Norsett and Wanner 1993, sec. II.10).
+Steps end on every sample, on every kink of a drive and on every change of a contact's mode: inside a step all
 right-hand sides are smooth.
 """
 
@@ -23,19 +23,25 @@ from vipetsc.modes.shooting.dop853 import E3, E5, STAGES, A, B
 # .8 to 3 %.
 # A step is at most one radian of the fastest mode, and this fraction of the duration of an impact in contact.
 OF_IMPACT = 0.25
-# First step after an onset, as a fraction of the impact: Hertz's force begins as a power 3/2.
+# Longest step after a change of mode, as a fraction of the impact: Hertz's force begins as the power 3/2 of the
+# indentation, so that its derivatives are largest there.
 AFTER_ONSET = 0.01
-# What of the step that would just be allowed is tried, and bounds of its shrinking and growth. Errors below the
-# smallest one count as that one, at which the bound of growth holds already.
+# First step, in radians of the fastest mode, a twentieth of the longest one. Errors decide from there on.
+FIRST_STEP = 0.05
+# The fraction of the step that would just be allowed that is tried, and bounds of its shrinking and growth. Errors
+# below the smallest one count as that one, for which the bound of growth holds already.
 SAFETY = 0.9
 LEAST_FACTOR = 0.2
 MOST_FACTOR = 6.0
 SMALLEST_ERROR = 1e-12
-# Shortest step, as a fraction of the largest time: its rounding is 1e-16. Below, the integration counts as stuck.
+# Shrinking of a step whose error overflows, of which no power can be taken.
+OVERFLOW_FACTOR = 0.1
+# Shortest step, as a fraction of the largest time, whose rounding is 1e-16. The integration is stuck below it.
 SMALLEST_STEP = 1e-14
-# A landing goes on from its tolerance, 1e-10 of the clearance, to this fraction of it, the rounding of w.
+# Landings go on to this fraction of their tolerance, which is 1e-10 of the clearance: to about the rounding of w.
 LANDING_GOAL = 1e-4
-# Longest step, in radians of the fastest mode, that is taken without a search.
+# Longest step, in radians of the fastest mode, that is taken without a search: none of its motions turns in so short a
+# time.
 BLIND = 1e-7
 # Outcomes: all samples are reached, or the step became too small.
 DONE, STUCK = range(2)
@@ -43,7 +49,12 @@ DONE, STUCK = range(2)
 
 @kernel
 def _scaled_error(motion: MotionState, n: int, omega: float, h: float) -> float:
-    """The largest error of a column over what is allowed, in a step of ``h`` s; infinite if it overflowed."""
+    """The largest error of a column over what is allowed, in a step of ``h`` s; infinite if it overflowed.
+
+    With the estimates e5 and e3 of orders 5 and 3 the error of a column is h e5^2/(e5^2 + 0.01 e3^2)^(1/2) (Hairer,
+    Norsett and Wanner, eq. II.10.17), here in the largest norm over its rows. ``n`` is the number of masses, ``omega``
+    the highest frequency in rad/s, which makes displacements of velocities.
+    """
     size = motion.end.size
     stages = motion.stages.reshape(STAGES, size)
     estimates = motion.estimates
@@ -82,6 +93,7 @@ def _step(lattice: Lattice, motion: MotionState, t: float, h: float, omega: floa
     state = motion.state.reshape(size)
     end = motion.end.reshape(size)
     stages = motion.stages.reshape(STAGES, size)
+    # Stage by stage, and as the last one the end of the step itself, with the weights B.
     for s in range(1, STAGES + 1):
         weights = A[s] if s < STAGES else B
         fraction = 0.0
@@ -103,12 +115,16 @@ def _step(lattice: Lattice, motion: MotionState, t: float, h: float, omega: floa
 
 @kernel
 def _land(lattice: Lattice, motion: MotionState, t: float, h: float, omega: float) -> tuple[float, bool]:
-    """Repeat a step that was just tried so that it ends on its first change of a mode: its length, whether it does."""
+    """Repeat a step of ``h`` s, just tried from ``t`` on, so that it ends on its first change of a mode.
+
+    Returns the length in s of the step as it was tried last, and whether it ends on a change. The length is 0 if the
+    change is at the beginning of the step.
+    """
     change = first_change(lattice.contacts, motion.before, motion.after, h, motion.room)
     if change.position > 1.0:
         return h, False
 
-    landing = Landing(change.position * h, h, np.inf, 0)
+    landing = Landing(length=change.position * h, longest=h, residual=np.inf, attempts=0)
     while True:
         if landing.length <= SMALLEST_STEP * h:
             start = switching(lattice.contacts, change.site, change.function, motion.before[change.site])
@@ -128,14 +144,16 @@ def _land(lattice: Lattice, motion: MotionState, t: float, h: float, omega: floa
 
 @njit(error_model="numpy")
 def _switch(lattice: Lattice, motion: MotionState, tracks: Tracks, t: float) -> Tracks:
-    """Switch every site that has landed, and begin the derivatives of w'_minus of those that close.
+    """Switch every site that has landed at ``t`` in s, and set the derivatives of w'_minus of those that close.
 
     With the onset at side w - D = 0 the instant moves by -(dw - side dD)/w', and w'_minus by dw' + w'' times that.
+    Returns ``tracks``, with as much room in the log as was needed.
     """
     n = lattice.inverse_mass.size
     contacts = lattice.contacts
     modes = contacts["mode"].copy()
     tracks = with_room(tracks)
+    # No ledger is kept: losses are those of nothing.
     switch_sites(contacts, tracks, motion.before, np.zeros(contacts.size), t)
     for i in range(contacts.size):
         if modes[i] != FREE or contacts[i].mode == FREE:
@@ -173,7 +191,7 @@ def _refresh(lattice: Lattice, motion: MotionState, t: float) -> None:
 
 @kernel
 def _accept(motion: MotionState, omega: float) -> None:
-    """Take the end of a step as the state."""
+    """Take the end of a step as the state, and update the largest values; ``omega`` as in ``_scaled_error``."""
     rows, columns = motion.state.shape
     for i in range(rows):
         unit = 1.0 if 2 * i < rows else 1.0 / omega
@@ -184,7 +202,10 @@ def _accept(motion: MotionState, omega: float) -> None:
 
 @kernel
 def _select_pieces(lattice: Lattice, breaks: np.ndarray, t: float) -> None:
-    """Turn on the pieces of drives that begin by the time t in s; ``breaks`` (drive,) are the next ones' beginnings."""
+    """Turn on the pieces of drives that begin by the time ``t`` in s; ``breaks`` (drive,) in s are when the next begin.
+
+    A drive is a sequence of smooth pieces. A time within rounding of a break is on it.
+    """
     for d in range(breaks.size):
         if t >= breaks[d] * (1.0 - 1e-14):
             breaks[d] = select_piece(lattice.drives, d, t * (1.0 + 1e-14))
@@ -192,10 +213,13 @@ def _select_pieces(lattice: Lattice, breaks: np.ndarray, t: float) -> None:
 
 @kernel
 def _length_to(left: float, h: float) -> float:
-    """A step of at most ``h`` s towards what is ``left``: a tiny remainder is avoided by two steps of one length."""
+    """A step of at most ``h`` s towards a time that is ``left`` s away; the last two steps have the same length."""
     if h >= left * (1.0 - 1e-12):
         return left
-    return 0.5 * left if h > 0.5 * left else h
+    # A full step would leave less than another one, perhaps a tiny remainder.
+    if h > 0.5 * left:
+        return 0.5 * left
+    return h
 
 
 @njit(error_model="numpy")
@@ -210,8 +234,9 @@ def integrate(
 ) -> tuple[int, Tracks, np.ndarray, np.ndarray]:
     """Go from the time ``begin`` in s through the rising ``times`` (sample,) in s; those before ``begin`` have zeros.
 
-    ``omega`` in rad/s is the fastest mode's. Returns the outcome, the log of contacts, samples (sample, watched, 4,
-    column) as ``_sample`` puts them, and the largest |w| (site, 2) in m on the sides + and -, at ends of steps.
+    ``omega`` in rad/s is the fastest mode's frequency, or a bound of it; ``watched`` (watched mass,) are the masses
+    that are sampled. Returns the outcome, DONE or STUCK, the log of contacts, samples (sample, watched mass, 4, column)
+    as ``_sample`` puts them, and the largest w and -w (site, 2) in m at ends of steps, at least 0.
     """
     out = np.zeros((times.size, watched.size, 4, motion.state.shape[1]))
     reached = np.zeros((lattice.contacts.size, 2))
@@ -220,7 +245,7 @@ def integrate(
     _select_pieces(lattice, breaks, begin)
     t = begin
     longest = max(abs(begin), abs(times[-1]))
-    h = 0.05 / omega
+    h = FIRST_STEP / omega
     _refresh(lattice, motion, t)
 
     sample = 0
@@ -231,6 +256,7 @@ def integrate(
             sample += 1
             continue
 
+        # The length of the step: towards the next sample or break, within all bounds.
         target = times[sample]
         for instant in breaks:
             if t < instant < target:
@@ -241,20 +267,27 @@ def integrate(
         if h < SMALLEST_STEP * longest and h < left:
             return STUCK, tracks, out, reached
 
+        # An error of the power 8 of h. One that is no number is not less than 1.
         error = _step(lattice, motion, t, h, omega)
         if not error < 1.0:
-            h *= max(LEAST_FACTOR, SAFETY * error ** (-0.125)) if error < 1e300 else 0.1
+            factor = OVERFLOW_FACTOR
+            if error < 1e300:
+                factor = max(LEAST_FACTOR, SAFETY * error ** (-0.125))
+            h *= factor
             continue
+
         grown = h * min(MOST_FACTOR, SAFETY * max(error, SMALLEST_ERROR) ** (-0.125))
         length, landed = _land(lattice, motion, t, h, omega)
         if length == 0.0 and not landed:
-            # A root at the very beginning that does not rise is none: a step so short that no change is missed.
+            # The search found a root at the very beginning of the step, but nothing changes there: the motion has just
+            # landed on it. A step that is too short for another change leads past it.
             length = min(h, BLIND / omega)
             _step(lattice, motion, t, length, omega)
 
         if length > 0.0:
             _accept(motion, omega)
             t = target if length == left else t + length
+        # A step that was short only because it ended on a sample or a break does not shorten the next one.
         h = max(grown, wanted) if h == left else grown
         _select_pieces(lattice, breaks, t)
         _refresh(lattice, motion, t)

@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-# A coordinate is determined if its standard error is at most this: 0.5 is a factor of 1.6 of a logarithmic parameter,
-# and half the range between the bounds of a linear one. With more, a linearised interval means nothing.
+# A coordinate is determined if its standard error is at most this: a factor of 1.6 of a logarithmic parameter, and half
+# the range between the bounds of a linear one. The model is not linear over larger errors, by which intervals would be
+# drawn.
 DETERMINED = 0.5
 # Singular values below this fraction of the largest one are rounding. They are raised to it, so that errors are finite.
 SMALLEST = 1e-12
@@ -15,8 +16,9 @@ SMALLEST = 1e-12
 class Uncertainty(NamedTuple):
     """Uncertainty of coordinates (parameter,): ``errors`` (parameter,), ``correlation`` (parameter, parameter).
 
-    ``singular`` (direction,) are the singular values of the Jacobian, ``directions`` (direction, parameter) its right
-    singular vectors: 1/s is the standard error along one. ``determined`` (parameter,).
+    ``singular`` (direction,) are the singular values s of the Jacobian, ``directions`` (direction, parameter) its right
+    singular vectors: 1/s is the standard error along one. ``determined`` (parameter,): whether the error is small
+    enough for an interval.
     """
 
     errors: np.ndarray
@@ -27,10 +29,14 @@ class Uncertainty(NamedTuple):
 
 
 def uncertainty_of(jacobian: np.ndarray) -> Uncertainty:
-    """The uncertainty by the ``jacobian`` J (datum, parameter) of residuals over the noise; covariance (J^T J)^-1."""
-    count = jacobian.shape[1]
+    """The uncertainty by the ``jacobian`` J (datum, parameter) of residuals over the noise: covariance (J^T J)^-1."""
+    # With fewer data than parameters rows of zeros stand for those that are missing: without them the singular value
+    # decomposition would leave out as many directions, along which the data determine nothing.
+    missing = jacobian.shape[1] - len(jacobian)
+    if missing > 0:
+        jacobian = np.pad(jacobian, ((0, missing), (0, 0)))
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
-    # Without any slope all errors are large, and finite.
+    # If nothing depends on any parameter, all errors are 1e12.
     floor = SMALLEST * max(float(np.max(singular, initial=0.0)), 1.0)
     deviations = 1 / np.maximum(singular, floor)
     factors = directions * deviations[:, None]
@@ -40,17 +46,18 @@ def uncertainty_of(jacobian: np.ndarray) -> Uncertainty:
     return Uncertainty(
         errors=errors,
         correlation=np.clip(correlation, -1.0, 1.0),
-        singular=np.pad(singular, (0, count - len(singular))),
-        directions=np.pad(directions, ((0, count - len(directions)), (0, 0))),
+        singular=singular,
+        directions=directions,
         determined=errors <= DETERMINED,
     )
 
 
 def marginal_jacobian(jacobian: np.ndarray, count: int) -> np.ndarray:
-    """The Jacobian (count, count) of the first ``count`` coordinates alone, whatever the others are.
+    """A Jacobian (count, count) of the first ``count`` coordinates, with the others left free.
 
-    Its information matrix is the Schur complement A - B D^-1 B^T of J^T J: in J = Q R with the other coordinates first
-    it is the last block of R. Without others it is the ``jacobian`` (datum, coordinate) itself.
+    Its uncertainty is that of these coordinates by the whole ``jacobian`` J (datum, coordinate): its product with its
+    transpose is the Schur complement A - B D^-1 B^T of J^T J, with the blocks A of these coordinates and D of the
+    others. In J = Q R with the other coordinates first it is the last block of R. Without others it is J itself.
     """
     others = jacobian.shape[1] - count
     if not others:
@@ -60,14 +67,15 @@ def marginal_jacobian(jacobian: np.ndarray, count: int) -> np.ndarray:
 
 
 def quantile(confidence: float) -> float:
-    """Standard errors on each side of a value that make an interval of that ``confidence`` for normal errors."""
+    """Number of standard errors on either side of a value in an interval of that ``confidence``, for normal errors."""
     return float(scipy.stats.norm.ppf(0.5 + confidence / 2))
 
 
 def errors_with_sensor(uncertainty: Uncertainty, slopes: np.ndarray, noise: float) -> np.ndarray:
     """Standard errors (mass, parameter) with one more sensor at each mass.
 
-    ``slopes`` (sample, mass, parameter) are derivatives of what the sensor measures, ``noise`` that of its values.
+    ``uncertainty`` is that without this sensor. ``slopes`` (sample, mass, parameter) are derivatives of what the sensor
+    measures, ``noise`` is the standard deviation of its errors, in the same unit.
     """
     scaled = uncertainty.directions * uncertainty.singular[:, None]
     information = scaled.T @ scaled

@@ -144,7 +144,7 @@ class Identification:
             "begin": start.tolist(),
             "coordinates": fit.coordinates.tolist(),
             "deviance": fit.deviance,
-            "misfit": fit.windows[-1].misfit,
+            "misfit": fit.misfit,
             "noise": [noise.tolist() for noise in fit.noise],
             "windows": [
                 {

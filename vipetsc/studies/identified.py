@@ -23,8 +23,12 @@ from vipetsc.identification.whiteness import ljung_box
 from vipetsc.io.records import Record
 from vipetsc.studies.identified_layout import LAYOUT
 
-# A misfit this many times the noise, and a probability below this over the number of channels, are reported.
+# A misfit more than this many times the noise that is given is reported. Intervals are as wide as the noise makes them:
+# up to here they are at most a fifth too narrow. By chance the misfit of n samples exceeds the noise by a fraction of
+# (2 n)^(-1/2): a fifth is twice that with 50 samples, nine times with 1000.
 BEYOND_NOISE = 1.2
+# A probability of residuals below this over the number of channels is reported. Of a hundred fits whose residuals are
+# white one is reported.
 IMPROBABLE = 0.01
 # Residuals below this fraction of their channel are those of rounding and steps, not noise.
 EXACT = 1e-6
@@ -293,12 +297,16 @@ def _warnings_of_parameters(data: xr.Dataset) -> Iterator[str]:
         if np.isfinite(least):
             yield f"{name}: at least {least:.4g} m; nothing touches there"
 
+    parameters = IdentifyCase.of(data).parameters
     for row in np.flatnonzero((data["determined"].values == 0) & np.isnan(at_least)):
         helped = "no further sensor would do so"
         error = float(data["sensor/relative_error"].values[row])
         if error < DETERMINED:
             place = f"mass {data['sensor/mass'].values[row]} of cell {data['sensor/cell'].values[row]}"
             helped = f"with a sensor at {place} its error would be {100 * error:.2g} %"
+            # Coordinates on a linear scale are positions between the bounds.
+            if not parameters[row].is_logarithmic:
+                helped += " of the range between its bounds"
         yield f"{data['parameter'].values[row]}: the data do not determine it; {helped}"
 
 
