@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 def coarse_pictures(replace: Callable[[object, str, object], None]) -> None:
-    """Make pictures coarse and do not lay them out, which costs most; ``replace`` is called as ``setattr`` is."""
+    """Make pictures coarse and leave out their layout, which takes longest; ``replace`` acts as ``setattr`` does."""
     from vipetsc.figures import style
     from vipetsc.figures.layout import remove_engine
 
@@ -16,7 +16,7 @@ def coarse_pictures(replace: Callable[[object, str, object], None]) -> None:
 
 
 def main() -> int:
-    """Go in by the front door."""
+    """Call the program with coarse pictures; returns its exit code."""
     coarse_pictures(setattr)
 
     from vipetsc.__main__ import main as vipetsc

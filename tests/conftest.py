@@ -71,7 +71,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(autouse=True)
 def ranks_end_together():
-    """End a test on all ranks: one that waits for the next test's first message would do so at full speed."""
+    """End each test on all ranks together: MPI keeps a core busy for a rank that waits in a call of the next test."""
     yield
 
     if MPI.COMM_WORLD.size > 1:
@@ -220,7 +220,10 @@ alone_and_on_two_ranks = pytest.mark.parametrize("ranks", [0, pytest.param(2, ma
 
 
 def on_two(*values: object) -> list:
-    """Parameters that ``scripts/test`` takes on one rank and two: more ranks would say the same again."""
+    """Parameters of tests that ``scripts/test`` runs on one rank and on two alone; a value may be a tuple of arguments.
+
+    On more ranks they would show nothing new.
+    """
     parameters = []
     for value in values:
         arguments = value if isinstance(value, tuple) else (value,)
@@ -254,10 +257,10 @@ def set_words(*changes: str) -> list[str]:
 
 
 def clean_environment() -> dict[str, str]:
-    """The environment without what this process's own MPI put into it: a child may then be an mpirun.
+    """The environment without what this process's own MPI has put into it: a child may then be an mpirun.
 
-    Ranks of tests are on one machine. Without its layers for networks Open MPI 5 writes no lines about interfaces among
-    those that the program prints, and Open MPI 4 starts in a quarter of the time that it takes to try some of them.
+    Ranks of tests are on one machine, and networks are switched off. Open MPI 5 would write lines about interfaces
+    among those that the program prints; Open MPI 4 would try some networks, and take four times as long to start.
     """
     kept = {name: value for name, value in os.environ.items() if not NAMES_OF_RANKS.match(name)}
     as_root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
@@ -309,7 +312,7 @@ def in_process(capsys, monkeypatch):
 def on_ranks(request, vipetsc, in_process):
     """Call the program on a number of ranks of mpirun, or with 0 in this process: ``on_ranks(ranks, "run", ...)``.
 
-    Where the test has plain pictures, those of the ranks are so too.
+    If the test has the fixture ``plain_pictures``, pictures of the ranks are coarse as well.
     """
     options: dict[str, Any] = {}
     if "plain_pictures" in request.fixturenames:
@@ -325,7 +328,7 @@ def on_ranks(request, vipetsc, in_process):
 
 @pytest.fixture
 def plain_pictures(monkeypatch):
-    """Coarse pictures that are not laid out, which costs most: for tests of files, not of what is seen."""
+    """Pictures are coarse and not laid out, which takes longest: for tests of files, not of what is seen."""
     coarse_pictures(monkeypatch.setattr)
 
 
@@ -344,6 +347,6 @@ def petsc_options():
 
     yield put
 
-    # The database of options is the process's: what one test leaves in it, the next one runs with.
+    # The database of options belongs to the process: the next test would run with what this one leaves in it.
     for name in given:
         options.delValue(name)

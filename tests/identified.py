@@ -10,6 +10,7 @@ import numpy as np
 from tests.conftest import run_of, with_sections
 from vipetsc.case import Case
 
+# Masses whose velocities are measured, one near each site.
 POINTS = [{"name": "a", "cell": 2, "mass": 1}, {"name": "b", "cell": 3, "mass": 2}, {"name": "c", "cell": 5, "mass": 1}]
 
 
@@ -29,7 +30,10 @@ def lattice_table(**sections: dict[str, Any]) -> dict[str, Any]:
 def measured_table(
     folder: Path, table: dict[str, Any], noise: float = 0.0, seed: int = 1, quantity: str = "velocity"
 ) -> dict[str, Any]:
-    """Measure the points of a run of ``table`` with ``noise`` over their size, and return the table of the record."""
+    """Write the motion of the ``POINTS`` in a run of ``table`` into a file, and return the table of that record.
+
+    ``noise`` is the standard deviation of random errors over the root mean square of each point's motion.
+    """
     run = run_of(Case.from_table(table))
     values = run[f"points/{quantity}"].values
     size = np.sqrt(np.mean(values**2, axis=0))

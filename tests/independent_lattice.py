@@ -26,7 +26,7 @@ class Stop:
     side: int = 1
 
     def row(self, count: int) -> np.ndarray:
-        """w = row @ u."""
+        """The row (``count``,) with which w = row @ u."""
         row = np.zeros(count)
         row[self.resonator] = 1.0
         if self.host >= 0:
@@ -59,7 +59,10 @@ class ScipyLattice:
     curved: tuple[CurvedSpring, ...] = ()
 
     def motion(self, times: np.ndarray, u: np.ndarray, v: np.ndarray, start: float) -> tuple[np.ndarray, int]:
-        """u, u', u'' as (quantity, time, mass) at ``times``, from the state at ``start`` on; the number of impacts."""
+        """u, u', u'' (quantity, time, mass) at ``times`` in s, and the number of impacts up to the last one.
+
+        The motion begins at the time ``start`` with the displacements ``u`` (mass,) and the velocities ``v`` (mass,).
+        """
         n = len(self.masses)
         rows = [stop.row(n) for stop in self.stops]
         # Springs and dashpots in one product: rates are asked for some ten thousand times.
@@ -74,7 +77,7 @@ class ScipyLattice:
             for k, speed in closed.items():
                 stop = self.stops[k]
                 depth = max(stop.side * (rows[k] @ y[:n]) - stop.gap, 0.0)
-                # The speed at the onset, which stays until the contact ends.
+                # The velocity over that at the onset, w'_minus, towards the stop.
                 ratio = stop.side * (rows[k] @ y[n:]) / speed
                 pressure = stop.stiffness * depth**stop.exponent * (1 + 1.5 * (1 - stop.restitution) * ratio)
                 total = total - stop.side * pressure * rows[k]
@@ -104,7 +107,7 @@ class ScipyLattice:
                 rtol=1e-11,
                 atol=1e-15,
                 events=events,
-                # At samples alone: interpolants of all steps would cost as much again as a fifth of the steps.
+                # Values at samples alone: a dense output of all steps would cost a fifth more.
                 t_eval=times[times >= t],
                 # Events are looked for once a step: a longer one could miss a short contact.
                 max_step=2e-4,
@@ -114,7 +117,7 @@ class ScipyLattice:
                 samples[number] = solution.y[:, number - first]
                 accelerations[number] = rates(at, samples[number])[n:]
 
-            # Started anew at each change: the force's derivative jumps there.
+            # The integration begins anew at each change, where the derivative of the force jumps.
             t, y = self._end_of(solution, times[-1])
             for k, found in enumerate(solution.t_events):
                 if found.size and k in closed:
@@ -135,6 +138,9 @@ class ScipyLattice:
 
 
 def chain_matrices(count: int, stiffness: float, damping: float, ground: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """K and C (count, count) of equal springs and dashpots between two walls, and dashpots to the ground."""
+    """K and C (count, count) of equal springs and dashpots between two walls, with a dashpot ``ground`` to the ground.
+
+    ``stiffness`` is in N/m, ``damping`` and ``ground`` are in N s/m.
+    """
     shape = 2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
     return stiffness * shape, damping * shape + ground * np.eye(count)

@@ -1,4 +1,4 @@
-"""What of a figure cannot be read: text outside the page or over other text, axes without labels, unnamed panels."""
+"""What cannot be read in a figure: text outside the page or over other text, axes without labels, unnamed panels."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-OVERLAP = 2  # pixels that boxes of text may share: these are higher than their letters
-FEWEST = 3  # labels of a logarithmic axis
+OVERLAP = 2  # pixels that boxes of text may have in common: a box is higher than the letters in it
+FEWEST = 3  # labels of a logarithmic axis: with fewer the values between them cannot be told
 
 
 def complaints(figure: Figure) -> list[str]:
@@ -40,7 +40,7 @@ def _texts(figure: Figure) -> Iterator[str]:
 
 
 def _hidden(figure: Figure) -> Iterator[Text]:
-    """Yield labels of ticks that are beyond their axis, switched off, or of axes that are."""
+    """Yield labels that are not drawn: those of ticks beyond their axis or switched off, and of axes switched off."""
     for axes in figure.findobj(Axes):
         for axis in (axes.xaxis, axes.yaxis):
             if not axes.axison:
@@ -61,7 +61,10 @@ def _logarithmic_axes(figure: Figure) -> Iterator[str]:
 
 
 def _letters(figure: Figure) -> Iterator[str]:
-    """Yield panels without a letter on a page of several; small ones in a row may have one together."""
+    """Yield a sentence for each panel without a letter on a page of several.
+
+    Panels of a subfigure may have one letter together, in the title of the subfigure.
+    """
     together = {part for part in figure.findobj(lambda one: getattr(one, "_suptitle", None)) if _begins(part._suptitle)}
     shown = [axes for axes in figure.get_axes() if axes.axison and axes.get_label() != "<colorbar>"]
     for axes in shown:

@@ -21,14 +21,14 @@ from tests.faults.scenarios import SCENARIOS
 from tests.faults.trials import Crew, judge, last_words, matrix, references
 from vipetsc.case import Case
 
-# Of the report: a task, and how it went.
+# A row of the report: a task, and how it went.
 Row = dict[str, Any]
-# Of verbs that leave results of their own, which the same command goes on with.
+# Scenarios of verbs that leave results of their own: after a kill the same command goes on with them.
 KILLED = [scenario.name for scenario in SCENARIOS.values() if scenario.verb.results]
 
 
 def faults(options: argparse.Namespace) -> dict[str, Any]:
-    """Do every kind of fault at every phase of every verb, on 2 and on 3 ranks."""
+    """Meet every kind of fault at every phase of every verb, on 2 and on 3 ranks."""
     rows: list[Row] = []
     reached: set[str] = set()
     with tempfile.TemporaryDirectory(prefix="faults-") as work:
@@ -61,7 +61,7 @@ def kills(options: argparse.Namespace) -> dict[str, Any]:
         for ranks in options.ranks:
             crews[ranks] = leaving.enter_context(Crew(Path(work) / str(ranks), ranks, options.patience))
 
-        # Kernels may be compiled in the first: the times of the second are those of a call.
+        # Kernels may be compiled in the first call: the time of the second is that of a call.
         for _ in range(2):
             unbroken = {ranks: references(crew, options.only) for ranks, crew in crews.items()}
         seconds = {(name, ranks): unbroken[ranks][name]["seconds"] for ranks in crews for name in options.only}
@@ -116,7 +116,7 @@ def cases(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def fault_table(rows: Sequence[dict[str, Any]], kinds: Sequence[str], ranks: Sequence[int]) -> str:
-    """Return the table of phases against kinds of faults and ranks: "." well, "x" not well, "-" it did not come."""
+    """Return the table of phases against kinds of faults and ranks: "." passed, "x" failed, "-" met no fault."""
     marks = {}
     for row in rows:
         mark = "." if row["came"] else "-"

@@ -34,13 +34,16 @@ class Injector:
         sys.addaudithook(self._hook)
 
     def arm(self, phase: str, number: int, kind: str, mark: Path | None = None) -> None:
-        """Strike with ``kind`` at the ``number``-th time from now on; the time is then written to ``mark``."""
+        """Strike with ``kind`` when ``phase`` comes for the ``number``-th time from now on.
+
+        The time in s at which it strikes is written to ``mark``.
+        """
         self.counts.clear()
         self.armed = (phase, number, kind)
         self.mark = mark
 
     def disarm(self) -> Counter[str]:
-        """Do nothing any more; returns how often every phase has come since the last call or ``arm``."""
+        """Strike no more; returns how often every phase has come since the last call of this or of ``arm``."""
         counts = self.counts
         self.counts = Counter()
         self.armed = None
@@ -55,7 +58,7 @@ class Injector:
         self.counts[phase] += 1
         if self.armed and self.armed[:2] == (phase, self.counts[phase]):
             kind = self.armed[2]
-            # Before it strikes, as what cleans up comes to phases too.
+            # Disarmed before it strikes: the clean-up after the fault comes to phases too.
             self.armed = None
             if self.mark:
                 self.mark.write_text(str(time.time()))
@@ -76,7 +79,7 @@ def strike(kind: str, where: str) -> None:
 
 
 def main() -> int:
-    """Arm the rank that is meant, then go in by the front door."""
+    """Arm the rank that is meant, then call the program; returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.inject", description=__doc__)
     parser.add_argument("phase")
     parser.add_argument("number", type=int)

@@ -29,6 +29,7 @@ from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest
 
 EXAMPLES = Path(__file__).parents[2] / "vipetsc" / "examples"
+# Values that some key may not take: zero, negative, not finite, too large or small, of another type, or too many.
 HOSTILE: list[Any] = [
     0, 1, 2, -1, 0.0, -1.0, 0.5, 1.5, float("nan"), float("inf"), -float("inf"), 1e308, -1e308, 1e-320, 1e-300, 1e300,
     1e17, 1e-17, 10**9, 10**12, 10**30, -(10**30), 10**400, True, "", " ", "pi", "0pi", "1e9", "foo", "traverse",
@@ -37,13 +38,14 @@ HOSTILE: list[Any] = [
     {"first": 1, "last": 10**9, "count": 5}, {"first": 5, "count": 3, "spacing": 10**9}, [{"start": 1, "end": 9}],
     {"log": [1.0, 100.0], "count": 3}, {"linear": [0, 1], "count": 10**9}, {"log": [0, 0], "count": 2},
 ]  # fmt: skip
+# Options of PETSc that are put into cases, with values of which some are valid.
 PETSC: dict[str, tuple[Any, ...]] = {
     "ts_rk_type": ("5dp", "8vr", "3bs", "1fe", "magic"), "ts_adapt_type": ("basic", "none", "dsp", "glee"),
     "ts_adapt_clip": ("0.1,2", "2", "0,0"), "ts_dt": ("1e-6", "0", "-1"), "ts_max_steps": ("0", "5"), "ts_rtol": ("1",),
     "ts_type": ("rk", "euler"), "ts_max_time": ("1e-3",), "ts_adapt_wnormtype": ("2", "infinity"), "ksp_type": ("cg",),
     "ts_adapt_safety": ("0.9", "7"), "ts_adapt_dt_max": ("1e-5",), "log_view": ("",), "snes_rtol": (1e-3,),
 }  # fmt: skip
-MISSPELT = ("s", ".x", "\u0445")
+# A lattice of the reader's own, which no example has.
 OWN: dict[str, Any] = {
     "lattice": {
         "cells": 20,
@@ -124,7 +126,7 @@ def mutations(seed: int, without: tuple[str, ...] = (), mild: bool = False) -> I
     keys = known_keys()
     sources = {name: table for name, table in parents().items() if name not in without}
     names = sorted(sources)
-    # What is there twice is done twice as often.
+    # Changes that are listed twice are made twice as often.
     counts = (1, 1, 2) if mild else (1, 1, 1, 2, 2, 3, 5)
     kinds = (_scale, _put) if mild else (_replace, _replace, _scale, _remove, _misspell, _lists, _put, _put)
 

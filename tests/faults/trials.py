@@ -21,16 +21,17 @@ from tests.faults.inject import KINDS
 from tests.faults.scenarios import unreadable
 
 ROOT = Path(__file__).parents[2]
-# Tasks of one worker.
+# Tasks that one worker is given before a new one is started.
 AT_ONCE = 60
-# Time in s from the fault to the end of all ranks.
+# Time in s from the fault to the end of all ranks, at most.
 ALLOWED = 10.0
 STOPPED = 75
 # What a call may end with; mpirun, which a kill or the signal itself may end, has codes of its own.
 CODES = {"sigterm": {0, STOPPED}, "sigkill": {128 + signal.SIGKILL}}
 OF_MPIRUN = {"sigterm": {128 + signal.SIGTERM, 1}, "sigkill": {-signal.SIGKILL}}
-# An exception may be dealt with: a file that cannot be read may be another's, or written again, and the linear run of a
-# sweep whose own job failed is simulated by the first member that needs it.
+# Phases at which the program may get over an exception. A file that cannot be read may belong to another program, or be
+# written again. A sweep's linear run is a job of its own: if it fails, the first member that needs the run simulates
+# it.
 CODES_AT_PHASES = {"read": {0, 1, 2}, "member": {0, 1}}
 Task = dict[str, Any]
 Record = dict[str, Any]
@@ -60,12 +61,12 @@ class Crew:
         self.dismiss()
 
     def do(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, dict[str, Record]]]:
-        """Do all ``tasks``: each with its records by stages, when it is done."""
+        """Do all ``tasks``; yield each one when it is done, with its records by stages."""
         for task in tasks:
             stages, end = self._put(task)
             if end and task["do"] == "trial" and "begun" in stages:
                 stages.setdefault("ended", end | {"broken": unreadable(self.folder / task["scenario"])})
-                # A new worker does what the old one did not come to: the same command again.
+                # The old worker did not come to call the same command again: a new one does.
                 found, end = self._put(task | {"do": "finish"})
                 stages |= found
 
@@ -86,7 +87,7 @@ class Crew:
         self._bury()
 
     def _put(self, task: Task) -> tuple[dict[str, Record], Record | None]:
-        """Have a worker do a task: its records by stages, and how it ended its worker if it did."""
+        """Have a worker do a task; return the records by stages, and the end of the worker if the task ended it."""
         if self.left == 0:
             self.dismiss()
         if self.worker is None:
@@ -94,7 +95,7 @@ class Crew:
 
         self.left -= 1
         (self.folder / "results.jsonl").write_text("")
-        # A worker that has ended takes none.
+        # A worker that has ended takes no task.
         with suppress(BrokenPipeError):
             self.worker.stdin.write(json.dumps(task) + "\n")
             self.worker.stdin.flush()
@@ -262,7 +263,8 @@ def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> li
     """Return what is wrong with how a trial ended, in words."""
     ended = stages.get("ended", {})
     finished = stages.get("finished", {})
-    # What ranks draw from a count may have gone to another: then the fault has not come, and nothing may be wrong.
+    # Ranks draw their jobs from a common count. The rank that was to meet the fault may have drawn fewer than in the
+    # unbroken call: then no fault has come, and all must be well.
     if not ended.get("fired"):
         return [] if ended.get("code") == finished.get("code") == 0 else ["it ends before the fault"]
 
@@ -280,7 +282,7 @@ def judge(task: Task, stages: dict[str, Record], allowed: float = ALLOWED) -> li
     if ended["code"] not in codes:
         wrong.append(f"exit code {ended['code']}")
 
-    # One for all ranks; a rank that is killed says nothing.
+    # One message for all ranks at most, and none where a rank is killed.
     messages = re.findall(r"^vipetsc: (?!warning:)", errors, re.MULTILINE)
     if len(messages) > (kind != "sigkill"):
         wrong.append(f"{len(messages)} messages")

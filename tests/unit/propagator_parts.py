@@ -34,7 +34,10 @@ class ChainParts(NamedTuple):
 
 
 def chain_parts(ends: str, interval: float, tolerance: float, sites: tuple[int, ...] = (5, 6, 12)) -> ChainParts:
-    """Return the parts of a propagator for a chain of 24 cells on one rank."""
+    """Return the parts of a propagator for a chain of 24 cells on one rank.
+
+    ``interval`` in s is the step, ``tolerance`` that of its series; ``sites`` are cells, from 1.
+    """
     model = small_case(lattice={"ends": ends}, contacts={"sites": list(sites)}).model()
     layout = Layout(model, MPI.COMM_SELF)
     return ChainParts(model, layout, StepSeries(model.chain, interval, tolerance), HaloRegions(layout))
@@ -90,7 +93,7 @@ def mass_on_cubic_spring(cubic: float) -> Cluster:
 
 
 def pressed_mass(gap: float, side: int = 1) -> Cluster:
-    """Return the mass of ``mass_on_stop`` on a stop at ``gap`` on one side, without modes: it acts always."""
+    """Return the mass of ``mass_on_stop`` at a permanent contact, whose stop is at w = ``gap`` in m on one ``side``."""
     cluster = mass_on_stop()
     cluster.contacts["mode"] = side * PERMANENT
     cluster.contacts["clearance"] = gap
