@@ -13,7 +13,10 @@ from vipetsc.parallel import SharedCounter, StoppedError, StopRequest, on_root, 
 from vipetsc.progress import Progress
 
 BLOCKS = 100  # that each team draws, at least: none then waits for the last longer than 1 % of the whole
-PATIENCE = 5.0  # s that a rank whose job failed waits for the rest of its team to have failed as well
+# Time in s that a rank whose job failed waits for the rest of its team to have failed as well. Ranks that fail together
+# come within the time of a message, or as late as other programs hold them up. A rank that gives up ends all jobs: too
+# short a time takes such ranks for those that wait for ever, a longer one only delays the end where they do.
+PATIENCE = 5.0
 
 Job = TypeVar("Job", bound=Hashable)
 

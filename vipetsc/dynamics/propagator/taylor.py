@@ -11,7 +11,8 @@ from vipetsc.compiled import kernel
 from vipetsc.contact.changes import LANDED_W
 from vipetsc.contact.law import gap_of
 
-# Lengths below this fraction of the step are rounding.
+# Lengths below this fraction of the step are rounding: positions in a step are numbers from 0 to 1 with a rounding of
+# 1e-16, and a length is the difference of two that are sums of several.
 ROUNDING = 1e-15
 
 
