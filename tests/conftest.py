@@ -38,6 +38,10 @@ from vipetsc.dynamics.result import Result
 from vipetsc.io.records import RecordFile
 from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest, wait_for_all
+from vipetsc.process import collect_seldom
+
+# As in the program's own processes.
+collect_seldom()
 
 ROOT = Path(__file__).parents[1]
 NUMBER_OF_RANKS = re.compile(r"parallel\[(\d+)\]")
