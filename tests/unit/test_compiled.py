@@ -53,13 +53,49 @@ hits = [sum(scaled.stats.cache_hits.values()), sum(twice.entry.stats.cache_hits.
 print(json.dumps([values, hits, environment == dict(os.environ) and folder == numba.config.CACHE_DIR]))
 """
 
+# To load numba and what it compiles with takes most of the time of a process that asks.
+SERVER = f"""
+import os, sys, numba
+sys.dont_write_bytecode = True  # files change within the second by which Python tells versions of them apart
+numba.njit(lambda x: x)(1.0)
+for folder in sys.stdin:
+    if os.fork():
+        os.wait()
+        continue
+    os.chdir(folder.strip())
+    sys.path.insert(0, folder.strip())
+    exec({ASK!r})
+    sys.stdout.flush()
+    os._exit(0)
+"""
+
+
+@pytest.fixture
+def ask(package, tmp_path):
+    """Call a function that imports the package in a copy of a Python that has loaded numba and no more.
+
+    It returns values of the kernels, their cache hits, and whether the import changed nothing outside.
+    """
+    with subprocess.Popen(
+        [sys.executable, "-c", SERVER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment_of(tmp_path),
+    ) as server:
+
+        def put(parent: Path = tmp_path) -> list:
+            server.stdin.write(f"{parent}\n")
+            server.stdin.flush()
+            return json.loads(server.stdout.readline())
+
+        yield put
+        server.stdin.close()
+
 
 @pytest.fixture
 def package(tmp_path):
-    """A package with kernels of two files, and a function that imports it in a fresh Python.
-
-    The function returns values of the kernels, their cache hits, and whether the import changed nothing outside.
-    """
+    """A package with kernels of two files."""
     folder = tmp_path / "vipetsc"
     folder.mkdir()
     (folder / "__init__.py").write_text("")
@@ -76,13 +112,7 @@ def package(tmp_path):
     shutil.copy(lowering.__file__, folder)
     shutil.copy(process.__file__, folder)
 
-    def ask(parent: Path = tmp_path) -> list:
-        environment = environment_of(tmp_path)
-        done = subprocess.run([sys.executable, "-c", ASK], cwd=parent, env=environment, capture_output=True)
-        assert done.returncode == 0, done.stderr.decode()
-        return json.loads(done.stdout)
-
-    return folder, ask
+    return folder
 
 
 def environment_of(folder: Path) -> dict[str, str]:
@@ -91,9 +121,9 @@ def environment_of(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_kernels_are_found_again_until_their_sources_change(package, tmp_path):
+def test_kernels_are_found_again_until_their_sources_change(package, ask, tmp_path):
     """Hits are those of the kernel in ``inner``, of the one in ``outer`` that calls it, and of the callback."""
-    folder, ask = package
+    folder = package
     assert ask() == [[12.0, 7.0], [0, 0, 0], True]
 
     # A file without kernels does not matter.
@@ -135,10 +165,9 @@ def test_a_kernel_is_translated_only_where_python_calls_it():
 
 
 def test_kernels_may_be_kept_in_a_chosen_folder(package, tmp_path):
-    folder, _ = package
-    file = folder / "outer.py"
-    chosen = kernel_cache.kernel_cache(folder, file, str(tmp_path / "chosen"))
-    assert chosen == tmp_path / "chosen" / kernel_cache.kernel_cache(folder, file).name
+    file = package / "outer.py"
+    chosen = kernel_cache.kernel_cache(package, file, str(tmp_path / "chosen"))
+    assert chosen == tmp_path / "chosen" / kernel_cache.kernel_cache(package, file).name
 
 
 @pytest.fixture
@@ -155,14 +184,13 @@ def forgotten():
 @pytest.mark.usefixtures("forgotten")
 def test_kernels_are_in_the_users_cache_or_else_in_the_package(package, tmp_path, monkeypatch):
     """Where modes of lattices are kept, too; on nodes without a home in a package that can be written."""
-    folder, _ = package
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "of-user"))
-    kernels = kernel_cache.kernel_cache(folder, folder / "outer.py")
+    kernels = kernel_cache.kernel_cache(package, package / "outer.py")
     assert kernels.parent == cache_folder() == tmp_path / "of-user" / "vipetsc"
 
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc")
     kernel_cache.kernel_cache.cache_clear()
-    assert kernel_cache.kernel_cache(folder, folder / "outer.py") == folder / "__pycache__" / kernels.name
+    assert kernel_cache.kernel_cache(package, package / "outer.py") == package / "__pycache__" / kernels.name
 
 
 @pytest.mark.usefixtures("forgotten")
