@@ -5,13 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.unit.propagator_parts import MASS, RATE, pressed_mass
+from tests.unit.propagator_parts import pressed_mass
 from vipetsc.contact.law import CLOSED
 from vipetsc.contact.search import MOST_ATTEMPTS
 from vipetsc.dynamics.propagator import advance
-from vipetsc.dynamics.propagator.advance import CUT, DONE, SHORTEST, advance_cluster
+from vipetsc.dynamics.propagator.advance import CUT, SHORTEST
 from vipetsc.dynamics.propagator.kinks import first_kink
-from vipetsc.dynamics.propagator.loss_tables import no_losses
 from vipetsc.dynamics.propagator.nodes import EXIT
 from vipetsc.dynamics.propagator.substeps import Substep
 
@@ -65,36 +64,6 @@ def test_a_kink_is_found_where_a_pressed_contact_opens_or_closes(side, gap, moti
     # Other contacts have modes, which are searched for elsewhere.
     cluster.contacts["mode"] = side * CLOSED
     assert first_kink(cluster, cluster.trial, length) == NONE
-
-
-@pytest.mark.parametrize("side", [1, -1])
-def test_substeps_end_where_a_pressed_contact_opens_and_closes(side):
-    """A mass pressed on a bilinear stop by a load P = k p: w'' = -omega^2 w while w > -p, then w'' = P/m, and back."""
-    speed = 0.13
-    depth = 4e-6
-    cluster = pressed_mass(-depth, side)
-    interval = cluster.interval
-    cluster.contacts["preload"] = side * MASS * RATE**2 * depth
-    cluster.taylor[0, 1] = -side * speed * interval
-    cluster.state["length"] = 1.0
-
-    _, losses = no_losses(dofs=1, clusters=1)
-    assert advance_cluster(cluster, losses, may_rest=False) == (DONE, -1)
-
-    # The phase at which it opens, the time in the air, and the rest of the step on the stop again.
-    opening = np.arcsin(depth * RATE / speed) / RATE
-    rebound = np.sqrt(speed**2 - (depth * RATE) ** 2)
-    flight = 2 * rebound / (RATE**2 * depth)
-    remaining = interval - opening - flight
-    assert remaining > 0
-
-    phase = RATE * remaining
-    w = -depth * np.cos(phase) + rebound / RATE * np.sin(phase)
-    v = RATE * depth * np.sin(phase) + rebound * np.cos(phase)
-    # Each substep may err by rtol = 1e-10, of which the errors of the few substeps here use a part.
-    assert cluster.taylor[0, 0] == pytest.approx(side * w, abs=1e-10 * depth)
-    assert cluster.taylor[0, 1] / interval == pytest.approx(side * v, abs=1e-10 * speed)
-    assert cluster.state["position"] == 1.0
 
 
 class SubstepsOnKinks:

@@ -208,3 +208,43 @@ def test_steps_end_where_pressed_contacts_open_and_close(law, bound, precompress
 
     assert result.statistics["landings"] > 80
     assert result.statistics["ledger_error"] < bound
+
+
+@pytest.mark.parametrize("side", ["plus", "minus"])
+def test_a_mass_that_leaves_a_bilinear_stop_and_comes_back_has_the_exact_motion(side):
+    """Pressed by a load P = k d: u'' = -omega^2 u while it is on the stop, u > -d, and u'' = P/m until it is back."""
+    mass = 0.02
+    omega = 3e4
+    depth = 4e-6
+    speed = 0.13
+    sign = 1 if side == "plus" else -1
+    stop = {"law": "bilinear", "stiffness": mass * omega**2, "side": side, "clearance": 0.0, "precompression": depth}
+    # Its neighbours, without which there is no lattice, pull at it with 1e-13 of the load.
+    weak = {"start": 1, "end": 1, "stiffness": 1e-6, "next_cell": True}
+    case = Case.from_table({
+        "lattice": {"cell": {"masses": [mass], "springs": [weak]}, "cells": 4, "ends": "free"},
+        "contacts": stop | {"sites": [2], "pair": [0, 1]},
+        "initial": {"kind": "velocity", "cell": 2, "velocity": -sign * speed},
+        "drive": {"amplitude": 0.0, "frequency": omega},
+        "time": {"end": 3e-3, "sample_interval": 1e-4, "engine": "propagator", "rtol": 1e-10},
+    })  # fmt: skip
+
+    dataset, result = simulated(case)
+    assert result.statistics["engine"] == "propagator"
+
+    # On the stop u = A sin(phase), and it leaves at the phase whose sine is -d/A; it is back as fast as it left.
+    amplitude = speed / omega
+    leaving = np.arcsin(depth / amplitude)
+    rebound = np.sqrt(speed**2 - (depth * omega) ** 2)
+    flight = 2 * rebound / (omega**2 * depth)
+    period = flight + (np.pi + 2 * leaving) / omega
+
+    times = dataset["time"].values
+    begin = times < leaving / omega
+    t = np.where(begin, 0.0, times - leaving / omega) % period
+    in_the_air = -depth - rebound * t + 0.5 * omega**2 * depth * t**2
+    on_the_stop = amplitude * np.sin(omega * (t - flight) - leaving)
+    expected = np.where(begin, -amplitude * np.sin(omega * times), np.where(t < flight, in_the_air, on_the_stop))
+    assert times[-1] > 10 * period
+    found = sign * dataset["displacement"].values[:, 1, 0]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * amplitude)
