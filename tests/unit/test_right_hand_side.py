@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from vipetsc.case import Model
 from vipetsc.contact.law import CLOSED, FREE
 from vipetsc.dynamics.lattice_record import LatticeRecord, create_record
 from vipetsc.dynamics.layout import Layout
-from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, right_hand_side
+from vipetsc.dynamics.ts.right_hand_side import observe, observe_pairs, register
 from vipetsc.lattice import Chain, Contact, Drive, Spring, UnitCell
 from vipetsc.lattice.chain import Pair
 
@@ -137,12 +138,23 @@ def accelerations(model: Model, motion: Motion) -> np.ndarray:
 
 
 class Evaluated(NamedTuple):
-    """A layout, its record, the state with its ghosts, and the rates by ``right_hand_side``, with theirs."""
+    """A layout, its record, the state, also with its ghosts, and the rates by the right-hand side, with theirs."""
 
     layout: Layout
     lattice: LatticeRecord
+    state: PETSc.Vec
     y: np.ndarray
     rates: np.ndarray
+
+
+def rates_of(lattice: LatticeRecord, time: float, state: PETSc.Vec) -> PETSc.Vec:
+    """The rates of a state as PETSc gets them; what is not written stays a NaN."""
+    rates = state.duplicate()
+    rates.array[:] = np.nan
+    ts = PETSc.TS().create(MPI.COMM_SELF)
+    register(ts, lattice)
+    ts.computeRHSFunction(time, state, rates)
+    return rates
 
 
 def evaluate(model: Model, motion: Motion, dashpots: bool = True) -> Evaluated:
@@ -157,13 +169,10 @@ def evaluate(model: Model, motion: Motion, dashpots: bool = True) -> Evaluated:
     with state.localForm() as local:
         y = local.array.copy()
 
-    rates = state.duplicate()
-    # What is not written stays a NaN.
-    rates.array[:] = np.nan
-    right_hand_side(motion.t, y, rates.array, record)
+    rates = rates_of(record, motion.t, state)
     rates.ghostUpdate()
     with rates.localForm() as local:
-        return Evaluated(layout, record, y, local.array.copy())
+        return Evaluated(layout, record, state, y, local.array.copy())
 
 
 PAIRS = {
@@ -235,13 +244,12 @@ def test_a_rank_writes_only_to_what_it_owns():
     n = CELLS
     d = CELL.dofs
 
-    layout, record, y, _ = evaluate(model, motion)
+    layout, record, state, _, _ = evaluate(model, motion)
     # Of the pressed site, which joins masses 1 and 3 of a cell, the host belongs to another rank; the last site too.
     record.site_dofs["host"]["cell"][2] = -1
     record.site_dofs["resonator"]["cell"][1] = -1
     record.site_dofs["ledger"][3] = -1
-    rates = np.full(layout.size, np.nan)
-    right_hand_side(motion.t, y, rates, record)
+    rates = rates_of(record, motion.t, state).array
 
     forces, _ = contact_forces(model.chain, motion)
     expected = whole.rates[: layout.size].copy()
