@@ -58,7 +58,8 @@ from vipetsc.dynamics.spring_law import SPRING_LAW
 # twice as much does the reverse, 3 % and 4 %.
 FIRST_SUBSTEP = 0.1
 FIRST_TOLERANCE = 1e-6
-# Most by which a loose tolerance lengthens it.
+# Most by which a loose tolerance lengthens it. At tolerances of 1e-3 to 1e-5 the small lattice of the tests has equal
+# errors with 1 and with 4; with 1 it takes up to 14 % more substeps, with 4 as many.
 LONGEST_FIRST = 2.0
 # Changes of one cluster in one step beyond which it counts as stalled; the built-in case has two at most.
 MOST_CHANGES = 5_000

@@ -2,8 +2,8 @@
 
 Two forces at times after which the fractions a <= b of the step remain cause a loss that is smooth in a and b (sec. 10
 of the derivation in the package's docstring): its rates turn by no more than 2 theta, theta = omega_max H, and its
-coefficient of degree p is at most 2 p + 1 times the spherical Bessel function j_p(theta) <= theta^p/(2 p + 1)!!. A
-dozen of polynomials does what would take forty powers, and without the powers' cancellation.
+coefficient of degree p is at most 2 p + 1 times the spherical Bessel function j_p(theta) <= theta^p/(2 p + 1)!!. Twelve
+polynomials are enough at theta = 0.8, and 18 at 3.1. Powers of a and b in their place would cancel one another.
 """
 
 from functools import lru_cache
@@ -22,6 +22,8 @@ def mode_count(theta: float) -> int:
     They are those whose bound ``theta``^p/(2 p + 1)!! of the module's docstring is not below ``SMALLEST_MODE``.
     Factorials outgrow powers, so that the loop ends and AssertionError is never raised.
     """
+    # Without the factor 2 p + 1: most rates of a lattice turn more slowly than the fastest. In the damped four-band
+    # lattice, at theta = 0.8 and 3.1, the coefficients of further degrees are 1e-14 of the largest: that is rounding.
     bound = 1.0
     for p in count(1):
         bound *= theta / (2 * p + 1)
