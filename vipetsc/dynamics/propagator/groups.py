@@ -4,6 +4,7 @@ They are contact sites, springs that are not linear, and driven masses. Those th
 group (sec. 6 of the derivation in the package's docstring).
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,7 @@ def spans_cells(chain: Chain) -> bool:
     return chain.is_joined or inside.size > 0
 
 
+@lru_cache(maxsize=2)  # each table of an engine asks for those of its model
 def contact_dofs(model: Model) -> np.ndarray:
     """The DoFs on which forces act: relative displacements of the sites, elongations, displacements of driven masses.
 
@@ -83,6 +85,7 @@ def contact_dofs(model: Model) -> np.ndarray:
     dofs["clearance"][first_drive:] = np.inf
     if len(springs):
         _fill_springs(dofs[len(sites) : first_drive], lattice, springs)
+    dofs.flags.writeable = False  # all who ask get the same array
     return dofs
 
 

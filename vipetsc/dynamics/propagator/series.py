@@ -20,9 +20,9 @@ and their sum is at most theta^(2n-1)/(2n-1)! times 1/(1 - theta/(2n)). That fac
 theta <= 2n - 1, which holds wherever the bound is below 1.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import factorial
 
 import numpy as np
@@ -37,6 +37,8 @@ from vipetsc.lattice.chain import Chain
 MOST_TERMS = 24
 # Cells whose rows are computed together: they take about 100 kB each, too much for all cells at once.
 BATCH = 64
+# Cells whose rows are kept: members of a sweep ask again for those near the same few contacts and ends.
+KEPT = 16
 # Entries of P below this fraction of the tolerance are dropped; ``truncation`` counts them.
 SMALL_ENTRY = 1e-3
 
@@ -168,6 +170,25 @@ class StepSeries:
         depend on which cells a batch holds.
         """
         cells = np.asarray(cells, np.int64)
+        if len(cells) <= KEPT:
+            for cell in cells.tolist():
+                yield self._kept_rows(cell)
+        else:
+            yield from self._compute_rows(cells)
+
+    @cached_property
+    def _kept_rows(self) -> Callable[[int], np.ndarray]:
+        """The rows of a cell, of which the last ``KEPT`` are kept; nobody may write to them."""
+
+        def compute(cell: int) -> np.ndarray:
+            (rows,) = self._compute_rows(np.array([cell]))
+            rows.flags.writeable = False
+            return rows
+
+        return lru_cache(maxsize=KEPT)(compute)
+
+    def _compute_rows(self, cells: np.ndarray) -> Iterator[np.ndarray]:
+        """The rows of each of ``cells``, see ``rows``."""
         distances = np.arange(-self._outermost, self._outermost + 1)
         for batch in np.split(cells, range(BATCH, len(cells), BATCH)):
             neighbours = batch[:, None] + distances
