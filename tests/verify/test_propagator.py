@@ -13,7 +13,7 @@ from vipetsc.case import Case
 from vipetsc.contact.law import create_contacts
 from vipetsc.dynamics import simulate
 from vipetsc.dynamics.propagator.nodes import collocation
-from vipetsc.dynamics.propagator.series import StepSeries
+from vipetsc.dynamics.propagator.series import KEPT, StepSeries
 from vipetsc.dynamics.propagator.taylor import first_onset
 from vipetsc.lattice import Contact, pass_bands
 from vipetsc.lattice.chain import Chain
@@ -328,6 +328,22 @@ def test_rows_near_an_end_turn_into_the_stencil(interval):
 
     # The last of the end's cells meets the wall only in its farthest entries.
     np.testing.assert_allclose(end[:, :, r:], interior[:, :, r + 1 :][:, :, :r], rtol=1e-9, atol=1e-9)
+
+
+def test_rows_of_a_few_cells_are_kept():
+    """They are those of a batch of many cells to the bit, asked for once or twice, and nobody can write to them."""
+    series = StepSeries(small_case().model().chain, 5e-4, 1e-14)
+    cells = list(range(series.chain.cells))
+    assert len(cells) > KEPT
+
+    together = list(series.rows(cells))
+    for cell in (0, 3, cells[-1], 0, 3):
+        (rows,) = series.rows([cell])
+        np.testing.assert_array_equal(rows, together[cell])
+        (again,) = series.rows([cell])
+        assert again is rows
+        with pytest.raises(ValueError, match="read-only"):
+            rows[:] = 0.0
 
 
 @st.composite
