@@ -1,4 +1,4 @@
-"""First calls of compiled kernels: small runs and branches that compile and store the kernels of most studies."""
+"""First calls of compiled kernels: small runs, branches and a fit, which compile and store those of most studies."""
 
 import tempfile
 from collections.abc import Callable
@@ -10,11 +10,13 @@ from typing import Any
 from mpi4py import MPI
 
 from vipetsc.case import Case, NnmCase
+from vipetsc.case.identify import IdentifyCase
 from vipetsc.dynamics.run import simulate
 from vipetsc.modes.branches.follow import follow_all
 from vipetsc.parallel import on_every_rank
 from vipetsc.process import compiling
 from vipetsc.studies.analysis import analyse
+from vipetsc.studies.identification import run_identification
 
 # Both sites are touched, so that all that contacts call is called.
 RUN: dict[str, Any] = {
@@ -34,26 +36,45 @@ BREATHER: dict[str, Any] = {
     "contacts": {"sites": [7]},
     "nnm": {"system": "chain", "start_frequency": [1600.0], "tolerance": 1e-12, "first_step": 1e-2, "points": 2},
 }
+# One clearance in the first contacts of the record that comes with the examples.
+RECORD = Path(__file__).parents[1] / "examples" / "identify.csv"
+IDENTIFIED: dict[str, Any] = {
+    "lattice": {"cells": 12},
+    "contacts": {"sites": [3], "clearance": 1e-3},
+    "drive": {"cycles": 6},
+    "identify": {
+        "steps": 1,
+        "profile": 0,
+        "records": [
+            {
+                "file": str(RECORD),
+                "time": "time (s)",
+                "end": 0.008,
+                "sensors": [{"quantity": "velocity", "column": "near (m/s)", "cell": 4, "mass": 1}],
+            }
+        ],
+        "unknowns": [{"quantity": "clearance", "bounds": [3e-4, 5e-3]}],
+    },
+}
 
 
 def compile_kernels(comm: MPI.Comm) -> float:
-    """Compile the kernels of runs and branches that are not kept yet; returns the seconds of the slowest rank.
+    """Compile the kernels of runs, branches and fits that are not kept yet; returns the seconds of the slowest rank.
 
-    The calls are divided over the ranks in turn. Of two, the first compiles the branches and the second the runs, which
-    take about as long and need some kernels in common. All ranks must call it.
+    The calls are divided over the ranks. Two ranks that need a kernel at the same time compile it twice: those of the
+    propagator's steps, which take longer than all others, are needed by runs and by breathers, and one rank has both.
+    All ranks must call it.
     """
-    calls: list[Callable[[], object]] = [
-        partial(follow, CELL),
-        partial(run, "propagator"),
-        partial(follow, BREATHER),
-        partial(run, "ts"),
-        find_fonts,
+    parts: list[list[Callable[[], object]]] = [
+        [partial(run, "propagator"), partial(follow, BREATHER)],
+        [partial(follow, CELL), partial(run, "ts"), identify, find_fonts],
     ]
     before = compiling.seconds
 
     def call_own() -> float:
-        for call in calls[comm.rank :: comm.size]:
-            call()
+        for part in parts[comm.rank :: comm.size]:
+            for call in part:
+                call()
         return compiling.seconds - before
 
     return max(comm.allgather(on_every_rank(comm, call_own)))
@@ -72,6 +93,12 @@ def follow(table: dict[str, Any]) -> None:
     # The branch itself is of no use: its kernels are what is left.
     with tempfile.TemporaryDirectory() as folder:
         follow_all(NnmCase.from_table(table), Path(folder), MPI.COMM_SELF)
+
+
+def identify() -> None:
+    """One step of a fit to a record."""
+    with tempfile.TemporaryDirectory() as folder:
+        run_identification(IdentifyCase.from_table(IDENTIFIED), Path(folder), MPI.COMM_SELF)
 
 
 def find_fonts() -> None:
