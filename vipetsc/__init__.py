@@ -43,6 +43,7 @@ def __getattr__(name: str) -> object:
     """Load a name when it is first used: importing the package must not start PETSc, whose options come first."""
     if name in MODULES:
         module, attribute = MODULES[name]
+        # ``register`` is a module of the package, the others are names in one.
         if module == __name__:
             return import_module(f"{module}.{attribute}")
         return getattr(import_module(module), attribute)

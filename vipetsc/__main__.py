@@ -9,7 +9,8 @@ from importlib.util import find_spec
 from vipetsc.cli.streams import check_standard_streams
 from vipetsc.process import collect_seldom, end_on_request, quick_start
 
-BUILT_FOR_MPI = "mpi4py", "petsc4py", "h5py"  # which no wheel brings
+# Libraries that must be built for the machine's MPI, so that setting up the package does not install them.
+BUILT_FOR_MPI = "mpi4py", "petsc4py", "h5py"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -22,7 +23,7 @@ def main(arguments: list[str] | None = None) -> int:
     # One thread per rank: further threads would compete with the other ranks for the cores.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    # Pictures go into files: the backend that a notebook names for its windows need not even be there.
+    # Pictures go into files. A notebook names a backend for its own windows, which may not be installed here.
     os.environ["MPLBACKEND"] = "agg"
     logging.basicConfig(format="%(message)s")
     logging.getLogger("vipetsc").setLevel(logging.INFO)
@@ -41,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     import petsc4py
 
-    # Signals are ours: SIGTERM ends a run at its next step, with a checkpoint.
+    # PETSc's handlers of signals would end the process at once; ours end a run at its next step, with a checkpoint.
     with quick_start():
         petsc4py.init([sys.argv[0], "-no_signal_handler", *arguments[end + 1 :]])
         from petsc4py import PETSc
@@ -68,7 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options:
         database.delValue(name)
 
-    # What is loaded stays, and need not be searched for garbage.
+    # Modules stay loaded until the process ends: searches for garbage leave their objects out.
     gc.freeze()
     return run_verb(arguments[:end], options)
 

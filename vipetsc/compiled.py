@@ -28,7 +28,7 @@ def njit(*signature: Any, **options: Any) -> Any:
     if signature and callable(signature[0]):
         return njit()(signature[0])
     disjoint = options.pop("disjoint", False)
-    # No C code calls these.
+    # No C code calls these functions: the wrapper that it would need is not compiled.
     compile_entry = _decorator(numba.njit, *signature, no_cfunc_wrapper=True, pipeline_class=EntryCompiler, **options)
     if signature:
         return compile_entry
@@ -42,7 +42,7 @@ def cfunc(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]
 
 def users_function(function: Callable[..., Any]) -> Any:
     """A ``function`` of a user's module, compiled where it is called; nothing is kept of it between runs."""
-    # One that the module has compiled itself has perhaps another model of errors.
+    # A function that the module itself has compiled may raise at a division by zero, which gives inf here.
     return numba.njit(error_model="numpy")(getattr(function, "py_func", function))
 
 
@@ -53,13 +53,18 @@ def c_address(function: Callable[..., Any], signature: str) -> int:
     return int(callback.address or 0)
 
 
-_CALLBACKS: list[Any] = []  # C functions that are called by their addresses, which keep nothing from being freed
+_CALLBACKS: list[Any] = []  # C functions in use: an address alone does not keep Python from freeing the function
 
 
 def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """``compiler`` with ``kernel_cache`` as numba's folder meanwhile; a NUMBA_CACHE_DIR stays the parent."""
+    """A decorator: compiles functions by numba's ``compiler``, and keeps their code in the folder ``kernel_cache``.
+
+    That folder lies within NUMBA_CACHE_DIR, if the user has set it.
+    """
 
     def decorate(function: Callable[..., Any]) -> Any:
+        # Numba takes its folder from the configuration, which is changed for this function alone: functions of other
+        # packages keep their own cache.
         config: Any = numba.config
         chosen = config.CACHE_DIR
         locators = config.CACHE_LOCATOR_CLASSES
@@ -68,6 +73,7 @@ def _decorator(compiler: Any, *signature: str, **options: Any) -> Callable[[Call
         PARENTS.add(folder.parent)
         config.CACHE_DIR = str(folder)
         config.CACHE_LOCATOR_CLASSES = f"{ByContent.__module__}.{ByContent.__name__}"
+
         # Callbacks and kernels with a signature are compiled here, others at their first call.
         if signature:
             compiling.start()
@@ -106,15 +112,15 @@ class CompilerListener(event.Listener):
     """Measures the time in which numba compiles functions that are not in the cache, and reports it once."""
 
     def on_start(self, event: Any) -> None:
-        """Begin to compile; a function that is called is compiled within."""
+        """Start the clock; functions that this one calls are compiled before it ends."""
         compiling.start()
         function = event.data["dispatcher"].py_func
-        # Functions of others, which numba compiles too, take their own time.
+        # The time that is announced is that of this package's functions; numba compiles those of others too.
         if function.__module__.split(".")[0] == __package__:
             _announce()
 
     def on_end(self, event: Any) -> None:
-        """End it."""
+        """Stop the clock."""
         compiling.stop()
 
 
@@ -129,11 +135,13 @@ def _announce() -> None:
 event.register("numba:compile", CompilerListener())
 
 
-# For functions that make no arrays but views: numba counts no references to theirs, which costs more than short sums do
-# (each array of a tuple, at each access). ``inlined`` ones are put in place of their calls, with the constants there.
+# For functions that make views of arrays, but no arrays. Without ``_nrt`` numba counts no references to arrays, which
+# would take longer than a short sum: each array of a tuple is counted at each access.
 kernel = njit(error_model="numpy", _nrt=False)
-# For loops over arrays of which none overlaps one that is written to: LLVM, which cannot know that, keeps sums in
-# registers then, where it would store each one before it reads the next number. They keep their order and their bits.
+# For loops over arrays of which none overlaps one that is written to. LLVM cannot see that, and would store each sum
+# before it reads the next number; if it is told so, it keeps sums in registers. Sums keep their order and their bits.
 disjoint = njit(error_model="numpy", _nrt=False, disjoint=True)
+# For short functions that numba puts in place of their calls, with the constants that are passed there.
 inlined = njit(error_model="numpy", _nrt=False, inline="always")
-allocating = njit(error_model="numpy", _nrt=True)  # makes arrays, also where it is called from those
+# For functions that make arrays; functions of the other kinds may call them.
+allocating = njit(error_model="numpy", _nrt=True)

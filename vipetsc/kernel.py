@@ -2,9 +2,9 @@
 
 Numba optimises each function together with all that it calls, translates it into machine code, and gives it a wrapper
 by which Python can call it. Its caller then links the optimised code and does the same again: what lies n calls deep is
-optimised and translated n times, and most of it is never called by Python. A ``Kernel`` comes to its callers as it was
-lowered. It is optimised once, as part of a kernel that Python calls, and the optimiser may put it in place of its
-calls there as before. The order of compilation changes no number.
+optimised and translated n times, and most of it is never called by Python. A ``Kernel`` is passed to its callers as
+code of LLVM that is not optimised. It is optimised once, as part of a kernel that Python calls, where the optimiser may
+put it in place of its calls, as numba's would. The order of compilation changes no number.
 """
 
 from collections.abc import Callable
@@ -61,7 +61,8 @@ class _LinkedLowering(_EntryLowering):
         super().run_pass(state)
         library.finalize()
 
-        # Numba tells functions by objects that Python could call. This one has no code: ``Kernel`` never calls it.
+        # Numba distinguishes functions by objects that Python can call. This object has no code, since ``Kernel``
+        # never calls it.
         lowered = state["cr"]
         description = lowered.fndesc
         key = _dynfunc.make_function(
@@ -74,12 +75,12 @@ class _LinkedLowering(_EntryLowering):
 
 
 class EntryCompiler(CompilerBase):
-    """Numba's compiler of what Python calls, with the lowering above."""
+    """Numba's compiler of functions that Python calls, with lowering by ``TupleLower``."""
 
     _lowering: type[NativeLowering] = _EntryLowering
 
     def define_pipelines(self) -> list[PassManager]:
-        """The passes of numba, of which the last but one is replaced."""
+        """The passes of numba, of which the lowering is replaced."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
         kinds = [kind for kind, _ in passes.passes]
         passes.passes[kinds.index(NativeLowering)] = (self._lowering, "lowering of tuples by address")
@@ -88,7 +89,7 @@ class EntryCompiler(CompilerBase):
 
 
 class _LinkedCompiler(EntryCompiler):
-    """The compiler of kernels."""
+    """The compiler of kernels for their callers, which link them."""
 
     _lowering = _LinkedLowering
 
@@ -103,9 +104,9 @@ class _DisjointCompiler(_LinkedCompiler):
 
 
 class Kernel(CPUDispatcher):
-    """A function that kernels and Python can call; ``decorator`` compiles what Python calls.
+    """A function that kernels and Python can call; ``decorator`` compiles it for calls by Python, at the first one.
 
-    Of the arrays that a ``disjoint`` one takes none overlaps one that it writes to.
+    A ``disjoint`` kernel takes arrays of which none overlaps one that it writes to.
     """
 
     def __init__(
@@ -115,6 +116,7 @@ class Kernel(CPUDispatcher):
         options: dict[str, Any],
         disjoint: bool = False,
     ) -> None:
+        # Kernels that call this one link it: neither Python nor C needs a wrapper of it.
         linked = {"nopython": True, "boundscheck": None, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
         compiler: type[CompilerBase] = _LinkedCompiler
         if disjoint:
@@ -128,5 +130,5 @@ class Kernel(CPUDispatcher):
         return self._decorator(self.py_func)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Call it from Python."""
+        """Call the function from Python."""
         return self.entry(*arguments, **named)

@@ -27,8 +27,8 @@ from vipetsc.process import cache_folder, launched_rank
 
 logger = logging.getLogger(__name__)
 
-# Bytes of all folders together; those that were not used for the longest time go first. The kernels of a version take
-# 20 MB.
+# Bytes of all folders together; the folders used longest ago are removed first. The kernels of a version take 20 MB, so
+# that some 25 versions have room.
 LARGEST = 2**29
 DAY = 86400  # s: how exactly it is known when a folder was used
 HAS_KERNELS = re.compile(rb"^(from|import) (vipetsc\.compiled|numba)\b", re.MULTILINE)
@@ -37,10 +37,10 @@ NAME = re.compile(r"\w+")
 
 
 class ByContent(UserProvidedCacheLocator):
-    """Has numba look for code in ``NUMBA_CACHE_DIR`` itself, whose name says of which sources it is.
+    """Locator that has numba look for code in ``NUMBA_CACHE_DIR`` itself, a folder that is named by its sources.
 
-    Numba would add the path of the source file, and older versions the time at which it was written, in which equal
-    files differ.
+    Numba's own locators add the path of the source file, and those of older versions the time at which it was written.
+    Equal files differ in both.
     """
 
     def __init__(self, function: object, file: str) -> None:
@@ -58,7 +58,7 @@ def kernel_cache(package: Path, file: Path, chosen: str = "") -> Path:
     """The folder for the compiled kernels of a ``file`` of ``package``, named by the hash of ``kernel_sources``.
 
     It is in ``chosen``, else in the user's cache; where that cannot be written, on nodes without a home for instance,
-    in a ``package`` that can.
+    it is in ``package``, if files can be written there.
     """
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
     for path in sorted(kernel_sources(package, file)):
@@ -86,8 +86,8 @@ def obstacle(folder: Path) -> str:
 
 
 def note_use(folder: Path) -> None:
-    """Note that a ``folder`` of kernels is used, if it is there and this was not noted within a day."""
-    # It may be absent, of another user, or on a device that can only be read.
+    """Note that a ``folder`` of kernels is used, if it exists and this was not noted within a day."""
+    # The folder may be absent, of another user, or on a device that can only be read.
     with suppress(OSError):
         if time.time() - folder.stat().st_mtime > DAY:
             os.utime(folder)
@@ -99,7 +99,7 @@ def remove_oldest(parent: Path) -> None:
 
     A process that has loaded kernels of a removed folder keeps them; it compiles those that it has yet to load.
     """
-    # Another process may remove the same ones.
+    # Another process may remove the same folders.
     with suppress(OSError):
         folders = [(folder.stat().st_mtime, folder) for folder in parent.glob("kernels-*")]
         total = 0
@@ -113,7 +113,7 @@ def remove_oldest(parent: Path) -> None:
 def can_keep(parent: Path) -> bool:
     """Whether kernels can be written below ``parent``; prints a message if they cannot."""
     reason = obstacle(parent)
-    # Once, on one rank: every command compiles for up to 20 s then.
+    # Every command then compiles for up to 20 s, which is said once, on one rank.
     if reason and not launched_rank():
         logger.warning("vipetsc: compiling kernels at every start; the cache %s cannot be written: %s", parent, reason)
     return not reason

@@ -41,17 +41,18 @@ def install_abort_hook(comm: MPI.Comm = MPI.COMM_WORLD) -> None:
         sys.stdout.flush()
         if comm.size > 1:
             comm.Abort(1)
-        # Without the usual farewell: HDF5 crashes in its own after a full disk.
+        # Without Python's functions at exit: that of HDF5 crashes after a full disk.
         os._exit(1)
 
     sys.excepthook = hook
 
 
 def wait_for_all(comm: MPI.Comm) -> None:
-    """Wait for all ranks of ``comm``, asleep after a moment: those that still work need the cores."""
+    """Wait for all ranks of ``comm``, asleep after a millisecond: those that still work need the cores."""
     barrier = comm.Ibarrier()
     begin = time.monotonic()
     while not barrier.Test():
+        # Shorter waits are not slept through: a sleep would lengthen them.
         if time.monotonic() - begin > 1e-3:
             time.sleep(1e-3)
 
@@ -238,7 +239,7 @@ class StopRequest:
     _requested = False
     _ends_at_once = False
     _GRACE = 2  # s in which EndedError has to get out of the work
-    _LOOK_EVERY = 0.1  # s between two looks at what others pass on, which take as long as a tenth of a time step
+    _LOOK_EVERY = 0.1  # s between two looks at what others pass on; a look takes as long as a tenth of a time step
     _passed: SharedCounter | None = None
     _next_look = 0.0
 
@@ -303,8 +304,8 @@ class StopRequest:
 
     def _leave(self) -> NoReturn:
         """Raise EndedError where the work is; end the process if the exception does not get out of the work in time."""
-        # A destructor swallows the exception. It is reported to one of these, or an error of the destructor's own is
-        # (h5py's), which nobody wants to read after a request to stop.
+        # A destructor swallows the exception, and Python reports it to one of these hooks, or an error that the
+        # destructor itself raises (h5py's do). Neither tells the user anything after a request to stop.
         sys.excepthook = sys.unraisablehook = _say_nothing
         signal.signal(signal.SIGALRM, end_now)
         signal.alarm(self._GRACE)
@@ -326,7 +327,7 @@ class StopRequest:
             if self._ends_at_once:
                 self._leave()
 
-        # What nohup has set stays.
+        # A signal that nohup has set to be ignored stays ignored.
         taken = [number for number in STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
         earlier = {number: signal.signal(number, receive) for number in taken}
         try:

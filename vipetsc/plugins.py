@@ -45,13 +45,13 @@ class Plugin:
 
 
 _PLUGINS: dict[str, Plugin] = {}
-# A context variable rather than an argument: types of keys ask for the names, and pydantic passes them nothing.
+# A context variable rather than an argument: the types of keys need the names, and pydantic passes them no arguments.
 _NAMED: ContextVar[tuple[str, ...] | None] = ContextVar("named", default=None)
 
 
 @contextmanager
 def only(names: Sequence[str]) -> Iterator[None]:
-    """Let ``registered`` list the parts of the modules ``names`` alone within the block, those that a case names."""
+    """Let ``registered`` list, within the block, only parts of the modules ``names``, which are those of a case."""
     token = _NAMED.set(tuple(names))
     try:
         yield
@@ -82,9 +82,10 @@ def is_file(name: str) -> bool:
 
 
 def located(name: str, folder: Path) -> str:
-    """The ``name`` of a module as it is from everywhere: of a file its whole path, which may begin at ``folder``.
+    """The ``name`` of a module, which for a file is its absolute path; a relative one begins at ``folder``.
 
-    A file that is not there, as where results have been moved, may lie in the working directory.
+    If the file is not there, for instance since results have been moved, a file of that name in the working directory
+    takes its place.
     """
     if not is_file(name):
         return name
@@ -110,7 +111,7 @@ def load(name: str) -> Plugin:
 
 def _imported(name: str) -> Plugin:
     """The module ``name``, imported."""
-    # What an import adds is what the module has brought along: it may import others that register.
+    # Modules that register parts during this import belong to it: the module may import others.
     earlier = _every_module()
     entry: metadata.EntryPoint | None = None
     try:
@@ -124,14 +125,15 @@ def _imported(name: str) -> Plugin:
             module = importlib.import_module(installed)
     except PluginError:
         raise
-    # SystemExit: a script that ends its process, imported by mistake.
+    # SystemExit is raised by a script that ends its process and was named by mistake.
     except (Exception, SystemExit) as error:
         _forget(_every_module() - earlier)
         raise PluginError(f"cannot be imported: {_reason(error, name)}") from error
 
-    # What it imports may register parts, and an earlier import may have registered its own.
+    # An earlier import may have executed the module already: then its parts are found by its name and its submodules'.
     within = {other for other in _every_module() if f"{other}.".startswith(f"{module.__name__}.")}
-    plugin = Plugin(name, _version(module, entry), frozenset(within | (_every_module() - earlier)))
+    added = _every_module() - earlier
+    plugin = Plugin(name=name, version=_version(module, entry), modules=frozenset(within | added))
     if not plugin.parts:
         raise PluginError("registers nothing; see the chapter extend of the manual")
     return plugin
@@ -174,7 +176,7 @@ def _reason(error: BaseException, file: str) -> str:
     ours = str(Path(__file__).parent)
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(ours)]
     frames = [frame for frame in frames if frame.filename == file] or frames[-1:]
-    # Python's machinery of imports is no file.
+    # Frames of Python's import machinery have a name in angle brackets instead of a file.
     if not frames or frames[-1].filename.startswith("<"):
         return text
     return f"{text} ({frames[-1].filename}, line {frames[-1].lineno})"

@@ -1,4 +1,4 @@
-"""The process itself: its rank before MPI is started, requests to stop until then, lines that it reports, compiling."""
+"""The process itself: its rank and requests to stop before MPI is started, its log, the time that it compiles."""
 
 import gc
 import logging
@@ -15,10 +15,10 @@ logger = logging.getLogger(__name__)
 STOP_SIGNALS = signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1
 # What launchers tell a process of its rank: Open MPI's, those with PMI (MPICH, Intel MPI, Slurm's), Slurm's own.
 RANKS = "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"
-# For Open MPI, where one process runs alone: no daemon is started for it, and no network is looked for.
+# Settings of Open MPI for a process that runs alone: no daemon is started for it, and no network is looked for.
 ALONE = {"OMPI_MCA_ess_singleton_isolated": "1", "OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self"}
-# For Open MPI, where all ranks run on one machine: their messages go through its memory, and no network is looked for,
-# which takes a fifth of a second (.29 s of MPI's start become .08).
+# Settings of Open MPI for ranks on one machine: their messages go through its memory, and no network is looked for,
+# which takes a fifth of a second (MPI starts in .08 s instead of .29 s).
 ONE_MACHINE = {"OMPI_MCA_pml": "ob1"}
 
 # Objects that may hold others, allocated between two searches for garbage. With Python's own 700 the searches take a
@@ -52,10 +52,10 @@ def all_on_this_machine() -> bool:
 
 @contextmanager
 def quick_start() -> Iterator[None]:
-    """Let MPI be started within the block in a tenth of a second instead of half a one, where it needs no network.
+    """Let MPI start within the block without looking for a network, in .1 s instead of .5 s, if it needs none.
 
-    That is where this process is alone, and where all ranks are on one machine. What the environment already says stays
-    as it is.
+    It needs none if this process is alone, or all ranks are on one machine. Variables that the environment already has
+    stay as they are.
     """
     wanted: dict[str, str] = {}
     if launched_rank() is None:
@@ -67,7 +67,7 @@ def quick_start() -> Iterator[None]:
     try:
         yield
     finally:
-        # A process that this one starts may be an mpirun.
+        # Not for processes that this one starts: one may be an mpirun, whose ranks need a network.
         for name in added:
             del os.environ[name]
 
@@ -75,7 +75,7 @@ def quick_start() -> Iterator[None]:
 def collect_seldom() -> None:
     """Look for cyclic garbage less often than Python does by itself.
 
-    Most objects are those of libraries, which stay; fields and records are freed without a search.
+    Most objects are those of libraries, which stay; arrays and records are freed without a search.
     """
     gc.set_threshold(ALLOCATIONS)
 
@@ -83,14 +83,14 @@ def collect_seldom() -> None:
 def end_on_request() -> None:
     """Let a request to stop end the process at once, with exit code 75, as long as nothing has begun."""
     for number in STOP_SIGNALS:
-        # What nohup has set stays.
+        # A signal that nohup has set to be ignored stays ignored.
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, end_now)
 
 
 def end_now(number: int, frame: FrameType | None) -> None:
     """Handle a signal by ending the process with exit code 75."""
-    # A launcher sends the signal to all ranks, when one of them was killed as well: it is the one to say what happened.
+    # A launcher sends the signal to all ranks, also when one of them was killed. It says what happened, once.
     if launched_rank() is None:
         os.write(2, b"vipetsc: stopped on request\n")
     # Without unwinding: modules that are being loaded would swallow an exception, or report one of their own.
@@ -115,9 +115,9 @@ def say(text: str) -> None:
 
 
 class CompileClock:
-    """Clock of the compiler: the ``seconds`` that this process has compiled kernels for, those of now among them.
+    """Clock of the compiler: the ``seconds`` for which this process has compiled kernels so far.
 
-    Progress leaves this time out of its rates: it passes once, at the first calls.
+    Progress leaves this time out of its rates: kernels are compiled once, at their first calls.
     """
 
     def __init__(self) -> None:
@@ -139,7 +139,7 @@ class CompileClock:
         self._depth += 1
 
     def stop(self) -> None:
-        """End what was begun last."""
+        """End the compilation of the kernel that was begun last."""
         if self._depth == 1:
             self._seconds = self.seconds
         self._depth -= 1

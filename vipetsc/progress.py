@@ -48,7 +48,12 @@ class Progress:
         self._first = done
         self._done = done
         if self._bar is not None:
-            self._bar.update(done)
+            # Not by an update: the bar would take what an earlier run has done for work of this instant, predict too
+            # short a time, and wait for another step of that size before it is drawn again.
+            self._bar.initial = done
+            self._bar.n = done
+            self._bar.last_print_n = done
+            self._bar.refresh()
 
     def update(self, done: float) -> None:
         """Report that ``done`` of the total is reached."""
@@ -77,7 +82,7 @@ class Progress:
         return time.monotonic() - compiling.seconds - self._begin
 
     def _leave_out_compiling(self) -> None:
-        """Move the times from which the bar takes its rate behind what was compiled since."""
+        """Move the times from which the bar counts, its start and its last print, by the time compiled since."""
         compiled = compiling.seconds
         self._bar.start_t += compiled - self._compiled
         self._bar.last_print_t += compiled - self._compiled

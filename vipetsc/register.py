@@ -270,14 +270,17 @@ def figure(name: str, *, source: str = "run") -> Callable[[Function], Function]:
 
 
 def reserve(kind: str, names: Iterable[str]) -> None:
-    """Keep the ``names`` of shipped parts of a ``kind`` from being registered; raises PartError for one that is."""
+    """Keep the ``names`` of shipped parts of a ``kind`` from being registered.
+
+    Raises PartError for a name that a module has registered already.
+    """
     _TAKEN[kind] |= {*names}
     for name in _TAKEN[kind] & PARTS[kind].keys():
         raise PartError(f"{PARTS[kind][name].file}: there is a {kind} {name!r} of vipetsc already")
 
 
 def file_digest(file: str) -> str:
-    """SHA-256 of a source ``file``; empty where there is none, as of what is typed in."""
+    """SHA-256 of a source ``file``; empty without one, as for code that is typed in."""
     path = Path(file)
     if not path.is_file():
         return ""
@@ -287,7 +290,7 @@ def file_digest(file: str) -> str:
 def _origin(name: str, function: Callable[..., Any]) -> dict[str, Any]:
     """The fields of the part ``name`` that say where its ``function`` comes from; raises ValueError if it is none."""
     file = str(_plain(function).__code__.co_filename)
-    # What is typed in has no file: its text is the source.
+    # Code that is typed in has no file: the hash is that of the function's own text.
     digest = file_digest(file) or hashlib.sha256(inspect.getsource(function).encode()).hexdigest()
     return {"name": name, "modules": {function.__module__}, "file": file, "sha256": digest}
 
@@ -310,7 +313,10 @@ def _check_arguments(function: Callable[..., Any], names: tuple[str, ...], what:
 
 
 def _add(part: RegisteredPart) -> None:
-    """Enter a ``part``; a module that is executed a second time replaces its parts, a copy of it adds none."""
+    """Enter a ``part`` in ``PARTS``; raises ValueError for a name that is invalid or taken.
+
+    A module that is executed again replaces its parts; a copy of a module, of equal source, adds none.
+    """
     if not NAME.fullmatch(part.name):
         raise ValueError(f"{part.name!r} is no name for a {part.kind}: letters, digits, - and _, a letter first")
     if part.name in _TAKEN[part.kind]:

@@ -116,3 +116,18 @@ def test_the_bar_leaves_it_out_as_well(written, monkeypatch):
     progress.update(1.0)
     assert progress._bar.start_t == begin + 60.0
     progress.close()
+
+
+def test_the_bar_of_a_resumed_run_begins_where_that_was_stopped(written, monkeypatch):
+    """Its rate is that of the work since then, and what was done before is no work of an instant."""
+    monkeypatch.setitem(sys.modules, "ipykernel", object())
+    progress = Progress(MPI.COMM_SELF, 100.0, "s")
+    bar = progress._bar
+    progress.start_at(90.0)
+    bar.start_t -= 2.0
+    bar.last_print_t -= 2.0
+    progress.update(92.0)
+    # Two seconds for 2 s of 100: eight more are left.
+    assert bar.format_dict["rate"] == pytest.approx(1.0, rel=0.05)
+    assert " 92%|" in written()
+    progress.close()
