@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from tests.conftest import search_table
 from vipetsc.case import CaseError, case_id
 from vipetsc.case.disorder import Deviation
+from vipetsc.case.named_files import relative_names, with_absolute_names
 from vipetsc.case.optimise import OptimiseCase
 from vipetsc.case.verb_cases import load_every
 from vipetsc.parallel import StopRequest
@@ -362,3 +363,38 @@ def test_a_run_that_memory_or_disk_was_short_for_has_no_record(tmp_path, error):
         assert records["stalls"]["reason"] == "stalled"
 
     assert asked == ["stalls", "short", "short"]
+
+
+def test_a_wrong_key_hides_no_other_and_brings_none():
+    """A wrong start is one problem besides that of a variable; a wrong objective has no problems of the default's."""
+    with pytest.raises(CaseError) as error:
+        plan("optimise.start=midst", "optimise.variables.sites=[30, 2]")
+    assert [problem.key for problem in error.value.problems] == ["optimise.start", "optimise.variables.sites"]
+
+    # The default, energy in the bands above the driven one, would be impossible here.
+    with pytest.raises(CaseError) as error:
+        plan("lattice.preset=diatomic", "drive={wavenumber='5pi/9', band=2}", "optimise.objective=[{band='x'}]")
+    assert [problem.key for problem in error.value.problems] == ["optimise.objective[1].band"]
+
+
+def test_clearances_are_matched_at_sites_of_one_kind():
+    """Equal restitutions in a list are one kind; a stop on one side at one of the sites makes two."""
+    matched = ["optimise.start=matched", "optimise.variables={clearance=[1e-5, 1e-2]}"]
+    plan(*matched, "contacts.each={restitution=[0.7, 0.7, 0.7]}")
+    with pytest.raises(CaseError, match="these sites differ"):
+        plan(*matched, "contacts.each={side=['plus', 'both', 'both']}")
+    with pytest.raises(CaseError, match="these sites differ"):
+        plan(*matched, "contacts.each={restitution=[0.7, 0.8, 0.7]}")
+
+
+def test_a_search_finds_files_next_to_its_case_file(tmp_path, monkeypatch):
+    """A list of states to begin with is one of files in the folder of the case file, wherever the program starts."""
+    folder = tmp_path / "case"
+    folder.mkdir()
+    for name in ("a.h5", "b.h5"):
+        (folder / name).touch()
+    monkeypatch.chdir(tmp_path)
+    table = {"optimise": {"variables": {"initial": {"path": ["a.h5", "b.h5"]}}}}
+    assert relative_names(table) == ["a.h5", "b.h5"]
+    variables = with_absolute_names(table, folder)["optimise"]["variables"]
+    assert variables["initial"]["path"] == [str(folder / "a.h5"), str(folder / "b.h5")]

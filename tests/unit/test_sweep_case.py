@@ -223,6 +223,8 @@ def test_a_range_meets_decimal_numbers_without_rounding():
     assert log[1] == np.geomspace(0.5, 50.0, 7)[1]
     assert values("{ linear = [0, 1], count = 11 }") == tuple(i / 10 for i in range(11))
     assert values("{ linear = [-0.1, 0.2], count = 4 }") == (-0.1, 0.0, 0.1, 0.2)
+    # A logarithmic range over 16 decades has no 0, which is nowhere near its values.
+    assert values("{ log = [1e-9, 1e7], count = 3 }") == (1e-9, 0.1, 1e7)
 
 
 def test_a_member_is_resolved_once():

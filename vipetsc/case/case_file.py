@@ -5,14 +5,12 @@ and, where there is one, the nearest valid key. ``CaseFile`` reads every case fr
 case is a subclass that declares the sections it reads.
 """
 
-import copy
 import difflib
 import math
 import re
 import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
 from functools import cache, lru_cache
 from inspect import Parameter, Signature
 from pathlib import Path
@@ -22,15 +20,16 @@ import tomli_w
 from pydantic import ValidationError
 
 from vipetsc.case.case_error import CaseError as CaseError
-from vipetsc.case.changes import has_more_keys, value_of
 from vipetsc.case.changes import put as put
+from vipetsc.case.changes import with_overrides as with_overrides
 from vipetsc.case.named_files import with_absolute_names
 from vipetsc.case.nearest_type import BRANCH, of_nearest_type
-from vipetsc.case.nesting import DEEPEST, TOO_DEEP, is_deeper
+from vipetsc.case.nesting import TOO_DEEP, is_deeper
 from vipetsc.case.parts import PluginsTable, missing_parts, module_names, with_located, with_parts
 from vipetsc.case.plain import plain_table
 from vipetsc.case.section import Problem as Problem
 from vipetsc.case.section import Section as Section
+from vipetsc.case.section import is_within
 from vipetsc.io.names import readable
 from vipetsc.plugins import only
 from vipetsc.register import PartError
@@ -38,8 +37,10 @@ from vipetsc.register import PartError
 if TYPE_CHECKING:
     import xarray as xr
 
-FOLDER = re.compile(r"[^\s./\\-][^/\\]*")
-LARGEST = 1e50  # products of six larger numbers overflow, and those of six below its inverse vanish
+FOLDER = re.compile(r"[^\s./\\-][^/\\]*")  # a name of a folder that is neither hidden nor taken for an option
+# Magnitude of a number in a case. A product of six is at most 1e300, and one of six of the smallest at least 1e-300:
+# both are ordinary numbers, while products of seven overflow or vanish.
+LARGEST = 1e50
 LONGEST_NAME = 200  # bytes; file systems take 255, and names of temporary files are longer
 Table = dict[str, Any]  # a parsed TOML table
 Valid = Callable[..., bool]  # whether neither any of the keys given nor a key inside it is invalid
@@ -93,9 +94,13 @@ class CaseFile(Section):
         """The class of each section that the verb reads, by the section's name."""
         classes: dict[str, type[Section]] = {}
         for key, field in cls.model_fields.items():
+            # Studies have the section of their own in the field ``options``.
+            name = key
+            if key == "options":
+                name = cls.section
             for kind in sections_in(field.annotation):
                 if not issubclass(kind, CaseFile):
-                    classes[cls.section if key == "options" else key] = kind
+                    classes[name] = kind
         return classes
 
     @classmethod
@@ -115,7 +120,7 @@ class CaseFile(Section):
         """The resolved case that a file of results carries in its attribute ``case``."""
         case = _kept_case(cls, run.attrs["case"])
         assert isinstance(case, cls)
-        # The modules of a case that was read before may have gone since.
+        # A kept case was read before, and the modules that it names may be gone by now: this reports them.
         case.import_plugins()
         return case
 
@@ -137,7 +142,8 @@ class CaseFile(Section):
         problems: list[Problem] = []
         if overrides:
             table, problems = with_overrides(table, overrides)
-        valid = {"name": None, **dict.fromkeys(_declared_sections(CaseFile))}  # sections of other verbs are allowed
+        # One file may have sections of several verbs. A dictionary keeps their order, which a message shows.
+        valid = {"name": None, **dict.fromkeys(_declared_sections(CaseFile))}
         problems += [_unknown_key(key, table[key], valid) for key in table if key not in valid]
         name = table.get("name", "case")
         problems += _check_name(name)
@@ -147,12 +153,12 @@ class CaseFile(Section):
         mistyped: list[Problem] = []
         if "plugins" in table:
             plugins, mistyped = read_section(PluginsTable, table["plugins"], "plugins")
-        # Without its modules the case has names that stand for nothing: only the modules are reported.
+        # Without the modules, names of parts in the case would be invalid too: only the modules are reported.
         if wrong + mistyped:
             raise CaseError(problems + wrong + mistyped, source)
 
         try:
-            # Another case may have imported further modules in this process, whose parts this case must not find.
+            # Other cases in this process may have imported further modules, whose parts this case must not find.
             with only(module_names(table)):
                 fields, wrong = cls.read(table)
         except PartError as error:
@@ -172,17 +178,17 @@ class CaseFile(Section):
                 fields[key], wrong = read_section(kind, table.get(key, {}), key)
                 problems += wrong
 
-        # A check between keys would be about defaults where a key is invalid, and would confuse: it asks ``valid``.
+        # An invalid key holds its default, about which a problem between keys would say nothing: checks ask ``valid``.
         invalid = {problem.key for problem in problems}
 
         def valid(*keys: str) -> bool:
-            return not any(i == k or i.startswith((f"{k}.", f"{k}[")) for i in invalid for k in keys)
+            return not any(is_within(i, keys) for i in invalid)
 
         return fields, problems + [p for p in cls.check(fields, valid) if valid(p.key)]
 
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterable[Problem]:
-        """Problems between keys; those that are not ``valid`` are reported already and hold their defaults."""
+        """Problems between keys; keys that are not ``valid`` are reported already, and hold their defaults."""
         return ()
 
     def import_plugins(self) -> None:
@@ -214,7 +220,7 @@ class CaseFile(Section):
         return copied
 
     def __getstate__(self) -> dict[Any, Any]:
-        # Cases are sent to other ranks, which compute cached properties again: these are larger than the case.
+        # Cases are sent to other ranks without the values of cached properties, which are larger than the case.
         fields = {name: value for name, value in self.__dict__.items() if name in type(self).model_fields}
         return super().__getstate__() | {"__dict__": fields}
 
@@ -223,7 +229,8 @@ class CaseFile(Section):
         return tomli_w.dumps(self.model_dump(by_alias=True, exclude_none=True))
 
 
-@lru_cache(maxsize=4)  # each measure and picture of a run asks for its case
+# Each measure and picture of a run asks for its case.
+@lru_cache(maxsize=4)
 def _kept_case(kind: type[CaseFile], text: str) -> CaseFile:
     """The resolved case of a ``kind`` in a ``text`` of TOML."""
     return kind.from_toml(text)
@@ -279,31 +286,6 @@ def _unknown_key(path: str, value: Any, valid: Iterable[str]) -> Problem:
     return Problem(path, value, f"unknown key; {remedy}")
 
 
-def with_overrides(table: Table, overrides: Iterable[str]) -> tuple[Table, list[Problem]]:
-    """A copy of ``table`` with each ``section.key=value`` set (TOML value or bare word), and the problems.
-
-    ``section.key=`` removes the key.
-    """
-    # The table may be the built-in one, which later cases read too.
-    table = copy.deepcopy(table)
-    problems: list[Problem] = []
-    for override in map(readable, overrides):
-        path, equals, text = (part.strip() for part in override.partition("="))
-        keys = path.split(".")
-        value = value_of(text)
-        if not equals or not all(keys):
-            problems.append(Problem("--set", override, "write section.key=value"))
-        elif has_more_keys(text):
-            problems.append(
-                Problem("--set", override, "gives a single key; give the keys in further lines with a --set each")
-            )
-        elif len(keys) > DEEPEST or is_deeper(value, DEEPEST - len(keys)):
-            problems.append(Problem("--set", override, TOO_DEEP))
-        else:
-            problems += [replace(p, key=f"--set {p.key}") for p in put(table, path, value)]
-    return table, problems
-
-
 def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySection, list[Problem]]:
     """The section ``name`` and its problems; with problems, the section holds the valid keys and defaults."""
     if not isinstance(table, dict):
@@ -320,10 +302,11 @@ def read_section(kind: type[AnySection], table: Any, name: str) -> tuple[AnySect
             problems.setdefault(problem.key, problem)
             invalid.add(item["loc"][0])
 
+    # The type of a value comes first: of a value that is not of its key's type the range says nothing.
     mistyped = tuple(problems)
-    problems |= {p.key: p for p in _out_of_range(table, name) if not p.key.startswith(mistyped)}
+    problems |= {p.key: p for p in _out_of_range(table, name) if not is_within(p.key, mistyped)}
     if problems:
-        # Read again without them: what is valid can still be checked against other sections.
+        # Read again without the invalid keys: the valid ones can still be checked against other sections.
         section, _ = read_section(kind, {k: v for k, v in table.items() if k not in invalid}, name)
     return section, list(problems.values())
 
@@ -345,7 +328,7 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
     """The problem behind one of pydantic's errors in section ``name``."""
     path = name
     for part in item["loc"]:
-        # Items count from 1, and the types that were tried are no part of the path that a user knows.
+        # Items count from 1. The names of types that pydantic tried are no part of a key's path.
         if isinstance(part, int):
             path += f"[{part + 1}]"
         elif not BRANCH.fullmatch(part):
@@ -375,14 +358,17 @@ def _problem_of(kind: type[Section], name: str, item: Any) -> Problem:
 
 
 def _section_at(kind: type[Section], path: Iterable[int | str]) -> type[Section]:
-    """The section that a path of keys, and of names of the sections that they may be, leads to below ``kind``."""
+    """The class of the section to which a ``path`` within the section ``kind`` leads.
+
+    The path has keys, numbers of items and, behind a key that may have several sections, the name of one of these.
+    """
     choices: list[type[Section]] = []
     for key in path:
         fields = {field.alias or name: field.annotation for name, field in kind.model_fields.items()}
         if key in fields:
             choices = [*sections_in(fields[str(key)])] or choices
             kind = choices[0]
-        # A name of a type chooses among the sections that the key before it may be.
+        # A class name in the path says which of the sections that the key before it may have was tried.
         for choice in choices:
             if choice.__name__ == key:
                 kind = choice

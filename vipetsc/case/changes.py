@@ -1,10 +1,15 @@
-"""Keys of a table by their paths: their values, changes of them, and the text of a value that `--set` gives."""
+"""Keys of a table by their paths: their values, changes of them, and the changes that `--set` gives as text."""
 
+import copy
 import re
 import tomllib
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
+from vipetsc.case.nesting import DEEPEST, TOO_DEEP, is_deeper
 from vipetsc.case.section import Problem
+from vipetsc.io.names import readable
 
 ITEM = re.compile(r"(.+)\[([1-9]\d*)\]")  # an entry of a list, as in masses[2]
 
@@ -20,7 +25,7 @@ def has_more_keys(text: str) -> bool:
 def value_of(text: str) -> Any:
     """Value written in ``text``: TOML, a number such as .5, or a bare word; None if ``text`` is empty."""
     try:
-        # TOML first: only TOML distinguishes lists, tables, booleans and quoted text.
+        # TOML first, which distinguishes lists, tables, booleans and quoted text.
         return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         pass
@@ -29,6 +34,32 @@ def value_of(text: str) -> Any:
         return float(text)
     except ValueError:
         return text or None
+
+
+def with_overrides(table: dict[str, Any], overrides: Iterable[str]) -> tuple[dict[str, Any], list[Problem]]:
+    """A copy of ``table`` with each ``section.key=value`` set (TOML value or bare word), and the problems.
+
+    ``section.key=`` removes the key.
+    """
+    # The table may be the built-in one, which later cases read too.
+    table = copy.deepcopy(table)
+    problems: list[Problem] = []
+    for override in map(readable, overrides):
+        path, equals, text = (part.strip() for part in override.partition("="))
+        keys = path.split(".")
+        value = value_of(text)
+
+        if not equals or not all(keys):
+            problems.append(Problem("--set", override, "write section.key=value"))
+        elif has_more_keys(text):
+            problems.append(
+                Problem("--set", override, "gives a single key; give the keys in further lines with a --set each")
+            )
+        elif len(keys) > DEEPEST or is_deeper(value, DEEPEST - len(keys)):
+            problems.append(Problem("--set", override, TOO_DEEP))
+        else:
+            problems += [replace(p, key=f"--set {p.key}") for p in put(table, path, value)]
+    return table, problems
 
 
 def put(table: dict[str, Any], path: str, value: Any) -> list[Problem]:
@@ -73,7 +104,7 @@ def value_at(table: dict[str, Any], path: str) -> Any:
 
 
 def _divided(place: Any, path: str) -> tuple[str, str]:
-    """The first key of a ``path`` in the table ``place``, which may have dots itself, and the rest of the path."""
+    """The first key of a ``path`` into ``place``, and the rest of the path; a key of a table may have dots itself."""
     dotted: list[str] = []
     if isinstance(place, dict):
         dotted = [key for key in place if "." in key and f"{path}.".startswith(f"{key}.")]
@@ -83,7 +114,11 @@ def _divided(place: Any, path: str) -> tuple[str, str]:
 
 
 def _below(place: Any, key: str, put_missing: bool = False) -> Any:
-    """The value of the table ``place`` at ``key``, perhaps an entry of a list; an empty table or None without one."""
+    """The value of ``place`` at ``key``, which may name an entry of a list as in "masses[2]".
+
+    Without a value it is None, or an empty table that is put there (``put_missing``). If ``place`` is no table, it is
+    ``place`` itself: ``put`` then reports a value where a section should be.
+    """
     if not isinstance(place, dict):
         return place
     item = ITEM.fullmatch(key)

@@ -13,7 +13,7 @@ from vipetsc.case.value_ranges import Values, leaves, short_names, values_in
 # To read a member takes half a millisecond, but to follow its curve takes seconds to minutes: a thousand are a day.
 MOST_MEMBERS = 1000
 SECTIONS = ("lattice", "contacts", "disorder", "drive")  # whose keys may vary
-PLAIN = re.compile(r"\w[\w.+-]*")  # a text that can be a part of a file's name
+PLAIN = re.compile(r"\w[\w.+-]*")  # a text that may be part of a file's name
 
 
 class FamilyMember(NamedTuple):
@@ -37,11 +37,13 @@ class Family(NamedTuple):
 def family_of(table: Table) -> tuple[Family, list[Problem]]:
     """The family of a ``table`` with ``[nfrc.family]``, and what is wrong with that section.
 
-    Each key takes each of its values with each of those of the others; the last key varies fastest. Values are lists or
+    There is a member for each combination of the values of all keys; the last key varies fastest. Values are lists or
     ranges, as in ``[sweep]``.
     """
     section = table["nfrc"]["family"]
-    given = dict(leaves(section)) if isinstance(section, dict) else {}
+    given: dict[str, Any] = {}
+    if isinstance(section, dict):
+        given = dict(leaves(section))
     if not given:
         remedy = "give keys of the case with their values, as in: [nfrc.family] contacts.clearance = [1e-4, 2e-4]"
         return Family([], table), [Problem("nfrc.family", section, remedy)]
@@ -64,29 +66,34 @@ def family_of(table: Table) -> tuple[Family, list[Problem]]:
     if problems:
         return Family([], table), problems
 
-    # Ranges are written out, so that a resumed family has the same values whatever later versions make of a range.
+    # Ranges are written out, so that a resumed family has the same values if a later version computes them otherwise.
     expanded = copy.deepcopy(table)
     expanded["nfrc"]["family"] = {key: list(of_key) for key, of_key in values.items()}
-    names = [_texts(key, of_key) for key, of_key in values.items()]
+    names = [_texts(of_key) for of_key in values.values()]
     members = []
-    for parts, combination in zip(itertools.product(*names), combinations, strict=True):
+    for texts, combination in zip(itertools.product(*names), combinations, strict=True):
         member = copy.deepcopy(table)
         del member["nfrc"]["family"]
         chosen = dict(zip(values, combination, strict=True))
         for key, value in chosen.items():
+            # A copy, since members must not have one list or table in common.
             problems += put(member, key, copy.deepcopy(value))
-        members.append(FamilyMember("-".join(_named(values, parts)), chosen, member))
-    return Family(members, expanded), problems
+        members.append(FamilyMember(name="-".join(_named(values, texts)), values=chosen, table=member))
+    return Family(members=members, table=expanded), problems
 
 
 def _named(values: Values, texts: Sequence[str]) -> list[str]:
-    """The parts of a file's name: the last word of each key, and the text of its value."""
+    """The parts of a file's name: the short name of each key without brackets, and the text of its value."""
     short = short_names(list(values))
     return [f"{re.sub(r'[][]', '', name)}-{text}" for name, text in zip(short.values(), texts, strict=True)]
 
 
-def _texts(key: str, values: Sequence[Any]) -> list[str]:
-    """A text for each value of a ``key``, of which no two are equal; numbers of values that are no plain text."""
+def _texts(values: Sequence[Any]) -> list[str]:
+    """A text for each of the ``values``, for names of files; no two are equal.
+
+    Numbers are written with the digits that distinguish them, and plain words as they are; if there is any other value,
+    or one that comes twice, all are numbered: "no-1", "no-2", ...
+    """
     if all(type(value) in (int, float) for value in values) and len(set(values)) == len(values):
         return distinct(values)
     are_plain = all(isinstance(value, str) and PLAIN.fullmatch(value) for value in values)

@@ -1,8 +1,8 @@
 """Files that a case file names, and the folders in which a relative name is looked up.
 
 A case file and the data that it reads are moved and copied together. A relative name is therefore that of a file in the
-folder of the case file; a file of the current folder is taken where that one does not exist. A name that is given by
-``--set`` or in code is one of the current folder alone.
+folder of the case file, or if there is none, of a file in the current folder. A name that is given by ``--set`` or in
+code is looked up in the current folder alone.
 """
 
 import os
@@ -12,8 +12,9 @@ from typing import Any
 
 from vipetsc.io.names import path_named, readable
 
-# Keys that name a file: `drive.samples.file` and `initial.path`, which a sweep may vary, and `identify.records`.
-SECTIONS = "drive", "initial", "sweep", "identify"
+# Keys that name a file: `drive.samples.file` and `initial.path`, which sweeps and searches may vary, and the `file` of
+# `identify.records`.
+SECTIONS = "drive", "initial", "sweep", "optimise", "identify"
 KEYS = "file", "path"
 MISSING = "no such file, neither in the folder of the case file nor in the current one"
 
@@ -27,7 +28,9 @@ def with_absolute_names(table: dict[str, Any], folder: Path) -> dict[str, Any]:
             return {inner: absolute(item, inner.rpartition(".")[2]) for inner, item in value.items()}
         if isinstance(value, list):
             return [absolute(item, key) for item in value]
-        return _absolute_name(value, folder) if key in KEYS and isinstance(value, str) else value
+        if key in KEYS and isinstance(value, str):
+            return _absolute_name(value, folder)
+        return value
 
     return table | {section: absolute(table[section], section) for section in SECTIONS if section in table}
 
@@ -53,7 +56,7 @@ def _absolute_name(name: str, folder: Path) -> str:
     path = path_named(name)
     # The folder of the case file first: a case that is moved with its data must not find other data of the same name.
     for place in (folder, Path()):
-        # Unlike the methods of paths, it takes names that are too long for the system.
+        # ``Path.is_file`` would raise for a name that is too long for the system.
         if os.path.isfile(place / path):
             return readable((place / path).absolute())
     return name

@@ -6,7 +6,7 @@ from typing import Any
 
 # The types that pydantic tried a value as, in the path of an error: "float", "list[int]", "Span".
 BRANCH = re.compile(r"int|float|str|bool|Span|ClearanceSpan|Profile|Defects|\w*\[(?!\d+\]).*|constrained.*")
-MISTYPED = 100  # errors within a value that weigh as much as another type: no value has so many
+MISTYPED = 100  # cost of a value of another type, in errors within a value, which has fewer than so many
 # What a value of a type is called, by the error of one that is not.
 NAMES_OF_TYPES = {
     "float_type": "a number",
@@ -43,7 +43,7 @@ def of_nearest_type(errors: Sequence[Any]) -> list[Any]:
                 name = _expected_type(error)
             expected.setdefault(value, {})[name] = None
 
-    # Of types with equal costs the first one, which is the type that the section lists first.
+    # Among types of equal cost this is the one that the section lists first.
     nearest = {value: min(types, key=lambda name: types[name]) for value, types in costs.items()}
     kept_errors = []
     for error in errors:
@@ -66,7 +66,10 @@ def _expected_type(error: Any) -> str:
 
 
 def _tried_type(location: Location) -> tuple[Location, str]:
-    """The path of the value in an error's ``location`` that may be of several types, and the one tried; "" if one."""
+    """The path, within an error's ``location``, of the value that may be of several types, and the type that was tried.
+
+    The type is "" if there is no such value.
+    """
     for i, part in enumerate(location):
         if BRANCH.fullmatch(str(part)):
             return location[:i], str(part)

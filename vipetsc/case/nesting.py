@@ -1,8 +1,8 @@
-"""Largest depth of nested tables and lists in a case file, because copying and sending them is recursive."""
+"""The largest depth of nested tables and lists in a case file: they are copied and sent recursively."""
 
 from typing import Any
 
-# Python's copy and pickle fail between 480 and 980 levels below any caller; the keys of a case have fewer than ten.
+# Python's copy and pickle fail from 480 to 980 levels on; the keys of a case have fewer than ten.
 DEEPEST = 50
 TOO_DEEP = f"tables and lists are nested more than {DEEPEST} levels deep; no key of a case needs this"
 

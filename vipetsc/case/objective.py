@@ -15,11 +15,11 @@ from vipetsc.case.schema import Finite, Positive
 from vipetsc.lattice import pass_bands
 from vipetsc.spectra.measures import PART, RunMeasure, measures_of
 
-# Measures of searches alone; all others are those of every run, by their names.
+# Measures that only searches have; all others are numbers of every run, by their names.
 OF_SEARCHES = ("upper_share_at_end", "ibtet", "band_share", "entropy", "transmitted")
-ABOVE_DRIVEN = ("upper_share_at_end", "ibtet")
+ABOVE_DRIVEN = ("upper_share_at_end", "ibtet")  # of the energy in the bands above the driven one
 FILE_AMPLITUDE = "a state from a file is taken as it is, with the amplitude that it has"
-# Of a run's analysis, but no number about the lattice's motion.
+# Numbers of a run's analysis that do not describe the lattice's motion.
 NO_GOAL = ("ledger_error", "entropy/start", "bands/modal_energy")
 Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 
@@ -27,12 +27,12 @@ Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 class MeasuredTable(Section):
     """A measure of a design: of a band or a part of one, at some amplitudes.
 
-    ``measure``: at the run's end, over the energy that the lattice received (the drive's work, and the energy of its
-    motion at t = 0), the energy in the pass bands above the driven one (``upper_share_at_end``), in the pass band
-    ``band`` or in ``part`` of it in rad/s (``band_share``), beyond the last site (``transmitted``); or ``ibtet``, or
-    the energy-weighted ``entropy`` in bit; or any other number of a run by its name, ``peak_velocity/tip`` of a point,
-    ``band_transmission/base-tip`` with the ``band``. Of the ``amplitudes`` of the drive, or of the motion at t = 0
-    where nothing is driven, by default the case's, the ``worst`` or the ``mean`` counts.
+    Three measures are energies at the run's end, over the energy that the lattice received (the drive's work, and the
+    energy of its motion at t = 0): ``upper_share_at_end`` in the pass bands above the driven one, ``band_share`` in the
+    pass band ``band`` or in ``part`` of it in rad/s, ``transmitted`` beyond the last site. Others are ``ibtet``, the
+    energy-weighted ``entropy`` in bit, and any other number of a run by its name: ``peak_velocity/tip`` of a point,
+    ``band_transmission/base-tip`` with the ``band``. The ``worst`` or the ``mean`` over the ``amplitudes`` counts:
+    those of the drive, or of the motion at t = 0 where nothing is driven, by default the case's.
 
     Measures that begin with ``response/`` are those of the curves of ``[nfrc]``: the largest value of a curve, or with
     ``below`` the width of the widest range of the parameter in which the value is below that level; in ``part`` of the
@@ -60,16 +60,16 @@ class MeasuredTable(Section):
 
     @property
     def is_of_runs(self) -> bool:
-        """Whether it is a number of every run, not one that searches alone measure."""
+        """Whether the measure is a number of every run, not one that only searches or frequency responses have."""
         return self.measure not in OF_SEARCHES and not self.is_of_responses
 
     @property
     def is_of_responses(self) -> bool:
-        """Whether it is a number of frequency responses, which ``[nfrc]`` describes."""
+        """Whether the measure is a number of frequency responses, which ``[nfrc]`` describes."""
         return str(self.measure).startswith(RESPONSE)
 
     def at_amplitudes(self, unit: str) -> str:
-        """Words that name the amplitudes of the objective, in their ``unit``, after its name; "" without any."""
+        """Words that name the amplitudes, in their ``unit``, after the name of the measure; "" without any."""
         if not self.amplitudes:
             return ""
         amplitudes = ", ".join(f"{amplitude:g}" for amplitude in self.amplitudes)
@@ -103,21 +103,22 @@ class ConstraintTable(MeasuredTable):
 
     def excess(self, value: float) -> float:
         """Distance of a ``value`` beyond the bounds, over the bound's size (or 1 for a bound of 0); 0 inside."""
+        # Relative, so that the excesses of different constraints can be added.
         below = above = 0.0
         if self.at_least is not None:
             below = (self.at_least - value) / (abs(self.at_least) or 1.0)
         if self.at_most is not None:
             above = (value - self.at_most) / (abs(self.at_most) or 1.0)
-        # Relative excesses of different constraints can be added.
         return max(below, above, 0.0)
 
 
 def measured_problems(
     objective: MeasuredTable, at: str, base: Case, varied: bool, responses: NfrcCase | None
 ) -> Iterator[Problem]:
-    """Problems with an objective or a constraint, of a cell that stays as it is unless ``varied``.
+    """Problems with an ``objective`` or a constraint at the path ``at``, for designs like the case ``base``.
 
-    ``responses`` is the case of the frequency responses, None for a case without ``[nfrc]``, or with an invalid one.
+    ``varied`` says that their cell is not that of ``base``. ``responses`` is the case of the frequency responses, None
+    for a case without ``[nfrc]``, or with an invalid one.
     """
     if objective.amplitudes and not has_free_amplitude(base):
         yield Problem(f"{at}.amplitudes", objective.amplitudes, f"{FILE_AMPLITUDE}; omit them")
@@ -134,22 +135,24 @@ def measured_problems(
     band = objective.band
     part = objective.part
 
-    # The top of the driven band and of those that overlap it.
+    # The upper edge of the driven band and of all that overlap it: bands from the lowest on, as long as the next one
+    # begins below the edge reached so far.
     top = base.wave_frequency or 0.0
     for other in sorted(bands, key=lambda band: band.low):
         if other.low <= top:
             top = max(top, other.high)
 
     if objective.measure == "transmitted" and not base.model().chain.sites:
-        yield Problem(f"{at}.measure", objective.measure, "there is no site, beyond which energy could be; another one")
+        remedy = "there is no site, beyond which energy could be; use another measure"
+        yield Problem(f"{at}.measure", objective.measure, remedy)
     elif objective.measure == "transmitted" and base.lattice.ends == "periodic":
-        remedy = "nothing lies beyond the last site of a ring; lattice.ends = fixed or free, or another measure"
+        remedy = "nothing lies beyond the last site of a ring; use lattice.ends = fixed or free, or another measure"
         yield Problem(f"{at}.measure", objective.measure, remedy)
     elif objective.measure in ABOVE_DRIVEN and base.wave_frequency is None:
-        remedy = "masses that are struck send waves of all bands, and none is the driven one; band_share of a band"
+        remedy = "masses that are struck send waves of all bands, and none is the driven one; use band_share"
         yield Problem(f"{at}.measure", objective.measure, remedy)
     elif objective.measure in ABOVE_DRIVEN and top >= max(b.high for b in bands):
-        remedy = f"the driven band is the highest of {len(bands)}; band_share of another, or a drive on a lower one"
+        remedy = f"the driven band is the highest of {len(bands)}; use band_share of another, or drive a lower one"
         yield Problem(f"{at}.measure", objective.measure, remedy)
     elif (objective.measure == "band_share") != (band is not None):
         remedy = f"missing; band_share needs a band, 1 to {len(bands)}"
@@ -163,7 +166,7 @@ def measured_problems(
     elif part and band:
         low = bands[band - 1].low
         high = bands[band - 1].high
-        # The band of a cell that varies is another one in each design.
+        # Where the cell varies, so do the edges of the band: only the order is checked.
         if not part[0] < part[1] or (not varied and (part[1] <= low or part[0] >= high)):
             yield Problem(
                 f"{at}.part", part, f"must be [low, high] in rad/s and meet band {band}, {low:.5g}-{high:.5g}"
@@ -195,10 +198,12 @@ def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | N
 
 
 def _nearest(name: str, valid: Sequence[str]) -> str:
-    """The nearest of the ``valid`` names if there is one, and all of them."""
+    """A remedy for a ``name`` that is not valid: the nearest of the ``valid`` names if one is near, and all of them."""
     # 0.6 is difflib's own bound: below it proposals are guesses.
     near = difflib.get_close_matches(name, valid, n=1, cutoff=0.6)
-    hint = f"did you mean {near[0]!r}? " if near else ""
+    hint = ""
+    if near:
+        hint = f"did you mean {near[0]!r}? "
     return f"{hint}There are {', '.join(valid)}"
 
 
@@ -223,7 +228,7 @@ def _problems_of_runs(objective: MeasuredTable, at: str, base: Case) -> Iterator
         return
 
     is_of_bands = measures[name].dimension == PART
-    # It would be NaN in every run, and all designs would fail.
+    # A steady amplitude would be NaN in every run, and all designs would fail.
     if name.startswith("steady") and base.drive.kind != "harmonic":
         remedy = f"a {base.drive.kind} becomes no steady vibration; drive.waveform = harmonic, or peak and rms"
         yield Problem(f"{at}.measure", name, remedy)

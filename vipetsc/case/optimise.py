@@ -16,6 +16,7 @@ from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.objective import FILE_AMPLITUDE, ConstraintTable, MeasuredTable, ObjectiveTable, measured_problems
 from vipetsc.case.schema import Positive
 from vipetsc.case.search_space import SearchSpace, case_of, search_space
+from vipetsc.case.section import is_within
 from vipetsc.case.study import StudyCase, with_fastest_engine
 from vipetsc.case.variable_problems import variable_problems
 from vipetsc.case.variables import Variable, VariablesTable
@@ -26,12 +27,13 @@ AMPLITUDES = ("drive.amplitude", "initial.amplitude", "initial.energy", "initial
 
 
 class OptimiseTable(Section):
-    """One objective is searched by CMA-ES, two by NSGA-II, for a Pareto front; designs are to meet each ``constraint``.
+    """A search for designs: of one ``objective`` by CMA-ES, of two by NSGA-II, which finds a Pareto front.
 
-    ``start``: the case, or clearances ``matched`` to its wave by the scattering law of a site; ``budget`` in designs,
-    the case among them; ``population``: designs a generation; ``step``: first standard deviation over the range between
-    the bounds; ``samples`` of what ``[disorder]`` draws are run of every design, and their mean counts; ``curve``:
-    amplitudes in N at which the best designs are compared; ``ranks`` compute a run together.
+    Designs are to meet each ``constraint``. ``start``: the case, or clearances ``matched`` to its wave by the
+    scattering law of a site; ``budget``: number of designs, the case among them; ``population``: designs of a
+    generation; ``step``: first standard deviation over the range between the bounds; ``samples``: draws of
+    ``[disorder]`` with which each design is run, and over which the mean counts; ``curve``: amplitudes at which the
+    best designs are compared; ``ranks``: how many ranks compute a run together.
     """
 
     variables: VariablesTable = Field(default_factory=lambda: VariablesTable.model_validate({}))
@@ -53,17 +55,17 @@ class OptimiseTable(Section):
 
     @property
     def measures_responses(self) -> bool:
-        """Whether something is measured of frequency responses."""
+        """Whether any objective or constraint is measured of frequency responses."""
         return any(table.is_of_responses for table in self.measured)
 
     @property
     def measures_runs(self) -> bool:
-        """Whether something is measured of runs."""
+        """Whether any objective or constraint is measured of runs."""
         return not all(table.is_of_responses for table in self.measured)
 
     @property
     def measured_at(self) -> list[tuple[str, MeasuredTable]]:
-        """The paths of the objectives and of the constraints, with these."""
+        """Pairs of the path of an objective or a constraint and its table; the objectives come first."""
         rows: list[tuple[str, MeasuredTable]] = []
         rows += [(f"optimise.objective[{i}]", objective) for i, objective in enumerate(self.objective, 1)]
         rows += [(f"optimise.constraint[{i}]", bound) for i, bound in enumerate(self.constraint or [], 1)]
@@ -98,12 +100,13 @@ class OptimiseCase(StudyCase):
         except CaseError as error:
             return {}, problems + error.problems
 
-        # What is wrong with a key's type is reported already; a check between keys would report its default.
         wrong = list(_problems(options, base, table, responses))
         if options.start == "matched":
             wrong += _matched_problems(table)
-        invalid = tuple(problem.key for problem in problems)
-        problems += [p for p in wrong if not invalid or not p.key.startswith(("optimise.variables", *invalid))]
+        # A key of the section holds its default if anything inside it is invalid: what is wrong there is reported, and
+        # checks would be about the default.
+        defaults = {".".join(problem.key.partition("[")[0].split(".")[:2]) for problem in problems}
+        problems += [problem for problem in wrong if not is_within(problem.key, defaults)]
         return {"table": table, "options": options, "base": base}, problems
 
     def warnings(self) -> list[str]:
@@ -164,7 +167,7 @@ class OptimiseCase(StudyCase):
     def responses(self, design: Case, sample: int | None = None) -> NfrcCase:
         """The frequency responses of a ``design``, with the scatter number ``sample`` if given; raises CaseError."""
         scatter = self._scatter(sample)
-        # A design that nothing changes is not resolved again.
+        # To vary a case is to resolve it again, which a design without scatter does not need.
         if scatter:
             design = design.varied(**scatter)  # type: ignore[arg-type]  # changes by section
         return responses_of(design, self.table["nfrc"])
@@ -227,7 +230,7 @@ def _amplitude_problems(options: OptimiseTable) -> Iterator[Problem]:
 
 
 def _matched_problems(table: Table) -> Iterator[Problem]:
-    """Problems with clearances that are matched by the scattering law of a case that has none."""
+    """Problems with clearances that are to be matched by a scattering law: of a case that has none, or has several."""
     without_scatter = {key: section for key, section in table.items() if key != "disorder"}
     try:
         law = LawCase.from_table(without_scatter | {"name": "law"})
@@ -236,6 +239,7 @@ def _matched_problems(table: Table) -> Iterator[Problem]:
             remedy = f"there is no scattering law by which clearances could be matched: {problem}"
             yield Problem("optimise.start", "matched", remedy)
         return
-    if law.model().laws or law.model().chain.pairs:
+    # One law is computed, for the cell's own pair, by whose linear motion all clearances are set.
+    if len(law.kinds.kinds) > 1 or law.model().chain.pairs:
         remedy = "clearances are matched by the scattering law of one site, and these sites differ; begin with the case"
         yield Problem("optimise.start", "matched", remedy)

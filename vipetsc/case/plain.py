@@ -17,7 +17,7 @@ def plain_table(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """``value`` in the types of TOML; what has no such type stays as it is, and is refused where it is read."""
+    """``value`` in the types of TOML; a value without such a type stays as it is, and is refused when it is read."""
     if isinstance(value, BaseModel):
         return value.model_dump(by_alias=True, exclude_none=True)
     if isinstance(value, Mapping):

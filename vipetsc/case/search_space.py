@@ -33,11 +33,11 @@ class SearchSpace:
         """The values (variable) of the case to begin with, or with other clearances in m, within the bounds."""
         values = [variable.start for variable in self.variables]
         if clearance:
-            # By either path: clearances vary one by one, or as the ends of a profile.
+            # Clearances vary one by one, or as the two ends of a profile: their paths differ.
             at = {f"contacts.clearance[{i}]": gap for i, gap in enumerate(clearance, 1)}
             at |= {"contacts.clearance.first": clearance[0], "contacts.clearance.last": clearance[-1]}
             values = [at.get(variable.path, variable.start) for variable in self.variables]
-        # The case may lie outside the bounds; the search does not.
+        # The values of the case may be outside the bounds; the search begins within them.
         return np.clip(values, [v.low for v in self.variables], [v.high for v in self.variables])
 
     def to_unit(self, values: np.ndarray) -> np.ndarray:
@@ -45,13 +45,14 @@ class SearchSpace:
         return np.array([variable.to_unit(x) for x, variable in zip(values, self.variables, strict=True)])
 
     def from_unit(self, point: np.ndarray) -> np.ndarray:
-        """The values (variable) at a ``point`` of the unit cube; sites in rising order, no two in one cell."""
+        """The values (variable,) at a ``point`` (variable,) of the unit cube; sites rise, no two in one cell."""
         inside = np.clip(point, 0.0, 1.0)
         values = np.array([variable.from_unit(x) for x, variable in zip(inside, self.variables, strict=True)])
 
         sites = [i for i, variable in enumerate(self.variables) if variable.kind == "site"]
         if sites:
-            # Rising without the number of those before, then with it: no two are the same.
+            # Each cell, less the number of sites before it, must not be below that of the site before: with that number
+            # added back, sites are one cell apart or more. The upper bound leaves room for the sites behind.
             order = np.arange(len(sites))
             last = self.variables[sites[0]].high
             cells = np.maximum.accumulate(np.sort(np.round(values[sites])) - order)
@@ -60,7 +61,7 @@ class SearchSpace:
 
     def table_at(self, values: Iterable[float]) -> Table:
         """The table of the case with ``values`` (variable)."""
-        # Designs must not change the table of the case to begin with, which all of them are built from.
+        # A copy, since all designs are built from the table of the case to begin with.
         table = copy.deepcopy(self.table)
         for variable, value in zip(self.variables, values, strict=True):
             put(table, variable.path, variable.in_case(value))
@@ -88,7 +89,7 @@ def search_space(bounds: VariablesTable, table: Table, base: Case) -> SearchSpac
     given = bounds.keys_of_case()
     table = _with_entries(table, base, [*(path for row in rows for path in row.paths), *given])
     if bounds.profile:
-        # Whatever the clearances are: those between the first and the last one follow from these two.
+        # The clearances of a profile follow from the first and the last one, whatever those of the case are.
         gaps = base.model().chain.clearances
         table["contacts"] = table["contacts"] | {"clearance": {"first": gaps[0], "last": gaps[-1]}}
 
@@ -96,7 +97,8 @@ def search_space(bounds: VariablesTable, table: Table, base: Case) -> SearchSpac
         try:
             rows.append(row_of(key, value, table))
         except ValueError:
-            continue  # as ``variable_problems`` reports
+            # ``variable_problems`` reports it.
+            continue
 
     resolved = base.model_dump(by_alias=True, exclude_none=True)
     variables: list[Variable] = []
@@ -106,9 +108,19 @@ def search_space(bounds: VariablesTable, table: Table, base: Case) -> SearchSpac
             in_row = ""
             if is_row and path.startswith(IN_ROWS) and path.endswith("]"):
                 in_row = row.paths[0]
-            start = _start(row, path, (table, resolved))
-            variables.append(Variable(name, path, row.low, row.high, row.kind, start, in_row, row.choices))
-    return SearchSpace(table, variables)
+            variables.append(
+                Variable(
+                    name=name,
+                    path=path,
+                    low=row.low,
+                    high=row.high,
+                    kind=row.kind,
+                    start=_start(row, path, (table, resolved)),
+                    row=in_row,
+                    choices=row.choices,
+                )
+            )
+    return SearchSpace(table=table, variables=variables)
 
 
 def _named_rows(bounds: VariablesTable, count: int) -> list[VariableRow]:
@@ -117,8 +129,9 @@ def _named_rows(bounds: VariablesTable, count: int) -> list[VariableRow]:
     rows: list[VariableRow] = []
 
     def add(pair: Sequence[float] | None, names: list[str], paths: list[str], kind: Kind) -> None:
+        """Add the row of a quantity with the bounds ``pair``, if it varies."""
         if pair:
-            rows.append(VariableRow(names, paths, float(pair[0]), float(pair[1]), kind))
+            rows.append(VariableRow(names=names, paths=paths, low=float(pair[0]), high=float(pair[1]), kind=kind))
 
     add(bounds.clearance, [f"clearance {i}" for i in numbers], [f"contacts.clearance[{i}]" for i in numbers], "log")
     ends = ["first", "last"]
@@ -159,14 +172,16 @@ def row_of(key: str, given: Any, table: Table) -> VariableRow:
     if isinstance(given, list):
         if len(given) < 2:
             raise ValueError("give two values or more")
-        return VariableRow([key], [key], 1.0, float(len(given)), "choice", tuple(given))
+        return VariableRow(
+            names=[key], paths=[key], low=1.0, high=float(len(given)), kind="choice", choices=tuple(given)
+        )
 
     kind, low, high = _range_of(given)
     value = value_at(table, key)
     paths = [key]
     if isinstance(value, list):
         paths = [f"{key}[{i}]" for i in range(1, len(value) + 1)]
-    return VariableRow(paths, paths, low, high, kind)
+    return VariableRow(names=paths, paths=paths, low=low, high=high, kind=kind)
 
 
 def _range_of(given: Any) -> tuple[Kind, float, float]:
@@ -203,7 +218,7 @@ def _start(row: VariableRow, path: str, tables: Iterable[Table]) -> float:
         return 1.0
 
     for value in values:
-        # Wavenumbers may be text with pi.
+        # Wavenumbers may be texts with pi.
         read = number(value)
         if type(read) in (int, float):
             return float(read)

@@ -1,5 +1,6 @@
 """Base class of the sections of a case file, a strict table, and the problems that are found in one."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +24,11 @@ class Problem:
         if len(text) > LONGEST_VALUE:
             text = f"{text[:LONGEST_VALUE]} ..."
         return f"{self.key} = {text}: {self.remedy}"
+
+
+def is_within(key: str, paths: Iterable[str]) -> bool:
+    """Whether ``key`` is one of the ``paths``, or a key or an entry of a list inside one of them."""
+    return any(key == path or key.startswith((f"{path}.", f"{path}[")) for path in paths)
 
 
 class Section(BaseModel):

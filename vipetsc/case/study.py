@@ -14,12 +14,17 @@ class StudyCase(CaseFile):
     @classmethod
     def keywords(cls) -> Iterable[str]:
         """The sections of a run, and that of the study."""
-        of_study = [cls.section] if cls.section else []  # this class has none
-        return (*Case.sections(), *of_study)
+        # This class itself has no section.
+        if not cls.section:
+            return [*Case.sections()]
+        return [*Case.sections(), cls.section]
 
     @classmethod
     def divide(cls, table: Table, remedy: str) -> tuple[Table, Table, list[Problem]]:
-        """The table of a run and the study's section in ``table``; a problem with the ``remedy`` if it is missing."""
+        """The table of a run and the study's section, out of ``table``; the problem of a section that is missing.
+
+        The problem's text ends with the ``remedy``.
+        """
         of_run = dict(table)
         section = of_run.pop(cls.section, None)
         if not isinstance(section, dict):
@@ -28,8 +33,9 @@ class StudyCase(CaseFile):
 
 
 def with_fastest_engine(table: Table) -> Table:
-    """The ``table`` of a run with the fastest engine that it allows, unless it names one: many runs want that."""
+    """The ``table`` of a run with the fastest engine that the case allows, unless it names one; for many runs."""
     time = table.get("time", {})
+    # Types are not checked yet.
     if not isinstance(time, dict):
         return table
     return table | {"time": {"engine": "auto"} | time}

@@ -23,8 +23,8 @@ from vipetsc.case.study import StudyCase, with_fastest_engine
 from vipetsc.case.value_ranges import MOST_MEMBERS, Values, axes_of, leaves, short_names, values_in
 from vipetsc.wording import counted, shortened
 
-# Members whose cases are resolved to check a sweep before it begins, and sites that they have together: either takes
-# about a second, at 0.6 ms a member and 5 us a site.
+# Members whose cases are resolved to check a sweep before it begins, and sites that they have together, at most. Each
+# takes about a second: 0.6 ms a member, 5 us a site.
 MOST_TRIED = 1_000
 MOST_TRIED_SITES = 200_000
 
@@ -46,7 +46,7 @@ class SweepTable(Section):
 
 @dataclass(frozen=True)
 class SweepMember:
-    """Run of a sweep: its index on every axis; the resolved case, or the problems that prevent it."""
+    """A run of a sweep: its ``index`` on every axis; its resolved ``case``, or None and the ``problems`` with it."""
 
     index: tuple[int, ...]
     case: Case | None
@@ -54,7 +54,10 @@ class SweepMember:
 
 
 class Sweep(StudyCase):
-    """A sweep: the table of its case file without ``[sweep]``, the options, and the axes in the file's order."""
+    """A sweep: the ``table`` of its case file without ``[sweep]``, the ``options``, and the ``axes``.
+
+    Axes are in the file's order. Each has the values of a key, or of several keys that vary together.
+    """
 
     options: SweepTable
     axes: tuple[Values, ...]
@@ -70,7 +73,7 @@ class Sweep(StudyCase):
             return {}, missing
         table = with_fastest_engine(table)
 
-        # What is measured is not varied: ``analyse`` measures a sweep again.
+        # The section [analysis] does not vary: all members are measured alike, and ``analyse`` measures them again.
         sections = Case.model_fields.keys() - {"name", "plugins", "analysis"} | {"disorder"}
         varying = {key: section[key] for key in section if key.partition(".")[0] in sections}
         options, problems = read_section(SweepTable, {k: v for k, v in section.items() if k not in varying}, "sweep")
@@ -117,7 +120,7 @@ class Sweep(StudyCase):
         return html_table(f"{self.name}: {self.count} members", rows)
 
     def ids(self) -> list[str]:
-        """A name for every member, a hash of the table and of what its keys take; equal members have one name."""
+        """A name for every member: a hash of the table and of the values of its keys; equal members have one name."""
         whole = hashlib.sha256(json.dumps(self.table, sort_keys=True, default=str).encode())
 
         def name(texts: Iterable[str]) -> str:
@@ -134,7 +137,7 @@ class Sweep(StudyCase):
         return [name(chosen) for chosen in itertools.product(*texts)]
 
     def member_table(self, index: Sequence[int]) -> tuple[Table, list[Problem]]:
-        """The table of the member with that ``index`` on every axis, and what could not be put into it."""
+        """The table of the member with that ``index`` on every axis, and the problems of keys that cannot be set."""
         table = copy.deepcopy(self.table)
         problems: list[Problem] = []
         for axis, i in zip(self.axes, index, strict=True):
@@ -148,24 +151,26 @@ class Sweep(StudyCase):
         if number in self._resolved_members:
             return self._resolved_members[number]
         member = self._resolve_member(number)
-        # A sweep may have a million members: those that are tried before it begins are asked for again, not all.
+        # Members that are tried before a sweep begins are asked for again. Not all are kept: there may be a million.
         if len(self._resolved_members) < MOST_TRIED:
             self._resolved_members[number] = member
         return member
 
     @cached_property
     def _resolved_members(self) -> dict[int, SweepMember]:
+        """Members that were resolved before, by number."""
         return {}
 
     def _resolve_member(self, number: int) -> SweepMember:
+        """The member ``number``, resolved."""
         index = tuple(map(int, np.unravel_index(number, self.shape)))
         table, problems = self.member_table(index)
         if problems:
-            return SweepMember(index, None, problems)
+            return SweepMember(index=index, case=None, problems=problems)
         try:
-            return SweepMember(index, Case.from_table(table))
+            return SweepMember(index=index, case=Case.from_table(table))
         except CaseError as error:
-            return SweepMember(index, None, error.problems)
+            return SweepMember(index=index, case=None, problems=error.problems)
 
     def number(self, name: str) -> int:
         """The number of the member ``name``, or of that number; raises CaseError if there is none."""
@@ -187,15 +192,15 @@ class Sweep(StudyCase):
     def members(self, most: int = MOST_MEMBERS) -> list[SweepMember]:
         """Members in their order, all of them or ``most`` drawn at random.
 
-        Raises CaseError if none of these is a valid case, and if one is not because of what its disorder draws: the
-        samples that are left would be of another distribution.
+        Raises CaseError if none of these is a valid case, and if any is invalid because of what its disorder draws: the
+        remaining samples would have another distribution.
         """
         # Drawn with a seed of its own, so that every rank and every call tries the same ones.
         numbers = np.arange(self.count)
         if most < self.count:
             numbers = np.sort(np.random.default_rng(0).choice(self.count, most, replace=False))
         members = [self.member(int(number)) for number in numbers]
-        # By their texts, since members with one seed have one problem.
+        # Each text once, since members with the same seed have the same problem.
         if refused := {str(p): p for member in members for p in member.problems if p.key.startswith("disorder")}:
             raise CaseError(refused.values(), self.name)
         if not any(member.case for member in members):
@@ -208,12 +213,12 @@ class Sweep(StudyCase):
         Each member resolves all of its sites: where these are many, fewer members are tried, and the others are checked
         when they begin.
         """
-        # The first member stands for all: to count the sites of each takes what is to be saved.
+        # The sites of the first member are counted for all: to count those of each would take the time to be saved.
         table, _ = self.member_table([0] * len(self.axes))
         return self.members(max(1, min(MOST_TRIED, MOST_TRIED_SITES // max(1, _site_count(table)))))
 
     def warnings(self) -> list[str]:
-        """Problems of members that are no valid cases, among those that are tried: they fail, the others do not."""
+        """The problems of members that will fail, as far as they are tried: their cases are invalid."""
         counts = Counter(str(problem) for member in self.tried() for problem in member.problems)
         if not counts:
             return []
@@ -236,7 +241,7 @@ class Sweep(StudyCase):
 
 
 def _site_count(table: Table) -> int:
-    """The number of sites that a table asks for, which need not be a valid case; 0 where it does not say."""
+    """The number of sites that a ``table`` asks for, whose types are not checked yet; 0 where it does not say."""
     contacts = table.get("contacts", {})
     if not isinstance(contacts, dict):
         return 0

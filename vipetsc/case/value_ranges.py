@@ -1,4 +1,4 @@
-"""Keys that vary: their values in a case file, the axes that they are of, short names of them."""
+"""Keys that vary in a case file: their values, the axes that they form, and their short names."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -11,8 +11,10 @@ from vipetsc.case.disorder import SEED
 
 # Every rank lists the names of all members: 0.6 s and 70 MB for a million.
 MOST_MEMBERS = 1_000_000
-DIGITS = 12  # of numbers that a range is meant to meet
-ROUNDINGS = 8  # relative roundings by which a value of a range may miss such a number; geomspace misses it by up to 3.2
+# A value of a range is taken for a decimal number of so many digits if it differs from it by so many roundings (2e-16)
+# at most; geomspace differs by up to 3.2.
+DIGITS = 12
+ROUNDINGS = 8
 RANGES = {"log", "linear", "whole"}  # the last one only in searches
 Values = dict[str, tuple[Any, ...]]  # the values of each key; an axis has those of keys that vary together
 
@@ -25,9 +27,9 @@ def short_names(keys: Sequence[str]) -> dict[str, str]:
 
 
 def leaves(tree: Table, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Keys as "a.b.c" with their values; a range is one value."""
+    """Pairs of a key's path, as "a.b.c", and its value in the table ``tree``; a range is one value."""
     for key, value in tree.items():
-        # The seed may be { count = n } alone, which is a range and no table.
+        # Of the seed, { count = n } alone is a range too, and no table.
         if isinstance(value, dict) and not value.keys() & RANGES and path + key != SEED:
             yield from leaves(value, f"{path}{key}.")
         else:
@@ -39,12 +41,13 @@ def values_in(value: Any) -> tuple[Any, ...]:
     if isinstance(value, list) and value:
         return tuple(value)
     if isinstance(value, dict) and value.keys() == {"count"} and type(value["count"]) is int and value["count"] > 0:
-        return tuple(range(min(value["count"], MOST_MEMBERS + 1)))  # one more than allowed is refused as a sweep
+        # One more than is allowed, rather than all: the sweep is refused for it, and a count may exceed the memory.
+        return tuple(range(min(value["count"], MOST_MEMBERS + 1)))
 
     remedy = "give a list of values, { log = [first, last], count = n } or { linear = [first, last], count = n }"
     if not isinstance(value, dict) or len(value) != 2 or "count" not in value:
         raise ValueError(remedy)
-    # What is left is checked step by step, so that the message is about the first thing that is wrong.
+    # The kind of range, its ends and its count are checked one by one, so that a message is about the first problem.
     (kind,) = value.keys() - {"count"}
     ends = value[kind]
     count = value["count"]
@@ -58,18 +61,21 @@ def values_in(value: Any) -> tuple[Any, ...]:
         raise ValueError("the ends of a log range must be positive")
 
     first, last = map(float, ends)
+    # A value of a linear range is a sum, with the rounding of its larger end; one of a log range is a product, and
+    # never 0.
     values = np.linspace(first, last, count)
+    largest = max(abs(first), abs(last))
     if kind == "log":
         values = np.geomspace(first, last, count)
-    largest = max(abs(first), abs(last))
+        largest = 0.0
     # The names of members are hashes of their values: 5 and 4.999999999999999 would be two members.
     return tuple(_without_rounding(value, largest) for value in values.tolist())
 
 
 def _without_rounding(value: float, largest: float) -> float:
-    """The decimal number that a ``value`` of a range is but for its rounding (5 for 4.999999999999999), or itself.
+    """The decimal number from which a ``value`` of a range differs by rounding (5 for 4.999999999999999), or itself.
 
-    ``largest`` is the magnitude of the range's larger end, to which sums of a linear range round.
+    It is 0 for a value within the rounding of ``largest``, the magnitude of the larger summand.
     """
     rounding = ROUNDINGS * np.finfo(float).eps
     if abs(value) <= rounding * largest:
@@ -77,12 +83,15 @@ def _without_rounding(value: float, largest: float) -> float:
     decimal = float(f"{value:.{DIGITS}g}")
     if math.isclose(value, decimal, rel_tol=rounding):
         return decimal
-    # Other values keep their bits, and with them the names of members.
+    # All other values keep their bits, of which the names of members are hashes.
     return value
 
 
 def axes_of(values: Values, groups: list[list[str]]) -> tuple[tuple[Values, ...], list[Problem]]:
-    """Axes of a sweep, each a key or a group of keys that vary together, and the problems with the groups."""
+    """Axes of a sweep, each with the values of a key or of a group that varies together, and problems with groups.
+
+    ``groups`` lists the keys of each group.
+    """
     problems: list[Problem] = []
     group_of: dict[str, tuple[str, ...]] = {}
     for group in groups:

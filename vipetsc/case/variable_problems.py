@@ -10,6 +10,7 @@ from vipetsc.case.case import Case
 from vipetsc.case.case_file import CaseError, Problem, Table, put
 from vipetsc.case.contacts import lists_of
 from vipetsc.case.search_space import VariableRow, case_of, row_of, search_space
+from vipetsc.case.section import is_within
 from vipetsc.case.variables import SECTIONS, VariablesTable
 
 AT = "optimise.variables"
@@ -32,7 +33,7 @@ def variable_problems(bounds: VariablesTable, table: Table, base: Case) -> Itera
         except ValueError as error:
             yield Problem(f"{AT}.{key}", value, str(error))
 
-    # Variables with names of their own come first.
+    # Variables with names of their own come first in the space; those of keys follow.
     count = len(space.variables) - sum(len(row.paths) for row in rows.values())
     paths = [variable.path for variable in space.variables[:count]]
     if bounds.restitution:
@@ -47,16 +48,15 @@ def variable_problems(bounds: VariablesTable, table: Table, base: Case) -> Itera
         if missing and not problems:
             remedy = "has no number in the case, at which the search would begin; give one there"
             problems.append(Problem(f"{AT}.{key}", given[key], remedy))
-        # One problem a key: the later checks meet what the first one has found, too.
+        # One problem for each key, since later checks find the cause of the first one again.
         yield from problems[:1]
         paths += row.paths
 
 
 def _twice(key: str, given: Any, paths: Iterable[str]) -> Iterator[Problem]:
-    """The problem of a ``key`` that varies already, or a part of which does, by one of the ``paths``."""
+    """The problem of a ``key`` that varies, whole or in part, by one of the ``paths`` already."""
     for path in paths:
-        short, long = sorted((key, path), key=len)
-        if long == short or long.startswith((f"{short}.", f"{short}[")):
+        if is_within(path, [key]) or is_within(key, [path]):
             yield Problem(f"{AT}.{key}", given, "varies by another variable already; omit one of them")
             return
 
@@ -70,19 +70,22 @@ def _of_each_site(name: str, key: str, given: Any, base: Case) -> Iterator[Probl
 
 
 def _tried(key: str, row: VariableRow, table: Table) -> Iterator[Problem]:
-    """Problems with a key itself at the bounds or with the values of its first variable, while all others stay.
+    """The problem of a ``key`` that is invalid at a bound, or with one of the choices, of its first variable.
 
-    A case that is impossible because of other keys may be possible where these vary too.
+    All other keys stay as they are. Only problems with the key itself count: others may vanish where other keys vary.
     """
     path = row.paths[0]
     values = row.choices or (row.low, row.high)
     for value in values:
         tried = copy.deepcopy(table)
-        problems = put(tried, path, int(value) if row.kind == "whole" else copy.deepcopy(value))
+        if row.kind == "whole":
+            value = int(value)
+        problems = put(tried, path, copy.deepcopy(value))
         try:
             case_of(tried)
         except CaseError as error:
             problems += error.problems
+
         for problem in problems:
             if _is_about(problem.key.replace('"', ""), path, is_entry=path != key):
                 yield Problem(f"{AT}.{key}", value, problem.remedy)
@@ -90,11 +93,14 @@ def _tried(key: str, row: VariableRow, table: Table) -> Iterator[Problem]:
 
 
 def _is_about(key: str, path: str, is_entry: bool) -> bool:
-    """Whether the problem of a ``key`` is about what stands at ``path``; entries of a list may only exclude each other.
+    """Whether the problem of a ``key`` is one of the value at ``path``.
 
-    A key that is unknown may be a part of its path.
+    It is if it names a key around that one, as for an unknown key. For an entry of a list (``is_entry``) it is not: a
+    problem of the whole list is that entries exclude each other, which may vanish where they all vary.
     """
-    return key == path or (not is_entry and path.startswith((f"{key}.", f"{key}[")))
+    if is_entry:
+        return key == path
+    return is_within(path, [key])
 
 
 def _bounds_problems(bounds: VariablesTable, base: Case) -> Iterator[Problem]:

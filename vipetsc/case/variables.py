@@ -1,4 +1,4 @@
-"""Variables of a search: names and keys of the case, with bounds or lists of values."""
+"""Variables of a search: quantities by name, and keys of the case, with bounds or lists of values."""
 
 import copy
 from typing import Annotated, Any, Literal, NamedTuple
@@ -61,9 +61,9 @@ class VariablesTable(Section):
 class Variable(NamedTuple):
     """A key of the case, by its ``path``, that varies between ``low`` and ``high``.
 
-    ``kind``: searched by its logarithm, as it is, as a whole number, as the cell of one of several sites that rise and
-    differ, or as the number (from 1) of one of the ``choices``. ``start`` is the value of the case. Variables of one
-    ``row`` are neighbours, which a search varies together at first.
+    ``kind`` is "log" (searched by its logarithm), "linear", "whole" (a whole number), "site" (the cell of one of the
+    sites, which rise and differ) or "choice" (the number, from 1, of one of the ``choices``). ``start`` is the value of
+    the case. Variables with the same ``row`` belong to one list, and a search varies neighbours together at first.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Variable(NamedTuple):
         if self.kind == "log":
             return float(np.log(value / self.low) / np.log(self.high / self.low))
         if self.kind == "choice":
-            # The middle of the interval that each choice has: choices are equally likely.
+            # Each choice has an interval of equal length, so that all are equally likely; this is its middle.
             return (value - 0.5) / self.high
         return (value - self.low) / (self.high - self.low)
 
@@ -89,7 +89,7 @@ class Variable(NamedTuple):
         if self.kind == "log":
             return float(self.low * (self.high / self.low) ** position)
         if self.kind == "choice":
-            # At 1, the end of the cube, floor gives one more than there are.
+            # At 1, the end of the last interval, floor gives one more than there are.
             return min(float(np.floor(position * self.high)) + 1, self.high)
         value = self.low + (self.high - self.low) * position
         if self.kind == "whole":

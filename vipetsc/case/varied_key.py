@@ -7,8 +7,8 @@ from vipetsc.case.case_file import Problem, Table, put
 
 PARAMETERS = "amplitude", "frequency"
 SECTIONS = ("lattice", "contacts", "disorder")  # whose keys can vary along a curve
-# Positions in the range at which the case is read before a curve is followed. A key that takes whole numbers alone may
-# be valid at both ends of its range, and is invalid at an irrational position between them.
+# Positions in the range at which the case is read before a curve is followed: both ends, and one between them. A key
+# that takes only whole numbers may be valid at both ends, and is refused at the third position, which gives none.
 TRIED = (0.0, 0.381966, 1.0)
 
 OVER_FREQUENCY = "sweeps and breathers are looked for over the frequency; omit them, or take curves over it"
@@ -25,7 +25,7 @@ def table_at(table: Table, value: float) -> tuple[Table, list[Problem]]:
     nfrc = changed["nfrc"]
     key = nfrc["over"]
     problems = put(changed, key, value)
-    # The range of the key is none of amplitudes, and what is fixed besides the frequency is one of them.
+    # The range is one of the key, and the values that are fixed are amplitudes: the states begin below the smallest.
     amplitudes = nfrc.pop("fixed", [])
     smallest = min(amplitudes, default=1.0)
     nfrc.pop("isolas", None)

@@ -23,15 +23,16 @@ OF_SECTION = {kind.section: kind for kind in VERB_CASES if kind.section}
 SECTIONS: dict[str, type[Section]] = {name: table for kind in VERB_CASES for name, table in kind.sections().items()}
 """Sections that a case file may have. A case reads those that it declares and ignores the others."""
 
-# Sections that mark a file as one of a run, or of verbs that consist of runs; normal modes read the others too.
+# Sections by which a file is one of a run, or of verbs that consist of runs. Normal modes read the other sections too.
 SECTIONS_OF_RUNS = {"disorder", "drive", "initial", "time", "output", "sweep", "optimise", "identify"}
 
 
 def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) -> list[CaseFile]:
-    """The cases that the verbs of the file's sections read from it, ``run`` first; the built-in one without a file.
+    """The cases of all verbs for which a file has sections, ``run`` first; the built-in case without a file.
 
-    A file with ``[nnm]`` or ``[design]`` and no section of a run is not read as one. A sweep may give what a run
-    lacks: then its first possible member represents the run. Raises CaseError with the problems of all verbs.
+    A file with the section of another verb is read as a run only if it has a section of runs. A sweep may give values
+    that the run lacks: then its first valid member takes the place of the run. Raises CaseError with the problems of
+    all verbs.
     """
     table, source = _table(path)
     overrides = list(overrides)
@@ -41,7 +42,7 @@ def load_every(path: str | Path | None = None, overrides: Iterable[str] = ()) ->
         try:
             case = kind.from_table(table, overrides, source)
             if isinstance(case, Sweep):
-                # The sweep may give what a run lacks: a member replaces the run, whose problems do not count.
+                # A member takes the place of a run that is invalid without the values of the sweep.
                 possible = [member.case for member in case.tried() if member.case]
                 cases = cases or [*possible[:1]]
                 problems = {}
@@ -62,7 +63,7 @@ def _kinds(table: Table) -> list[type[CaseFile]]:
 
 
 def verbs_of(path: str | Path) -> list[str]:
-    """The verbs for which a case file has a section of their own, else ``run``; raises CaseError."""
+    """The verbs of which a case file has the section, or ``run`` if there is none; raises CaseError."""
     table, _ = _table(path)
     return [kind.verb for section, kind in OF_SECTION.items() if section in table] or [Case.verb]
 
@@ -70,7 +71,7 @@ def verbs_of(path: str | Path) -> list[str]:
 def disorder_of(
     path: str | Path | None, overrides: Iterable[str], cases: Iterable[CaseFile] = ()
 ) -> tuple[DisorderTable, Case, Case] | None:
-    """Scatter in a valid case file, the case without and with it; for a sweep, those of its first possible member.
+    """Scatter in a valid case file, the case without and with it; for a sweep, those of its first valid member.
 
     The sweep is taken from the ``cases`` that were read from the file, if it is among them, so that its members are
     resolved once.
