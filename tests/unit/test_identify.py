@@ -11,6 +11,7 @@ import xarray as xr
 
 from tests.identified import identify_table, lattice_table
 from vipetsc.case import Case, CaseError
+from vipetsc.case import measured as measured_module
 from vipetsc.case.identify import IdentifyCase
 from vipetsc.case.measured import RecordTable, read_measured
 from vipetsc.studies.identified import _start_values, _warnings_of_parameters, parameter_lines
@@ -56,6 +57,7 @@ def rows_with(index, row):
         (["0.0,1.0"] * 20, "time", "must rise"),
         ([f"{1e-3 * k},0.0" for k in range(20)], "sensors[1].column", "zero at all times"),
         ([f"{1e-3 * k},1.0" for k in range(5)], "file", "leaves 5 samples"),
+        ([], "file", "has no line of numbers"),
     ],
 )
 def test_bad_data_are_one_clear_error(tmp_path, rows, key, part):
@@ -332,3 +334,44 @@ def test_the_force_of_a_moved_wall_is_no_sensor(tmp_path):
     (problem,) = caught.value.problems
     assert problem.key == "identify.records[1].sensors[2].quantity"
     assert "drive 1 moves a wall" in problem.remedy
+
+
+@pytest.mark.parametrize(
+    ("column", "changes", "key", "part"),
+    [
+        (np.array([b"a"] * 20), {}, "sensors[1].column", "the dataset v is not one of real numbers"),
+        (1j * np.arange(20), {}, "sensors[1].column", "the dataset v is not one of real numbers"),
+        # A file without samples, of which those from a time on are asked for.
+        (np.zeros(0), {"begin": 0.1}, "file", "leaves 0 samples"),
+        (np.zeros((20, 2)), {}, "sensors[1].column", 'is an array of 20 x 2; write "v[1]"'),
+    ],
+)
+def test_bad_data_sets_are_one_clear_error(tmp_path, column, changes, key, part):
+    with h5py.File(tmp_path / "record.h5", "w") as file:
+        file["v"] = column
+    record = {"file": str(tmp_path / "record.h5"), "rate": 1e3, "sensors": [SENSOR]} | changes
+    problems = problems_of(record)
+    assert list(problems) == [f"identify.records[1].{key}"]
+    assert part in problems[f"identify.records[1].{key}"]
+
+
+def test_the_size_of_a_data_set_is_checked_before_it_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(measured_module, "MOST_NUMBERS", 19)
+    with h5py.File(tmp_path / "record.h5", "w") as file:
+        file["v"] = np.arange(20.0)
+    problems = problems_of({"file": str(tmp_path / "record.h5"), "rate": 1e3, "sensors": [SENSOR]})
+    assert problems["identify.records[1].sensors[1].column"].endswith(
+        "the dataset has 20 numbers; at most 19 are possible"
+    )
+
+
+def test_the_force_of_a_drive_that_only_the_record_has_can_be_measured(tmp_path):
+    """The number of a force's drive is one among the drives of the record, of which the case has the first."""
+    path = written(tmp_path, [f"{1e-3 * k:.4f},{np.sin(k):.6f},{np.cos(k):.6f}" for k in range(20)], "t,v,f")
+    sensors = [SENSOR, {"quantity": "force", "column": "f", "drive": 2}]
+    second = {"more": [{"frequency": 1000.0, "cycles": 4, "cell": 3}]}
+    case = IdentifyCase.from_table(identify_table(lattice_table(), record_in(path, sensors=sensors, drive=second)))
+    assert len(case.trials(0).base.drive.every) == 2
+
+    problems = problems_of(record_in(path, sensors=sensors))
+    assert problems == {"identify.records[1].sensors[2].drive": "2: the case has 1 drive"}

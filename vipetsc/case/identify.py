@@ -34,7 +34,7 @@ from vipetsc.lattice.contact import LAWS
 
 DASHPOTS = ("dashpot", "grounding")
 MOST_MASSES = 200
-"""Masses of a lattice whose initial state is estimated.
+"""Masses of a lattice whose initial state is estimated, at most.
 
 Each has two unknowns, by which the motion is differentiated: 400 columns of 400 numbers, 1.3 MB a stage of a step.
 """
@@ -43,10 +43,10 @@ Each has two unknowns, by which the motion is differentiated: 400 columns of 400
 class IdentifyTable(Section):
     """Parameters are fitted to ``records`` over windows that grow, from one or several starts.
 
-    The first window ends with the model's contact number ``impacts`` in each record, and each has ``growth`` times as
-    many as the one before. ``starts``: the first one is that of the unknowns, the others are drawn between their bounds
-    by Latin hypercube sampling with ``seed``. ``steps``: evaluations of a window. ``confidence`` is that of the
-    intervals; ``profile``: values of each parameter for which all others are fitted.
+    The first window ends with the model's contact number ``impacts`` in each record, and each window has ``growth``
+    times as many contacts as the one before. ``starts``: the first start is that of the unknowns, the others are drawn
+    between their bounds by Latin hypercube sampling with ``seed``. ``steps``: evaluations of a window, at most.
+    ``confidence`` is that of the intervals; ``profile``: values of each parameter for which all others are fitted.
     """
 
     records: list[RecordTable] = Field([], min_length=1)
@@ -86,13 +86,13 @@ class IdentifyCase(StudyCase):
             base = Case.from_table({k: table[k] for k in table if k in Case.model_fields} | {"name": "model"})
         except CaseError as error:
             return {}, problems + error.problems
-        # The case is valid: what remains is whether this verb can do what it asks.
+        # The case is valid. This verb may not support all of its features.
         problems += refusals(cls, dict(base), lambda *keys: True)
         if problems:
             return {}, problems
 
         fields = {"table": table, "options": options, "base": base}
-        # Data are read last: a file of GBs must not be read for a case that is refused anyway.
+        # Data are read last, since files may be large, and not at all for a case that is refused.
         problems = [*_case_problems(base), *_unknown_problems(options, base), *_record_problems(options, base)]
         if problems:
             return fields, problems
@@ -101,7 +101,7 @@ class IdentifyCase(StudyCase):
 
     def warnings(self) -> list[str]:
         """Warnings of settings in the case that are probably unintended."""
-        # Times and samples are those of the records: what a run would warn of does not matter.
+        # Warnings about times and samples of a run do not apply: those of the records are used.
         return [*unit_warnings(self.base.drive, self.base.model().chain), *loss_warnings(self.base.lattice)]
 
     def to_toml(self) -> str:
@@ -183,9 +183,9 @@ def _case_problems(base: Case) -> Iterator[Problem]:
 def _group_problems(
     unknown: UnknownTable, groups: Sequence[Sequence[int]], base: Case, taken: set[tuple[str, int]], at: str
 ) -> Iterator[Problem]:
-    """Problems of the ``groups`` of members of an ``unknown``, of which each has one value; they join those ``taken``.
+    """Problems of the ``groups`` of members of an ``unknown`` at the path ``at``; each group has one value.
 
-    ``at`` is the path of the unknown.
+    ``taken`` are the pairs of a quantity and a member that are sought already. Those of the unknown are added to it.
     """
     quantity = unknown.quantity
     gaps = base.model().gaps  # none where the clearances of both sides are equal
@@ -201,7 +201,7 @@ def _group_problems(
 
 def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
     """Problems of the unknowns in a case."""
-    # A value that two unknowns change would be determined by neither.
+    # Pairs of a quantity and a member: two unknowns that change one value would not be determined.
     taken: set[tuple[str, int]] = set()
     for index, unknown in enumerate(options.unknowns, 1):
         at = f"identify.unknowns[{index}]"
@@ -212,6 +212,8 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             yield Problem(f"{at}.bounds", unknown.bounds, "must be [low, high] with low below high")
             continue
         yield from _bounds_problems(unknown, at)
+
+        # The quantity is one that the case has.
         if quantity == "clearance_minus" and not differs_by_side(base):
             remedy = "the case has no other clearance on the side w < 0; set contacts.clearance_minus"
             yield Problem(f"{at}.quantity", quantity, remedy)
@@ -219,6 +221,8 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
         if not values:
             yield Problem(f"{at}.quantity", quantity, "the case has no contact sites")
             continue
+
+        # The quantity can be sought in this case.
         if quantity == "exponent" and any(law.law != "power" for law in base.model().used_laws):
             yield Problem(f"{at}.quantity", quantity, 'only the law "power" has an exponent; set contacts.law')
         if quantity == "stiffness" and any(law.law not in LAWS for law in base.model().used_laws):
@@ -235,6 +239,7 @@ def _unknown_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             what = {"dashpot": "springs", "grounding": "masses"}[quantity]
             yield Problem(f"{at}.start", None, f"missing; the case has {what} without a dashpot to begin with")
 
+        # The members exist, and each value has a start within the bounds.
         groups = groups_of(unknown, len(values))
         wrong = [member + 1 for group in groups for member in group if not 0 <= member < len(values)]
         if wrong or not all(groups):
@@ -256,7 +261,7 @@ def _bounds_problems(unknown: UnknownTable, at: str) -> Iterator[Problem]:
     """Problems of bounds beyond what the quantity may be."""
     low, high = unknown.bounds
     quantity = unknown.quantity
-    # On a linear scale any bounds will do.
+    # On a linear scale a quantity of either sign may have any bounds.
     if quantity in OF_EITHER_SIGN and unknown.scale != "logarithmic":
         return
     if quantity == "restitution" and not 0 <= low < high <= 1:
@@ -282,23 +287,26 @@ def _record_problems(options: IdentifyTable, base: Case) -> Iterator[Problem]:
             yield Problem(f"{at}.time", record.time, "give the column of times or the rate in Hz, one of both")
         if isinstance(record.offset, list) and not record.offset[0] < record.offset[1]:
             yield Problem(f"{at}.offset", record.offset, "must be a number, or bounds [low, high] with low below high")
-        yield from sensor_problems(record, at, base.lattice.cells, dofs, len(base.drive.every))
+
+        # The case of the record, which may have other drives.
+        case = base
+        try:
+            case = base.varied(**_varied_sections(record))
+        except CaseError as error:
+            for problem in error.problems:
+                # The case itself is valid, so that the problem is one of the record's keys.
+                yield replace(problem, key=f"{at}.{problem.key}")
+        else:
+            yield from _wall_problems(record, case.model().drives, at)
+        yield from sensor_problems(record, at, base.lattice.cells, dofs, len(case.drive.every))
 
         if record.initial == "estimate" and masses > MOST_MASSES:
             remedy = f"of {masses} masses is too much to estimate; {MOST_MASSES} masses are possible"
             yield Problem(f"{at}.initial", "estimate", remedy)
         if record.initial == "estimate" and all(sensor.quantity == "force" for sensor in record.sensors):
             yield Problem(f"{at}.initial", "estimate", "needs a sensor of motion; a drive's force says nothing of it")
-        try:
-            drives = base.varied(**_varied_sections(record)).model().drives
-        except CaseError as error:
-            for problem in error.problems:
-                # Named by the record's key: the case itself is valid.
-                yield replace(problem, key=f"{at}.{problem.key}")
-        else:
-            yield from _wall_problems(record, drives, at)
 
-    # Without contact the misfit does not depend on them, and the fit would be singular.
+    # Without contact the misfit does not depend on quantities of sites, and the fit would be singular.
     if not any(record.contact for record in options.records):
         for index, unknown in enumerate(options.unknowns, 1):
             if unknown.quantity in OF_SITES:
@@ -321,7 +329,7 @@ def _with_hashes(options: IdentifyTable) -> tuple[IdentifyTable, list[Problem]]:
     records = []
     problems = []
     for number, record in enumerate(options.records, 1):
-        # With a hash it is a resolved one: results are read where the data are gone.
+        # A record with a hash belongs to a resolved case, of which results are read where the data are gone.
         if record.sha256 is None:
             try:
                 record = record.model_copy(update={"sha256": read_measured(record).sha256})

@@ -19,14 +19,15 @@ from vipetsc.wording import counted
 
 # Lines of a table of text. Fields are split in Python: a million lines of two columns take 1.6 s and 300 MB.
 MOST_ROWS = 1_000_000
+MOST_NUMBERS = 100_000_000  # of a dataset: 0.8 GB
 LEAST_SAMPLES = 8  # of a record: two windows of the least length in ``identification.growing_windows``
 # Times may differ from even ones by this fraction of their interval, as those printed with few digits do. With ten
-# samples a period this moves a value by 3 % of its amplitude.
+# samples a period, .05 of a sample is a phase of .03, which moves a value by 3 % of its amplitude.
 UNEVEN = 0.05
 HDF5 = (".h5", ".hdf5", ".nc")
 UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2", "force": "N"}
 
-Place = int | str
+Place = int | str  # of a column: its number from 1, or its name
 
 
 class SensorTable(Section):
@@ -46,7 +47,7 @@ class SensorTable(Section):
 
     @property
     def name(self) -> str:
-        """The sensor in words."""
+        """A description of the sensor: its quantity and its place."""
         if self.quantity == "force":
             return f"force of drive {self.drive or 1}"
         return f"{self.quantity} of mass {self.mass or 1} in cell {self.cell}"
@@ -55,13 +56,13 @@ class SensorTable(Section):
 class RecordTable(Section):
     """A measurement: its ``file``, the times, and what the ``sensors`` recorded.
 
-    ``time``: the column of times, which ``time_factor`` makes seconds, or the ``rate`` in Hz instead. The drive begins
-    at the record's time ``offset``, with the lattice at rest or in the motion of ``[initial]``; [low, high] are bounds
-    between which it is sought. ``begin`` and ``end``: the first and the last time that are used, in s. ``initial``:
-    keys in which the initial motion differs from that of the case, or "estimate" for a lattice that moves already: the
-    displacements and velocities of all masses at the first time are estimated with the parameters. ``drive``: keys in
-    which the drive differs from that of the case. Without ``contact`` nothing touched. The ``sha256`` of the file is
-    filled in.
+    ``time``: the column of times, which are in s when multiplied by ``time_factor``; instead, ``rate`` in Hz. The drive
+    begins at the record's time ``offset``, with the lattice at rest or in the motion of ``[initial]``; for bounds
+    [low, high] the offset is sought. ``begin`` and ``end``: the first and the last time that are used, in s.
+    ``initial``: keys in which the initial motion differs from that of the case, or "estimate" for a lattice that moves
+    already: the displacements and velocities of all masses at the first time are estimated with the parameters.
+    ``drive``: keys in which the drive differs from that of the case. ``contact``: whether anything touched. The
+    ``sha256`` of the file is filled in.
     """
 
     file: str
@@ -79,7 +80,10 @@ class RecordTable(Section):
 
 
 class Measured(NamedTuple):
-    """A record in SI units: even ``times`` (sample,) in s of its own clock, ``values`` (sample, sensor)."""
+    """A record in SI units: even ``times`` (sample,) in s of its own clock, ``values`` (sample, sensor).
+
+    ``sha256`` is that of its file.
+    """
 
     times: np.ndarray
     values: np.ndarray
@@ -97,7 +101,7 @@ class MeasuredError(ValueError):
 
 
 def read_measured(record: RecordTable) -> Measured:
-    """The times and values of a ``record``; raises MeasuredError for bad data."""
+    """The times and values of a ``record`` between its ``begin`` and ``end``; raises MeasuredError for bad data."""
     path = path_named(record.file).resolve()
     try:
         digest = file_hash(path)
@@ -124,17 +128,18 @@ def read_measured(record: RecordTable) -> Measured:
     values = np.column_stack(
         [columns[f"sensors[{number}].column"] * sensor.factor for number, sensor in enumerate(record.sensors, 1)]
     )
+    _check_count("file", record.file, len(values))
     # Cut only after the times were found even: the interval of a short part would be less exact.
     times = _times(record, columns.get("time"), len(values))
     for key, sign in (("begin", -1.0), ("end", 1.0)):
         limit = getattr(record, key)
         if limit is not None:
-            # A limit on a sample keeps that sample, whatever the last digit of its time is.
+            # A sample at the limit is kept, even if its time is beyond it by rounding.
             used = sign * (times - limit) <= 1e-9 * abs(times[-1] - times[0])
             times = times[used]
             values = values[used]
             _check_count(key, limit, len(times))
-    _check_count("file", record.file, len(times))
+
     for number, column in enumerate(values.T, 1):
         if not column.any():
             raise MeasuredError(
@@ -142,7 +147,7 @@ def read_measured(record: RecordTable) -> Measured:
                 record.sensors[number - 1].column,
                 "is zero at all times; is the sensor connected?",
             )
-    return Measured(times, values, digest)
+    return Measured(times=times, values=values, sha256=digest)
 
 
 def _check_count(key: str, value: Any, count: int) -> None:
@@ -156,10 +161,8 @@ def _times(record: RecordTable, column: np.ndarray | None, count: int) -> np.nda
     if record.rate is not None:
         return np.arange(count) / record.rate
     assert column is not None
-    times = column * record.time_factor
-    if count < 2:
-        return times
 
+    times = column * record.time_factor
     interval = (times[-1] - times[0]) / (count - 1)
     even = times[0] + interval * np.arange(count)
     if not interval > 0:
@@ -181,7 +184,7 @@ def _wanted(record: RecordTable) -> Iterator[tuple[str, Place]]:
 
 
 def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
-    """The columns of a table of text, with a line of names or without."""
+    """The columns of a ``record`` from a table of text, by their keys; the table may begin with a line of names."""
     try:
         lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
     except (OSError, ValueError):
@@ -199,10 +202,12 @@ def _text_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
         lines = decimals
     rows = [[field.strip().strip('"') for field in line.split(separator)] for line in lines]
     names: list[str] = []
-    # Measuring programs leave "nan" for what they miss: that is a number, though a bad one.
+    # Measuring programs write "nan" for a missing value: a first row with it is one of numbers, not of names.
     if not all(_is_number(field) for field in rows[0]):
         names = rows.pop(0)
 
+    if not rows:
+        raise MeasuredError("file", record.file, "has no line of numbers")
     # Before the conversion to numbers, whose error would not say that a line lacks a field.
     widths = {len(row) for row in rows}
     if len(widths) != 1:
@@ -244,7 +249,7 @@ def _is_number(field: str) -> bool:
 
 
 def _hdf5_columns(path: Path, record: RecordTable) -> dict[str, np.ndarray]:
-    """The datasets of an HDF5 file, or columns of those with two dimensions."""
+    """The columns of a ``record`` from datasets of an HDF5 file, by their keys."""
     columns = {}
     try:
         with h5py.File(path) as file:
@@ -268,7 +273,11 @@ def _hdf5_column(file: h5py.File, key: str, place: Place) -> np.ndarray:
     dataset = file.get(name)
     if not isinstance(dataset, h5py.Dataset):
         raise MeasuredError(key, place, f"the file has no dataset {name}")
-    if dataset.size > MOST_ROWS * 100 or dataset.ndim != dimensions:
+    if dataset.dtype.kind not in "biuf":
+        raise MeasuredError(key, place, f"the dataset {name} is not one of real numbers")
+    if dataset.size > MOST_NUMBERS:
+        raise MeasuredError(key, place, f"the dataset has {dataset.size} numbers; at most {MOST_NUMBERS} are possible")
+    if dataset.ndim != dimensions:
         shape = " x ".join(map(str, dataset.shape))
         remedy = f'is an array of {shape}; write "{name}[1]" for the first column of two dimensions'
         raise MeasuredError(key, place, remedy)
@@ -280,7 +289,10 @@ def _hdf5_column(file: h5py.File, key: str, place: Place) -> np.ndarray:
 
 
 def sensor_problems(record: RecordTable, at: str, cells: int, dofs: int, drives: int) -> Iterator[Problem]:
-    """Problems of a record's sensors in a lattice of ``cells`` with ``dofs`` masses each and so many ``drives``."""
+    """Problems of the sensors of a ``record`` at the path ``at``.
+
+    The lattice has ``cells`` cells with ``dofs`` masses each, and as many ``drives``.
+    """
     for number, sensor in enumerate(record.sensors, 1):
         path = f"{at}.sensors[{number}]"
         if sensor.factor == 0:
@@ -293,6 +305,7 @@ def sensor_problems(record: RecordTable, at: str, cells: int, dofs: int, drives:
             if (sensor.drive or 1) > drives:
                 yield Problem(f"{path}.drive", sensor.drive, f"the case has {counted(drives, 'drive')}")
             continue
+
         if sensor.drive is not None:
             yield Problem(f"{path}.drive", sensor.drive, "applies to a force; give cell and mass")
         if sensor.cell is None:

@@ -18,7 +18,7 @@ OF_SPRINGS = {"spring": "stiffness", "dashpot": "damping", "quadratic": "quadrat
 """Unknowns that each spring has, and their names in ``vipetsc.lattice.Spring``."""
 OF_CELL = ("mass", "grounding", *OF_SPRINGS)
 WITHOUT_CONTACT = (*OF_CELL, "amplitude")
-"""Unknowns on which a motion without contact depends."""
+"""Unknowns on which a motion depends also without contact."""
 OF_EITHER_SIGN = ("quadratic", "cubic")
 """Unknowns that may be negative."""
 ON_LINEAR_SCALE = ("restitution", "exponent", *OF_EITHER_SIGN)
@@ -40,10 +40,10 @@ UNITS = {
 class UnknownTable(Section):
     """A ``quantity`` that is sought within ``bounds`` in SI units, from ``start`` on, by default that of the case.
 
-    ``of``: "all" sites, masses or springs have one value, "each" has one of its own, or groups of their numbers have.
-    ``scale``: derivatives and steps are those of the logarithm or of the value. ``dashpot`` is parallel to a spring,
-    ``grounding`` a dashpot between a mass and the ground; ``quadratic`` and ``cubic`` are a spring's; ``amplitude`` is
-    that of the first drive.
+    ``of``: "all" sites, masses or springs have one value in common, "each" has one of its own, or each of the listed
+    groups of their numbers (from 1) has one. ``scale``: whether derivatives and steps are those of the logarithm or of
+    the value. ``dashpot`` is parallel to a spring, ``grounding`` a dashpot between a mass and the ground; ``quadratic``
+    and ``cubic`` are terms of a spring's force; ``amplitude`` is that of the first drive.
     """
 
     quantity: Literal[
@@ -69,7 +69,7 @@ class UnknownTable(Section):
 class SoughtParameter(NamedTuple):
     """A number that is sought: a ``quantity`` at the ``members`` (sites, masses, springs or records, from 0).
 
-    The coordinate of the fit is its logarithm, or its position between the bounds: a number of order one.
+    The coordinate of the fit is its logarithm, or its position between the bounds ``low`` (0) and ``high`` (1).
     """
 
     name: str
@@ -83,7 +83,7 @@ class SoughtParameter(NamedTuple):
 
     @property
     def acts_without_contact(self) -> bool:
-        """Whether the motion depends on it without contact."""
+        """Whether the motion depends on the parameter also without contact."""
         return self.quantity in WITHOUT_CONTACT
 
     def to_coordinate(self, value: float) -> float:
@@ -103,7 +103,7 @@ class SoughtParameter(NamedTuple):
     def slope(self, z: float) -> float:
         """Derivative of the value by the fit's coordinate at ``z``."""
         if self.is_logarithmic:
-            # Of exp(z) the value itself.
+            # The derivative of exp(z) is exp(z), the value itself.
             return self.from_coordinate(z)
         return self.high - self.low
 
@@ -125,7 +125,7 @@ def values_of(case: Case, quantity: str) -> list[float]:
     if quantity == "clearance":
         return list(model.chain.clearances)
     if quantity == "clearance_minus":
-        # The numbers of the case: a site without a stop on that side has one too, which acts on nothing.
+        # As the case gives them: a site without a stop on that side has a number too, without effect.
         given = values_of_sites(case.contacts, quantity, len(model.chain.sites))
         both = model.chain.clearances
         return [both[site] if value is None else value for site, value in enumerate(given)]
@@ -139,7 +139,7 @@ def differs_by_side(base: Case) -> bool:
 
 
 def _with_values(cell: UnitCell, quantity: str, numbers: list[float]) -> UnitCell:
-    """The ``cell`` with other numbers of its masses or its springs."""
+    """The ``cell`` with other ``numbers`` of a ``quantity`` of its masses or its springs."""
     if quantity == "mass":
         return replace(cell, masses=tuple(numbers))
     if quantity == "grounding":
@@ -175,7 +175,7 @@ def _parameter(unknown: UnknownTable, members: tuple[int, ...], start: float) ->
         members=members,
         low=low,
         high=high,
-        # The case may lie outside the bounds; the search does not.
+        # The value of the case may be outside the bounds; the search begins within them.
         start=min(max(start, low), high),
         unit=UNITS.get(unknown.quantity, "1"),
         is_logarithmic=is_logarithmic,
@@ -192,17 +192,20 @@ def parameters_of(unknown: UnknownTable, base: Case) -> list[SoughtParameter]:
         elif unknown.start is not None:
             start = unknown.start
         else:
-            # Members of one value may differ in the case: their mean is nearest to all of them.
+            # Members that have one value may differ in the case: their mean has the least squares from them.
             start = float(np.mean([values[member] for member in members]))
         parameters.append(_parameter(unknown, members, start))
     return parameters
 
 
 def numbers_of(base: Case, parameters: Sequence[SoughtParameter], values: Iterable[float]) -> dict[str, list[float]]:
-    """The numbers (member,) by quantity that is sought: ``values`` (parameter,), and those of ``base`` elsewhere."""
+    """The numbers (member,) of each quantity that is sought, by its name.
+
+    Members that a parameter has are given its value, out of ``values`` (parameter,); others keep that of ``base``.
+    """
     of_quantity: dict[str, list[float]] = {}
     for parameter, value in zip(parameters, values, strict=True):
-        # The beginning of a record's drive is no number of the case.
+        # The offset of a record's clock is no number of the case.
         if parameter.quantity == "offset":
             continue
         numbers = of_quantity.setdefault(parameter.quantity, list(values_of(base, parameter.quantity)))
@@ -218,7 +221,7 @@ def changed_case(base: Case, parameters: Sequence[SoughtParameter], values: Iter
     cell = base.lattice.undamped_cell()
     changed_cell = cell
 
-    # By quantity, since a section takes all values of one at once: those that are not sought keep theirs.
+    # By quantity, since a section has the values of all members together, also of those that are not sought.
     for quantity, numbers in numbers_of(base, parameters, values).items():
         if quantity == "amplitude":
             drive["amplitude"] = numbers[0]
@@ -231,16 +234,17 @@ def changed_case(base: Case, parameters: Sequence[SoughtParameter], values: Iter
         else:
             each = contacts.get("each") or (base.contacts.each or Section()).model_dump(exclude_none=True)
             contacts["each"] = each | {quantity: numbers}
-            # A quantity stands in one place.
+            # Not for all sites, too, where the list has it for each.
             contacts[quantity] = None
 
     changes = {key: section for key, section in (("contacts", contacts), ("drive", drive)) if section}
-    # Only then: a preset's cell that is written out would be another case to its hash.
+    # Only if the cell changes: the case of a preset would have another hash if its cell were written out.
     if changed_cell is not cell:
         lattice = base.lattice.model_dump(by_alias=True, exclude_none=True)
         changes["lattice"] = dict.fromkeys(lattice) | with_cell(lattice, changed_cell, {})
-        # Samples are those of the measurement; for the bands of this cell, a run's may be too coarse.
-        assert base.time.sample_interval != "auto"  # resolved
+        # The samples that count are those of the record. A run's interval may be too coarse for the bands of the new
+        # cell, for which the case would be refused.
+        assert base.time.sample_interval != "auto"  # the case is resolved
         if base.time.sample_interval * pass_bands(changed_cell)[-1].high >= np.pi:
             changes["time"] = {"sample_interval": None}
     return base.varied(name=name, **changes)

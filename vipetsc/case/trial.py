@@ -1,9 +1,9 @@
 """Cases with trial values of the parameters that ``identify`` seeks, without reading a table for each of them.
 
-A fit asks for hundreds of cases that differ from each other in a few numbers. To read one is to check and resolve all
-of its sections, and the bands of a lattice with other masses or springs take more time than its motion. The sections
-of a resolved case are fixed but for the numbers that are sought: a trial case is a copy of one that was read, with
-other numbers in their places. Tests compare both, case by case and bit by bit.
+A fit asks for hundreds of cases that differ from each other in a few numbers. To read each would be to check and
+resolve all of its sections, and to compute the bands of a lattice with other masses or springs, which takes more time
+than its motion. In the sections of a resolved case only the numbers that are sought differ: a trial case is a copy of a
+case that was read, with other numbers in their places. Tests compare the copies with cases that were read, bit by bit.
 """
 
 import copy
@@ -19,11 +19,12 @@ from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sought import OF_CELL, OF_SPRINGS, SoughtParameter, changed_case, numbers_of
 
 FOLLOWING = ("kind", "energy", "near")
-"""Keys of ``[initial]`` from which numbers of the motion follow by the lattice: of its kind, energy or frequency."""
+"""Keys of ``[initial]`` from which, together with the lattice, other numbers of the motion follow."""
 KEPT = 32
 """Cases that are kept. Residuals, contacts and derivatives are asked for at the same values, one after the other.
 
-Half as many are read twice where eight parameters are differentiated in two parts; twice as many change nothing.
+If half as many are kept, cases are read twice where eight parameters are differentiated in two parts; twice as many
+change nothing.
 """
 
 
@@ -34,9 +35,9 @@ class TrialCases:
         self._base = base
         self._parameters = parameters
         self._changes = changes
-        # A motion that is resolved by the lattice's masses, springs or contacts has other numbers with each of them.
+        # If numbers of the initial motion follow from masses, springs or contacts, each case must be read.
         self._follows = bool(set(FOLLOWING) & set(changes.get("initial", {})))
-        # A record's own amplitude holds whatever that of the case is.
+        # The amplitude of a record's own drive is known, and is not the one that is sought.
         self._has_amplitude = "amplitude" in changes.get("drive", {})
         self._read: dict[tuple[str, ...], Case] = {}
         self._case = lru_cache(maxsize=KEPT)(self._new_case)
@@ -62,11 +63,12 @@ class TrialCases:
         return case.varied(**copy.deepcopy(dict(self._changes)))
 
     def _new_case(self, values: tuple[float, ...]) -> Case:
+        """The case with the ``values`` (parameter,), which is read once for each form of its table."""
         if self._follows:
             return self.read(values)
 
         numbers = numbers_of(self._base, self._parameters, values)
-        # Sites that all have one number have it in another place than sites with several.
+        # The form: a number that all sites have in common stands in another place of the table than a list.
         form = tuple(quantity for quantity, several in numbers.items() if len(set(several)) == 1)
         if form not in self._read:
             self._read[form] = self.read(values)
@@ -80,16 +82,16 @@ class TrialCases:
         for quantity, several in numbers.items():
             if quantity in OF_CELL:
                 lattice = _with_cell_numbers(lattice, quantity, several)
+            elif quantity == "amplitude":
+                if not self._has_amplitude:
+                    drive = drive.model_copy(update={"amplitude": several[0]})
             elif quantity == "clearance":
                 contacts = contacts.model_copy(update={"clearance": several})
-            elif quantity != "amplitude":
-                each = contacts.each
-                if each and getattr(each, quantity):
-                    contacts = contacts.model_copy(update={"each": each.model_copy(update={quantity: several})})
-                else:
-                    contacts = contacts.model_copy(update={quantity: several[0]})
-            elif not self._has_amplitude:
-                drive = drive.model_copy(update={"amplitude": several[0]})
+            elif contacts.each and getattr(contacts.each, quantity):
+                each = contacts.each.model_copy(update={quantity: several})
+                contacts = contacts.model_copy(update={"each": each})
+            else:
+                contacts = contacts.model_copy(update={quantity: several[0]})
 
         trial = case.model_copy(update={"contacts": contacts, "lattice": lattice, "drive": drive})
         problems = _problems(trial, case)
@@ -110,18 +112,20 @@ def _with_cell_numbers(lattice: LatticeTable, quantity: str, numbers: list[float
         key = OF_SPRINGS[quantity]
         springs = []
         for spring, number in zip(cell.springs, numbers, strict=True):
-            # As with_cell writes a spring: a part that it lacks is not written.
-            value = number if number or key == "stiffness" else None
+            # As ``with_cell`` writes a spring: without a parameter that is 0.
+            value: float | None = number
+            if number == 0 and key != "stiffness":
+                value = None
             springs.append(spring.model_copy(update={key: value}))
         update = {"springs": springs}
     return lattice.model_copy(update={"cell": cell.model_copy(update=update)})
 
 
 def _problems(trial: Case, case: Case) -> list[Problem]:
-    """Problems with the numbers of a ``trial``; the ``case`` is valid, and differs in nothing else.
+    """Problems with the numbers of a ``trial``, which differs from the valid ``case`` in these alone.
 
-    A case that is read is also refused where its samples are too coarse for the bands, and where nothing is driven at
-    a frequency of the bands: samples and frequencies of an identification are those that were measured.
+    Two problems that reading a case finds are left out: samples that are too coarse for the bands, and a drive that
+    sends no wave. Samples and frequencies of an identification are those that were measured.
     """
 
     def valid(*keys: str) -> bool:
