@@ -44,3 +44,18 @@ def test_that_no_end_will_do_is_found_once(tried):
         with pytest.raises(CaseError, match="is reflected, mostly slow waves"):
             case(amplitude, reflection=1e-9)
     assert len(tried) == len(set(tried))
+
+
+def test_a_lattice_that_is_too_short_for_an_end_is_told_so():
+    """Of 24 cells an end may have 8, and the shortest that is tried has 10."""
+    lattice = {"preset": "four-band", "cells": 24, "absorbing": {}}
+    with pytest.raises(CaseError, match="an end has 10 cells or more, and at most a third of the lattice"):
+        Case.from_table({"lattice": lattice, "contacts": {"sites": 0}})
+
+
+def test_the_length_that_is_given_is_the_one_that_is_named(tried):
+    """A length of the case is tried, whatever part of the lattice it is."""
+    lattice = {"preset": "four-band", "cells": 60, "absorbing": {"cells": 25, "reflection": 1e-9}}
+    with pytest.raises(CaseError, match="no end of up to 25 cells satisfies it"):
+        Case.from_table({"lattice": lattice, "contacts": {"sites": 0}})
+    assert len(tried) == len(absorbing.LOSSES)

@@ -306,3 +306,15 @@ def test_the_exact_damping_needs_some_restitution():
 def test_an_output_too_coarse_to_measure_is_a_warning(override, message):
     (warning,) = Case.load(overrides=[override]).warnings()
     assert message in warning
+
+
+def test_a_missing_file_of_samples_hides_no_problem_with_times():
+    """Without its file a drive has no samples, which is one problem; a wrong number of samples in time is another."""
+    found = problems({"drive": {"waveform": "samples", "samples": {"file": "none.csv"}}, "time": {"samples": 1}})
+    assert list(found) == ["drive.samples.file", "time.samples"]
+
+
+def test_a_key_whose_name_begins_with_that_of_an_invalid_one_is_checked_too():
+    """The type of ``clearance`` is wrong, and the size of ``clearance_minus``."""
+    found = problems({"contacts": {"clearance": "wide", "clearance_minus": 1e60}})
+    assert list(found) == ["contacts.clearance", "contacts.clearance_minus"]

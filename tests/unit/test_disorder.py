@@ -17,7 +17,7 @@ from vipetsc.case.verb_cases import disorder_of
 from vipetsc.figures.sweep_members import Files, Sweeps
 from vipetsc.figures.transfer_curves import transfer_curves
 from vipetsc.io.read import open_ensemble, over_samples
-from vipetsc.lattice import Spring, UnitCell, pass_bands
+from vipetsc.lattice import Spring, UnitCell, contact_stiffness, pass_bands
 from vipetsc.studies.linear_run import linear_name
 
 BASE = {"name": "small", "lattice": {"preset": "four-band", "cells": 40}, "drive": {"cycles": 4}}
@@ -323,3 +323,41 @@ def test_fits_and_pictures_have_means_in_place_of_single_samples(ensemble):
     with Files() as files:
         (curve,) = transfer_curves(Sweeps([ensemble], files))
     assert curve.data["ibtet"].values[:6] == pytest.approx(mean.values[:6])
+
+
+def test_a_modulus_scales_the_stiffness_of_sites_with_radii_of_their_own():
+    """Each site's stiffness follows from the modulus of all and its own radius."""
+    material = {"sites": [5, 9], "clearance": CLEARANCE, "modulus": 1e8, "each": {"radius": [0.004, 0.005]}}
+    plain = draw(material).contacts
+    drawn = draw(material, modulus={"relative": 0.1}).contacts
+    ratio = drawn.each.stiffness[0] / plain.each.stiffness[0]
+    assert abs(ratio - 1) > 1e-3
+    assert drawn.each.stiffness[1] == pytest.approx(ratio * plain.each.stiffness[1], rel=1e-15)
+    assert drawn.stiffness == pytest.approx(ratio * plain.stiffness, rel=1e-15)
+
+
+def test_a_modulus_is_not_drawn_where_each_site_has_its_own():
+    with pytest.raises(CaseError, match=r"disorder\.modulus: the case has none"):
+        draw(TEN_SITES | {"each": {"modulus": [1e8] * 10}}, modulus={"relative": 0.1})
+
+
+def test_radii_of_the_sites_complete_the_material_of_all():
+    """A cell without a preset, whose sites have radii, takes modulus and Poisson ratio of all, also with a scatter."""
+    springs = [{"start": 1, "end": 1, "stiffness": 2e4, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 6e3}]
+    contacts = {"sites": [5, 9], "clearance": CLEARANCE, "modulus": 1e8, "poisson": 0.3}
+    lattice = {"cells": 20, "cell": {"masses": [0.01, 0.004], "springs": springs}}
+    table = {"lattice": lattice, "drive": {"frequency": 900.0}}
+    radii = {"radius": [0.004, 0.005]}
+
+    case = Case.from_table(table | {"contacts": contacts | {"each": radii}})
+    stiffness = [contact_stiffness(1e8, radius, 0.3) for radius in radii["radius"]]
+    assert [law.stiffness for law in case.model().laws] == pytest.approx(stiffness)
+    assert Case.from_toml(case.to_toml()) == case
+
+    scattered = table | {"contacts": contacts | {"each": radii}, "disorder": {"modulus": {"relative": 0.1}}}
+    first, second = Case.from_table(scattered).model().laws
+    assert first.stiffness / stiffness[0] == pytest.approx(second.stiffness / stiffness[1])
+    assert first.stiffness != pytest.approx(stiffness[0], rel=1e-3)
+
+    with pytest.raises(CaseError, match=r"contacts\.modulus: missing; needed for the stiffness of each site"):
+        Case.from_table(table | {"contacts": {key: contacts[key] for key in ("sites", "clearance")} | {"each": radii}})

@@ -291,3 +291,30 @@ def test_a_lossy_stop_without_clearance_is_refused_where_the_state_is_at_rest(br
             case_with(**changes)
     else:
         assert Case.from_toml(case_with(**changes).to_toml())
+
+
+def test_a_lattice_that_nothing_drives_may_absorb_at_its_first_cell():
+    """An end is refused that covers a packet, and not for the cell of a drive that there is not."""
+    ends = {"end": "both", "cells": 5, "strength": 50.0}
+    absorbing = FOUR_BAND | {"absorbing": ends}
+    for initial in (PACKET, {"kind": "mode", "number": 3, "amplitude": 1e-3}):
+        case = case_with(lattice=absorbing, initial=initial)
+        assert case.lattice.absorbing.cells == 5
+        assert Case.from_toml(case.to_toml()) == case
+
+    with pytest.raises(CaseError, match="waves are sent from cell 4, which is in the absorbing end"):
+        case_with(lattice=absorbing, initial=PACKET | {"cell": 4})
+    with pytest.raises(CaseError, match="waves are sent from cell 1, which is in the absorbing end"):
+        case_with(lattice=absorbing, drive={"amplitude": 1.0})
+
+
+def test_a_lossy_site_is_not_at_rest_where_a_packet_reaches_around_a_ring():
+    """A packet in the first cell reaches the last one of a ring, and not that of a lattice with ends."""
+    changes = {
+        "contacts": {"sites": [40], "clearance": 0.0, "side": "plus", "restitution": 0.7, "stiffness": 1e6},
+        "initial": PACKET | {"cell": 1},
+    }
+    ring = FOUR_BAND | {"cells": 40, "ends": "periodic"}
+    assert case_with(lattice=ring, **changes).initial.cell == 1
+    with pytest.raises(CaseError, match="site 1 touches its stop at rest"):
+        case_with(lattice=ring | {"ends": "fixed"}, **changes)

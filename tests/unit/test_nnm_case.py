@@ -219,3 +219,16 @@ def test_a_forced_mass_that_is_not_there_is_refused(nnm, message):
     table = {"lattice": {"preset": "four-band", "cells": 8}, "contacts": {"sites": [2], "clearance": 1e-3}}
     with pytest.raises(CaseError, match=message):
         NnmCase.from_table(table | {"nnm": nnm})
+
+
+def test_beads_between_ends_without_walls_move_as_a_rigid_body():
+    """No spring ties them to a wall, whatever the ends are called: their first mode has no frequency."""
+    pressed = {"sites": [1, 2], "next_cell": True, "side": "minus", "clearance": 0.0, "precompression": 1e-6}
+    table: dict[str, Any] = {
+        "lattice": {"cells": 3, "ends": "fixed", "cell": {"masses": [1e-3]}},
+        "contacts": pressed | {"stiffness": 1e9},
+        "nnm": {"system": "chain", "modes": [1, 2]},
+    }
+    with pytest.raises(CaseError, match=r"nnm\.modes = \[1\]: the system can move as a rigid body"):
+        NnmCase.from_table(table)
+    NnmCase.from_table(table | {"nnm": {"system": "chain", "modes": [2]}})

@@ -123,3 +123,10 @@ def test_the_propagator_names_what_no_step_of_its_own_suits(cells, frequency, re
         "time": {"end": 0.01, "sample_interval": 2e-4},
     })  # fmt: skip
     assert reason in str(refusal(case.model()))
+
+
+def test_a_precompression_is_named_as_it_is_given():
+    """With a clearance, the indentation is less than the key's value."""
+    stops = {"sites": [4], "clearance": 1e-5, "precompression": 3e-5, "side": "plus", "restitution": 0.7}
+    with pytest.raises(CaseError, match=r"contacts\.precompression = 3e-05: site 1: a precompressed contact"):
+        small_case(contacts=stops)

@@ -112,3 +112,16 @@ def test_verbs_about_waves_refuse_it():
         CaseError, match=r"initial\.kind = 'velocity': the law's fractions .* in a lattice that starts at rest"
     ):
         LawCase.from_table({"initial": {"kind": "velocity", "cell": 1, "velocity": 1.0}, "law": {}})
+
+
+def test_a_lossy_site_is_not_at_rest_where_the_mass_of_the_next_cell_is_struck():
+    """Its contact is with the next cell; on a ring that of the last cell is with the first."""
+    lossy = {"stiffness": STIFFNESS, "next_cell": True, "side": "minus", "clearance": 0.0, "restitution": 0.9}
+    assert beads({"cell": 4, "velocity": -1.0}, contacts=lossy | {"sites": [3]})
+    with pytest.raises(CaseError, match="site 1 touches its stop at rest"):
+        beads({"cell": 5, "velocity": -1.0}, contacts=lossy | {"sites": [3]})
+
+    ring = {"cells": 5, "ends": "periodic", "cell": {"masses": [MASS]}}
+    assert beads({"cell": 1, "velocity": -1.0}, lattice=ring, contacts=lossy | {"sites": [5]})
+    with pytest.raises(CaseError, match="site 1 touches its stop at rest"):
+        beads({"cell": 2, "velocity": -1.0}, lattice=ring, contacts=lossy | {"sites": [5]})

@@ -131,6 +131,22 @@ def test_contacts_that_are_brief():
     assert warnings_of(petsc={"ts_adapt_type": "none", "ts_dt": "1e-5"}) == []
 
 
+def test_the_time_of_a_contact_is_that_of_the_masses_it_joins():
+    """A stop to ground turns the whole mass over, and a contact of two masses their reduced mass."""
+
+    def duration(**join) -> str:
+        """Return the duration that the warning names, of a case with brief contacts."""
+        case = small_case(time={"end": 0.04}, contacts={"modulus": 1e12, "side": "plus"} | join)
+        (sentence,) = [text for text in case.warnings() if "of a sample interval" in text]
+        model = case.model()
+        speed = model.scale * model.drive.frequency
+        (mass,) = set(model.chain.reduced_masses())
+        assert f"lasts {model.contact.impact_time(speed, mass):.3g} s" in sentence
+        return sentence
+
+    assert duration() != duration(pair=[0, 3])
+
+
 def test_verbs_warn_of_what_concerns_them():
     """Recording one cell in two concerns a run and a search; a law and a frequency response curve record nothing."""
     sparse = ["output.every=2"]
@@ -198,3 +214,22 @@ def test_a_run_that_ends_within_its_burst_or_ramp():
 
     assert endless(0.08) == []
     assert endless(0.06) == ["time.end = 0.06 s is before the end of the drive's ramp, at 0.0628319 s"]
+
+
+def test_a_ring_on_which_the_site_is_near_the_drive_the_other_way_round():
+    """Cell 299 of 300 is two cells from the first: the wave is back there after a revolution and two cells."""
+    table = {
+        "lattice": {"preset": "four-band", "cells": 300, "ends": "periodic"},
+        "contacts": {"sites": [299], "clearance": 1e-3},
+        "drive": {"cycles": 6},
+        "predict": {},
+    }
+    model = PredictCase.from_table(table).model()
+
+    def warned(passed_cells: float) -> bool:
+        """Return whether a run that ends when the burst has passed so many cells has a warning."""
+        end = passed_cells / model.speed + model.drive.duration
+        return any("second time" in text for text in PredictCase.from_table(table | {"time": {"end": end}}).warnings())
+
+    assert warned(302.5)
+    assert not warned(301.5)

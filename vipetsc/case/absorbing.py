@@ -13,10 +13,11 @@ from vipetsc.lattice.chain import Ends
 from vipetsc.lattice.ends import EndSection, absorbing_section, reflection
 from vipetsc.lattice.sent import Source
 
-# Lengths (cells) that are tried double: from one to the next the waves of lower and lower group velocity are absorbed.
+# Lengths that are tried, in cells. Each is twice the one before, and absorbs waves of lower group velocities as well.
 LENGTHS = (10, 20, 40, 80, 160, 320, 640)
-# Logarithmic losses of a wave over both of its passes. Where the end is long enough that its gradient reflects less,
-# they leave 3e-4, 5e-5, 2e-6 and 4e-8 of the energy; in the built-in case 40 cells are within 1.3 times of that.
+# Logarithms of the loss of a wave's energy on its way through the end and back. They leave 3e-4, 5e-5, 2e-6 and 4e-8 of
+# the energy if the end is so long that its gradient reflects less; in the built-in case 40 cells leave up to 1.3 times
+# as much.
 LOSSES = (8.0, 10.0, 13.0, 17.0)
 
 
@@ -26,16 +27,20 @@ def sources_of(drives: Sequence[Drive], cell: UnitCell, ends: Ends, cells: int) 
     for drive in with_unit_amplitude(drives):
         # The waves of springs at one wall interfere, so that their energies do not add: they are one source.
         load = loads.setdefault((drive.waveform, drive.cell), np.zeros(cell.dofs))
+        # A wall's motion is a force of that motion times the spring's stiffness.
         load[drive.mass] += drive.stiffness or 1.0
     return [Source(cell, ends, cells, place, load, waveform) for (waveform, place), load in loads.items()]
 
 
 def with_unit_amplitude(drives: Sequence[Drive]) -> tuple[Drive, ...]:
-    """The ``drives`` normalised for fractions of energies, from which the amplitude of a single burst cancels."""
+    """The ``drives``, where a burst that is the only one has the amplitude 1.
+
+    Fractions of its energy do not depend on its amplitude, so that ``_first_end`` designs one end for all amplitudes.
+    """
     unit = []
     for drive in drives:
         waveform = drive.waveform
-        # An amplitude is 0 where a lattice begins in motion.
+        # An amplitude is 0 if the lattice begins in motion: its waves are those of a burst of that frequency.
         if isinstance(waveform, ToneBurst) and (len(drives) == 1 or not waveform.amplitude):
             waveform = replace(waveform, amplitude=1.0)
         unit.append(replace(drive, waveform=waveform))
@@ -43,7 +48,7 @@ def with_unit_amplitude(drives: Sequence[Drive]) -> tuple[Drive, ...]:
 
 
 def sections_of(table: AbsorbingTable, cell: UnitCell, ends: Ends, cells: int, strength: float) -> list[EndSection]:
-    """The sections of ``cells`` that absorb."""
+    """The absorbing sections, of ``cells`` cells each, with dashpots of a ``strength`` in 1/s."""
     sections = []
     if table.end != "right":
         sections.append(absorbing_section(cell, ends, cells, strength, "left"))
@@ -53,7 +58,7 @@ def sections_of(table: AbsorbingTable, cell: UnitCell, ends: Ends, cells: int, s
 
 
 def reflected_at(omega: float, sections: Sequence[EndSection]) -> float:
-    """Largest fraction of a wave's energy at ``omega`` (rad/s) that a section reflects; NaN in a gap."""
+    """Largest fraction of a wave's energy at ``omega`` (rad/s) that any of the ``sections`` reflects; NaN in a gap."""
     return max(reflection(chain, omega, cells, end) for chain, cells, end in sections)
 
 
@@ -78,13 +83,21 @@ def reflected(sources: Sequence[Source], sections: Sequence[EndSection]) -> floa
 def designed_end(
     table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: Sequence[Drive], cells: int
 ) -> AbsorbingTable:
-    """``table`` with a length, up to a third of ``cells``, and a strength; raises ValueError if none will do.
+    """``table`` with the length and the strength that it does not give, for a lattice of ``cells`` cells.
 
-    The reflected fraction counts all ``drives`` together.
+    A length is at most a third of the lattice. Raises ValueError if no end that is tried reflects, of the waves of all
+    ``drives``, at most ``table.reflection``.
     """
     waves = [wave for drive in drives for wave in waves_at(cell, drive.waveform.frequency)]
     if not waves:
         raise ValueError("the drive frequency is in a gap: no wave reaches the end")
+
+    lengths = lengths_tried(table, cells)
+    if not lengths:
+        raise ValueError(
+            f"an end has {LENGTHS[0]} cells or more, and at most a third of the lattice, which has {cells} cells;"
+            " lengthen the lattice, or give lattice.absorbing.cells"
+        )
 
     # The fastest wave passes the dashpots in the shortest time and loses least.
     speed = max(wave[2] for wave in waves)
@@ -92,10 +105,18 @@ def designed_end(
     if end.cells:
         return table.model_copy(update={"cells": end.cells, "strength": end.strength})
     raise ValueError(
-        f"no end of up to {cells // 3} cells satisfies it: {end.back:.2g} is reflected, mostly slow waves at band"
+        f"no end of up to {max(lengths)} cells satisfies it: {end.back:.2g} is reflected, mostly slow waves at band"
         f" edges;"
         " allow more reflection, lengthen the lattice, increase the cycles, or drive farther from the band edges"
     )
+
+
+def lengths_tried(table: AbsorbingTable, cells: int) -> list[int]:
+    """The lengths in cells that ends by ``table`` are tried with, in a lattice of ``cells``; [] if it is too short."""
+    if table.cells:
+        return [table.cells]
+    # Two such ends leave a third of the lattice between them, or more.
+    return [length for length in LENGTHS if length <= cells // 3]
 
 
 class TriedEnd(NamedTuple):
@@ -116,15 +137,11 @@ def _first_end(
     table: AbsorbingTable, cell: UnitCell, ends: Ends, drives: tuple[Drive, ...], cells: int, speed: float
 ) -> TriedEnd:
     """The first end that satisfies the bound of ``table``, for waves with a ``speed`` in cells/s."""
-    lengths = [length for length in LENGTHS if length <= cells // 3]
-    if table.cells:
-        lengths = [table.cells]
-
     sources = sources_of(drives, cell, ends, cells)
     # From the shortest end on, which costs fewest cells; of one length from the weakest on, whose gradient reflects
     # least.
     best = np.inf
-    for length in lengths:
+    for length in lengths_tried(table, cells):
         # The dashpots leave exp(-loss) of a wave's energy, the integral of strength x^3 through the end and back.
         strengths = [2 * speed * loss / length for loss in LOSSES]
         if table.strength:

@@ -9,10 +9,10 @@ Changes = dict[str, dict[str, Any]]
 
 
 def amplitude_of(case: Case) -> float:
-    """The amplitude of the first drive; of a lattice that nothing drives, that of its motion at t = 0.
+    """The amplitude of the first drive of a resolved ``case``, or of its motion at t = 0 if nothing is driven.
 
-    The latter is the largest displacement in m of a mode, of a packet or of a state from a file, or the speed in m/s of
-    the first of the masses that are struck.
+    The amplitude of a mode, of a packet or of a state from a file is its largest displacement in m; that of masses that
+    are struck is the speed in m/s of the one that is listed first.
     """
     initial = case.initial
     if case.drive.amplitude or initial is None:
@@ -42,14 +42,15 @@ def drive_unit(drive: DriveTable) -> str:
 
 
 def has_free_amplitude(case: Case) -> bool:
-    """Whether the case can have any amplitude: a state from a file is taken as it is."""
+    """Whether ``amplitude_changes`` can change the amplitude of the case; that of a state from a file is fixed."""
     return bool(case.drive.amplitude) or case.initial is None or case.initial.kind != "file"
 
 
 def amplitude_changes(case: Case, amplitude: float) -> Changes:
-    """The changes, as ``Case.varied`` takes them, that bring a resolved ``case`` to an ``amplitude``.
+    """The changes, as ``Case.varied`` takes them, that give a resolved ``case`` another ``amplitude``.
 
-    Masses that are struck keep the ratios of their velocities. Of a state from a file there are none.
+    Further drives stay as they are; masses that are struck keep the ratios of their velocities. A state from a file has
+    a fixed amplitude, and no changes.
     """
     initial = case.initial
     if case.drive.amplitude or initial is None:
@@ -60,7 +61,7 @@ def amplitude_changes(case: Case, amplitude: float) -> Changes:
         return {"initial": {"amplitude": float(amplitude)}}
 
     assert initial.velocity is not None and initial.amplitude is not None
-    # The magnitude, since an amplitude is positive and the sign of a velocity is its direction.
+    # By the magnitude of the velocity, whose sign is a direction: amplitudes are positive.
     factor = float(amplitude) / abs(initial.velocity)
     changes: dict[str, Any] = {"velocity": factor * initial.velocity, "amplitude": factor * initial.amplitude}
     if initial.more:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, read_section
-from vipetsc.case.contacts import check_pairs, check_touching, contact_of, gaps_of_sites, laws_of_sites, values_of_sites
+from vipetsc.case.contacts import check_pairs, check_touching, contact_of, gaps_of_sites, laws_of_sites
 from vipetsc.case.disorder import DisorderTable, with_drawn
 from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_frequency
 from vipetsc.case.features import refusals
@@ -22,6 +22,7 @@ from vipetsc.case.model import Model
 from vipetsc.case.points import check_points
 from vipetsc.case.resolve import (
     build_chain,
+    cells_of_sites,
     check_cell,
     check_contacts,
     check_unsprung,
@@ -39,9 +40,10 @@ from vipetsc.case.warnings import loss_warnings, unit_warnings, warnings_of
 from vipetsc.case.waveforms import DEFAULT
 from vipetsc.lattice import Chain, Drive, UnitCell, pass_bands
 
-# Waves this much weaker than the drive's are still followed to the relative tolerance: grazes magnify their errors.
+# The absolute tolerances are this fraction of the relative one times the drive's wave, so that waves weaker by this
+# factor are followed to the relative tolerance too: contacts that graze magnify their errors.
 WEAKEST = 0.1
-# One recorded mass would take 16 GB, displacement and velocity: more samples are a mistyped interval.
+# The displacement and the velocity of one mass would take 16 GB at so many samples; more are a mistyped interval.
 MOST_SAMPLES = 1e9
 ORDER = ("lattice", "contacts", "disorder", "drive", "initial", "time", "output", "analysis", "petsc")
 
@@ -65,7 +67,8 @@ class Case(CaseFile):
     @cache
     def sections(cls) -> dict[str, type[Section]]:
         """Class of each section that the verb reads, in the order of the manual."""
-        classes = super().sections() | {"disorder": DisorderTable}  # a resolved case holds the values drawn instead
+        # No field of a case has this section: a resolved case has the values that were drawn.
+        classes = super().sections() | {"disorder": DisorderTable}
         return {name: classes.pop(name) for name in ORDER} | classes
 
     @classmethod
@@ -73,8 +76,9 @@ class Case(CaseFile):
         """The resolved sections, and all problems with them."""
         table, unread = with_samples(with_preset(table))
         sections, problems = super().read(table)
-        # A file of samples that cannot be read leaves keys empty, which are no problems of their own.
-        problems = unread + [p for p in problems if not unread or ".samples" not in p.key]
+        if unread:
+            # A file that cannot be read leaves the drive's samples empty, which is no problem of its own.
+            problems = unread + [p for p in problems if not (p.key.startswith("drive") and ".samples" in p.key)]
         disorder, wrong = read_section(DisorderTable, table.get("disorder", {}), "disorder")
         problems += wrong
         if problems:
@@ -99,14 +103,17 @@ class Case(CaseFile):
     @classmethod
     def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
         """Problems between keys."""
-        lattice, contacts, drive, time = (sections[name] for name in ("lattice", "contacts", "drive", "time"))
+        lattice = sections["lattice"]
+        contacts = sections["contacts"]
+        drive = sections["drive"]
+        time = sections["time"]
         cell: UnitCell | None = None
         if valid("lattice"):
             cell, problems = check_cell(lattice)
             yield from problems
         if cell and valid("drive"):
-            # The cell of a moved wall is filled in on resolution only.
-            driven = [one.cell for _, one in drive.every if one.end is None]
+            # The cell of a moved wall is filled in on resolution only. Without an amplitude no cell is driven.
+            driven = [one.cell for _, one in drive.every if one.end is None and one.amplitude != 0]
             yield from check_inhomogeneity(lattice, driven)
 
         if valid("lattice.cells", "contacts.sites"):
@@ -121,16 +128,19 @@ class Case(CaseFile):
         yield from refusals(cls, sections, valid)
 
         yield from _check_undriven(sections, valid)
-        length = lattice.cells if valid("lattice.cells") else None
+        length = None
+        if valid("lattice.cells"):
+            length = lattice.cells
         yield from _check_output(sections["output"], length, cell, valid)
         problems = list(check_drives(drive, lattice, cell, length, valid))
         yield from problems
-        # Only of drives that are sound, since waves are computed for it.
+        # Only for drives without problems, since the waves of the first one are computed.
         if cell and not problems and drive.wave_choices and valid("lattice", "drive", "time.end"):
             yield from check_wave(cell, drive, time)
         if cell and not cell.springs and valid("drive", "time"):
             yield from check_unsprung(drive, time)
-            cell = None  # it has no bands that samples could be too coarse for
+            # Without springs there are no bands that samples could be too coarse for.
+            cell = None
         yield from _check_sampling(time, cell, valid)
 
     def model(self) -> Model:
@@ -144,7 +154,7 @@ class Case(CaseFile):
         # ``read`` has replaced both words by numbers; the assertion narrows their types.
         assert time.end != "traverse" and time.sample_interval != "auto"
         chain = build_chain(self.lattice, contacts)
-        # The drive by which tolerances are judged: without a force it has the frequency of the initial motion.
+        # Tolerances refer to this drive: if nothing is driven, it has the frequency of the motion at t = 0.
         drive = reference_drive(self.drive, self.initial)
         drives = build_drives(drive, chain)
         scale = self._scale(chain, drives)
@@ -173,7 +183,10 @@ class Case(CaseFile):
         return self.drive.frequency
 
     def _scale(self, chain: Chain, drives: tuple[Drive, ...]) -> float:
-        """Displacement in m of the drives' linear waves together, or of the motion at the beginning if that is more."""
+        """Displacement in m of the linear waves of all ``drives`` together, or of the motion at t = 0 if that is more.
+
+        The sum is a bound, since waves of different drives may cancel.
+        """
         scale = 0.0
         if self.drive.amplitude:
             # A wall's drive is a displacement: its force is that times the stiffness of the spring to it.
@@ -230,7 +243,7 @@ class Case(CaseFile):
         return self.contacts.radius
 
     def runs(self) -> list[CaseFile]:
-        """The case itself: verbs that simulate others vary it."""
+        """The case itself; verbs that simulate several runs vary it."""
         return [self]
 
     @property
@@ -262,12 +275,12 @@ def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem
         return None, []
     lattice = sections["lattice"]
     frequency = None
-    # A drive that gives its wave gives the motion's frequency, too; a pulse has none that others could have.
+    # The frequency of a drive's wave is that of the motion, too. A pulse has no frequency of which this could be said.
     if drive.wave_choices:
         frequency, _ = driven_wave(lattice.unit_cell(), drive)
 
     def touching(speed: float) -> float:
-        """The frequency of contacts at a speed; of a lattice without any, of one half of its time."""
+        """The frequency in rad/s of contacts at a ``speed`` in m/s; without sites, half a period is the whole run."""
         return contact_frequency(lattice, sections["contacts"], speed) or np.pi / sections["time"].end
 
     return beginning_of(initial, lattice, frequency, touching)
@@ -276,7 +289,11 @@ def _beginning(sections: dict[str, Any]) -> tuple[Beginning | None, list[Problem
 def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[Problem]:
     """Problems that show only in the ``resolved`` sections: of the absorbing end and of the samples."""
     # Checked a second time: the absorbing end and the wall of a drive have their cells only now.
-    driven = [drive.cell for _, drive in resolved["drive"].every]
+    driven = [drive.cell for _, drive in resolved["drive"].every if drive.amplitude != 0]
+    initial = resolved.get("initial")
+    if not driven and initial is not None and initial.cell is not None:
+        # A packet or a mass that is struck sends waves as a drive does.
+        driven = [initial.cell]
     problems = list(check_inhomogeneity(resolved["lattice"], driven))
     for path, drive in resolved["drive"].every:
         if drive.end == "right" and not problems:
@@ -296,23 +313,21 @@ def _resolved_problems(given: dict[str, Any], resolved: dict[str, Any]) -> list[
 
 
 def _touching_problems(sections: dict[str, Any], beginning: Beginning | None) -> Iterator[Problem]:
-    """Lossy sites that touch their stops and that the state of a file leaves at rest."""
+    """The problem of a lossy site that touches its stop and is at rest in the state of a file."""
     if beginning is None or beginning.moving is None:
         return
+    lattice = sections["lattice"]
     contacts = sections["contacts"]
-    cells = site_cells(sections["lattice"], contacts)
-    is_to_next = values_of_sites(contacts, "next_cell", len(cells))
-    at_rest = []
-    for cell, reaches_on in zip(cells, is_to_next, strict=True):
-        touched = {cell}
-        if reaches_on:
-            touched.add(cell + 1)
-        at_rest.append(not touched & beginning.moving)
-    yield from check_touching(contacts, clearances(sections["lattice"], contacts, len(cells)), at_rest)
+    joined = cells_of_sites(lattice, contacts)
+    at_rest = [not set(cells) & beginning.moving for cells in joined]
+    yield from check_touching(contacts, clearances(lattice, contacts, len(joined)), at_rest)
 
 
 def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
-    """A lattice without a force needs an initial motion, and a tolerance that does not refer to the force."""
+    """Problems of a lattice that nothing drives: no motion at t = 0, or a tolerance that refers to the drive.
+
+    With a drive and a motion at t = 0, the problem of a second frequency.
+    """
     drive = sections["drive"]
     initial = sections.get("initial")
     has_wave = drive.amplitude != 0 or bool(drive.wave_choices)
@@ -333,7 +348,7 @@ def _check_undriven(sections: dict[str, Any], valid: Valid) -> Iterator[Problem]
 
 
 def _check_output(output: OutputTable, cells: int | None, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:
-    """The window and the points are within the lattice's ``cells``, its masses those of the ``cell``; None: invalid."""
+    """Problems with a window or points outside a lattice of ``cells`` cells like ``cell``; None: those are invalid."""
     window = output.window
     if window is not None and cells is not None and not 1 <= window[0] <= window[1] <= cells:
         yield Problem("output.window", window, f"must be [first, last] within cells 1 to {cells}")
@@ -343,7 +358,7 @@ def _check_output(output: OutputTable, cells: int | None, cell: UnitCell | None,
 
 
 def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Iterator[Problem]:
-    """The samples resolve the bands, and there is one before the end."""
+    """Problems with an interval of samples that does not resolve the bands of ``cell``, or exceeds the run."""
     interval = time.sample_interval
     if interval == "auto" or not valid("time.sample_interval"):
         return
@@ -356,7 +371,10 @@ def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Ite
 
 
 def _too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[Problem]:
-    """The problem of samples every ``interval`` s, asked for by ``key``, beyond the top band's Nyquist interval."""
+    """The problem of samples at an ``interval`` in s that is not below the top band's Nyquist interval.
+
+    ``key`` is the key by which the case asks for them, and ``value`` its value.
+    """
     top = pass_bands(cell)[-1].high
     if top == 0 or interval < np.pi / top:
         return []

@@ -19,12 +19,14 @@ MATERIAL = ("modulus", "radius", "poisson")
 SIDES = ("side", "clearance_minus", "precompression")
 JOINS = ("pair", "next_cell")
 NO_APPROACH = "a precompressed contact has no approach velocity: its restitution must be 1"
-Gaps = tuple[tuple[float, float], ...]
+Gaps = tuple[tuple[float, float], ...]  # clearances in m of each site on the sides + and -
 
 
 def lists_of(contacts: ContactsTable) -> dict[str, list[Any]]:
-    """The lists over sites, by key."""
-    return contacts.each.model_dump(exclude_none=True) if contacts.each else {}
+    """The lists over sites, ``contacts.each``, by key."""
+    if contacts.each is None:
+        return {}
+    return contacts.each.model_dump(exclude_none=True)
 
 
 def values_of_sites(contacts: ContactsTable, key: str, count: int) -> list[Any]:
@@ -56,14 +58,14 @@ def check_per_site(
         yield Problem(f"contacts.{lacking[0]}", None, "missing; needed for the stiffness of each site")
     yield from _check_laws(contacts, count)
     yield from _check_sides(contacts, count)
-    # A stop that is wrong itself touches, too: only the first reason is given.
+    # A pressed or touching stop that is wrong by itself would be reported again for its restitution.
     wrong = list(_check_stops(contacts, gaps))
     yield from wrong or check_touching(contacts, gaps, at_rest)
 
 
 def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
     """Problems with parameters of unused laws, missing parameters, and an unbounded damping."""
-    # Without sites the law of all is checked, which normal modes have though no site is listed.
+    # Without sites the values for all sites are checked, here and below: normal modes need no list of sites.
     laws = values_of_sites(contacts, "law", count) or [contacts.law]
     for key, parameter in PARAMETERS.items():
         values = values_of_sites(contacts, key, max(count, 1))
@@ -76,10 +78,9 @@ def _check_laws(contacts: ContactsTable, count: int) -> Iterator[Problem]:
             yield Problem(path, None, f'missing; needed for the law "{parameter.law}"')
 
     yield from _check_registered(contacts, laws, count)
-    # Without sites the values for all are checked: normal modes need no list of sites.
     names = values_of_sites(contacts, "damping", count) or [contacts.damping]
     restitutions = values_of_sites(contacts, "restitution", count) or [contacts.restitution]
-    # None, the default damping, cannot be compared with a name: text orders both.
+    # In the order of their texts, since the default damping, None, cannot be compared with a name.
     for name, restitution in sorted(set(zip(names, restitutions, strict=True)), key=str):
         if name and restitution < least_restitution(name):
             remedy = f"the {name} damping increases without bound towards 0; give at least {least_restitution(name):g}"
@@ -95,9 +96,9 @@ def _check_registered(contacts: ContactsTable, laws: list[str], count: int) -> I
     if wrong or not any(registered_law(name) for name in laws):
         return
 
-    # Of many sites with parameters of their own, the first of each law.
+    # Sites may have parameters of their own: formulas are checked with those of the first site of each law. They are
+    # checked with the stiffness 1 where a case lacks one, which is reported elsewhere.
     first: dict[str, Contact] = {}
-    # The stiffness of a case that lacks one is reported elsewhere: formulas are checked with 1.
     for law in laws_of_sites(contacts, count) or (contact_of(contacts),):
         if registered_law(law.law):
             first.setdefault(law.law, replace(law, stiffness=law.stiffness or 1.0))
@@ -116,7 +117,10 @@ def _check_sides(contacts: ContactsTable, count: int) -> Iterator[Problem]:
 
 
 def check_touching(contacts: ContactsTable, gaps: list[float], at_rest: Sequence[bool]) -> Iterator[Problem]:
-    """The first lossy site that touches its stop and is ``at_rest`` (site,) at t = 0; ``gaps`` are clearances in m."""
+    """The problem of the first lossy site that touches its stop and is ``at_rest`` (site,) at t = 0.
+
+    ``gaps`` are the clearances in m.
+    """
     restitutions = values_of_sites(contacts, "restitution", len(gaps))
     stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
     for number, (plus, minus) in enumerate(stops, 1):
@@ -135,7 +139,7 @@ def _check_stops(contacts: ContactsTable, gaps: list[float]) -> Iterator[Problem
     restitutions = values_of_sites(contacts, "restitution", len(gaps))
     precompressions = values_of_sites(contacts, "precompression", len(gaps))
     stops = gaps_of_sites(contacts, gaps) or tuple((gap, gap) for gap in gaps)
-    # One problem is enough: sites of one kind would all have the same.
+    # Only the first problem is given, since similar sites all have the same.
     for number, (plus, minus) in enumerate(stops, 1):
         if min(plus, minus) <= 0 and max(plus, minus) < np.inf:
             remedy = "contacts that touch at rest or are precompressed have a stop on one side only; set contacts.side"
@@ -146,20 +150,23 @@ def _check_stops(contacts: ContactsTable, gaps: list[float]) -> Iterator[Problem
             yield Problem(_path_of(contacts, "precompression"), precompressions[number - 1], remedy)
             return
         if min(plus, minus) < 0 and restitutions[number - 1] < 1:
-            yield Problem(_path_of(contacts, "precompression"), -min(plus, minus), f"site {number}: {NO_APPROACH}")
+            remedy = f"site {number}: {NO_APPROACH}"
+            yield Problem(_path_of(contacts, "precompression"), precompressions[number - 1], remedy)
             return
 
 
 def _path_of(contacts: ContactsTable, key: str) -> str:
     """Path of a key, in the lists over sites if it is given there."""
-    return f"contacts.each.{key}" if key in lists_of(contacts) else f"contacts.{key}"
+    if key in lists_of(contacts):
+        return f"contacts.each.{key}"
+    return f"contacts.{key}"
 
 
 def resolved_per_site(contacts: ContactsTable, count: int) -> PerSiteTable | None:
     """The lists over sites, with a stiffness in place of a material."""
     if contacts.each is None or not lists_of(contacts).keys() & {*MATERIAL}:
         return contacts.each
-    # What a list does not give is the value for all sites.
+    # A key without a list has the same value at all sites.
     rows = zip(*(values_of_sites(contacts, key, count) for key in MATERIAL), strict=True)
     stiffness = [float(contact_stiffness(*row)) for row in rows]
     return contacts.each.model_copy(update=dict.fromkeys(MATERIAL) | {"stiffness": stiffness})
@@ -237,7 +244,7 @@ def _describe_stop(side: str, gap: float) -> str:
 
 
 def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple[Pair, ...]:
-    """The masses that each site joins; () if all join the cell's own pair, and no cell has two sites."""
+    """The masses (0-based) that each site joins; () if all join the cell's own pair, and no cell has two sites."""
     pairs = []
     given = values_of_sites(contacts, "pair", count)
     next_cell = values_of_sites(contacts, "next_cell", count)
@@ -245,16 +252,18 @@ def pairs_of_sites(contacts: ContactsTable, cell: UnitCell, count: int) -> tuple
         host, resonator = pair or (cell.host + 1, cell.resonator + 1)
         pairs.append(Pair(host - 1, resonator - 1, bool(is_in_next_cell)))
 
-    sites = contacts.sites if isinstance(contacts.sites, list) else []
-    # Without pairs a chain is treated by the methods for one contact, of the cell's own pair, in a cell.
-    is_plain = set(pairs) <= {Pair(cell.host, cell.resonator)} and len(set(sites)) == len(sites)
-    return () if is_plain else tuple(pairs)
+    # Without pairs, methods for one contact of the cell's own pair in a cell apply to the chain.
+    comes_twice = isinstance(contacts.sites, list) and len(set(contacts.sites)) < len(contacts.sites)
+    if set(pairs) <= {Pair(cell.host, cell.resonator)} and not comes_twice:
+        return ()
+    return tuple(pairs)
 
 
 def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, cells: list[int]) -> Iterator[Problem]:
     """Problems with the pairs of masses that contacts join, in the ``cells`` (1-based) with sites."""
+    # Lists of another length are reported by ``check_per_site``.
     if any(len(lists_of(contacts).get(key, cells)) != len(cells) for key in JOINS):
-        return  # as ``check_per_site`` says
+        return
 
     pairs = pairs_of_sites(contacts, cell, len(cells)) or [Pair(cell.host, cell.resonator)] * len(cells)
     for number, (at, pair) in enumerate(zip(cells, pairs, strict=True), 1):
@@ -270,7 +279,7 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
             yield Problem("contacts.next_cell", True, f"site {number} in cell {at} has no next cell to touch")
             return
 
-    # Without a pair of its own a cell that comes twice is refused by ``check_sites`` already.
+    # Where no pair is given, a cell that is listed twice is reported by ``check_sites``.
     has_pair = contacts.pair or (contacts.each and contacts.each.pair)
     times = Counter(zip(cells, pairs, strict=True))
     twice = [at for (at, _), count in times.items() if count > 1]
@@ -297,7 +306,7 @@ def gaps_of_sites(contacts: ContactsTable, gaps: list[float]) -> Gaps:
         elif side == "plus":
             minus = np.inf
         stops.append((plus, minus))
-    # Equal clearances are no gaps, by which symmetric motions are recognised.
+    # () for equal clearances on both sides: motions of such sites may be symmetric, which is recognised by it.
     if all(plus == minus for plus, minus in stops):
         return ()
     return tuple(stops)

@@ -38,7 +38,10 @@ class EtaTable(GridTable):
 
 
 class DesignTable(Section):
-    """Grids of lambda and eta, number of ``wavenumbers`` in [0, pi], readings of the paper's parameters."""
+    """Grids of lambda and eta, the number of ``wavenumbers`` in [0, pi], the ``readings`` of the paper's parameters.
+
+    One map of the search is computed for each reading.
+    """
 
     readings: list[Literal["printed", "calibrated"]] = Field(["printed", "calibrated"], min_length=1)
     lam: GridTable = Field(GridTable(), alias="lambda")

@@ -20,7 +20,7 @@ from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Spring, UnitCell
 
 SEED = "disorder.seed"
-# What a spring may have besides its stiffness: its dashpot and the terms of its nonlinear force.
+# The numbers of a spring besides its stiffness: its dashpot and the terms of its nonlinear force.
 SPRING_PARAMETERS = tuple(field.name for field in fields(Spring) if isinstance(field.default, float))
 
 
@@ -44,23 +44,27 @@ class DisorderTable(Section):
     cells: dict[str, Deviation] | None = None
 
     def quantities(self) -> dict[str, Deviation]:
-        """Deviations of the scattered quantities, by name."""
-        names = type(self).model_fields.keys() - {"seed", "cells"}
-        return {name: getattr(self, name) for name in type(self).model_fields if name in names and getattr(self, name)}
+        """Deviations of the scattered quantities except those of ``cells``, by name."""
+        deviations = {}
+        for name in type(self).model_fields:
+            given = getattr(self, name)
+            if isinstance(given, Deviation):
+                deviations[name] = given
+        return deviations
 
 
 def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Sequence[float]]:
-    """The quantities of a resolved case by name; one that it does not have is empty.
+    """The values of each quantity of a resolved case, by its name; empty if the case has none.
 
-    ``modulus`` is the stiffness, which is proportional to it.
+    Those of ``modulus`` are the stiffnesses of the contacts, which are proportional to it.
     """
     cell = lattice.unit_cell()
     sites = contacts.sites
     clearance = contacts.clearance
     assert isinstance(sites, list) and isinstance(clearance, list)
-    stiffness = []
-    if contacts.stiffness:
-        stiffness.append(contacts.stiffness)
+    stiffness = lists_of(contacts).get("stiffness", [])
+    if not stiffness and contacts.stiffness:
+        stiffness = [contacts.stiffness]
 
     clearance_minus = lists_of(contacts).get("clearance_minus", [])
     if not clearance_minus and contacts.clearance_minus is not None:
@@ -71,7 +75,7 @@ def values_of(lattice: LatticeTable, contacts: ContactsTable) -> dict[str, Seque
         "clearance_minus": clearance_minus,
         "sites": sites,
         "restitution": values_of_sites(contacts, "restitution", len(sites)),
-        "stiffness": lists_of(contacts).get("stiffness") or stiffness,
+        "stiffness": stiffness,
         "modulus": stiffness,
         "masses": cell.masses,
         "springs": [spring.stiffness for spring in cell.springs],
@@ -92,10 +96,11 @@ def scatter(
         remedy = "contains no quantity that scatters; give one, as in: clearance = { relative = 0.01 }"
         return {}, [Problem("disorder", disorder.seed, remedy)]
 
-    # A resolved case has no modulus: what is drawn scales the stiffness, which is proportional to it.
+    # A resolved case has no modulus: one that is drawn scales the stiffnesses, which are proportional to it. Where each
+    # site has a modulus of its own, none holds for all sites.
     values = values_of(lattice, contacts)
     values["modulus"] = []
-    if given.modulus and values["stiffness"]:
+    if given.modulus and values["stiffness"] and "modulus" not in lists_of(given):
         values["modulus"] = [given.modulus]
     drawn, problems = _draw(disorder, values)
     if problems:
@@ -103,7 +108,7 @@ def scatter(
 
     changed: dict[str, Table] = {}
     table: Table = lattice.model_dump(by_alias=True, exclude_none=True)
-    # Cells are drawn when the lattice is built: a million numbers do not belong into the text of a case.
+    # Cells are drawn when the lattice is built, so that the text of a case need not have a million numbers.
     if disorder.cells:
         quantities = {key: deviation.model_dump(exclude_none=True) for key, deviation in disorder.cells.items()}
         table["scatter"] = {"seed": disorder.seed, "quantities": quantities}
@@ -113,7 +118,7 @@ def scatter(
     if drawn.keys() & {"masses", "springs"}:
         # The undamped cell: [lattice.damping] stays in the table and is added to the drawn cell.
         changed["lattice"] = with_cell(table, lattice.undamped_cell(), drawn)
-        # A cell of its own has no preset that would say the radius.
+        # A cell that is written out has no preset, from which the radius would follow.
         if lattice.preset and "stiffness" in changed["contacts"]:
             changed["contacts"].setdefault("radius", CONTACTS["radius"])
     return changed, []
@@ -133,10 +138,10 @@ def with_drawn(
     if problems or not drawn:
         return resolved, problems
 
-    # What is drawn may be out of bounds: it is checked as if it stood in the file.
+    # Drawn values may be out of bounds: they are checked as those of a file are.
     tables = {name: section.model_dump(by_alias=True, exclude_none=True) for name, section in resolved.items()}
     sections, problems = read(tables | drawn)
-    # The file has no such value: the message names the seed that drew it.
+    # The file does not have these values: the message names the seed that drew them.
     return sections, [replace(p, key=f"{SEED} = {disorder.seed} draws {p.key}") for p in problems]
 
 
@@ -148,7 +153,7 @@ def _draw(
     problems: list[Problem] = []
     quantities = disorder.quantities()
     if "clearance" in quantities and values["clearance_minus"]:
-        # The stops on both sides are machined by themselves.
+        # The stops on the two sides are machined one by one, so that their clearances scatter independently.
         quantities["clearance_minus"] = quantities["clearance"]
     for name, deviation in quantities.items():
         key = f"disorder.{name.removesuffix('_minus')}"
@@ -157,9 +162,10 @@ def _draw(
             problems.append(Problem(key, deviation.model_dump(exclude_none=True), "give `absolute`, in cells"))
         elif not about.size:
             problems.append(Problem(key, None, "the case has none that could scatter"))
-        elif deviation.relative or deviation.absolute:  # none leaves the case as it is, to the last bit
+        # A deviation of 0 draws nothing and leaves the case as it is, to the last bit.
+        elif deviation.relative or deviation.absolute:
             new = deviation.draw(about, disorder.seed, name)
-            # Negated, so that NaN, the lognormal scatter of a 0, is refused too.
+            # The condition is negated, so that it is true of NaN, the lognormal scatter of a 0.
             changes_sign = ~(new * about > 0) & (new != about)
             if changes_sign.any():
                 numbers = [float(f"{x:.4g}") for x in new[changes_sign]]
@@ -170,7 +176,7 @@ def _draw(
 
 
 def _drawn_contacts(contacts: ContactsTable, drawn: Mapping[str, list[float]], modulus: float | None) -> Table:
-    """The table of resolved ``contacts`` with what is ``drawn``, a modulus about ``modulus`` in Pa."""
+    """The table of resolved ``contacts`` with the ``drawn`` numbers; a modulus in Pa is drawn about ``modulus``."""
     table: Table = contacts.model_dump(by_alias=True, exclude_none=True)
     if "clearance" in drawn:
         table["clearance"] = drawn["clearance"]
@@ -187,7 +193,12 @@ def _drawn_contacts(contacts: ContactsTable, drawn: Mapping[str, list[float]], m
     if "sites" in drawn:
         table["sites"] = np.rint(drawn["sites"]).astype(int).tolist()
     if "modulus" in drawn and modulus:
-        table["stiffness"] *= drawn["modulus"][0] / modulus
+        ratio = drawn["modulus"][0] / modulus
+        # Sites with radii or Poisson ratios of their own have a list of stiffnesses, beside the one of all.
+        if "stiffness" in table:
+            table["stiffness"] *= ratio
+        if "stiffness" in table.get("each", {}):
+            table["each"]["stiffness"] = [ratio * stiffness for stiffness in table["each"]["stiffness"]]
     return table
 
 
@@ -197,7 +208,7 @@ def with_cell(lattice: Table, cell: UnitCell, drawn: Mapping[str, list[float]]) 
     springs: list[Table] = []
     for spring, value in zip(cell.springs, stiffness, strict=True):
         table = {"start": spring.start + 1, "end": spring.end + 1, "stiffness": value, "next_cell": spring.next_cell}
-        # Whatever else the spring has goes with it: a parameter left behind would change the lattice without a word.
+        # All other parameters of the spring too: a spring without one of them would be another.
         for key in SPRING_PARAMETERS:
             if parameter := getattr(spring, key):
                 table[key] = parameter
@@ -207,6 +218,6 @@ def with_cell(lattice: Table, cell: UnitCell, drawn: Mapping[str, list[float]]) 
     if cell.grounding:
         cell_table["grounding"] = list(cell.grounding)
     cell_table["contact"] = [cell.host + 1, cell.resonator + 1]
-    # A preset and its parameters would contradict the cell.
+    # Without the preset and its parameters, which would contradict the cell.
     kept_keys = {key: value for key, value in lattice.items() if key not in ("preset", "lambda", "eta")}
     return kept_keys | {"cell": cell_table}

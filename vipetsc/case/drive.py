@@ -20,22 +20,23 @@ WAVE_REMEDY = 'give one of: frequency; wavenumber and band; band and at = "max-g
 
 
 class DriveTable(OneDrive):
-    """A drive, and ``more`` drives. With an initial state, ``amplitude`` may be 0.
+    """A drive, and ``more`` drives.
 
-    Then ``frequency`` and ``cell`` are by default those of its motion.
+    In a lattice that begins in motion its ``amplitude`` may be 0: then ``frequency`` and ``cell`` are by default those
+    of the motion.
     """
 
     more: list[OneDrive] | None = None
 
     @property
     def every(self) -> list[tuple[str, OneDrive]]:
-        """Drives by the path of their keys, the first drive first."""
+        """Pairs of the path of a drive's keys and the drive; the first drive comes first."""
         others = [(f"drive.more[{i}]", drive) for i, drive in enumerate(self.more or [], 1)]
         return [("drive", self), *others]
 
     @property
     def ratios(self) -> list[tuple[OneDrive, float]]:
-        """Drives, each with the ratio of its amplitude to that of the first one, which is not zero."""
+        """Pairs of a drive and the ratio of its amplitude to that of the first drive, which must not be zero."""
         return [(drive, drive.amplitude / self.amplitude) for _, drive in self.every]
 
 
@@ -45,14 +46,18 @@ AnyDrive = TypeVar("AnyDrive", bound=OneDrive)
 def check_drives(
     drives: DriveTable, lattice: LatticeTable, cell: UnitCell | None, length: int | None, valid: Valid
 ) -> Iterator[Problem]:
-    """Problems with the keys of each drive: those of its waveform, its frequency, where it acts."""
+    """Problems with the keys of each drive: those of its waveform, its frequency, and the place where it acts.
+
+    ``cell`` and ``length``, the number of cells, are None for an invalid lattice.
+    """
     for path, drive in drives.every:
         yield from _check_place(drive, path, lattice, cell, length)
         if not valid("drive"):
             continue
 
         yield from _check_keys(drive, path)
-        # A lattice that is not at rest needs no drive, but then it is the plain one.
+        # A lattice that begins in motion may have a first drive of amplitude 0, which stands for none; a waveform that
+        # is named asks for a drive.
         may_be_none = drive is drives and drive.kind == DEFAULT
         if drive.amplitude == 0 and not may_be_none:
             yield Problem(f"{path}.amplitude", 0.0, "must not be zero")
@@ -118,7 +123,7 @@ def _check_place(
     if lattice.ends != "fixed":
         remedy = f'only a fixed end has a wall that can be moved, and lattice.ends = "{lattice.ends}" has none'
         yield Problem(f"{path}.end", drive.end, remedy)
-    if cell and any(spring.damping or not spring.is_linear for spring in cell.springs if spring.next_cell):
+    if cell and not all(spring.is_linear and not spring.damping for spring in cell.springs if spring.next_cell):
         yield Problem(
             f"{path}.end", drive.end, "a wall can only move a linear spring: omit damping, quadratic and cubic"
         )
@@ -133,7 +138,7 @@ def _check_place(
 
 
 def _end_masses(cell: UnitCell, end: str) -> list[tuple[int, int]]:
-    """Masses of the end's cell that springs tie to the wall, and these springs' numbers."""
+    """Pairs of a mass (0-based) of an ``end``'s cell that a spring ties to the wall, and the number of that spring."""
     masses = []
     for number, spring in enumerate(cell.springs):
         if spring.next_cell:
@@ -144,7 +149,7 @@ def _end_masses(cell: UnitCell, end: str) -> list[tuple[int, int]]:
 
 
 def _place_at_wall(cell: UnitCell, end: str, cells: int) -> Table:
-    """The cell and the mass (from 1) of ``cells`` cells that the wall at an ``end`` acts on first."""
+    """The keys ``cell`` and ``mass`` (from 1) of the first mass on which the wall at an ``end`` of ``cells`` acts."""
     mass, _ = _end_masses(cell, end)[0]
     return {"cell": {"left": 1, "right": cells}[end], "mass": mass + 1}
 
@@ -168,6 +173,7 @@ def driven_wave(cell: UnitCell, drive: OneDrive) -> tuple[float, float]:
 
 @lru_cache
 def _wave(cell: UnitCell, frequency: float | None, wavenumber: float | None, band: int | None) -> tuple[float, float]:
+    """The wave of ``driven_wave``, by its frequency in rad/s, its wavenumber in a band, or a band's fastest wave."""
     if wavenumber is not None and band is not None:
         point = bloch(cell, wavenumber)
         return float(point.frequency[band - 1]), float(abs(point.group_velocity[band - 1]))
@@ -189,8 +195,11 @@ def packet_frequency(drive: OneDrive) -> float:
 
 
 def wave_speed(cell: UnitCell, frequency: float) -> float:
-    """Group velocity in cells/s of the fastest wave at ``frequency`` in rad/s; in a gap, the cell's fastest."""
-    # The fastest, since what arrives first decides how long a run lasts.
+    """Group velocity in cells/s of the fastest wave at ``frequency`` in rad/s.
+
+    In a gap, or where all waves stand, it is that of the cell's fastest wave at any frequency.
+    """
+    # The fastest wave, since what arrives first decides how long a run lasts.
     speed = max((wave[2] for wave in waves_at(cell, frequency)), default=0.0)
     return speed or fastest_speed(cell)
 
@@ -198,7 +207,7 @@ def wave_speed(cell: UnitCell, frequency: float) -> float:
 def check_wave(cell: UnitCell, drive: OneDrive, time: TimeTable) -> Iterator[Problem]:
     """Problems with a valid drive that sends out no wave, or one that never crosses the lattice."""
     frequency, speed = driven_wave(cell, drive)
-    # The key by which the user has chosen the wave.
+    # The problem names the key by which the user has chosen the wave.
     key = next((name for name in ("frequency", "wavenumber") if getattr(drive, name)), "band")
     if not frequency > 0:
         yield Problem(
@@ -217,17 +226,18 @@ def resolve_drives(drives: DriveTable, cell: UnitCell, cells: int, frequency: fl
     resolved = resolve_drive(drives, cell, cells, frequency)
     if not drives.more:
         return resolved.model_copy(update={"more": None})
-    # The motion at t = 0 gives the frequency of the first drive alone.
+    # Only the first drive may take its frequency from the motion at t = 0.
     others = [resolve_drive(drive, cell, cells) for drive in drives.more]
     return resolved.model_copy(update={"more": others})
 
 
 def resolve_drive(drive: AnyDrive, cell: UnitCell, cells: int, frequency: float | None = None) -> AnyDrive:
-    """The valid ``drive`` with its frequency in place of what it follows from, a ramp, and the place of a wall."""
+    """The valid ``drive`` with its frequency instead of keys that choose it, with a ramp and the place of a wall."""
     frequency = float(frequency or frequency_of(cell, drive))
     update: dict[str, Any] = {"frequency": frequency, "wavenumber": None, "band": None, "at": None}
     if drive.kind == DEFAULT:
-        update["waveform"] = None  # as if left out: the same case
+        # A case that names the default waveform is the same as one that leaves it out.
+        update["waveform"] = None
     if drive.record.ramp and drive.ramp is None:
         update["ramp"] = drive.record.ramp(drive, frequency)
     if drive.end:
@@ -241,7 +251,7 @@ def build_drives(drives: DriveTable, chain: Chain) -> tuple[Drive, ...]:
 
 
 def build_drive(drive: OneDrive, chain: Chain) -> list[Drive]:
-    """A resolved drive; the motion of a wall acts on each mass that a spring ties to it."""
+    """The drives of a resolved ``drive``: one, or one for each mass that a spring ties to a wall that moves."""
     waveform = waveform_of(drive)
     if drive.end is None:
         return [Drive(waveform, drive.cell - 1, drive.mass - 1)]
@@ -253,7 +263,7 @@ def build_drive(drive: OneDrive, chain: Chain) -> list[Drive]:
             # The spring to the left wall belongs to the cell before the first one, which does not vary.
             built.append(Drive(waveform, 0, mass, float(chain.cell.springs[number].stiffness)))
         else:
-            # Of the last cell's own spring: with a profile it is another than the reference cell's.
+            # The spring to the right wall is the last cell's, which profiles and scatter may change.
             stiffness = chain.coefficients(last, last + 1).stiffness[0, number]
             built.append(Drive(waveform, last, mass, float(stiffness)))
     return built

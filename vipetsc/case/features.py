@@ -1,7 +1,7 @@
 """Features of a case that some verbs refuse, and the messages that refuse them.
 
-A case class gives in ``refuses`` the reason why its verb does not accept a feature; it accepts all others. Reasons that
-begin with "not yet" are no matter of physics: the verb could accept the feature, but is not written for it.
+A case class gives in ``refuses`` the reason why its verb does not accept a feature; it accepts all others. Physics does
+not exclude a feature whose reason begins with "not yet": only the code for it is missing.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,12 +21,14 @@ FEATURES = {
     "scatter": "omit disorder.cells",
     "absorbing ends": "omit [lattice.absorbing]",
     "rings": "use fixed or free ends",
-    "unlike sites": "omit the key",  # laws that differ, stops on one side, other masses than the cell's pair
+    # Laws that differ, stops on one side, other masses than the cell's pair.
+    "unlike sites": "omit the key",
     "touching stops": "give a clearance above 0",
     "initial motion": "omit [initial]",
     "many drives": "omit [[drive.more]]",
     "moved wall": "omit drive.end",
-    "other waveforms": "run accepts all",  # than those of ``waveforms``
+    # Waveforms that the class does not list in ``waveforms``.
+    "other waveforms": "run accepts all",
     "disorder": "omit [disorder]",
 }
 """Features that a verb may refuse, each with the remedy that ends the message."""
@@ -43,7 +45,7 @@ def refuse_disorder(kind: type[CaseFile], table: Table) -> list[Problem]:
 
 
 def refusals(kind: type[CaseFile], sections: Mapping[str, Any], valid: Valid) -> Iterator[Problem]:
-    """Problems of those ``sections`` of a case that the verb of ``kind`` does not accept; absent sections have none."""
+    """Problems of the features of a case that the verb of ``kind`` does not accept; absent ``sections`` have none."""
     if "contacts" in sections and valid("contacts"):
         yield from _unlike_sites(kind, sections["contacts"])
 
@@ -64,11 +66,13 @@ def _refusal(kind: type[CaseFile], feature: str, key: str, value: Any = None) ->
 
 
 def _unlike_sites(kind: type[CaseFile], contacts: ContactsTable) -> Iterator[Problem]:
+    """Problems of sites that differ from one contact of the cell's pair with equal clearances above 0."""
     for key in ("each", *SIDES, *JOINS):
         value = getattr(contacts, key)
         if value is not None:
+            # Lists over all sites would fill the message.
             if key == "each":
-                value = None  # whole lists would fill the message
+                value = None
             yield from _refusal(kind, "unlike sites", f"contacts.{key}", value)
 
     clearance = contacts.clearance
@@ -77,6 +81,7 @@ def _unlike_sites(kind: type[CaseFile], contacts: ContactsTable) -> Iterator[Pro
 
 
 def _other_drives(kind: type[CaseFile], drive: DriveTable) -> Iterator[Problem]:
+    """Problems of further drives, walls that move, and waveforms."""
     if drive.more:
         yield from _refusal(kind, "many drives", "drive.more")
     if drive.end:
@@ -87,13 +92,14 @@ def _other_drives(kind: type[CaseFile], drive: DriveTable) -> Iterator[Problem]:
 
 
 def _other_lattices(kind: type[CaseFile], lattice: LatticeTable) -> Iterator[Problem]:
+    """Problems of unlike cells, nonlinear springs, dashpots and rings."""
     for key, feature in UNLIKE_CELLS.items():
         if getattr(lattice, key):
             yield from _refusal(kind, feature, f"lattice.{key}")
 
     cell, wrong = check_cell(lattice)
     if cell and not wrong:
-        # One message for all of them: they have one reason and one remedy.
+        # The first key alone: all of them have one reason and one remedy.
         for key in lattice.nonlinear_keys[:1]:
             yield from _refusal(kind, "nonlinear springs", key)
         if cell.is_damped:

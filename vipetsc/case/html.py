@@ -11,16 +11,16 @@ from vipetsc.lattice import UnitCell, pass_bands
 from vipetsc.lattice.chain import Pair
 from vipetsc.wording import MOST_SHOWN, shortened
 
-# Fraction of a band's upper edge that counts as zero: a frequency is the root of an eigenvalue, which has a rounding
-# error of 1e-16 of the largest one, so that an edge at zero comes out as 1e-8 of the upper one.
+# Fraction of a band's upper edge that counts as zero. A frequency is the root of an eigenvalue, which has a rounding
+# error of 1e-16 of the largest one, so that an edge at zero is computed as 1e-8 of the largest frequency.
 ROUNDING = 1e-6
-# Lengths of the drawing in pixels.
-COLUMN = 96.0
-ROW = 62.0
-RADIUS = 15.0
-MARGIN = 28.0
+# Lengths of the drawing in pixels, and the number of turns of a spring.
+COLUMN = 96.0  # between neighbouring masses of a row
+ROW = 62.0  # between rows
+RADIUS = 15.0  # of a mass
+MARGIN = 28.0  # around the centres of the outermost masses
 COILS = 7
-COIL_HEIGHT = 5.0
+COIL_HEIGHT = 5.0  # from the line between the masses to a turn
 STYLE = {
     "spring": 'fill="none" stroke="#666" stroke-width="1.3"',
     "mass": 'fill="#cfe0f3" stroke="#27598c" stroke-width="1.5"',
@@ -42,7 +42,7 @@ def html_table(title: str, rows: Iterable[tuple[str, object]], drawing: str = ""
 
 
 def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
-    """The case ``name`` in a table: lattice, bands, contacts, ``drives`` in words; and its cell."""
+    """The case ``name`` as HTML: a table of its lattice, bands, contacts and ``drives`` (in words), its cell drawn."""
     chain = model.chain
     cell = chain.cell
     masses = "1 mass"
@@ -78,7 +78,7 @@ def _band_edges(cell: UnitCell) -> list[str]:
     edges = []
     for band in pass_bands(cell):
         low = band.low
-        # The edge at 0 is computed to rounding.
+        # An edge at 0 has a rounding error.
         if low <= ROUNDING * band.high:
             low = 0.0
         edges.append(f"{low:.5g} to {band.high:.5g}")
@@ -91,7 +91,7 @@ def cell_svg(cell: UnitCell, pair: Pair | None) -> str:
     shift = max((x for x, _ in places), default=0.0) + COLUMN
     next_places = [_moved(place, shift) for place in places]
     parts = []
-    beyond = set()
+    beyond = set()  # masses of the next cell that are drawn
     for spring in cell.springs:
         end = places[spring.end]
         if spring.next_cell:
@@ -118,13 +118,15 @@ def cell_svg(cell: UnitCell, pair: Pair | None) -> str:
         label = f"mass {number + 1}: {cell.masses[number]:.4g} kg"
         parts.append(_mass(place, str(number + 1), STYLE["mass"], label))
 
-    width = shift + 2 * MARGIN
+    # A spring or a contact may lead to a mass farther on in the next cell.
+    right = max((next_places[mass][0] for mass in beyond), default=shift)
+    width = right + 2 * MARGIN
     box = f'viewBox="{-MARGIN:g} {top:g} {width:g} {height:g}" width="{width:g}" height="{height:g}"'
     return f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="unit cell" {box}>{"".join(parts)}</svg>'
 
 
 def _places(cell: UnitCell) -> list[Point]:
-    """Where each mass is drawn: those from one end of the cell to the other in a row, others above a neighbour."""
+    """The place of each mass: masses on the way through the cell form a row, others are above one that they join."""
     joined: dict[int, list[int]] = {mass: [] for mass in range(cell.dofs)}
     for spring in cell.springs:
         if not spring.next_cell:
@@ -135,7 +137,7 @@ def _places(cell: UnitCell) -> list[Point]:
     waiting = list(grid)
     while len(grid) < cell.dofs:
         if not waiting:
-            # A mass that no spring ties to the others stands in the row behind them.
+            # A mass without springs to the others is at the end of the row.
             waiting = [min(joined.keys() - grid.keys())]
             grid[waiting[0]] = (1 + max(column for column, _ in grid.values()), 0)
         at = waiting.pop(0)
@@ -171,10 +173,12 @@ def _through(cell: UnitCell, joined: Mapping[int, Sequence[int]]) -> list[int]:
 
 
 def _moved(place: Point, right: float, down: float = 0.0) -> Point:
+    """The ``place`` moved to the ``right`` and ``down``."""
     return place[0] + right, place[1] + down
 
 
 def _mass(place: Point, number: str, style: str, label: str = "") -> str:
+    """A mass as a circle with its ``number``; a ``label`` is shown under the mouse."""
     x, y = place
     parts = [f'<circle cx="{x:g}" cy="{y:g}" r="{RADIUS:g}" {style}/>']
     if label:

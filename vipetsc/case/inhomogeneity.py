@@ -42,7 +42,10 @@ def place_of(key: str, cell: UnitCell) -> tuple[str, int] | None:
 
 
 def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
-    """The quantity's values (cells,) in place of the reference cell's, or what is wrong."""
+    """The values (cells,) that a profile gives in place of the reference cell's ``values``, and what is wrong with it.
+
+    The text of what is wrong is "" if nothing is.
+    """
     if isinstance(given, Profile):
         return np.linspace(given.first, given.last, len(values)), ""
     if isinstance(given, list):
@@ -68,6 +71,7 @@ def _profile(given: AnyProfile, values: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def _drawn(deviation: Deviation, seed: int, key: str, values: np.ndarray) -> tuple[np.ndarray, str]:
+    """Numbers (cells,) drawn about the ``values`` of the quantity ``key``, and what is wrong with them, as above."""
     drawn = deviation.draw(values, seed, key)
     if deviation.relative and not values.any():
         return drawn, "is 0 in all cells, so that a relative deviation has no effect"
@@ -75,16 +79,21 @@ def _drawn(deviation: Deviation, seed: int, key: str, values: np.ndarray) -> tup
 
 
 def _arrays(chain: Chain, start: int, stop: int) -> dict[str, np.ndarray]:
-    """The arrays of the cells ``start`` to ``stop`` of ``chain``, by their names in ``Variation``."""
+    """The arrays (cell, ...) of the cells from ``start`` to ``stop`` of ``chain``, by their names in ``Variation``."""
     return chain.coefficients(start, stop)._asdict() | chain.spring_terms(start, stop)._asdict()
 
 
 def vary(lattice: LatticeTable, cell: UnitCell) -> tuple[dict[str, np.ndarray], list[Problem]]:
-    """Arrays (cell, ...) without Rayleigh damping, by their names in ``Variation``, and what is wrong with them."""
+    """Arrays (cell, ...) of all cells by their names in ``Variation``, and what is wrong with them.
+
+    They have the profiles and the scatter of the ``lattice`` about its undamped ``cell``; what follows from these, as
+    Rayleigh damping and absorbing ends do, is added by ``cell_variation``.
+    """
     arrays = _arrays(Chain(cell, lattice.cells), 0, lattice.cells)
     problems: list[Problem] = []
 
     def put(key: str, path: str, change: Callable[[np.ndarray], tuple[np.ndarray, str]]) -> None:
+        """Put what ``change`` makes of the values (cells,) of the quantity ``key`` in their place."""
         place = place_of(key, cell)
         if place is None:
             remedy = f"the cell has {cell.dofs} masses and {len(cell.springs)} springs; as in masses[1], grounding[1]"
@@ -140,7 +149,8 @@ def cell_variation(lattice: LatticeTable) -> Variation | None:
 
     absorbing = lattice.absorbing
     if absorbing and absorbing.cells and absorbing.strength:
-        # Last: absorbing dashpots are added to what profiles, scatter and Rayleigh damping give.
+        # Last: absorbing dashpots are added to what profiles, scatter and Rayleigh damping give. A cell outside the
+        # absorber, as cell -2, has the reference cell's dashpots: the end adds the difference from these.
         graded = absorber(lattice.unit_cell(), lattice.ends, absorbing.cells, absorbing.strength, 0)
         assert graded.variation is not None and graded.variation.grounding is not None
         extra = graded.variation.grounding - graded.coefficients(-2, -1).grounding
@@ -153,11 +163,13 @@ def cell_variation(lattice: LatticeTable) -> Variation | None:
     reference = _arrays(Chain(lattice.unit_cell(), 2), 0, 1)
     # Every rank holds these arrays: those that equal the reference are left out.
     differing = {name: array for name, array in arrays.items() if np.any(array != reference[name])}
-    return Variation(**differing) if differing else None
+    if not differing:
+        return None
+    return Variation(**differing)
 
 
 def check_inhomogeneity(lattice: LatticeTable, driven: Sequence[int]) -> Iterator[Problem]:
-    """Problems with what differs from a valid cell; ``driven`` are the cells (from 1) of the drives."""
+    """Problems with what differs from a valid cell; ``driven`` are the cells (from 1) from which waves are sent."""
     if (lattice.profiles or lattice.scatter or lattice.absorbing) and lattice.cells > MOST_VARIED:
         yield Problem(
             "lattice.cells", lattice.cells, f"at most {MOST_VARIED} cells may differ, because every rank stores them"
@@ -185,11 +197,12 @@ def check_right_wall(lattice: LatticeTable, key: str) -> list[Problem]:
 
 
 def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: Sequence[int]) -> Iterator[Problem]:
-    """Problems with an absorbing end that no wave reaches, or that covers half the lattice or a driven cell."""
+    """Problems with an absorbing end that no wave reaches, or that covers half the lattice or a ``driven`` cell."""
     if not lattice.undamped_cell().springs:
         yield Problem("lattice.absorbing", None, "in a lattice without springs no waves reach an end; omit it")
     if lattice.ends == "periodic":
         yield Problem("lattice.absorbing", None, 'a ring has no end; use ends = "fixed" or "free"')
+    # Without a length it is chosen later, and checked then.
     n = absorbing.cells or 0
     if 2 * n >= lattice.cells:
         yield Problem("lattice.absorbing.cells", n, f"half of the {lattice.cells} cells, or more")
@@ -203,4 +216,5 @@ def _check_absorbing(lattice: LatticeTable, absorbing: AbsorbingTable, driven: S
         high -= n
     inside = [cell for cell in driven if not low < cell <= high]
     if inside:
-        yield Problem("lattice.absorbing.end", absorbing.end, f"the driven cell {inside[0]} is in the absorbing end")
+        remedy = f"waves are sent from cell {inside[0]}, which is in the absorbing end"
+        yield Problem("lattice.absorbing.end", absorbing.end, remedy)

@@ -37,13 +37,16 @@ class Deviation(Section):
             deviation = np.full(len(values), self.absolute)
         else:
             deviation = self.relative * np.abs(values)
+
         if self.distribution == "uniform":
             # A uniform distribution of half-width h has the standard deviation h / sqrt(3).
             return values + deviation * np.sqrt(3) * generator.uniform(-1, 1, len(values))
         normal = generator.standard_normal(len(values))
         if self.distribution == "normal":
             return values + deviation * normal
-        with np.errstate(all="ignore"):  # of 0 there is none: not a number
+
+        # A lognormal distribution about 0 does not exist: it gives NaN, which callers refuse.
+        with np.errstate(all="ignore"):
             spread = np.log1p((deviation / values) ** 2)  # variance of the logarithm
             # - spread / 2: the mean of exp(s normal) is exp(s^2 / 2), and the mean shall be the value of the case.
             return np.asarray(values * np.exp(np.sqrt(spread) * normal - spread / 2))
@@ -79,7 +82,7 @@ class ScatterTable(Section):
 
 
 class AbsorbingTable(Section):
-    """An absorbing end: dashpots to ground, strength x^3 times the mass, over the last ``cells``, with x from 0 to 1.
+    """An absorbing end: dashpots to ground, strength x^3 (1/s) times the mass; x goes from 0 to 1 over its ``cells``.
 
     By default, ``cells`` and ``strength`` are the first tried values whose reflected fraction of the energy is below
     ``reflection``.

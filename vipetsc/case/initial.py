@@ -18,12 +18,16 @@ from vipetsc.lattice.modes import mode_frequency, mode_shape, number_near
 from vipetsc.lattice.packet import Packet, gaussian_packet
 from vipetsc.wording import shortened
 
-# A packet's envelope has fallen below 1e-10, the tolerance of a landing, so many widths from its middle.
+# So many widths from its middle the envelope of a packet is below 1e-10 of its height, as exp(-6.8^2/2) is: a fraction
+# of a clearance to which contacts are located.
 PACKET_WIDTHS = 6.8
 
 
 class KindKeys(NamedTuple):
-    """The keys of one kind of motion: those that it ``needs``, of which it needs ``one_of``, others that it takes."""
+    """The keys of one kind of motion: all that it ``needs``, those of which it needs ``one_of``, and the ``others``.
+
+    A motion that ``is_scaled`` needs either an amplitude or an energy, too.
+    """
 
     needs: tuple[str, ...] = ()
     one_of: tuple[str, ...] = ()
@@ -32,9 +36,13 @@ class KindKeys(NamedTuple):
 
     @property
     def choices(self) -> list[tuple[str, ...]]:
-        """Groups of keys of each of which one is given."""
-        groups = [self.one_of, ("amplitude", "energy")] if self.is_scaled else [self.one_of]
-        return [group for group in groups if group]
+        """Groups of keys; a motion needs exactly one key of each group."""
+        groups = []
+        if self.one_of:
+            groups.append(self.one_of)
+        if self.is_scaled:
+            groups.append(("amplitude", "energy"))
+        return groups
 
 
 KINDS = {
@@ -90,7 +98,7 @@ class InitialTable(Section):
     frequency: Positive | None = None
 
     def __hash__(self) -> int:
-        # Engines keep tables by model; a list has no hash of its own.
+        # Engines keep their tables by model, whose hash includes this one; the list ``more`` has none.
         return hash(self.model_dump_json())
 
     @property
@@ -107,10 +115,16 @@ class InitialTable(Section):
         """Whether there is motion at t = 0."""
         return self.kind != "zero"
 
-    def is_at_rest(self, cell: int) -> bool:
-        """Whether masses of the ``cell`` (from 1) are at rest at t = 0, as far as the section itself says."""
+    def is_at_rest(self, cell: int, ring: int | None = None) -> bool:
+        """Whether all masses of the ``cell`` (from 1) are at rest at t = 0; False if the section does not say so.
+
+        ``ring`` is the number of cells of a ring, around which a packet may reach.
+        """
         if self.kind == "packet" and self.cell and self.width:
-            return abs(cell - self.cell) > PACKET_WIDTHS * self.width
+            distance = abs(cell - self.cell)
+            if ring:
+                distance = min(distance, ring - distance)
+            return distance > PACKET_WIDTHS * self.width
         if self.kind == "velocity":
             return all(strike.cell != cell for _, strike in self.strikes)
         return not self.moves
@@ -152,10 +166,11 @@ class InitialTable(Section):
 
 
 class Beginning(NamedTuple):
-    """The resolved ``section``, the frequency in rad/s of the motion, the cell (1-based) in its middle.
+    """The resolved ``section``, the ``frequency`` in rad/s of the motion, and its ``cell`` (1-based).
 
-    ``moving`` are the cells (1-based) of a state that was read from a file in which some mass moves or is displaced;
-    None where the section alone says what is at rest.
+    That is the middle of a packet, the cell of the fastest mass that is struck, or of the largest displacement of a
+    state; of a mode, which is everywhere, the first one. ``moving`` are the cells (1-based) of a state that was read
+    from a file in which some mass moves or is displaced; it is None where the section alone says what is at rest.
     """
 
     section: InitialTable
@@ -167,11 +182,14 @@ class Beginning(NamedTuple):
 def check_initial(
     initial: InitialTable, lattice: LatticeTable, cell: UnitCell | None, valid: Valid
 ) -> Iterator[Problem]:
-    """Problems with the keys of a section."""
+    """Problems with the keys of the section ``initial``, and with its cells, bands and modes in a ``lattice``.
+
+    ``cell`` is the lattice's, None if it is invalid.
+    """
     keys = KINDS[initial.kind]
     given = initial.model_dump(exclude_none=True, exclude={"kind"})
     taken = {*keys.needs, *keys.others, *itertools.chain(*keys.choices)}
-    for key in given.keys() - taken:
+    for key in sorted(given.keys() - taken):
         yield Problem(f"initial.{key}", given[key], f"does not apply to the kind {initial.kind!r}")
     for key in keys.needs:
         if key not in given and valid(f"initial.{key}"):
@@ -181,7 +199,7 @@ def check_initial(
             yield Problem(f"initial.{group[0]}", given.get(group[0]), f"give one of {' and '.join(group)}")
 
     yield from _check_strikes(initial, cell)
-    # The first strike is the section itself, whose cell other kinds have, too.
+    # Cells that are named: that of the section itself, of any kind, and those of further masses that are struck.
     others = [(path, strike.cell) for path, strike in initial.strikes[1:]]
     for path, at in [("initial", initial.cell), *others]:
         if at and valid("lattice.cells") and at > lattice.cells:
@@ -190,7 +208,9 @@ def check_initial(
     if cell and initial.band and initial.band > cell.dofs:
         yield Problem("initial.band", initial.band, f"the cell has {cell.dofs} bands")
 
-    dofs = lattice.cells * cell.dofs if cell and valid("lattice.cells") else None
+    dofs = None
+    if cell and valid("lattice.cells"):
+        dofs = lattice.cells * cell.dofs
     if dofs and initial.number and initial.number > dofs:
         yield Problem("initial.number", initial.number, f"the lattice has {dofs} modes")
     elif initial.kind in ("mode", "packet") and cell and not cell.springs:
@@ -217,10 +237,10 @@ def _check_strikes(initial: InitialTable, cell: UnitCell | None) -> Iterator[Pro
 def beginning_of(
     initial: InitialTable, lattice: LatticeTable, frequency: float | None, touching: Callable[[float], float]
 ) -> tuple[Beginning | None, list[Problem]]:
-    """Numbers that follow from a valid section with motion, or the problems with it.
+    """The numbers that follow from a valid section with motion, or the problems with it.
 
-    ``frequency`` in rad/s is the case's, if any; ``touching`` gives that of a contact at a speed in m/s, where contacts
-    alone hold a mass that is struck.
+    ``frequency`` in rad/s is that of the case's drive, if it has one. If no springs hold a mass that is struck, its
+    frequency is that of a contact, which ``touching`` gives for a speed in m/s.
     """
     # Without contacts, and with equal cells: modes and packets are those of the linear, uniform lattice.
     chain = Chain(lattice.unit_cell(), lattice.cells, lattice.ends)
@@ -235,7 +255,7 @@ def beginning_of(
 
 
 def _mode(initial: InitialTable, chain: Chain, frequency: float | None) -> Beginning:
-    """A mode by its number and its amplitude."""
+    """The beginning with a mode, which is given by its number and its amplitude."""
     number = initial.number or number_near(chain, initial.near or 0.0)
     omega = mode_frequency(chain, number)
     if omega == 0:
@@ -251,7 +271,7 @@ def _mode(initial: InitialTable, chain: Chain, frequency: float | None) -> Begin
 
 
 def _packet(initial: InitialTable, chain: Chain, frequency: float | None) -> Beginning:
-    """A packet by its amplitude."""
+    """The beginning with a packet, whose size is given by its amplitude."""
     assert initial.band and initial.wavenumber and initial.cell
     omega = float(bloch(chain.cell, initial.wavenumber).frequency[initial.band - 1])
     if initial.energy:
@@ -264,11 +284,11 @@ def _packet(initial: InitialTable, chain: Chain, frequency: float | None) -> Beg
 def _velocity(
     initial: InitialTable, chain: Chain, frequency: float | None, touching: Callable[[float], float]
 ) -> Beginning:
-    """Masses that are struck, with the displacement of an oscillation at their frequency."""
+    """The beginning with masses that are struck; their amplitude is that of a sine of their speed and frequency."""
     _, fastest = max(initial.strikes, key=lambda item: abs(item[1].velocity))
     speed = abs(fastest.velocity)
     if not frequency:
-        # That of the mass on its own springs while all others are held; without springs, of its contact.
+        # The frequency of the fastest mass on its springs while all others are held; without springs, of its contact.
         mass = fastest.mass - 1
         stiffness = sum(end.stiffness for end in chain.cell.couplings() if end.mass == mass)
         if stiffness > 0:
@@ -280,14 +300,14 @@ def _velocity(
 
 
 def _file(initial: InitialTable, chain: Chain, frequency: float | None) -> Beginning:
-    """A state in a file by its path, hash and largest displacement."""
-    # A resolved section, which has a hash, is taken as it is: runs are read where their file is gone.
+    """The beginning with a state in a file, which is given by its path, hash and largest displacement."""
+    # A section with a hash is resolved, and is taken as it is: results are read where that file is gone.
     if initial.sha256 and initial.amplitude and frequency:
         return Beginning(initial, frequency, cell=1)
 
     path = path_named(str(initial.path)).resolve()
     state, digest = _read_state(path, initial)
-    # The lattice is checked before the numbers: those of another lattice would have no meaning.
+    # The lattice is checked before the numbers, since a state of another lattice has no meaning here.
     _check_state(state, path, initial, chain)
     frequency = frequency or state.frequency()
     if not frequency:

@@ -48,9 +48,10 @@ def unit_and_text(name: str, key: str) -> tuple[str, str]:
 
 
 def unit_of(path: str, case: Table) -> str:
-    """Unit of the key with that ``path`` in a ``case`` (``contacts.clearance``); empty where it has none of its own.
+    """Unit of the key with that ``path``, as in "contacts.clearance", in the table of a ``case``.
 
-    An amplitude has that of its waveform, or of the wall that it moves.
+    An amplitude of a drive has the unit of its waveform, or m for a wall. The unit is empty for keys without one, and
+    where it depends on other keys.
     """
     drive = case.get("drive", {})
     if path == "drive.amplitude":
@@ -67,7 +68,7 @@ def unit_of(path: str, case: Table) -> str:
     if table is None or not keys:
         return ""
     unit, _ = unit_and_text(table.__name__, keys[-1])
-    # A phrase says on what the unit depends.
+    # Such a text says on what the unit depends.
     if " of " in unit or " or " in unit:
         return ""
     return unit
@@ -84,7 +85,7 @@ def _parameter_of(path: str, case: Table) -> Parameter | None:
     """The parameter of a registered law or waveform whose key has that ``path``; None for other keys."""
     section, _, key = path.partition(".parameters.")
     if section == "contacts":
-        # The law itself may vary: any that takes the key has its unit.
+        # The law itself may vary: the unit is that of any law that takes the key.
         for name in PARTS[LAW]:
             law = registered_law(name)
             if law and key in law.parameters:
@@ -130,7 +131,7 @@ def json_schema(modules: Sequence[str] = ()) -> Schema:
         # A schema shows the first paragraph of the docstring.
         schema["description"] = schema.get("description", "").partition("\n\n")[0].replace("\n", " ").replace("``", "`")
     classes["PetscTable"]["additionalProperties"] = {"type": ["string", "number", "boolean"]}
-    # What a sweep takes in turn may be lists or ranges of anything.
+    # Keys that vary in a sweep have lists or ranges of values, of which the schema checks none.
     varied = Case.model_fields.keys() - {"name", "plugins", "analysis"} | {"disorder"}
     classes["SweepTable"]["properties"] |= {key: {"type": "object"} for key in sorted(varied)}
     sections = {key: {"$ref": f"#/$defs/{table.__name__}"} for key, table in SECTIONS.items()}
@@ -159,7 +160,7 @@ def chapter() -> str:
 
 def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator[str]:
     """The table of one section, and those of the tables in it that were not shown yet."""
-    # Sections contain each other's tables, and a table may contain itself.
+    # Several sections may contain the same table, and a table may contain itself.
     if name in shown:
         return
     shown.add(name)
@@ -172,8 +173,8 @@ def _section(path: str, name: str, classes: Schema, shown: set[str]) -> Iterator
     for key, item in rows:
         unit, text = unit_and_text(name, key)
         default = item.get("default")
-        # An empty list stands for a key that is not given: the text says what holds then, as that of an optional key
-        # does. A table is shown by itself.
+        # No default is shown for an optional key, nor for a list that is empty by default: their texts say what holds
+        # without them. A table that is a default is shown by its own keys.
         shown_default = ""
         if key in schema.get("required", ()):
             shown_default = "required"

@@ -1,7 +1,7 @@
-"""Kinds of sites: sites of one kind have one scattering law, over amplitude in clearances.
+"""Kinds of sites: sites of one kind have one scattering law, a function of the amplitude over the clearance.
 
 A kind is the law of the contact with its restitution, the clearances on the two sides over the lesser one, and the
-masses that the contact joins. The lesser clearance itself differs from site to site of one kind.
+masses that the contact joins. The lesser clearance itself may differ between sites of one kind.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ DIGITS = 12  # of the ratio of two clearances: sites of one kind differ by round
 class SiteKind(NamedTuple):
     """The properties that sites of one kind have in common.
 
-    ``sides`` are the clearances on the sides + and - over the lesser of both, inf without a stop.
+    ``sides`` are the clearances on the sides + and - over the lesser of both; inf stands for no stop.
     """
 
     law: Contact
@@ -68,23 +68,23 @@ def site_kinds(model: Model) -> SiteKinds:
 
 def mean_clearance(contacts: ContactsTable, clearances: Sequence[float], sites: Sequence[int]) -> float:
     """Geometric mean in m of the lesser clearances of those ``sites`` (from 0), all above 0."""
-    # The law is one of ratios.
+    # Geometric, since the law depends on ratios of amplitudes to clearances.
     lesser = lesser_clearances(gaps_of_sites(contacts, list(clearances)), clearances)
     return float(np.exp(np.mean(np.log(lesser[list(sites)]))))
 
 
 def contacts_of_one(contacts: ContactsTable, site: int, kind: SiteKind, cell: int, clearance: float) -> dict[str, Any]:
-    """Changes of ``[contacts]`` after which a single site of a ``kind`` is in ``cell`` (from 1).
+    """Changes of ``[contacts]`` that leave a single site of a ``kind`` in ``cell`` (from 1).
 
-    ``clearance`` in m is its lesser one; ``site`` (from 0) is one of that kind.
+    ``clearance`` in m is its lesser clearance; ``site`` (from 0) is a site of that kind in ``contacts``.
     """
-    # What the lists say of this site becomes the value for all, of which there is one.
+    # The values of this site in the lists become those of all sites, of which one is left.
     of_site = {key: values[site] for key, values in lists_of(contacts).items()}
     if "stiffness" in of_site:
         # The stiffness of the site is that of its own material.
         of_site |= dict.fromkeys(("modulus", "radius", "poisson"))
 
-    # The lists have values for parameters of the other sites' laws too.
+    # Without the parameters of other laws, which the lists may have for other sites.
     law = kind.law.law
     of_site |= {key: None for key, parameter in PARAMETERS.items() if parameter.law != law}
     if law in LAWS:
@@ -98,7 +98,7 @@ def contacts_of_one(contacts: ContactsTable, site: int, kind: SiteKind, cell: in
         changes["side"] = "minus"
     elif plus != minus:
         changes["clearance_minus"] = clearance * minus
-    # The lesser clearance is on the side that has a stop.
+    # The key ``clearance`` is that of the side +, or of the side - if stops are on that side alone.
     first = clearance
     if plus < np.inf:
         first *= plus

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
@@ -15,30 +15,34 @@ from vipetsc.case.kinds import SiteKinds, lesser_clearances, mean_clearance, sit
 from vipetsc.case.resolve import with_preset
 from vipetsc.case.schema import PRESETS, Positive
 from vipetsc.case.sites import ContactsTable
+from vipetsc.case.study import with_fastest_engine
 from vipetsc.case.warnings import wave_warnings
 from vipetsc.lattice import max_group_velocity, pass_bands, waves_at
 from vipetsc.lattice.packet import packet_speeds
 
-# A run of so many takes the propagator 100 s, and a point of the law has several.
-LARGEST = 1e9  # cells times samples of a run
-# Half and twice as many change fractions of the energy by 2e-4, far less than runs of a point scatter (0.01).
-RESOLVED = 8  # times the top band's edge: frequencies that the samples of a damped lattice resolve
-SHORTEST = 64  # cells of the ring: more than the propagator's band
-SLOWEST = 1e-9  # cells/s: a standing wave then needs a run that is too large, and is refused for that reason
+# Cells times samples of a run, at most: so many take the propagator 100 s, and a point of the law has several runs.
+LARGEST = 1e9
+# Samples of a damped lattice resolve frequencies up to so many times the top band's edge. Half and twice as many change
+# fractions of the energy by 2e-4, far less than the scatter of the runs of a point (0.01).
+RESOLVED = 8
+SHORTEST = 64  # cells of the ring, at least: more than the propagator's band
+# Speed in cells/s of a wave that stands: its run is too large, for which the case is refused.
+SLOWEST = 1e-9
 
 
 class LawTable(Section):
     """How the scattering law of one site is computed.
 
-    It is that of the kind of ``site``, a number in the list of the sites (by default the leading one): a kind is a law
-    with its restitution, the ratio of the clearances on both sides, and the masses that the contact joins.
-    ``clearance`` in m, the lesser one (by default the geometric mean of the sites of that kind), ``distance`` in cells
-    from the driven cell to the site (by default that of the leading site, or the length of the burst; at least so large
-    that the burst ends before a wave returns from the site). The law reaches up to ``largest`` relative displacement
-    over clearance; between neighbouring points it is refined until no fraction is further than ``tolerance`` from a
-    straight line over log z, or than the scatter, or the points are closer than ``finest``. At each, ``samples`` runs
-    with amplitudes up to ``jitter`` apart from it give mean and scatter. A run ends ``settle`` lengths of the burst
-    after the first of the slow waves reaches the site.
+    It is the law of the kind of ``site``, a number in the list of the sites (by default the site nearest to the drive).
+    A kind is a contact law with its restitution, the ratio of the clearances on both sides, and the masses that the
+    contact joins. ``clearance`` in m is the lesser one, by default the geometric mean of the sites of that kind.
+    ``distance`` is the number of cells from the driven cell to the site, by default that of the nearest site, or
+    without sites the length of the burst; it is so large that the burst ends before a wave returns from the site. The
+    law is a function of z, the largest relative displacement over the clearance, up to ``largest``. Points are added
+    until between neighbouring ones all fractions are straight lines over log z up to ``tolerance`` or the scatter, or
+    the points are closer than ``finest``. At each point ``samples`` runs with amplitudes that differ from it by up to
+    the fraction ``jitter`` give mean and scatter. A run ends ``settle`` durations of the burst after the slow waves
+    reach the site.
     """
 
     site: int | None = Field(None, ge=1)
@@ -52,15 +56,25 @@ class LawTable(Section):
     settle: Annotated[float, Field(ge=1, le=1e3)] = 1.5
 
 
+class NearestSite(NamedTuple):
+    """The site nearest to the drive: ``distance`` in cells, 0 without any; ``towards`` is +1 at higher cells, else -1.
+
+    ``number`` (from 0) is that in the list of the sites.
+    """
+
+    distance: int
+    towards: int
+    number: int
+
+
 @dataclass(frozen=True)
 class OneSite:
-    """A ring of ``cells`` driven at its first; the ``site`` (0-based) lies ``distance`` cells on.
+    """A ring of ``cells`` cells that is driven in its first cell, with one ``site`` ``distance`` cells away.
 
-    ``kind`` is the number of the site's kind; ``clearance`` in m is that on the side where it is less.
-
-    Runs end at ``end`` s, after ``samples`` of ``interval`` s. ``band`` (from 0) is the drive's, in which all but 1e-3
-    of the energy is faster than ``slow`` cells/s; ``towards`` is +1 if the site lies at higher cells than the drive,
-    else -1.
+    ``site`` is its cell (0-based), ``kind`` the number of its kind, ``clearance`` in m the lesser one of its two sides;
+    ``towards`` is +1 if it lies at higher cells than the drive, else -1. Runs end at ``end`` s, after ``samples``
+    intervals of ``interval`` s. ``band`` (from 0) is the drive's; all but 1e-3 of its energy there is faster than
+    ``slow`` cells/s.
     """
 
     cells: int
@@ -97,11 +111,7 @@ class LawCase(Case):
     @classmethod
     def read(cls, table: Table) -> tuple[dict[str, Any], list[Problem]]:
         """The resolved sections, and everything that is wrong with them."""
-        # Many runs want the fastest engine that a case allows.
-        time = table.get("time", {})
-        if isinstance(time, dict):
-            table = table | {"time": {"engine": "auto"} | time}
-        sections, problems = super().read(table)
+        sections, problems = super().read(with_fastest_engine(table))
         if problems:
             return sections, problems
 
@@ -157,8 +167,7 @@ class LawCase(Case):
             return self.kinds.of[self.law.site - 1]
         if not self.contacts.sites:
             return 0
-        _, _, leading = self._nearest_site()
-        return self.kinds.of[leading]
+        return self.kinds.of[self._nearest_site().number]
 
     def mean_clearance(self, kind: int) -> float:
         """Geometric mean in m of the lesser clearances of the sites of the ``kind`` of that number."""
@@ -167,7 +176,7 @@ class LawCase(Case):
         return mean_clearance(self.contacts, clearances, self.kinds.sites(kind))
 
     def warnings(self) -> list[str]:
-        """Sentences about what is likely not meant in the wave; lattice, times and sites of the runs are others."""
+        """Warnings about the wave; those about lattice, times and sites do not apply to the runs of a law."""
         return list(wave_warnings(self.model()))
 
     def fastest(self) -> float:
@@ -176,19 +185,20 @@ class LawCase(Case):
         return max(max_group_velocity(cell, number + 1)[2] for number in range(cell.dofs))
 
     def one_site(self, kind: int | None = None) -> OneSite:
-        """The lattice and the times of the law's runs (see ``studies.ring``) with a site of the ``kind`` of a number.
+        """The lattice and the times of the law's runs (see ``studies.ring``), with a site of the kind number ``kind``.
 
-        Without a number it is that of ``law.site``, and the clearance that of the law.
+        By default it is the kind of ``law.site``, and the clearance that of the law.
         """
         law = self.law
         clearance = law.clearance
         if kind is None:
             kind = self._kind()
         elif len(self.kinds.kinds) > 1:
-            # One clearance does not suit them all.
+            # The law's clearance is that of another kind.
             clearance = self.mean_clearance(kind)
         model = self.model()
         assert law.distance is not None and clearance is not None
+
         cell = model.chain.cell
         interval = model.sample_interval
         if cell.is_damped:
@@ -198,9 +208,10 @@ class LawCase(Case):
         # The slow waves of the burst set the end: until they have passed, the fractions of the energy still change.
         end = law.distance / max(slow, SLOWEST) + law.settle * model.drive.duration
         samples = int(np.ceil(end / interval))
-        # No wave that the site sends out returns along the ring before the end.
+        # Until the end nothing reaches the site from behind: the wave that the drive sends the other way round has
+        # ``cells - distance`` to go, and what the site sends out a whole revolution.
         cells = max(int(np.ceil(law.distance + self.fastest() * samples * interval)) + 1, SHORTEST)
-        _, towards, _ = self._nearest_site()
+        towards = self._nearest_site().towards
         return OneSite(
             cells=cells,
             site=towards * law.distance % cells,
@@ -215,41 +226,41 @@ class LawCase(Case):
             interval=interval,
         )
 
-    def _nearest_site(self) -> tuple[int, int, int]:
-        """Cells from the driven one to the nearest site in another (0 without any), whether up (1) or down (-1), which.
-
-        The third is the number of that site, from 0.
-        """
+    def _nearest_site(self) -> NearestSite:
+        """The nearest site that is not in the driven cell; without any, one in the direction of the farther end."""
         drive = self.drive.cell
         cells = self.lattice.cells
         assert isinstance(self.contacts.sites, list)
         offsets = [site - drive for site in self.contacts.sites]
-        if self.lattice.ends == "periodic":  # along the shorter arc of the ring
+        if self.lattice.ends == "periodic":
+            # Along the shorter arc of the ring.
             offsets = [(offset + cells // 2) % cells - cells // 2 for offset in offsets]
 
         numbers = [number for number, offset in enumerate(offsets) if offset != 0]
-        if not numbers:  # towards the farther end
-            return 0, 1 if 2 * drive <= cells + 1 else -1, 0
+        if not numbers:
+            towards = -1
+            if 2 * drive <= cells + 1:
+                towards = 1
+            return NearestSite(distance=0, towards=towards, number=0)
         nearest = min(numbers, key=lambda number: abs(offsets[number]))
-        return abs(offsets[nearest]), 1 if offsets[nearest] > 0 else -1, nearest
+        return NearestSite(distance=abs(offsets[nearest]), towards=int(np.sign(offsets[nearest])), number=nearest)
 
     def _least_distance(self) -> int:
-        """Cells from the driven one to the site such that the burst is over before a wave is back from there."""
-        # Half: the wave goes to the site and back while the burst lasts.
+        """The least number of cells from the drive to the site for which the burst ends before a wave is back."""
+        # The fastest wave goes to the site and back in the duration of the burst.
         return int(np.ceil(self.fastest() * self.model().drive.duration / 2))
 
     def _default_distance(self) -> int:
-        """The distance of the nearest site, without sites the length of the burst, but no less than the least."""
+        """The distance of the nearest site, without sites the length of the burst; at least ``_least_distance``."""
         model = self.model()
-        distance, _, _ = self._nearest_site()
+        distance = self._nearest_site().distance
         if not distance:
-            length = model.drive.duration * packet_speeds(model.chain.cell, model.drive, model.drive_mass)[1]
-            distance = int(min(length, LARGEST))
-        # A site that is nearer would reflect into the burst while the drive still works.
+            _, slow, _ = packet_speeds(model.chain.cell, model.drive, model.drive_mass)
+            distance = int(min(model.drive.duration * slow, LARGEST))
         return max(distance, self._least_distance())
 
     def _place_problems(self) -> list[Problem]:
-        """Problems with the wave of a resolved case and with the distance that it gives."""
+        """Problems with the frequency of the wave of a resolved case, and with the distance that the case gives."""
         frequency = self.drive.frequency or 0.0
         if not waves_at(self.lattice.unit_cell(), frequency):
             return [Problem("drive.frequency", frequency, "lies in no pass band, so that no wave reaches the site")]
@@ -260,7 +271,7 @@ class LawCase(Case):
         return []
 
     def _size_problems(self) -> list[Problem]:
-        """Runs that would be too large, since the wave is too slow."""
+        """The problem of runs that are too large, because the wave is too slow."""
         setting = self.one_site()
         if setting.cells * setting.samples <= LARGEST:
             return []
@@ -304,4 +315,6 @@ def _given_clearances(table: Table) -> list[float]:
     if clearance:
         return [clearance.first, clearance.last]
     preset = PRESETS.get(str(table["lattice"].get("preset")))
-    return list(preset.clearance_span(1)) if preset else []
+    if preset is None:
+        return []
+    return list(preset.clearance_span(1))

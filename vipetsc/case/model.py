@@ -12,12 +12,12 @@ from vipetsc.lattice import Chain, Contact, Drive, Waveform
 
 @dataclass(frozen=True)
 class Model:
-    """A case in the terms of ``vipetsc.lattice``: 0-based indices, seconds, newtons, everything decided.
+    """A case in terms of ``vipetsc.lattice``: indices from 0, SI units, every choice resolved.
 
-    ``atol`` is the pair (displacement m, velocity m/s); ``scale`` the displacement in m of the drive's
-    linear wave or of the ``initial`` state, ``packet`` the frequency in rad/s of the wave that arrives first, infinite
-    for a pulse. The law of each site is in ``laws`` (() if all have ``contact``), its clearances in m on the sides +
-    and - are in ``gaps`` (() if the chain's are those of both).
+    ``atol`` are the absolute tolerances of displacements (m) and velocities (m/s); ``scale`` is the displacement in m
+    of the drives' linear waves or of the ``initial`` state, ``packet`` the frequency in rad/s of the wave that arrives
+    first, infinite for a pulse. ``laws`` has the law of each site, or is () if all have ``contact``; ``gaps`` has the
+    clearances in m of each site on the sides + and -, or is () if those of the chain hold on both sides.
     """
 
     chain: Chain
@@ -36,13 +36,16 @@ class Model:
 
     @property
     def speed(self) -> float:
-        """The group velocity in cells/s that ``traverse`` uses."""
-        # Only where it is asked for: the bands of a cell take longer than all else in a model.
+        """The group velocity in cells/s of the wave that arrives first, by which ``time.end = "traverse"`` is set."""
+        # Computed only when it is needed: the bands of a cell take longer than the rest of a model.
         return wave_speed(self.chain.cell, self.packet)
 
     @property
     def used_laws(self) -> tuple[Contact, ...]:
-        """The law of each site, or the one of all: not ``contact`` where each has its own, which may have no limit."""
+        """The laws of the sites: one for each, or one for all of them.
+
+        Where each site has its own law, ``contact`` holds at none of them, and its numbers may be impossible.
+        """
         return self.laws or (self.contact,)
 
     @property
@@ -50,13 +53,13 @@ class Model:
         """The effective restitution of each site's law, or of all where they are alike."""
         if not self.laws:
             return self.contact.effective_restitution
-        # A root search each: sites have few laws.
+        # Once for each law, since it takes a root search, and many sites have few laws.
         values = {law: law.effective_restitution for law in set(self.laws)}
         return [values[law] for law in self.laws]
 
     @property
     def drive(self) -> Waveform:
-        """The waveform of the first drive, by which frequency, wave and times are judged."""
+        """The waveform of the first drive, to which frequency, wave and times refer."""
         return self.drives[0].waveform
 
     @property

@@ -28,10 +28,10 @@ MOST_UNKNOWNS = 6000  # harmonics of all places: a dense matrix of 300 MB
 
 
 class ResponseCurve(NamedTuple):
-    """A curve of a case: the ``name`` of its files, its ``case`` without a family, and where it is followed.
+    """A curve of a case: the ``name`` of its files, its ``case`` without a family, and what is fixed along it.
 
-    ``restitution`` is that of all sites, ``fixed`` the value of the parameter that does not vary along the curve;
-    ``member`` is the number (from 0) of its case in the family, ``values`` are those of the family's keys.
+    ``restitution`` is that of all sites, ``fixed`` the value of the amplitude or frequency that does not vary along the
+    curve; ``member`` is the number (from 0) of its case in the family, ``values`` are those of the family's keys.
     """
 
     name: str
@@ -45,8 +45,8 @@ class ResponseCurve(NamedTuple):
 class NfrcCase(Case):
     """A case of the verb ``nfrc``: that of a run with the section ``[nfrc]``.
 
-    With ``nfrc.family`` its sections are those of the first member, and those of the lower end of the range where a key
-    varies along the curves; ``table`` is then what it was read from.
+    With ``nfrc.family`` its sections are those of the first member; where a key varies along the curves, they are those
+    at the lower end of the key's range. In both cases ``table`` is the table from which it was read, else None.
     """
 
     nfrc: NfrcTable
@@ -87,11 +87,8 @@ class NfrcCase(Case):
         if nfrc.over == "amplitude":
             update["fixed"] = nfrc.fixed or [sections["drive"].frequency]
         nfrc = nfrc.model_copy(update=update)
-        # Where bands overlap, the band of the fastest wave.
         if nfrc.source == "wave" and nfrc.band is None:
-            first = nfrc.fixed[0] if nfrc.over == "amplitude" else nfrc.range[0]
-            fastest = max(waves_at(cell, first), key=lambda wave: wave[2], default=None)
-            nfrc = nfrc.model_copy(update={"band": fastest and fastest[0]})
+            nfrc = nfrc.model_copy(update={"band": _fastest_band(nfrc, cell)})
         problems = [
             *_check_waves(nfrc, cell),
             *check_ground(nfrc, sections["lattice"], chain, gaps_of_sites(contacts, list(chain.clearances))),
@@ -143,7 +140,8 @@ class NfrcCase(Case):
             remedy = f"a spring is linear at {options.over} = {low:g} and has no harmonics; begin at another value"
             return read[0], [Problem("nfrc.range", options.range, remedy)]
 
-        # What follows from the lattice follows from that at the lower end.
+        # The band and the restitutions are those at the lower end. The lattice is infinite, or its motions symmetric,
+        # only if they are so at all values that were tried.
         of_case: dict[str, Any] = {name: getattr(read[0]["nfrc"], name) for name in ("band", "restitutions")}
         for name in ("infinite", "symmetric"):
             of_case[name] = all(getattr(sections["nfrc"], name) for sections in read)
@@ -180,7 +178,7 @@ class NfrcCase(Case):
         if not nfrc.smallest_step < nfrc.largest_step:
             yield Problem("nfrc.smallest_step", nfrc.smallest_step, "must be below nfrc.largest_step")
 
-        # Curves are those of the sites: without one there is nothing to follow.
+        # Curves are those of sites or of nonlinear springs: without either there is nothing to follow.
         if valid("contacts"):
             contacts = sections["contacts"]
             yield from check_stiffness(contacts, contacts.sites not in (0, []), valid)
@@ -220,7 +218,7 @@ class NfrcCase(Case):
         return self.model_copy(update={"nfrc": nfrc, "table": None})
 
     def to_toml(self) -> str:
-        """The resolved case as TOML; where keys vary what it was read from, since others may follow from them."""
+        """The resolved case as TOML; with keys that vary it is the table that was read, whose other keys may follow."""
         if self.table is None:
             return super().to_toml()
         table = self.table | {"name": self.name, "nfrc": self.table["nfrc"] | {"points": self.nfrc.points}}
@@ -230,16 +228,16 @@ class NfrcCase(Case):
 
     @property
     def frequency(self) -> float:
-        """A frequency of the curves in rad/s."""
+        """A frequency of the curves in rad/s: the drive's, the first that is fixed, or the lower end of the range."""
         if self.nfrc.varies_key:
-            assert self.drive.frequency is not None  # that of a resolved case
+            assert self.drive.frequency is not None  # the case is resolved
             return self.drive.frequency
         if self.nfrc.over == "amplitude":
             return self.nfrc.fixed[0]
         return self.nfrc.range[0]
 
     def laws(self, restitution: float) -> list[Contact]:
-        """The law of each site with a ``restitution``; where each has a restitution of its own, with that."""
+        """The law of each site, with the ``restitution`` unless the case gives each site one of its own."""
         model = self.model()
         laws = list(model.laws or (model.contact,) * len(model.chain.sites))
         if self.contacts.each and self.contacts.each.restitution:
@@ -254,6 +252,7 @@ class NfrcCase(Case):
 
     @cached_property
     def _members(self) -> list[tuple[FamilyMember, "NfrcCase"]]:
+        """The members of the family with their cases; of a case without a family, the case itself."""
         if self.table is None or not self.nfrc.family:
             return [(FamilyMember("", {}, {}), self)]
         family, _ = family_of(self.table | {"nfrc": self.table["nfrc"] | {"points": self.nfrc.points}})
@@ -263,6 +262,7 @@ class NfrcCase(Case):
         """The curves of all members of the family; of a case without one its own."""
         curves = []
         for number, (member, case) in enumerate(self._members):
+            # Without a family there is one member, whose name is empty.
             for name, restitution, fixed in case.curves():
                 curves.append(
                     ResponseCurve(
@@ -277,7 +277,7 @@ class NfrcCase(Case):
         return curves
 
     def curves(self) -> list[tuple[str, float, float]]:
-        """Name, restitution and the fixed parameter of the curves of the case itself, or of the first member."""
+        """Name, restitution and value of the fixed parameter of each curve of the case, or of its first member."""
         restitutions = zip(distinct(self.nfrc.restitutions), self.nfrc.restitutions, strict=True)
         fixed = zip(distinct(self.nfrc.fixed), self.nfrc.fixed, strict=True)
         return [(f"r{of_r}-{of_f}", r, f) for (of_r, r), (of_f, f) in itertools.product(restitutions, fixed)]
@@ -289,12 +289,27 @@ def has_waves(chain: Chain) -> bool:
 
 
 def needs_modes(chain: Chain) -> bool:
-    """Whether the response of the finite ``chain`` is computed from its modes, those of contacts of other pairs too."""
+    """Whether the response of the finite ``chain`` is computed from all of its modes.
+
+    It is if its motions do not consist of Bloch waves, or if contacts join other masses than the cell's pair.
+    """
     return not has_waves(chain) or bool(chain.pairs)
 
 
+def _fastest_band(nfrc: NfrcTable, cell: UnitCell) -> int | None:
+    """The band of the fastest wave at the frequency at which a curve begins; None in a gap."""
+    frequency = nfrc.range[0]
+    if nfrc.over == "amplitude":
+        frequency = nfrc.fixed[0]
+    waves = waves_at(cell, frequency)
+    if not waves:
+        return None
+    band, _, _ = max(waves, key=lambda wave: wave[2])
+    return int(band)
+
+
 def _check_drives(nfrc: NfrcTable, drives: DriveTable) -> Iterator[Problem]:
-    """Problems with further drives, which are resolved: in addition to a wave, or with other frequencies."""
+    """Problems with drives besides the first: none acts with an incident wave, and all have one frequency."""
     for path, drive in drives.every[1:]:
         if nfrc.source == "wave":
             yield Problem(path, None, 'a wave that is incident acts alone; omit it, or nfrc.source = "force"')
@@ -320,7 +335,7 @@ def _check_lattice(nfrc: NfrcTable, contacts: ContactsTable, chain: Chain) -> It
     if not has_waves(chain):
         yield from no_waves(nfrc, chain)
 
-    # Of motions that do not consist of Bloch waves all modes are computed, by dense matrices.
+    # The size of the dense matrices by which all modes are computed, and of those of the harmonics.
     if not needs_modes(chain) or nfrc.infinite or nfrc.source == "wave":
         return
     dofs = chain.cells * chain.cell.dofs

@@ -1,4 +1,4 @@
-"""Supports of the lattice of steady states: walls, contacts that are pressed at rest, and ends that go on for ever."""
+"""Supports of the lattice of a steady state: walls, contacts that are pressed at rest, cells beyond its open ends."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -24,9 +24,9 @@ def are_contacts_springs(
 ) -> bool:
     """Whether the contacts that are pressed at rest are springs of the linear lattice.
 
-    They are where nothing else holds the masses: at the ground of a lattice without walls, and where no springs join
-    them. Without these springs a mean force would push such masses away without bound. ``gaps`` are the clearances in m
-    of the sites of ``chain`` on both sides.
+    They are if nothing else holds the masses: contacts with the ground in a lattice without walls, and all contacts in
+    a lattice without springs. A mean force would push masses that no spring holds away without bound. ``gaps`` are the
+    clearances in m of the sites of ``chain`` on both sides; () if they are equal, and then no contact is pressed.
     """
     pressed = [pair for pair, gap in zip(chain.contact_pairs, gaps, strict=False) if min(gap) < 0]
     if not lattice.unit_cell().springs:
@@ -35,7 +35,7 @@ def are_contacts_springs(
 
 
 def no_waves(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
-    """Problems with an infinite lattice whose motions do not consist of Bloch waves."""
+    """Problems with an incident wave or an infinite lattice where no motions of ``chain`` are sums of Bloch waves."""
     reason = "a wave in springs that are not linear changes its shape as it travels"
     if chain.is_damped:
         reason = "in a lattice with dashpots a wave from far away has decayed before it arrives"
@@ -56,6 +56,8 @@ def check_ground(
     """
     if nfrc.symmetric:
         return
+    # Masses without springs must be held together by contacts that are pressed. Springs hold the masses of a lattice
+    # together, which only contacts to ground can push away.
     if not (chain.cell.springs or nfrc.infinite):
         yield from _check_loose(chain, gaps)
         return
@@ -86,7 +88,7 @@ def _check_loose(chain: Chain, gaps: Sequence[tuple[float, float]]) -> Iterator[
         ends.append((host, 1 + cell * d + pair.resonator))
 
     pressed = [pair for pair, gap in zip(ends, gaps, strict=False) if min(gap) < 0]
-    # A node is joined to itself, so that there is a pair without contacts that are pressed, too.
+    # The ground is joined to itself, so that there is a pair even if no contact is pressed.
     group = connected_groups(1 + chain.cells * d, ((0, 0), *pressed))
     for number, (host, resonator) in enumerate(ends, 1):
         if group[host] != group[resonator]:
@@ -98,7 +100,7 @@ def _check_loose(chain: Chain, gaps: Sequence[tuple[float, float]]) -> Iterator[
 
 
 def check_open_ends(sections: dict[str, Any]) -> Iterator[Problem]:
-    """Problems with ends that go on for ever."""
+    """Problems with ``nfrc.open_ends``, by which the lattice goes on for ever in place of its absorbing ends."""
     absorbing = sections["lattice"].absorbing
     cell, _ = check_cell(sections["lattice"])
     moved = sections["drive"].end

@@ -15,7 +15,7 @@ IsolaSearch = Literal["amplitudes", "sweeps", "breathers"]
 class NfrcTable(Section):
     """Steady responses of the sites to an incident ``wave`` of a ``band``, or to a ``force`` on the driven mass.
 
-    With ``drive.end`` the force is that of the wall, which moves.
+    With ``drive.end`` the force is that of a wall that moves.
 
     Curves run ``over`` the amplitude (of a wave: the relative displacement that it alone would make at the first site,
     over the clearance there; of a force: N; of a wall: m) or the frequency (rad/s), within the ``range`` [low, high].
@@ -26,16 +26,16 @@ class NfrcTable(Section):
     resolved anew at each value.
 
     The lattice is ``infinite``, or ends where its cells do: always if it has dashpots or cells that differ, and under a
-    force also by default if contacts join other masses than the cell's pair. With ``open_ends`` it goes on for ever as
-    the reference cell in the place of its absorbing ends. ``harmonics`` is the number of the last one; motions that are
-    not ``symmetric`` (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too.
+    force also by default if contacts join other masses than the cell's pair. With ``open_ends`` equal cells without end
+    take the place of its absorbing ends. ``harmonics`` is the number of the last one; motions that are not
+    ``symmetric`` (w(t + T/2) = -w(t)), as those of contacts that differ on their two sides, have even ones too.
 
-    Besides folds the points are located where states become stable or unstable (``special_points``: Neimark-Sacker,
-    period doubling, branch points), or ``all`` where the number of growing perturbations changes. At ``isolas`` places
-    within the range isolated curves are looked for as ``isola_search`` says: by ``amplitudes`` up to ``isola_reach``
-    times larger or smaller, from the motion in ``sweeps`` up and down of ``isola_periods`` periods from one place to
-    the next, or near ``breathers``, the free motions of the lattice without loss. Steps are in units of the clearance
-    and of the amplitude that touches, or half the range of frequencies.
+    Besides folds, ``special_points`` are located: Neimark-Sacker, period-doubling and branch points where states become
+    stable or unstable, or ``all`` where the number of growing perturbations changes. At ``isolas`` places within the
+    range isolated curves are looked for as ``isola_search`` says: by ``amplitudes`` up to ``isola_reach`` times larger
+    or smaller, from the motion in ``sweeps`` up and down of ``isola_periods`` periods from one place to the next, or
+    near ``breathers``, the free motions of the lattice without loss. Steps are in units of the clearance and of the
+    amplitude that touches, or half the range of frequencies.
     """
 
     source: Literal["wave", "force"] = "wave"

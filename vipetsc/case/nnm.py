@@ -1,6 +1,6 @@
 """The case of the verb ``nnm``: the system, and the branches that are followed.
 
-The system itself is built by ``vipetsc.modes.system.System.from_case``.
+``vipetsc.modes.system.System.from_case`` builds the system of a case.
 """
 
 from collections.abc import Iterator, Mapping
@@ -11,7 +11,15 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field
 
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, read_section
-from vipetsc.case.contacts import Gaps, check_per_site, contact_of, gaps_of_sites, laws_of_sites, with_stiffness
+from vipetsc.case.contacts import (
+    MATERIAL,
+    Gaps,
+    check_per_site,
+    contact_of,
+    gaps_of_sites,
+    laws_of_sites,
+    with_stiffness,
+)
 from vipetsc.case.disorder import DisorderTable, with_drawn
 from vipetsc.case.features import refusals
 from vipetsc.case.nnm_checks import (
@@ -44,8 +52,9 @@ from vipetsc.case.sites import ContactsTable
 from vipetsc.lattice import Chain, Contact
 from vipetsc.lattice.cell import connected_groups
 
-# Keys of [contacts] that a preset gives, as for a run; the others are those of a run alone.
-MATERIAL = "law", "modulus", "radius", "poisson"
+# Keys of [contacts] that normal modes take from a preset. They do not take its restitution and its number of sites,
+# which are those of a run.
+OF_PRESET = "law", *MATERIAL
 
 
 class NnmCase(CaseFile):
@@ -54,7 +63,7 @@ class NnmCase(CaseFile):
     lattice: LatticeTable
     contacts: ContactsTable
     nnm: NnmTable
-    # No part of the case: results that are drawn or not are the same.
+    # Not written into a resolved case: whether results are drawn does not change them.
     output: Annotated[OutputTable, Field(exclude=True)]
 
     verb = section = "nnm"
@@ -66,7 +75,7 @@ class NnmCase(CaseFile):
     @classmethod
     @cache
     def sections(cls) -> dict[str, type[Section]]:
-        """Class of each section that the verb reads; a case that was read holds the values drawn by the disorder."""
+        """Class of each section that the verb reads; a resolved case has the drawn values instead of ``[disorder]``."""
         return super().sections() | {"disorder": DisorderTable}
 
     @classmethod
@@ -76,13 +85,13 @@ class NnmCase(CaseFile):
         nnm = table.get("nnm", {})
         has_no_lattice = isinstance(nnm, dict) and nnm.get("system") == "own"
         if isinstance(contacts, dict) and not has_no_lattice:
-            # Of a preset's contacts a run's damping and number of sites do not concern normal modes.
-            stated = {*MATERIAL, *table.get("contacts", {})}
-            table = table | {"contacts": {key: value for key, value in contacts.items() if key in stated}}
+            taken = {*OF_PRESET, *table.get("contacts", {})}
+            table = table | {"contacts": {key: value for key, value in contacts.items() if key in taken}}
 
         fields, problems = super().read(with_default_preset(table))
         lattice = fields["lattice"]
         contacts = fields["contacts"]
+        # A valid case without a clearance has a preset, from which it follows.
         if not (problems or has_no_lattice or contacts.clearance):
             count = _contact_count(fields["nnm"], lattice, contacts)
             fields["contacts"] = contacts.model_copy(update={"clearance": clearances(lattice, contacts, count)})
@@ -161,7 +170,7 @@ class NnmCase(CaseFile):
     def physics(self) -> tuple[Any, ...]:
         """Keys that a resumed branch must keep: the system, the shooting map and the flow."""
         nnm = self.nnm
-        # Steps, bounds and numbers of points may change from one resumption to the next: they do not move the curve.
+        # Steps, bounds and numbers of points may change from one resumption to the next: the curve is the same.
         begun = nnm.method, nnm.start_frequency, nnm.start_sites, nnm.truncation, self.krylov
         return self.lattice, self.contacts, nnm.system, nnm.custom, nnm.map, nnm.flow, nnm.jacobian, begun
 
@@ -202,7 +211,7 @@ class NnmCase(CaseFile):
         return gaps_of_sites(self.contacts, given) or tuple((gap, gap) for gap in given)
 
     def _clearances(self) -> list[float]:
-        """The clearance in m of each contact, on the side + unless stops are on the other side alone."""
+        """The clearance in m of each contact, that of the side + unless its only stop is on the side -."""
         if self.nnm.custom is not None:
             return [pair.clearance for pair in self.nnm.custom.contacts]
         count = _contact_count(self.nnm, self.lattice, self.contacts)
@@ -227,7 +236,7 @@ def _contact_count(nnm: NnmTable, lattice: LatticeTable, contacts: ContactsTable
 
 
 def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], valid: Valid) -> Iterator[Problem]:
-    """Problems with the contacts and the modes of a system of one's own, of which some keys are ``wrong`` already."""
+    """Problems with the contacts and the modes of a system of one's own, whose keys have the problems ``wrong``."""
     custom = nnm.custom
     if custom is None:
         return
@@ -242,11 +251,13 @@ def _check_own(nnm: NnmTable, contacts: ContactsTable, wrong: list[Problem], val
     rigid = 0
     if not wrong:
         joined = [(spring.start, spring.end) for spring in custom.springs]
-        # A contact that is pressed at rest is a spring of small motions.
+        # A contact that is pressed at rest is a spring of small motions. There are no gaps where all clearances are
+        # equal on both sides, and then no contact is pressed.
         gaps = gaps_of_sites(contacts, [pair.clearance for pair in custom.contacts])
-        for number, gap in enumerate(gaps):  # none where both sides have the clearance, and nothing is pressed
+        for number, gap in enumerate(gaps):
             if min(gap) < 0:
                 joined.append((custom.contacts[number].host, custom.contacts[number].resonator))
+        # Node 0 is the ground. Each further group of masses moves as a rigid body.
         group = connected_groups(masses + 1, tuple(joined))
         rigid = len(set(group)) - 1
     yield from _check_modes(nnm, masses, rigid, wrong)
@@ -261,12 +272,12 @@ def _check_stops(contacts: ContactsTable, given: list[float], valid: Valid) -> I
 
 
 def _check_modes(nnm: NnmTable, dofs: int, rigid: int, wrong: list[Problem]) -> list[Problem]:
-    """Problems with the modes of a system of ``dofs`` masses that moves ``rigid`` times as a whole."""
+    """Problems with the modes of a system of ``dofs`` masses, of which the first ``rigid`` ones are rigid motions."""
     still = [mode for mode in nnm.modes if mode <= rigid]
     problems = []
     if still:
         problems.append(Problem("nnm.modes", still, "the system can move as a rigid body, which has no period"))
-    # A number of masses that is wrong itself says nothing about modes.
+    # Only for a system without other problems, whose number of masses is right.
     beyond = [mode for mode in nnm.modes if mode > dofs]
     if beyond and not (problems or wrong):
         problems.append(Problem("nnm.modes", beyond, f"the system has {dofs} modes"))

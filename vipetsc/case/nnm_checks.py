@@ -24,7 +24,7 @@ def check_options(nnm: NnmTable) -> Iterator[Problem]:
     for key, (low, high) in (("energy", nnm.energy), ("frequency", nnm.frequency)):
         if not low < high:
             yield Problem(f"nnm.{key}", [low, high], "must be [low, high]")
-    # Downwards the energy tends to zero, and steps in its logarithm never end.
+    # Downwards the energy may tend to 0, which no number of steps in its logarithm reaches.
     if nnm.direction != "up" and not nnm.energy[0] > 0:
         yield Problem("nnm.energy", nnm.energy, "the direction down needs a lowest energy above 0 (J)")
 
@@ -51,16 +51,19 @@ def check_options(nnm: NnmTable) -> Iterator[Problem]:
 def check_forced(nnm: NnmTable, cells: int | None, masses: int) -> Iterator[Problem]:
     """Problems with the forced mass of a lattice of ``cells`` cells with ``masses`` each.
 
-    ``cells`` is None for a system that is no lattice, whose masses ``masses`` counts.
+    For a system that is no lattice, ``cells`` is None and ``masses`` is the number of all its masses.
     """
     if nnm.forced is None:
         return
     *cell, mass = nnm.forced
-    if len(cell) != (cells is not None):
+    names_cell = bool(cell)
+    is_lattice = cells is not None
+    if names_cell != is_lattice:
         yield Problem("nnm.forced", nnm.forced, "give the mass that is forced, [mass], or in a lattice [cell, mass]")
-    elif mass > masses or (cells is not None and cell[0] > cells):
-        of_cells = f" in each of {cells} cells" if cells else ""
-        yield Problem("nnm.forced", nnm.forced, f"is no mass; there are {masses}{of_cells}")
+    elif cells is None and mass > masses:
+        yield Problem("nnm.forced", nnm.forced, f"is no mass; there are {masses}")
+    elif cells is not None and (mass > masses or cell[0] > cells):
+        yield Problem("nnm.forced", nnm.forced, f"is no mass; there are {masses} in each of {cells} cells")
 
 
 def check_size(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> list[Problem]:
@@ -79,7 +82,7 @@ def check_size(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> list[Pro
 
 
 def check_reduced(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell) -> Iterator[Problem]:
-    """Problems with what the reduced model, two masses of one ``cell`` and the contact between them, cannot have."""
+    """Problems with keys that do not apply to the reduced model, two masses of one ``cell`` and their contact."""
     if isinstance(contacts.clearance, list) and len(contacts.clearance) != 1:
         yield Problem("contacts.clearance", contacts.clearance, ONE_CONTACT)
     if contacts.clearance is None and lattice.preset is None:
@@ -111,7 +114,9 @@ def check_gaps(contacts: ContactsTable, gaps: Gaps, valid: Valid) -> Iterator[Pr
         return
     if any(0 in gap for gap in gaps):
         remedy = "a contact that touches at rest resists on one side only: no motion about it is linear, however small"
-        key = "clearance_minus" if contacts.clearance_minus == 0 else "clearance"
+        key = "clearance"
+        if contacts.clearance_minus == 0:
+            key = "clearance_minus"
         yield Problem(f"contacts.{key}", 0.0, f"{remedy}; give a clearance above 0, or a precompression")
 
 
@@ -131,7 +136,7 @@ def check_lattice(
 
 
 def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> Iterator[Problem]:
-    """The problem of stops to ground that would have to hold a lattice, which moves freely between them.
+    """The problem of a lattice that nothing but stops to ground could hold, between which it moves freely.
 
     ``gaps`` are the clearances in m of its sites on both sides.
     """
@@ -143,7 +148,8 @@ def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
     if any(plus != minus for plus, minus in to_ground):
         remedy = "nothing holds this lattice, and a stop to ground that differs on its two sides pushes it away"
         yield Problem("contacts.pair", contacts.pair, f"{remedy}; {fixed}")
-    # Symmetric motions pass the centre between the stops. Others have a mean, which small motions leave open.
+    # Symmetric motions pass the centre between the stops. Unsymmetric ones have a mean position, which small motions,
+    # without contact, do not determine.
     elif any(plus != minus for plus, minus in gaps) or not _is_odd(lattice):
         remedy = (
             "nothing holds this lattice between its stops to ground, and its other forces are not symmetric, so that"
@@ -153,12 +159,14 @@ def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
 
 def is_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> bool:
     """Whether springs to the walls, or a contact that is pressed to the ground, hold a lattice at rest."""
-    return lattice.ends == "fixed" or any(min(gap) < 0 for gap in _gaps_to_ground(contacts, cell, gaps))
+    # Springs tie the ends to the walls: a lattice that contacts alone join has none.
+    has_walls = lattice.ends == "fixed" and bool(cell.springs)
+    return has_walls or any(min(gap) < 0 for gap in _gaps_to_ground(contacts, cell, gaps))
 
 
 def _gaps_to_ground(contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> list[tuple[float, float]]:
-    """The clearances, out of all ``gaps``, of contacts with the ground."""
-    # There are no pairs where all sites join the cell's own, of which none is the ground.
+    """The clearances on both sides of the contacts with the ground; ``gaps`` are those of all sites."""
+    # There are no pairs if all sites join the cell's own pair, which the ground is no part of.
     pairs = pairs_of_sites(contacts, cell, len(gaps))
     return [gaps[number] for number, pair in enumerate(pairs) if pair.host < 0]
 
@@ -170,15 +178,17 @@ def _is_odd(lattice: LatticeTable) -> bool:
 
 
 def check_method(nnm: NnmTable) -> Iterator[Problem]:
-    """Keys that belong to the other method than the one by which motions are found."""
+    """Problems with keys of another method than the one by which motions are found."""
     foreign: tuple[str, ...]
     if nnm.system == "condensed" or nnm.method == "condensed":
         method = "shot"
         foreign = ("compare", "switch")
+    elif nnm.system == "chain" and nnm.start_frequency:
+        # Localised motions of a chain begin at this frequency and at the start sites: both keys apply.
+        return
     elif nnm.system == "chain":
-        # A start frequency begins a branch of localised motions of a chain, at sites: neither is foreign here.
         method = "that begin at a start_frequency"
-        foreign = () if nnm.start_frequency else ("start_sites",)
+        foreign = ("start_sites",)
     else:
         method = "condensed"
         foreign = ("start_frequency", "start_sites")
@@ -203,7 +213,8 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
     if needs_modes(chain) and masses > MOST_DOFS:
         remedy = f"{masses} masses: all modes of a lattice with unlike cells or other contact pairs are needed"
         yield Problem("lattice.cells", chain.cells, f"{remedy}, of at most {MOST_DOFS} masses")
-    unknowns = count * (nnm.harmonics + 1)  # fewer for motions of odd harmonics alone
+    # Cosines alone, since free motions are symmetric in time; motions of odd harmonics have half as many.
+    unknowns = count * (nnm.harmonics + 1)
     if not chain.is_linear and unknowns > MOST_UNKNOWNS:
         remedy = f"{count} contacts and nonlinear springs have up to {unknowns} unknown harmonics, of at most"
         yield Problem("nnm.harmonics", nnm.harmonics, f"{remedy} {MOST_UNKNOWNS}; fewer cells or harmonics do")
@@ -214,7 +225,7 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
         yield Problem(
             "nnm.multipliers", nnm.multipliers, f"{remedy}; multiplier_max needs only the motion of the sites"
         )
-    # A motion whose frequency is in a band sends waves away: it is not localised, and nothing is periodic.
+    # A motion whose frequency is in a band sends waves away, so that it is neither localised nor periodic.
     bands = pass_bands(cell)
     inside = [omega for omega in nnm.start_frequency if any(band.low <= omega <= band.high for band in bands)]
     if inside:
@@ -223,14 +234,14 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
 
 
 def check_start_sites(nnm: NnmTable, count: int) -> Iterator[Problem]:
-    """The problem of motions that begin at other places than the ``count`` that there are."""
+    """The problem of motions that begin at numbers of sites other than 1 to ``count``; signs are directions."""
     outside = [number for number in nnm.start_sites if not 1 <= abs(number) <= count]
     if outside:
         yield Problem("nnm.start_sites", outside, f"give site numbers from 1 to {count}, with a sign")
 
 
 def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iterator[Problem]:
-    """Keys of [nnm] that do not fit the shooting method of a lattice of such cells."""
+    """Problems with keys of [nnm] that do not fit the shooting method of a lattice of such cells."""
     dofs = lattice.cells * cell.dofs
     is_linear = not lattice.nonlinear_keys
     krylov = nnm.is_krylov(dofs, is_linear)
@@ -243,8 +254,10 @@ def check_shooting(nnm: NnmTable, lattice: LatticeTable, cell: UnitCell) -> Iter
             if getattr(nnm, key) != NnmTable.model_fields[key].default:
                 yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs dense matrices: nnm.shooting = "dense"')
     if nnm.shooting == "dense" and (nnm.multipliers or nnm.start_frequency):
-        key = "multipliers" if nnm.multipliers else "start_frequency"
+        key = "start_frequency"
+        if nnm.multipliers:
+            key = "multipliers"
         yield Problem(f"nnm.{key}", getattr(nnm, key), 'needs nnm.shooting = "krylov"; "dense" has all half-traces')
-    # Beyond this size all linear modes are no longer computed, from which branches begin.
+    # In larger lattices the linear modes, from which branches begin, are not computed.
     if krylov and dofs > MOST_MASSES and not nnm.start_frequency:
         yield Problem("nnm.modes", nnm.modes, f"are computed up to {MOST_MASSES} masses: give nnm.start_frequency")

@@ -10,8 +10,9 @@ from vipetsc.case.schema import Finite, Positive, once
 # Masses of a system whose orbits are shot with dense matrices: the derivatives of the state at the period by the state
 # at the beginning are 8000 x 8000 numbers, 512 MB, and twice the masses take four times the memory.
 MOST_MASSES = 4000
-# Masses of a lattice whose orbits are shot without matrices: with so many, two points of a breather take 39 s of CPU,
-# compilation with it, and 0.7 GB, of which GMRES has 200 vectors of 80,000 numbers. More has not been tried.
+# Masses of a lattice whose orbits are shot without matrices. With so many, two points of a breather take 39 s of CPU,
+# including compilation, and 0.7 GB, of which 200 vectors of GMRES with 80,000 numbers each are 0.13 GB. More masses
+# have not been tried.
 MOST_OF_LATTICE = 40_000
 # Masses of a lattice beyond which "auto" shoots without matrices. Dense matrices give all multipliers and special
 # points, and cost the cube: six points in contact take 8, 25 and 237 s of CPU at 52, 100 and 200 masses, without
@@ -69,12 +70,14 @@ class SystemTable(Section):
 class Guards(Section):
     """Bounds on one step that keep a branch from jumping to another arc; 0 switches one off.
 
-    Changes of asinh(c) of every Floquet half-trace c and of the number of contact episodes of the arc (those that a
-    symmetry of the orbit takes to one another count once), length of the correction over the step's length, angle in
-    rad between consecutive tangents: in the chart of the step, and in that named ``relative``, since near grazing
-    another chart hides the angle between two branches that cross. Residuals cannot show a jump: both arcs satisfy the
-    equations to rounding. A branch whose last ``standstill`` points are all within ``advance`` times the orbit's size
-    is ended: orbits are corrected to 1e-13, and the paper's branches move by 2e-6 in 200 points at least.
+    ``half_trace`` bounds the change of asinh(c) of every Floquet half-trace c; ``contacts`` that of the number of
+    contact episodes of the arc that is integrated (a part or the whole of the orbit), of which those that a symmetry of
+    the orbit takes to one another count once; ``corrector`` the length of the correction over that of the step;
+    ``turn`` the angle in rad between consecutive tangents in the chart of the step, and ``turn_relative`` that in the
+    chart ``relative``, since near grazing another chart hides the angle between two branches that cross. Residuals
+    cannot show a jump: both arcs satisfy the equations to rounding. A branch whose last ``standstill`` points are all
+    within ``advance`` times the orbit's size is ended: orbits are corrected to 1e-13, and the paper's branches move by
+    2e-6 in 200 points at least.
     """
 
     half_trace: Annotated[float, Field(ge=0)] = 0.5
@@ -90,18 +93,21 @@ class NnmTable(Section):
     """Nonlinear normal modes.
 
     ``system``: ``reduced`` (the paper's model of the cell's contact pair), ``chain`` (the lattice with its sites),
-    ``own`` (``[nnm.own]``), or ``condensed`` (the lattice of any length, by harmonics of its sites alone; the
-    others with the ``method`` condensed). Branches of these begin at ``start_frequency`` in rad/s, outside the pass
-    bands, with contact at ``start_sites`` (numbers of sites, from 1; negative ones move in the opposite direction), and
-    take at most ``harmonics``, as many as keep the part left out below ``truncation``. ``modes`` are linear modes
-    (1-based, lowest first). ``energy`` in J and ``frequency`` in Hz bound the branch; ``direction`` is where
-    energy goes first. ``orbits_at`` lists energies in J: the orbits of these energies, wherever the branch passes one,
-    are stored in addition to those of the regions; ``compare`` corrects every fourth point with other flows; ``switch``
-    follows the branches that cross at these kinds of special points, ``switch_points`` points each. ``shooting``
-    "krylov" does without dense matrices, for a chain on all ranks together ("auto" beyond 100 masses): there and in a
-    condensed lattice so many of the largest ``multipliers`` (true: 8) are found. Where dashpots or contacts dissipate,
-    points have the loss along the motion without loss, and the force on the mass ``forced`` that makes up for it:
-    [cell, mass] of a lattice, else [mass].
+    ``own`` (``[nnm.own]``), or ``condensed`` (the lattice of any length, by harmonics of its sites alone). The
+    ``method`` condensed treats ``reduced``, ``chain`` and ``own`` by harmonics too. ``modes`` are the linear modes
+    (from 1, lowest first) from which branches begin. Those of a condensed lattice, and others where it is given, begin
+    at ``start_frequency`` in rad/s, outside the pass bands, with contact at ``start_sites`` (numbers of sites from 1;
+    those that move in the opposite direction are negative). Condensed motions have at most ``harmonics``, as many as
+    keep the part left out below ``truncation``.
+
+    ``energy`` in J and ``frequency`` in Hz bound the branch; ``direction`` is that in which the energy goes first.
+    ``orbits_at`` lists energies in J: the orbits of these energies, wherever the branch passes one, are stored in
+    addition to those of the regions; ``compare`` corrects every fourth point with other flows; ``switch`` follows the
+    branches that cross at these kinds of special points, ``switch_points`` points each. ``shooting`` "krylov" does
+    without dense matrices, for a chain on all ranks together ("auto" beyond 100 masses): there and in a condensed
+    lattice so many of the largest ``multipliers`` (true: 8) are found. Where dashpots or contacts dissipate, points
+    have the loss along the motion without loss, and the force on the mass ``forced`` that makes up for it: [cell, mass]
+    of a lattice, else [mass].
     """
 
     system: Literal["reduced", "chain", "own", "condensed"] = "reduced"
@@ -142,5 +148,6 @@ class NnmTable(Section):
         """Whether orbits of a lattice of so many masses, with linear springs or others, are shot without matrices."""
         # Other flows, branch switching and difference quotients work on the whole matrix of derivatives.
         needs_dense = self.compare or self.switch or self.flow != "compiled" or self.jacobian != "variational"
-        auto = is_linear and (bool(self.start_frequency or self.multipliers) or (dofs > FEW_MASSES and not needs_dense))
-        return self.method == "shooting" and self.shooting != "dense" and (auto or self.shooting == "krylov")
+        needs_krylov = bool(self.start_frequency or self.multipliers)
+        is_chosen = is_linear and (needs_krylov or (dofs > FEW_MASSES and not needs_dense))
+        return self.method == "shooting" and self.shooting != "dense" and (is_chosen or self.shooting == "krylov")

@@ -1,7 +1,7 @@
 """The section ``[plugins]``: modules of the user's, which register laws, waveforms and other parts by name.
 
 The resolved case records every part on which numbers depend, with the version of its module and the SHA-256 of its
-source, so that every result carries them and one that was begun with another source is not continued.
+source. Every result thus states them, and a result that was begun with another source is not continued.
 """
 
 import logging
@@ -55,12 +55,12 @@ class PartName:
         return (*self.shipped, *plugins.registered(self.kind))
 
     def _check(self, value: Any) -> str:
-        # At the check, not at import: modules of the case register their names in between.
+        # Looked up at each check, since the modules of a case register their names after this class was made.
         if isinstance(value, str) and value in self.choices:
             return value
         names = [repr(name) for name in self.choices]
         expected = f"{', '.join(names[:-1])} or {names[-1]}"
-        # The type is that of pydantic's choices of names, whose message this is.
+        # The type and the words of pydantic's own error for a choice among names, which messages are made of.
         message = "Input should be {expected}; plugins.modules names modules that register others"
         raise PydanticCustomError("literal_error", message, {"expected": expected})
 
@@ -74,11 +74,11 @@ class PartName:
 
 
 def module_names(table: Mapping[str, Any]) -> list[str]:
-    """The modules that a parsed case names; none where the key is not as it should be."""
+    """The modules that the ``table`` of a case names; [] if the key is missing or invalid."""
     section = table.get("plugins")
     if not isinstance(section, dict):
         return []
-    # Before the types are checked, so that anything may be here; what is wrong is named by that check.
+    # Types are not checked yet: anything may be here, and that check reports what is wrong.
     names = section.get("modules")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return []
@@ -86,12 +86,12 @@ def module_names(table: Mapping[str, Any]) -> list[str]:
 
 
 def relative_modules(table: Mapping[str, Any]) -> list[str]:
-    """The relative names of the files of modules that a parsed case names."""
+    """The relative names of files among the modules that the ``table`` of a case names."""
     return [name for name in module_names(table) if plugins.is_file(name) and not Path(name).is_absolute()]
 
 
 def with_located(table: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """``table`` with the whole paths of files of modules, which its case file names from its ``folder``."""
+    """``table`` with absolute paths of files of modules, which a case file in ``folder`` may name by relative ones."""
     names = module_names(table)
     if not names:
         return table
@@ -99,9 +99,10 @@ def with_located(table: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
-    """``table`` with a record of the parts of its modules, which are imported, and what is wrong with these.
+    """``table`` with a record of the parts of its modules, and what is wrong with these; the modules are imported.
 
-    A resolved case may lack modules on which its physics does not depend: a warning says so, and the record stays.
+    If a resolved case does not need a module for its physics, the module may be missing: a warning says so, and the
+    record stays as it is.
     """
     names = module_names(table)
     if not names:
@@ -110,19 +111,20 @@ def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
             return table, [Problem("plugins.modules", None, "missing; name files or modules")]
         return table, []
 
-    # Whole paths: results are read from other folders than the one in which they were computed.
+    # Absolute paths, since results are read from other folders than the one in which they were computed.
     table = with_located(table, Path())
     earlier = table["plugins"].get("parts")
     recorded: dict[str, Any] = {}
     if isinstance(earlier, dict):
         recorded = earlier
+
     parts: dict[str, dict[str, Any]] = {}
     problems = []
     for number, name in enumerate(module_names(table)):
         try:
             rows = _record(name)
         except plugins.PluginError as error:
-            # The record of an earlier reading stands for the module that is not there.
+            # The record of an earlier reading takes the place of a module that is missing.
             rows = _rows_of(recorded, name)
             if earlier is None or any(kind in PHYSICS and part in _texts(table) for kind, part, _ in rows):
                 problems.append(Problem(f"plugins.modules[{number + 1}]", names[number], str(error)))
@@ -136,16 +138,16 @@ def with_parts(table: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
         now = parts.get(kind, {}).get(part)
         if now and now.get("sha256") != row.get("sha256"):
             changed.setdefault(now["module"], []).append(f"{kind} {part}")
-    # One warning a file, which lists its parts.
+    # One warning for each module, which lists its parts.
     for name, which in changed.items():
         _warn(f"{name} has changed since the case was resolved that used it: {', '.join(which)}")
     return table | {"plugins": table["plugins"] | {"parts": parts}}, problems
 
 
 def parts_in_use(table: Mapping[str, Any]) -> list[tuple[plugins.Plugin, RegisteredPart]]:
-    """The parts that a resolved case uses, with their modules: what it names, and all measures and figures.
+    """Pairs of a module and a part that a resolved case uses: parts that it names, and all measures and figures.
 
-    A module that is not there is left out: results can be read without those of measures and figures.
+    A module that is missing is left out: results can be read without its measures and figures.
     """
     texts = _texts(table)
     used = []
@@ -162,9 +164,12 @@ def parts_in_use(table: Mapping[str, Any]) -> list[tuple[plugins.Plugin, Registe
 
 
 def missing_parts(table: PluginsTable) -> list[Problem]:
-    """Problems with importing the modules of a resolved case, as on another rank, to the sources that it records."""
+    """Problems with importing the modules that a resolved case records, for instance on a rank that did not read it.
+
+    A module is a problem if it is missing, or if its source is not the one recorded.
+    """
     problems = []
-    # Modules that all other ranks have imported may be missing on one: the message says where.
+    # A module that other ranks have imported may be missing on this one: the message names the rank.
     rank = launched_rank()
     where = ""
     if rank is not None:
@@ -195,7 +200,7 @@ def _record(name: str) -> list[tuple[str, str, dict[str, str]]]:
 
 
 def _all_rows(recorded: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Kind, name and record of all parts of a resolved table; what is no record is left to the check of types."""
+    """Kind, name and record of all parts in ``plugins.parts``; the check of types reports entries of another type."""
     for kind, parts in recorded.items():
         if not isinstance(parts, dict):
             continue
@@ -205,7 +210,8 @@ def _all_rows(recorded: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str,
 
 
 def _rows_of(recorded: Mapping[str, Any], name: str) -> list[tuple[str, str, dict[str, Any]]]:
-    """Kind, name and record of the parts of the module ``name``; a file may have been recorded elsewhere."""
+    """Kind, name and record of the parts of the module ``name`` in ``plugins.parts``."""
+    # By the last part of the path: the file may have been recorded in another folder.
     return [row for row in _all_rows(recorded) if Path(str(row[2].get("module"))).name == Path(name).name]
 
 
@@ -226,6 +232,6 @@ def _texts(table: Mapping[str, Any]) -> set[str]:
 
 @cache
 def _warn(text: str) -> None:
-    """Warn on one rank, and once of each ``text``: a file's case is read many times."""
+    """Warn on one rank, and once for each ``text``, since a file's case is read many times."""
     if not launched_rank():
         logger.warning("vipetsc: %s", text)

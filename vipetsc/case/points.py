@@ -7,8 +7,9 @@ from pydantic import Field
 
 from vipetsc.case.case_file import Problem, Section
 
-NAME = "^[A-Za-z][A-Za-z0-9_]*$"  # of a point: it is a part of names in files
-# Points are recorded at every sample, whatever the stride of the fields: a thousand take 24 kB a sample.
+NAME = "^[A-Za-z][A-Za-z0-9_]*$"  # of a point, which is part of names in result files
+# Points are recorded at every sample, whatever the stride of the fields: displacement, velocity and acceleration of a
+# thousand take 24 kB a sample.
 MOST_POINTS = 1000
 
 
@@ -30,9 +31,9 @@ def masses_remedy(dofs: int) -> str:
 def check_points(
     points: list[PointTable], transmission: list[list[str]], cells: int | None, dofs: int | None
 ) -> Iterator[Problem]:
-    """Problems of ``points`` in a lattice of ``cells`` with ``dofs`` masses each (None: invalid), and of their pairs.
+    """Problems of ``points``, and of ``transmission``, pairs of their names.
 
-    ``transmission`` are pairs of their names.
+    The lattice has ``cells`` with ``dofs`` masses each; a number that is None is invalid, and not checked.
     """
     names = [point.name for point in points]
     for number, point in enumerate(points, 1):

@@ -14,16 +14,17 @@ from vipetsc.case.waveforms import DEFAULT
 from vipetsc.lattice.packet import narrow_fraction
 
 MOST = 10_000  # amplitudes
-# A pulse that is no burst has at least the fraction NARROW of its energy within WIDTH of its main frequency: the
-# scattering law that a prediction reads has one frequency.
+# A scattering law has one frequency. Of a pulse that is no burst, at least the fraction NARROW of the energy must be in
+# one band and within the fraction WIDTH of its main frequency. Predictions for such Gaussian pulses and chirps differ
+# from runs by .044 to .122 decades (rms), and those for a burst by .056.
 WIDTH = 0.3
 NARROW = 0.95
 
 
 class PredictTable(Section):
-    """``amplitudes`` in N, of a moved wall in m.
+    """``amplitudes`` of the drive, in N or for a moved wall in m, at which the lattice is predicted.
 
-    By default they are ``count``, log-spaced from that of the first contact to ``span`` times it.
+    By default there are ``count``, log-spaced from the amplitude of the first contact to ``span`` times it.
 
     ``points``: number of runs with a single site. ``simulate``: also simulate the same amplitudes, for comparison.
     """
@@ -51,7 +52,9 @@ class PredictCase(LawCase):
         """Warnings about the waves of the prediction; its runs do not store fields."""
         model = self.model()
         warnings = [*wave_warnings(model), *length_warnings(model), *end_warnings(model, self.output)]
-        nearest = min(abs(site - model.drive_cell) for site in model.chain.sites)
+        # Cells to the nearest site, in a ring along the shorter arc.
+        offsets = [abs(site - model.drive_cell) for site in model.chain.sites]
+        nearest = min(min(offset, model.chain.cells - offset) for offset in offsets)
         # One revolution of the ring and on to the site, until the end of the burst has passed it.
         passed = (model.chain.cells + nearest) / model.speed + model.drive.duration
         if model.chain.ends == "periodic" and passed < model.end:
@@ -62,11 +65,11 @@ class PredictCase(LawCase):
         return warnings
 
     def _place_problems(self) -> list[Problem]:
-        """Problems with the wave, whose form is not that of a burst, and with the distance that it gives."""
+        """Problems with the wave, which need not be a burst, and with the distance that the case gives."""
         return self._pulse_problems() or super()._place_problems()
 
     def _pulse_problems(self) -> list[Problem]:
-        """Problems with a wave that goes on, or that has no amplitude of one frequency."""
+        """Problems with a wave without an end, or with one that is not narrow in frequency."""
         model = self.model()
         if not np.isfinite(model.drive.duration):
             remedy = "a prediction is that of a wave that ends; give drive.duration"

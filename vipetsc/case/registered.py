@@ -8,22 +8,27 @@ import numpy as np
 from vipetsc.case.section import Problem
 from vipetsc.lattice import Contact
 from vipetsc.lattice.contact import registered_factor, registered_law
+from vipetsc.plugins import call
 from vipetsc.register import Parameter
 from vipetsc.wording import with_unit
 
-# Indentations in m at which the formulas of a law are compared with each other, and those of its onset.
+# Indentations in m at which force, slope and energy of a law are compared with each other, and those of its onset.
 DEPTHS = np.geomspace(1e-6, 1e-3, 7)
 ONSET = np.array([1e-9, 1e-8])
-# Relative difference of a derivative from a central difference quotient with a step of 1e-5 x. The quotient of a power
-# of x is exact to 1e-10, and a wrong factor or exponent in a formula differs by far more.
+# Relative difference of a derivative from a central difference quotient, and the step of that over x. The quotient of a
+# power of x is exact to 1e-10, and a wrong factor or exponent in a formula differs by far more.
 CLOSE = 1e-5
+STEP = 1e-5
+# Difference of the power with which a force begins from the one that is stated: it distinguishes 1, 1.5 and 2, and
+# allows for terms of higher order at the onset.
+POWER_CLOSE = 0.05
 
 
 def check_parameters(
     path: str, given: Mapping[str, float], parameters: Mapping[str, Parameter], owner: str
 ) -> Iterator[Problem]:
     """Problems with numbers ``given`` at a ``path`` for the ``parameters`` of an ``owner``, as 'the law "stop"'."""
-    for key in given.keys() - parameters.keys():
+    for key in sorted(given.keys() - parameters.keys()):
         remedy = f"{owner} takes {', '.join(parameters) or 'no parameters'}"
         yield Problem(f"{path}.{key}", given[key], remedy)
     for key, about in parameters.items():
@@ -39,12 +44,14 @@ def check_law_parameters(
     path: str, laws: Sequence[str], given: Sequence[Mapping[str, float] | None]
 ) -> Iterator[Problem]:
     """Problems with the parameters ``given`` for the ``laws`` (site,) of sites, at a ``path``."""
+    # Parameters that the law of any site takes.
     every: dict[str, Parameter] = {}
     for name in laws:
         law = registered_law(name)
         if law:
             every |= law.parameters
     names = ", ".join(f'"{name}"' for name in dict.fromkeys(laws))
+    # Sites of equal laws and parameters are checked once.
     pairs = {(name, tuple(sorted((values or {}).items()))) for name, values in zip(laws, given, strict=True)}
 
     problems: dict[str, Problem] = {}
@@ -55,7 +62,7 @@ def check_law_parameters(
         if law:
             taken = law.parameters
             owner = f'the law "{name}"'
-        # What another site's law takes may stand in the section for all.
+        # Parameters of other sites' laws are no problem: one section may give those of all laws.
         relevant = {key: value for key, value in values if key in taken or key not in every}
         for problem in check_parameters(path, relevant, taken, owner):
             problems.setdefault(problem.key, problem)
@@ -80,11 +87,11 @@ def check_law(law: Contact) -> str:
         return f"its force, slope or energy is no number at some x from 0 to {DEPTHS[-1]:g} m"
     if force_at_rest != 0 or energy_at_rest != 0:
         return f"its force and energy at x = 0 are {force_at_rest:g} and {energy_at_rest:g}; both must be 0"
-    if not ((force > 0).all() and (slope >= 0).all()):
+    if not ((force > 0).all() and (onset > 0).all() and (slope >= 0).all()):
         return "its force must be positive for x > 0, and must not fall"
 
-    # Relative to each indentation: these span three decades.
-    step = 1e-5 * DEPTHS
+    # Steps in proportion to the indentations, which span three decades.
+    step = STEP * DEPTHS
     quotient = (law.elastic_force(DEPTHS + step) - law.elastic_force(DEPTHS - step)) / (2 * step)
     work = (law.elastic_energy(DEPTHS + step) - law.elastic_energy(DEPTHS - step)) / (2 * step)
     for name, stated, expected in (("slope", slope, quotient), ("energy's derivative", force, work)):
@@ -95,20 +102,22 @@ def check_law(law: Contact) -> str:
                 return f"its slope at x = {DEPTHS[worst]:.3g} m is {values_there} as the differences of its force"
             return f"its force at x = {DEPTHS[worst]:.3g} m is {values_there} as the differences of its energy"
 
-    power = float(np.log10(onset[1] / onset[0]))
-    # 0.05 tells the exponents 1, 1.5 and 2 apart, and allows for terms of higher order at these indentations.
-    if abs(power - law.onset_exponent) > 0.05:
+    power = float(np.log(onset[1] / onset[0]) / np.log(ONSET[1] / ONSET[0]))
+    if abs(power - law.onset_exponent) > POWER_CLOSE:
         return f"its force begins as x^{power:.3g}, and onset_exponent is {law.onset_exponent:g}"
     return ""
 
 
 def check_factors(path: str, names: Iterable[str], restitutions: Iterable[float]) -> Iterator[Problem]:
-    """Problems with what registered factors of these ``names`` give for ``restitutions`` (site,)."""
+    """Problems with the values of registered factors: those ``names`` (site,) for the ``restitutions`` (site,).
+
+    Raises PartError for a factor that fails.
+    """
     for name, restitution in sorted(set(zip(names, restitutions, strict=True)), key=str):
         factor = registered_factor(name or "")
         if factor is None or restitution < factor.least_restitution:
             continue
-        value: Any = factor.function(restitution)
+        value: Any = call(factor, factor.function, restitution)
         if not (isinstance(value, int | float | np.number) and np.isfinite(value) and value >= 0):
             remedy = f"gives c = {value!r} for the restitution {restitution:g}; a number from 0 is needed"
             yield Problem(path, name, remedy)

@@ -8,7 +8,16 @@ import numpy as np
 
 from vipetsc.case.absorbing import designed_end
 from vipetsc.case.case_file import Problem, Table, Valid
-from vipetsc.case.contacts import check_per_site, contact_of, laws_of_sites, pairs_of_sites, with_stiffness
+from vipetsc.case.contacts import (
+    MATERIAL,
+    check_per_site,
+    contact_of,
+    laws_of_sites,
+    lists_of,
+    pairs_of_sites,
+    values_of_sites,
+    with_stiffness,
+)
 from vipetsc.case.drive import DriveTable, build_drives, packet_speed, resolve_drives, waveform_of
 from vipetsc.case.inhomogeneity import cell_variation
 from vipetsc.case.initial import Beginning, InitialTable
@@ -18,14 +27,15 @@ from vipetsc.case.waveforms import DEFAULT, is_sine
 from vipetsc.lattice import Chain, UnitCell, pass_bands
 from vipetsc.lattice.cell import cell_problems, connected_groups
 
-# A key of a case file takes the place of these keys of the preset.
+# A key of a case file takes the place of these keys of the preset, which would contradict it.
 REPLACES = {
     "stiffness": {"modulus", "radius", "poisson"},
     "frequency": {"wavenumber", "band", "at"},
     "wavenumber": {"at"},
     "at": {"wavenumber"},
 }
-SAMPLES_OF_HALF_PERIOD = 3  # of the top band's edge, at least, where no sample interval is given
+# Samples of half a period of the top band's edge where no interval is given; one would just resolve the bands.
+SAMPLES_OF_HALF_PERIOD = 3
 
 
 def with_default_preset(table: Table) -> Table:
@@ -39,7 +49,7 @@ def with_default_preset(table: Table) -> Table:
 def with_preset(table: Table) -> Table:
     """``table`` with the preset's length, contacts and drive where it does not give them itself.
 
-    With an initial state, and no section for a drive, there is none.
+    A lattice that begins in motion has no drive unless the table has a section for one.
     """
     table = with_default_preset(table)
     initial = table.get("initial", {})
@@ -63,8 +73,9 @@ def with_preset(table: Table) -> Table:
 
 def _preset_drive(defaults: Table, given: Table) -> Table:
     """Keys of a preset's drive that apply to a ``given`` one: the paper's burst, or the place of its wave on a band."""
+    # Without an amplitude nothing is driven, and there is the motion at t = 0 alone.
     if given.get("amplitude") == 0:
-        return {}  # the motion at t = 0 alone
+        return {}
     waveform = given.get("waveform", DEFAULT)
     if waveform == DEFAULT:
         return defaults
@@ -75,7 +86,7 @@ def _preset_drive(defaults: Table, given: Table) -> Table:
 
 def _with_defaults(defaults: Table, given: Table) -> Table:
     """``given`` with the ``defaults`` that none of its keys replaces."""
-    # Both would contradict each other: a stiffness replaces the preset's material, a frequency its wavenumber.
+    # For instance, a stiffness replaces the preset's material, and a frequency its wavenumber.
     replaced = {key for choice in given.keys() & REPLACES.keys() for key in REPLACES[choice]}
     return {key: value for key, value in defaults.items() if key not in replaced} | given
 
@@ -96,7 +107,20 @@ def site_cells(lattice: LatticeTable, contacts: ContactsTable) -> list[int]:
     return _spread(sites.first, sites.last, sites.count)
 
 
+def cells_of_sites(lattice: LatticeTable, contacts: ContactsTable) -> list[tuple[int, ...]]:
+    """The cells (1-based) whose masses each site joins: its own one, and the next one if the contact reaches there."""
+    cells = site_cells(lattice, contacts)
+    joined: list[tuple[int, ...]] = [(cell,) for cell in cells]
+    # A list over the sites may have another length, which ``check_per_site`` reports.
+    for site, reaches_on in enumerate(values_of_sites(contacts, "next_cell", len(cells))[: len(cells)]):
+        if reaches_on:
+            # The first cell of a ring follows the last one.
+            joined[site] += (cells[site] % lattice.cells + 1,)
+    return joined
+
+
 def _spread(first: float, last: float, count: int) -> list[int]:
+    """``count`` whole numbers evenly from ``first`` to ``last``."""
     return [int(cell) for cell in np.round(np.linspace(first, last, count))]
 
 
@@ -189,7 +213,8 @@ def check_sites(lattice: LatticeTable, contacts: ContactsTable) -> Iterator[Prob
         count = sites
     elif isinstance(sites, Span):
         count = sites.count
-    if count > lattice.cells:  # before so many are placed
+    # Checked before the sites are placed, since a count may exceed the memory.
+    if count > lattice.cells:
         yield Problem("contacts.sites", count, f"more sites than the lattice has cells, {lattice.cells}")
         return
 
@@ -226,20 +251,25 @@ def check_contacts(
     if contacts.clearance is not None or lattice.preset is not None:
         gaps = clearances(lattice, contacts, len(sites))
     if len(gaps) == len(sites):
-        at_rest = [initial is None or initial.is_at_rest(site) for site in sites]
+        ring = lattice.cells if lattice.ends == "periodic" else None
+        joined = cells_of_sites(lattice, contacts)
+        at_rest = [initial is None or all(initial.is_at_rest(cell, ring) for cell in cells) for cells in joined]
         yield from check_per_site(contacts, gaps, at_rest, valid)
 
 
 def check_stiffness(contacts: ContactsTable, any_sites: bool, valid: Valid) -> Iterator[Problem]:
-    """The contact stiffness is given once: as a number, or by the material; a radius may be given with the number."""
-    material = {"modulus": contacts.modulus, "radius": contacts.radius, "poisson": contacts.poisson}
-    given = [key for key, value in material.items() if value is not None]
-    missing = [key for key in material if key not in given]
+    """Problems with a stiffness that is missing where there are ``any_sites``, or given twice.
+
+    It is a number, or follows from the material. A radius may stand beside the number: indentations are compared to it.
+    """
+    given = [key for key in MATERIAL if getattr(contacts, key) is not None]
+    missing = [key for key in MATERIAL if key not in given]
     if contacts.stiffness is not None and given not in ([], ["radius"]):
         yield Problem("contacts.stiffness", contacts.stiffness, f"give it or {', '.join(given)}, not both")
-    has_stiffnesses = contacts.each and (contacts.each.stiffness or contacts.each.modulus)
+    # A material that is given for each site in part is completed by that of all sites, as ``check_per_site`` says.
+    has_stiffnesses = bool(lists_of(contacts).keys() & {"stiffness", *MATERIAL})
     is_needed = any_sites and contacts.stiffness is None and not has_stiffnesses
-    if is_needed and missing and valid(*(f"contacts.{key}" for key in material)):
+    if is_needed and missing and valid(*(f"contacts.{key}" for key in MATERIAL)):
         yield Problem("contacts.stiffness", None, f"missing; give it or also {', '.join(missing)}")
 
 
@@ -259,14 +289,15 @@ def resolve(sections: Mapping[str, Any], beginning: Beginning | None) -> dict[st
     resolved["contacts"] = resolved_contacts(sections["contacts"], lattice)
     resolved["drive"] = drive
     resolved["time"] = _resolved_time(sections["time"], cell, lattice.cells, reference)
-    resolved.pop("initial", None)  # a lattice at rest says nothing
+    # The case of a lattice at rest is the same with a section [initial] and without.
+    resolved.pop("initial", None)
     if initial:
         resolved["initial"] = initial
     return resolved
 
 
 def _resolved_drive(drive: DriveTable, cell: UnitCell, cells: int, beginning: Beginning | None) -> DriveTable:
-    """The drives; without a force there is no frequency, and the cell is that of the motion at the beginning."""
+    """The drives; where nothing is driven they have no frequency, and by default the cell of the motion at t = 0."""
     if beginning is None or drive.amplitude != 0:
         return resolve_drives(drive, cell, cells)
     resolved = resolve_drives(drive, cell, cells, beginning.frequency).model_copy(update={"frequency": None})
@@ -276,7 +307,7 @@ def _resolved_drive(drive: DriveTable, cell: UnitCell, cells: int, beginning: Be
 
 
 def _resolved_initial(beginning: Beginning | None, drive: DriveTable) -> InitialTable | None:
-    """The motion at the beginning, with its frequency where nothing is driven; None for a lattice at rest."""
+    """The motion at t = 0, with its frequency where nothing is driven; None for a lattice at rest."""
     if beginning is None:
         return None
     frequency = None
@@ -286,7 +317,7 @@ def _resolved_initial(beginning: Beginning | None, drive: DriveTable) -> Initial
 
 
 def reference_drive(drive: DriveTable, initial: InitialTable | None) -> DriveTable:
-    """The drives by which times and tolerances are judged: without a force at the frequency of the initial motion."""
+    """The drives to which times and tolerances refer; if nothing is driven, at the frequency of the motion at t = 0."""
     if drive.frequency is None and initial is not None:
         return drive.model_copy(update={"frequency": initial.frequency})
     return drive
@@ -350,9 +381,9 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
 
 
 def check_unsprung(drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
-    """A lattice that contacts alone join has no bands from which times could follow."""
+    """Problems with times of a lattice that contacts alone join, which has no bands from which they could follow."""
     remedy = "missing; without springs there are no bands from which it would follow"
-    # The frequency of other waveforms follows from their own keys, that of a struck lattice from what is struck.
+    # The frequency of a pulse follows from its own keys, and that of a struck lattice from the mass that is struck.
     if drive.frequency is None and drive.is_sine and drive.amplitude != 0:
         yield Problem("drive.frequency", None, remedy)
     if time.end == "traverse":

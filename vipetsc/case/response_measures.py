@@ -13,9 +13,10 @@ OF_POINTS = tuple(f"{kind}_{of}" for kind in ("peak", "first") for of in ("displ
 
 
 class ResponseMeasure(NamedTuple):
-    """A quantity of the states of a curve: of the ``member`` (from 0) of its dimension, the largest of all without one.
+    """A quantity of the states of a curve: that of the ``member`` (from 0) of its dimension, or the largest of all.
 
-    ``quantity`` is the name in the curve's file, ``unit`` its unit there.
+    ``name`` is that of the measure, ``quantity`` the one in the curve's file, ``unit`` its unit there. ``member`` is a
+    number of a site, a point, a pair of points, a wall or a fraction; None for the largest of all.
     """
 
     name: str
@@ -48,7 +49,8 @@ def response_measures(case: NfrcCase) -> dict[str, ResponseMeasure]:
     for quantity, names in members.items():
         unit = (LAYOUT | OUTPUTS)[quantity].units
         if names is sites:
-            measures.append(ResponseMeasure(f"{RESPONSE}{quantity}", quantity, None, unit))
+            measures.append(ResponseMeasure(name=f"{RESPONSE}{quantity}", quantity=quantity, member=None, unit=unit))
         for member, name in enumerate(names):
-            measures.append(ResponseMeasure(f"{RESPONSE}{quantity}/{name}", quantity, member, unit))
+            named = f"{RESPONSE}{quantity}/{name}"
+            measures.append(ResponseMeasure(name=named, quantity=quantity, member=member, unit=unit))
     return {measure.name: measure for measure in measures}

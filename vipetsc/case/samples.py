@@ -49,17 +49,19 @@ def with_samples(table: Table) -> tuple[Table, list[Problem]]:
 
 
 def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
-    """The table of a drive with the samples of the file that it names, and what is wrong with that."""
-    samples = drive.get("samples") if isinstance(drive, dict) else None
-    # With a hash it is a resolved one: runs are read where their files are gone.
+    """The table of a ``drive`` with the samples of the file that it names, and what is wrong with that."""
+    samples = None
+    # Types are not checked yet.
+    if isinstance(drive, dict):
+        samples = drive.get("samples")
+    # With a hash the drive is a resolved one, and has its samples: results are read where that file is gone.
     if not isinstance(samples, dict) or not isinstance(samples.get("file"), str) or "sha256" in samples:
         return drive, []
 
     key = f"{path}.samples.file"
     if {"time", "value"} & samples.keys():
         return drive, [Problem(key, samples["file"], "give it or time and value, not both")]
-    # The absolute path is recorded: the resolved case stands in a folder of results, relative to which the name is
-    # wrong.
+    # The absolute path is recorded, since the resolved case is stored in a folder of results.
     file = path_named(samples["file"]).resolve()
     try:
         rows = _read(file, samples.get("dataset"))
@@ -69,7 +71,7 @@ def _filled(drive: Any, path: str) -> tuple[Any, list[Problem]]:
     except (OSError, ValueError, KeyError) as error:
         return drive, [Problem(key, samples["file"], str(error))]
 
-    # Numbers smaller than a case may have are noise about 0.
+    # Numbers that are smaller than those allowed in a case are noise about 0.
     times, values = np.where(np.abs(rows) < 1 / LARGEST, 0.0, rows).T.tolist()
     filled = {"file": readable(file), "sha256": digest, "time": times, "value": values}
     return drive | {"samples": samples | filled}, []
@@ -98,7 +100,7 @@ def _read(path: Path, dataset: Any) -> np.ndarray:
 
 
 def _table_lines(path: Path) -> list[list[str]]:
-    """The fields of a table's lines without comments, of a table that is too long its beginning."""
+    """The fields of a table's lines without comments; of a table that is too long only its beginning."""
     lines = []
     # utf-8-sig: editors on Windows begin files with a byte order mark, which is no number.
     with path.open(encoding="utf-8-sig") as file:
@@ -106,7 +108,7 @@ def _table_lines(path: Path) -> list[list[str]]:
             fields = re.split(r"[,;\s]+", text.strip())
             if fields[0] and not fields[0].startswith("#"):
                 lines.append(fields)
-            # Two more than the samples: a line of names, and one by which the table is too long.
+            # Two more than samples are allowed: a line of names, and one line by which the table is too long.
             if len(lines) == MOST_SAMPLES + 2:
                 break
     return lines

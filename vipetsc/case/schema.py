@@ -22,7 +22,7 @@ MULTIPLE_OF_PI = r"\s*(\d*\.?\d*)\s*\*?\s*pi\s*(?:/\s*([1-9]\d*))?\s*"
 
 
 def number(value: Any) -> Any:
-    """Wavenumbers may be written as multiples of pi: "5pi/9"."""
+    """The number that a text such as "5pi/9" stands for, as wavenumbers may be written; any other value as it is."""
     if not isinstance(value, str):
         return value
     match = re.fullmatch(MULTIPLE_OF_PI, value)
@@ -34,21 +34,23 @@ def number(value: Any) -> Any:
 
 def once(values: list[Any]) -> list[Any]:
     """``values`` if none of them comes twice; raises ValueError."""
-    # Each named once, in the order of the list.
+    # A dictionary, so that the message names each value once, and in the order of the list.
     twice = [value for value in dict.fromkeys(values) if values.count(value) > 1]
     if twice:
         raise ValueError(f"names {', '.join(map(repr, twice))} more than once")
     return values
 
 
-MOST_CELLS = 10**12  # products with masses and samples stay below 2^63, the largest index of an array
+# The largest index of an array is 2^63 = 9.2e18. So many cells reach it with a thousand masses each in nine thousand
+# samples; the product of two strides (over samples, cells or pixels) stays below it.
+MOST_CELLS = 10**12
+MOST_STRIDE = 10**9
 # The resolved case lists the cell and the clearance of every site: a million are 39 MB of text and take 4 s to resolve.
 MOST_SITES = 10**6
-MOST_STRIDE = 10**9  # samples, cells or pixels; products of two stay below 2^63, the largest index of an array
 
 
 def _text(value: Any) -> Any:
-    """PETSc's options are text; a case may give numbers and truth values."""
+    """A ``value`` of a PETSc option as text, which a case may give as a number or a truth value."""
     if isinstance(value, bool | int | float):
         return str(value)
     return value
@@ -60,10 +62,10 @@ Wavenumber = Annotated[float, Field(gt=0, le=np.pi), BeforeValidator(number)]
 
 @dataclass(frozen=True)
 class Preset:
-    """Lattice of the paper; the tables contain the sections of a case file, in SI units.
+    """A lattice of the paper: its cell, its length, and the sections ``[contacts]`` and ``[drive]``, in SI units.
 
-    ``site_span(cells, count)`` gives the 1-based positions (first, last) between which sites are spread,
-    ``clearance_span(count)`` the clearances in m of the leading and of the last site.
+    ``site_span(cells, count)`` gives the cells (first, last), from 1, between which sites are spread,
+    ``clearance_span(count)`` the clearances in m of the first and of the last site.
     """
 
     cell: Callable[..., UnitCell]
@@ -74,7 +76,22 @@ class Preset:
     clearance_span: Callable[[int], tuple[float, float]]
 
 
+def _four_band_sites(cells: int, count: int) -> tuple[float, float]:
+    """Sites of the four-band lattice are from N/4 to 2N/3 of ``cells`` = N; a single one is at N/3."""
+    if count == 1:
+        return cells / 3, cells / 3
+    return cells / 4, 2 * cells / 3
+
+
+def _four_band_clearances(count: int) -> tuple[float, float]:
+    """Clearances of the four-band lattice fall from 10^-2.65 to 10^-2.75 m; a single site has the last one."""
+    if count == 1:
+        return 10**-2.75, 10**-2.75
+    return 10**-2.65, 10**-2.75
+
+
 CONTACTS: dict[str, Any] = {"law": "hertz", "radius": 0.005, "poisson": 0.3, "restitution": 0.7, "sites": 5}
+"""Keys of ``[contacts]`` that both presets have."""
 
 PRESETS: dict[str, Preset] = {
     "four-band": Preset(
@@ -82,8 +99,8 @@ PRESETS: dict[str, Preset] = {
         cells=300,
         contacts=CONTACTS | {"modulus": 1e8},
         drive={"amplitude": 24.33, "cycles": 30, "band": 2, "at": "max-group-velocity"},
-        site_span=lambda n, count: (n / 3, n / 3) if count == 1 else (n / 4, 2 * n / 3),
-        clearance_span=lambda count: (10 ** (-2.75 if count == 1 else -2.65), 10**-2.75),
+        site_span=_four_band_sites,
+        clearance_span=_four_band_clearances,
     ),
     "diatomic": Preset(
         cell=diatomic,
@@ -134,7 +151,8 @@ class CellTable(Section):
     def arguments(self) -> tuple[tuple[float, ...], tuple[Spring, ...], int, int, tuple[float, ...]]:
         """The arguments of ``UnitCell`` and ``cell_problems``, with 0-based indices."""
         springs = tuple(spring.spring() for spring in self.springs)
-        # A cell of one mass has no pair: host and resonator are the same, which only a contact would refuse.
+        # A cell of one mass has no pair: host and resonator are the same mass, which is refused only if a contact joins
+        # them.
         host, resonator = self.contact or (1, min(2, len(self.masses)))
         return tuple(self.masses), springs, host - 1, resonator - 1, tuple(self.grounding or ())
 
@@ -153,8 +171,11 @@ class DampingTable(Section):
     springs: list[NotNegative] | None = None
 
     def fitted(self, cell: UnitCell) -> tuple[np.ndarray, np.ndarray]:
-        """The dashpots (dof,), (spring,) in N s/m of a valid ``loss`` in the undamped ``cell``; 0 without one."""
-        # A resolved case has the fitted dashpots, which are not fitted again: another version might fit others.
+        """The dashpots (dof,) to ground and (spring,) in N s/m of a valid ``loss`` in the undamped ``cell``.
+
+        Without a loss they are 0.
+        """
+        # A resolved case has its dashpots, which are not fitted again: another version might find others.
         if self.grounding is None and self.loss:
             return fitted_dashpots(cell, tuple((int(band), loss) for band, loss in self.loss.items()))
         return np.array(self.grounding or 0.0), np.array(self.springs or 0.0)
@@ -181,12 +202,15 @@ class LatticeTable(Section):
 
         Raises ValueError for an invalid cell.
         """
-        keys = [] if self.undamped_cell().is_linear else ["lattice.cell.springs"]
-        scattered = self.scatter.quantities if self.scatter else {}
-        for section, quantities in (("lattice.profiles", self.profiles or {}), ("disorder.cells", scattered)):
-            for name in quantities:
-                if name.endswith((".quadratic", ".cubic")):
-                    keys.append(f'{section}."{name}"')
+        keys = []
+        if not self.undamped_cell().is_linear:
+            keys.append("lattice.cell.springs")
+        varied = [("lattice.profiles", name) for name in self.profiles or {}]
+        if self.scatter:
+            varied += [("disorder.cells", name) for name in self.scatter.quantities]
+        for section, name in varied:
+            if name.endswith((".quadratic", ".cubic")):
+                keys.append(f'{section}."{name}"')
         return keys
 
     def unit_cell(self) -> UnitCell:
@@ -196,7 +220,7 @@ class LatticeTable(Section):
         if damping is None or not (damping.mass or damping.stiffness or damping.loss):
             return cell
 
-        # Both kinds of proportional damping, and the dashpots that the cell has itself, act in parallel: they add.
+        # Rayleigh damping, dashpots that are fitted to a loss, and those of the cell itself act in parallel: they add.
         fitted_grounding, fitted_dashpots = damping.fitted(cell)
         dashpots = np.multiply(damping.stiffness, [spring.stiffness for spring in cell.springs]) + fitted_dashpots
         springs = tuple(
@@ -222,12 +246,11 @@ class LatticeTable(Section):
 class TimeTable(Section):
     """Time: end in s or ``traverse`` (burst + cells / group velocity), engine, method, tolerances, sampling.
 
-    ``samples`` is the number of samples from 0 to the end, instead of an interval.
-
     ``engine``: ``ts`` steps with PETSc's Runge-Kutta ``method``; ``propagator`` takes exact linear steps, with
-    contact forces collocated; ``auto`` is the propagator where it applies. ``atol``: ``scaled`` is 0.1 rtol times the
-    displacement and the velocity of the drive's linear wave, ``paper`` is 1e-9 times the amplitude, a number is
-    used for displacements (m) and velocities (m/s).
+    contact forces collocated; ``auto`` is the propagator where it applies. ``atol``, the absolute tolerance: ``scaled``
+    is 0.1 rtol times the displacement and the velocity of the drive's linear wave, ``paper`` is 1e-9 times the
+    amplitude, and a number holds for displacements (m) and velocities (m/s). ``samples`` is the number of samples from
+    0 to the end, instead of their interval.
     """
 
     end: Positive | Literal["traverse"] = "traverse"
@@ -267,12 +290,12 @@ class OutputTable(Section):
 class AnalysisTable(Section):
     """Resolution of the measures. Strides of 1 leave nothing out; ``analysis.h5`` states the error of larger strides.
 
-    ``band_stride``: samples between those at which energies above the pass bands are taken; ``snapshot_stride`` and
-    ``cell_stride``: of the snapshots (500 at most) and of the cells whose entropy is taken. ``modal_stride``: samples
-    between those, in addition to those before and after contacts, at which the energies of the linear modes are taken.
-    ``pixels``: most rows and columns of a map. Fields larger than ``memory``, in GiB, are read in blocks of at most
-    that. A steady amplitude is that of the last ``steady_periods`` of the drive, where it differs from those of the two
-    windows before by no more than the fraction ``steady_tolerance``.
+    Energies above the pass bands are taken at every ``band_stride``-th sample; entropies at every
+    ``snapshot_stride``-th snapshot, of which there are 500 at most, and in every ``cell_stride``-th cell; energies of
+    the linear modes at every ``modal_stride``-th sample, and before and after contacts. ``pixels``: most rows and
+    columns of a map. Fields larger than ``memory``, in GiB, are read in blocks of at most that size. A steady amplitude
+    is that of the last ``steady_periods`` of the drive, if it differs from those of the two windows before by no more
+    than the fraction ``steady_tolerance``.
     """
 
     band_stride: int = Field(10, ge=1, le=MOST_STRIDE)
@@ -305,12 +328,12 @@ class PetscTable(Section):
         if not isinstance(table, dict):
             return table
 
-        # Both stay where both are given; ``check_options`` refuses them.
-        later = [new for new, old in RENAMED_OPTIONS.items() if new in table and old not in table]
-        return {RENAMED_OPTIONS[name] if name in later else name: value for name, value in table.items()}
+        # Both names stay if both are given; ``check_options`` refuses them.
+        earlier = {new: old for new, old in RENAMED_OPTIONS.items() if old not in table}
+        return {earlier.get(name, name): value for name, value in table.items()}
 
 
-# Options that say what PETSc prints, checks and does about an error, and change no result.
+# Options for what PETSc prints, checks and does about an error, none of which changes a result.
 _LOOKS = re.compile(
     r"log(_(view|trace|all|sync|exclude|summary)\w*)?|info(_exclude)?|malloc(_(debug|dump|view|test|hbw)\w*)?"
     r"|memory_view|options_(left|view|monitor|file)\w*|objects_dump|start_in_debugger|stop_for_debugger|debugg?er?_\w+"

@@ -10,7 +10,7 @@ from vipetsc.case.schema import MOST_SITES, Finite, NotNegative, Positive
 from vipetsc.lattice.contact import DAMPINGS, LAWS, PARAMETERS, LawParameter
 from vipetsc.register import DISSIPATION, LAW
 
-Ends = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
+Ends = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]  # host (0: ground), resonator
 Side = Literal["both", "plus", "minus"]
 Restitution = Annotated[float, Field(ge=0, le=1)]
 Poisson = Annotated[float, Field(gt=-1, le=0.5)]
@@ -40,7 +40,7 @@ def bounded(parameter: LawParameter) -> Any:
 
 
 if TYPE_CHECKING:
-    # For the type checker: keys that are created at run time are invisible to it.
+    # For the type checker, which does not see keys that are created at run time.
     class ElasticLaw(Section):
         """The law of all sites, and its parameters."""
 
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
         law: list[Law] | None = None
 
 else:
-    # The parameters of elastic laws are declared where the laws are: a key of each follows the law's name.
+    # The parameters of elastic laws are declared where the laws are: each is a key here, behind that of the law.
     ElasticLaw = create_model(
         "ElasticLaw",
         __base__=Section,
@@ -87,11 +87,11 @@ class PerSiteTable(ElasticLaws):
 class ContactsTable(ElasticLaw):
     """Contact law, stiffness (given, or from modulus in Pa, radius in m, Poisson ratio), sites, clearances.
 
-    ``damping``: ``paper`` (if left out), which is ``hunt-crossley``, ``exact`` or another by name: see
-    ``vipetsc.lattice.Contact``. ``parameters`` are those of a law that a module registers. ``side``: on which side of
-    w = u_resonator - u_host stops are; ``clearance_minus`` is that of the side -, if it differs. ``pair``: host (0 is
-    ground) and resonator, in the next cell if ``next_cell``; ``precompression``: static indentation in m, from which
-    displacements count. ``each`` has lists over the sites.
+    ``damping`` is the name of a dissipation factor, see ``vipetsc.lattice.Contact``; by default it is ``paper``, which
+    is that of ``hunt-crossley``. ``parameters`` are those of a law that a module registers. ``side``: the sides of
+    w = u_resonator - u_host that have stops; ``clearance_minus`` is the clearance on the side -, if it differs.
+    ``pair``: host (0 is ground) and resonator, which is in the next cell if ``next_cell``; ``precompression``: static
+    indentation in m, from which displacements count. ``each`` has lists over the sites.
     """
 
     modulus: Positive | None = None

@@ -15,8 +15,8 @@ from vipetsc.lattice import Chain, bloch, max_group_velocity, pass_bands, waves_
 from vipetsc.lattice.damped import KAPPAS, damped_bloch
 from vipetsc.lattice.drive import main_frequency, spectrum
 
-# Bounds of what is probably meant. They change no result: a warning that comes too seldom or too often costs a reader
-# a glance, so that they are round numbers.
+# Bounds beyond which a setting is probably unintended. They change no result, and a warning too many or too few costs a
+# reader little, so that they are round numbers.
 SLOW = 0.1  # fraction of the band's fastest group velocity
 WAVELENGTHS = 4.0  # in a lattice: its spectra over the wavenumber then have eight bins up to twice the driven one
 MISSED = 0.1  # relative deviation of a loss from the request, in the mean over the wavenumbers of a band
@@ -40,9 +40,10 @@ def warnings_of(model: Model, output: OutputTable, petsc: Mapping[str, str]) -> 
 
 
 def losses(lattice: LatticeTable) -> np.ndarray:
-    """Loss ratios (band, 4): the one asked in ``[lattice.damping]`` (NaN: none), the least, mean and largest there is.
+    """Loss ratios (band, 4): that requested in ``[lattice.damping]``, NaN without a request; least, mean and largest.
 
-    From the complex dispersion of the resolved cell, at ``KAPPAS``; (0, 4) if it asks for none.
+    The last three are those of the complex dispersion of the resolved cell over the wavenumbers ``KAPPAS``. If the
+    lattice requests no loss, the array is (0, 4).
     """
     if not (lattice.damping and lattice.damping.loss):
         return np.zeros((0, 4))
@@ -53,7 +54,10 @@ def losses(lattice: LatticeTable) -> np.ndarray:
 
 
 def loss_warnings(lattice: LatticeTable) -> Iterator[str]:
-    """Warnings of bands whose loss deviates from the request by more than ``MISSED``, or by a factor of 2 somewhere."""
+    """The warning of bands whose loss deviates from the request.
+
+    It does if the mean deviates by more than ``MISSED``, or the loss at some wavenumber by a factor of 2.
+    """
     off: list[str] = []
     for band, (asked, least, mean, most) in enumerate(losses(lattice), 1):
         is_off_in_mean = abs(mean - asked) > MISSED * asked + TINY
@@ -143,8 +147,7 @@ def length_warnings(model: Model) -> Iterator[str]:
     waves = waves_at(cell, drive.frequency)
     if model.is_driven and waves:
         _, kappa, _ = max(waves, key=lambda wave: wave[2])
-        # The wave of 2 pi - kappa is the same one, in the other direction.
-        wavelength = 2 * pi / max(min(kappa, 2 * pi - kappa), 1e-300)
+        wavelength = 2 * pi / max(kappa, 1e-300)
         if wavelength * WAVELENGTHS > cells:
             yield (
                 f"lattice.cells = {cells} contain only {cells / wavelength:.3g} wavelengths of {wavelength:.4g}"
@@ -166,17 +169,19 @@ def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     at = model.drive_cell
     if chain.ends == "periodic" or not (model.is_driven and waves_at(chain.cell, drive.frequency)):
         return
-    # Sites are what a run is about; without them it is what is kept, or what is near the drive.
+    # The wave should not return to the sites; without sites, to the recorded window, or to the driven cell.
     name = "cell"
     measured = [cell - 1 for cell in output.window or (at + 1,)]
     if chain.sites:
         name = "site in cell"
         measured = [*chain.sites]
     for end, cell in (("left", 0), ("right", chain.cells - 1)):
+        # An absorbing end has dashpots besides those of the cell.
         if chain.coefficients(cell, cell + 1).grounding.sum() > sum(chain.cell.grounding):
-            continue  # it absorbs
+            continue
         arrival = abs(cell - at) / model.speed
-        if arrival <= drive.settled / 2:  # what comes back is part of what the drive sends out
+        # A wave that is back before the drive ends is part of what the drive sends out.
+        if arrival <= drive.settled / 2:
             continue
         nearest = min(measured, key=lambda site: abs(site - cell))
         back = arrival + abs(nearest - cell) / model.speed
@@ -189,7 +194,10 @@ def end_warnings(model: Model, output: OutputTable) -> Iterator[str]:
 
 
 def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
-    """Warnings of fields that do not resolve the waves, in the words of the analysis, so that each is said once."""
+    """Warnings of fields that do not resolve the waves.
+
+    Those of measures that fields do not allow have the words of the analysis: a command that prints both shows one.
+    """
     chain = model.chain
     top = pass_bands(chain.cell)[-1].high
     interval = output.stride * model.sample_interval
@@ -220,8 +228,10 @@ def contact_warnings(model: Model, petsc: Mapping[str, str]) -> Iterator[str]:
     if not model.chain.sites or not speed:
         return
 
-    # The stiffest law decides, at the speed of the undisturbed wave.
-    time = min(law.impact_time(speed, model.chain.cell.reduced_mass) for law in {*model.used_laws})
+    # The briefest contact decides, at the speed of the undisturbed wave. A set, since similar sites have one duration.
+    masses = model.chain.reduced_masses()
+    laws = model.laws or (model.contact,) * len(masses)
+    time = min(law.impact_time(speed, mass) for law, mass in {*zip(laws, masses, strict=True)})
     # Options of PETSc are text in a case.
     step = float(petsc.get("ts_dt", DEFAULT_STEP / model.drive.frequency))
     if petsc.get("ts_adapt_type") == "none" and step > time / STEPS:

@@ -1,8 +1,8 @@
-"""The waveforms of a drive, one record each: its keys, its frequency, its description, and the waveform that is built.
+"""The waveforms of a drive, each with a record: its keys, its frequency, its description, and how it is built.
 
-A new waveform is one more record in ``WAVEFORMS``, and a field of ``OneDrive`` for each key that no other one has: the
-choices of ``drive.waveform``, the checks of its keys and the schema follow from these. One of a user's module is a
-record that is built from what the module registers.
+A new waveform is one more record in ``WAVEFORMS``, and a field of ``OneDrive`` for each key that no other waveform has:
+the choices of ``drive.waveform``, the checks of its keys and the schema follow from these. The record of a waveform of
+a user's module is built from what the module registers.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,21 +21,20 @@ from vipetsc.plugins import call
 from vipetsc.register import PARTS, WAVEFORM, Parameter, PartError, WaveformPart, reserve
 from vipetsc.wording import counted
 
-# Defaults of keys.
+# Defaults of the keys of ``[drive]``.
 CYCLES = 30  # of a burst, as in the paper
 RAMP_PERIODS = 10  # of a harmonic drive's ramp: its transient lies mostly within a tenth of its frequency
 RAMP_FRACTION = 0.1  # of a chirp's duration, at either end: eight tenths of its band have the full amplitude
 
 
 class WaveformRecord(NamedTuple):
-    """Waveform of a drive: what builds and describes it, and its keys.
+    """A waveform of a drive: what builds and describes it, and its keys.
 
-    ``build(drive)`` gives the waveform of a resolved drive, ``describe(drive)`` its words. ``needs`` are the
-    keys without which there is none, ``takes`` the others that it has; keys of other waveforms are refused. A waveform
-    whose wave is chosen by the case has no ``frequency``; of the others ``frequency(drive, highest)`` is the one in
-    rad/s that they are about, at most the ``highest`` that the lattice can follow. ``ramp(drive, frequency)`` is the
-    ramp in s where none is given; ``unit`` is the amplitude's. ``parameters`` are numbers of ``[drive.parameters]``
-    that a waveform of a user's module takes.
+    ``build(drive)`` gives the waveform of a resolved drive, ``describe(drive)`` its description. ``needs`` are the keys
+    that must be given, ``takes`` those that may; keys of other waveforms are refused. ``frequency(drive, highest)``
+    gives the main frequency in rad/s, at most the ``highest`` that the lattice can follow; it is None for a waveform
+    whose frequency the case gives. ``ramp(drive, frequency)`` is the default ramp in s; ``unit`` is that of the
+    amplitude. ``parameters`` are numbers of ``[drive.parameters]`` that a waveform of a user's module takes.
     """
 
     build: Callable[["OneDrive"], Waveform]
@@ -50,7 +49,10 @@ class WaveformRecord(NamedTuple):
     @property
     def keys(self) -> tuple[str, ...]:
         """The keys of the waveform."""
-        return (*self.needs, *self.takes, *(["parameters"] if self.parameters else []))
+        keys = (*self.needs, *self.takes)
+        if self.parameters:
+            keys += ("parameters",)
+        return keys
 
 
 def _build_burst(drive: "OneDrive") -> Waveform:
@@ -77,7 +79,7 @@ def _build_step(drive: "OneDrive") -> Waveform:
 
 def _build_samples(drive: "OneDrive") -> Waveform:
     assert drive.samples
-    # A wall stays where its motion ends; a force does not go on.
+    # After the last sample a wall stays where it is, and a force is 0.
     hold = drive.end is not None
     return spline(drive.amplitude, drive.samples.time, drive.samples.value, _given(drive.frequency), hold)
 
@@ -99,7 +101,7 @@ def _impulse_frequency(drive: "OneDrive", highest: float) -> float:
 
 
 def _step_frequency(drive: "OneDrive", highest: float) -> float:
-    # A ramp is taken for half a sine of its length.
+    # As if the ramp were half a sine of its length.
     return float(min(np.pi / (drive.ramp or 1.0), highest))
 
 
@@ -167,7 +169,7 @@ reserve(WAVEFORM, WAVEFORMS)
 
 def waveform_record(name: str) -> WaveformRecord:
     """The record of a waveform, shipped or of a user's module; raises KeyError if there is none."""
-    # First the package's own names, which no module can register.
+    # The package's own names first, which no module can register.
     if name in WAVEFORMS:
         return WAVEFORMS[name]
     part = cast(WaveformPart, PARTS[WAVEFORM][name])
@@ -177,7 +179,7 @@ def waveform_record(name: str) -> WaveformRecord:
         return [given[key] for key in part.parameters]
 
     def build(drive: "OneDrive") -> Waveform:
-        # A user's function may return anything: what it returns is checked here, where the file can be named.
+        # A user's function may return anything. It is checked here, where the message can name the file.
         built = call(part, part.function, drive, *numbers(drive))
         if not isinstance(built, get_args(Waveform)):
             returned = f"the waveform {part.name!r} of {part.file} returns {built!r}"
@@ -190,7 +192,11 @@ def waveform_record(name: str) -> WaveformRecord:
 
     def frequency(drive: "OneDrive", highest: float) -> float:
         assert part.frequency
-        return float(min(call(part, part.frequency, drive, *numbers(drive)), highest))
+        value = call(part, part.frequency, drive, *numbers(drive))
+        if not (isinstance(value, int | float | np.number) and value > 0):
+            given = f"the frequency of the waveform {part.name!r} of {part.file} is {value!r}"
+            raise PartError(f"{given}; a positive number in rad/s is needed")
+        return float(min(value, highest))
 
     return WaveformRecord(
         build=build,
@@ -205,7 +211,7 @@ def waveform_record(name: str) -> WaveformRecord:
 
 def is_sine(name: Any) -> bool:
     """Whether ``name`` is that of a waveform whose frequency the case gives."""
-    # Called with unchecked values of a table.
+    # The name may be a value of any type, from a table that is not checked yet.
     is_waveform = isinstance(name, str) and (name in WAVEFORMS or name in PARTS[WAVEFORM])
     return is_waveform and waveform_record(name).frequency is None
 
@@ -256,17 +262,17 @@ class OneDrive(Section):
 
     @property
     def wave_choices(self) -> list[Any]:
-        """Given choices of the wave, of frequency, wavenumber and ``at``; more than one contradict each other."""
+        """The values given for frequency, wavenumber and ``at``, each of which chooses the wave; one is allowed."""
         return [given for given in (self.frequency, self.wavenumber, self.at) if given is not None]
 
     def describe(self) -> str:
-        """A resolved drive in words."""
+        """A description of the resolved drive: amplitude, waveform and place."""
         about = self.record.describe(self)
         if self.end:
             return f"{self.amplitude:g} m, {about}; {self.kind} of the {self.end} wall"
 
         size = f"{self.amplitude:g} {self.record.unit}, {about}"
-        # The default drive has no need of a name and a place.
+        # The name and the place of the default drive are left out.
         if self.waveform is None and self.cell == self.mass == 1:
             return size
         return f"{size}; {self.kind} on mass {self.mass} of cell {self.cell}"

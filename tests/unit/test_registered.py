@@ -1,0 +1,77 @@
+"""Registered laws, factors and waveforms are checked before a case is simulated: their formulas, what they return."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from vipetsc.case.registered import check_factors, check_law
+from vipetsc.case.waveforms import OneDrive, waveform_record
+from vipetsc.register import DISSIPATION, PARTS, WAVEFORM, DissipationPart, PartError, WaveformPart
+
+pytestmark = pytest.mark.parallel(1)
+
+ONSET = 1e-7  # m: below every indentation at which force, slope and energy are compared
+
+
+class Formulas:
+    """A law by its force, slope and energy over the indentation in m, as ``check_law`` asks a contact for them."""
+
+    def __init__(self, force: Callable, slope: Callable, energy: Callable, onset_exponent: float) -> None:
+        self.elastic_force = force
+        self.elastic_slope = slope
+        self.elastic_energy = energy
+        self.onset_exponent = onset_exponent
+
+
+def test_a_sound_law_has_no_defect():
+    law = Formulas(lambda x: 2e6 * x**1.5, lambda x: 3e6 * x**0.5, lambda x: 0.8e6 * x**2.5, 1.5)
+    assert check_law(law) == ""
+
+
+@pytest.mark.parametrize(
+    ("slope", "energy", "exponent", "defect"),
+    [
+        (3.1e6, 0.8e6, 1.5, "as the differences of its force"),
+        (3e6, 0.9e6, 1.5, "as the differences of its energy"),
+        (3e6, 0.8e6, 1.0, "its force begins as x^1.5, and onset_exponent is 1"),
+    ],
+)
+def test_formulas_that_contradict_each_other_are_named(slope, energy, exponent, defect):
+    law = Formulas(lambda x: 2e6 * x**1.5, lambda x: slope * x**0.5, lambda x: energy * x**2.5, exponent)
+    assert defect in check_law(law)
+
+
+def test_a_force_that_begins_later_has_no_onset():
+    """A contact is felt at its clearance: a force of 0 over the first tenth of a micrometre has no power there."""
+
+    def beyond(x: np.ndarray) -> np.ndarray:
+        return np.maximum(np.asarray(x) - ONSET, 0.0)
+
+    law = Formulas(
+        lambda x: 2e6 * beyond(x), lambda x: 2e6 * (np.asarray(x) > ONSET), lambda x: 1e6 * beyond(x) ** 2, 1.0
+    )
+    assert check_law(law) == "its force must be positive for x > 0, and must not fall"
+
+
+ORIGIN = {"modules": {__name__}, "file": __file__, "sha256": ""}
+
+
+def test_a_factor_that_fails_is_named_with_its_file(monkeypatch):
+    """A division by zero in a user's function is no error of the package, and one that is refused."""
+    part = DissipationPart(name="inverse", function=lambda restitution: 1 / restitution, **ORIGIN)
+    monkeypatch.setitem(PARTS[DISSIPATION], "inverse", part)
+    assert list(check_factors("contacts.damping", ["inverse"], [0.5])) == []
+    with pytest.raises(PartError, match=r"the dissipation 'inverse' of .* fails: ZeroDivisionError"):
+        list(check_factors("contacts.damping", ["inverse"], [0.0]))
+
+
+@pytest.mark.parametrize("frequency", [None, "fast", 0.0, np.nan])
+def test_a_frequency_that_is_none_is_named_with_its_file(monkeypatch, frequency):
+    """A waveform that gives its own frequency gives a positive number."""
+    part = WaveformPart(name="tap", function=lambda drive: None, frequency=lambda drive: frequency, **ORIGIN)
+    monkeypatch.setitem(PARTS[WAVEFORM], "tap", part)
+    with pytest.raises(PartError, match=r"the frequency of the waveform 'tap' of .*; a positive number"):
+        waveform_record("tap").frequency(OneDrive(), np.inf)
