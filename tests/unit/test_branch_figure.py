@@ -9,17 +9,19 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.figure import Figure
 
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.nnm import NnmCase
 from vipetsc.cli.drawing import draw_pictures
 from vipetsc.cli.verbs.branch_verbs import PICTURES, parameter_unit
-from vipetsc.figures import branch_curves, nfrc, registry, style
+from vipetsc.figures import branch_curves, nfrc, registry, response_outputs, style
 from vipetsc.figures.sources import BRANCHES
 from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures
 from vipetsc.io import branch_kinds
-from vipetsc.io.netcdf import write_netcdf
+from vipetsc.io.netcdf import open_netcdf, write_netcdf
+from vipetsc.modes.branches.stored_states import stored_states
 
 EXAMPLES = Path(__file__).parents[2] / "vipetsc" / "examples"
 
@@ -54,6 +56,27 @@ def test_a_branch_is_drawn_through_its_points_along_its_tangents():
     radius = np.hypot(np.log(fine_energy), np.log(fine_frequency / 100))
     # Straight lines between the points would be off by 6e-3.
     assert np.abs(radius - 0.1).max() < 3e-4
+
+
+def test_an_unstable_part_is_drawn_from_its_first_point_to_its_last():
+    """The curve has several points for each step; those of the part's last step go to the end of the step."""
+    energy = np.geomspace(1.0, 2.0, 8)
+    multiplier = np.where((np.arange(8) >= 3) & (np.arange(8) <= 5), 2.0, 1.0)
+    branch = branch_of(
+        energy=energy,
+        frequency=energy**0.1,
+        slope=0.1 * energy**-0.9,
+        tangent_period=-0.1 * energy**-1.1,
+        multiplier_max=multiplier,
+        kind=np.full(8, "regular"),
+    )
+    axes = Figure().subplots()
+    branch_curves.draw_branch(axes, branch)
+
+    (unstable,) = [line for line in axes.lines if line.get_label() == "unstable"]
+    drawn = unstable.get_xdata()[np.isfinite(unstable.get_ydata())]
+    assert len(drawn) == 2 * branch_curves.FINE + 1
+    np.testing.assert_allclose(drawn[[0, -1]], energy[[3, 5]])
 
 
 @pytest.mark.parametrize("slope_at_grazing", [1e-9, 50.0])
@@ -137,14 +160,33 @@ def test_fractions_that_are_rounding_have_no_panel():
         assert nfrc.has_fractions(xr.Dataset({"share": (("point", "way"), lost)})) == is_shown
 
 
-def put_condensed_branch(path: Path, points: int) -> None:
+@pytest.mark.parametrize(
+    ("variables", "rows"),
+    [
+        ([["lag"], ["largest_force"]], 0),
+        ([["lag", "largest_force"], ["largest_force"]], 1),
+        ([["lag", "largest_force"], ["lag"]], 4),
+        ([["lag", "largest_force"], ["lag", "largest_force"]], 5),
+    ],
+)
+def test_outputs_on_one_page_are_those_that_all_curves_have(monkeypatch, variables, rows):
+    """Three amplitudes and a phase of masses, and the forces."""
+    curves = [xr.Dataset(dict.fromkeys(names, 1.0)) for names in variables]
+    assert bool(response_outputs.without_outputs(curves)) == (rows == 0)
+
+    monkeypatch.setattr(response_outputs, "responses_in", lambda paths: curves)
+    monkeypatch.setattr(response_outputs, "response_page", lambda curves, drawn, height: len(drawn))
+    assert response_outputs.response_outputs([]) == rows
+
+
+def put_condensed_branch(path: Path, points: int, places: int = 1) -> None:
     """Write a condensed branch as it stands before its end: without motions."""
     case = NnmCase.load(EXAMPLES / "breather.toml")
     branch = branch_of(energy=[1.0, 2.0, 3.0], frequency=[1.0, 2.0, 3.0], multiplier_max=[1.0, 2.0, 3.0])
     branch["kind"] = xr.Variable("point", np.zeros(3, np.int8), {"flag_meanings": "regular fold-energy"})
-    branch["elongation"] = (("point", "place"), np.ones((3, 1)))
-    branch["harmonics"] = (("point", "place"), np.ones((3, 1)))
-    branch = branch.assign_coords(point=[0, 1, 2], place=[1])
+    branch["elongation"] = (("point", "place"), np.ones((3, places)))
+    branch["harmonics"] = (("point", "place"), np.ones((3, places)))
+    branch = branch.assign_coords(point=[0, 1, 2], place=np.arange(places) + 1)
     branch.attrs = {"branch_kind": branch_kinds.CONDENSED, "case": case.to_toml(), "name": "breather"}
     write_netcdf(path, branch.isel(point=slice(points)))
 
@@ -154,6 +196,24 @@ def test_a_condensed_branch_that_was_interrupted_is_drawn_without_motions(tmp_pa
     with style.rc_style():
         figure = registry.branch([tmp_path / "branch-begun.h5"])
     assert [text.get_text() for text in figure.axes[2].texts] == ["no motions stored"]
+
+
+def test_every_contact_and_every_motion_of_a_condensed_branch_has_a_curve(tmp_path):
+    """Seven of each, more than there are colours; all look different."""
+    path = tmp_path / "branch-many.h5"
+    put_condensed_branch(path, 3, places=7)
+    with open_netcdf(path, "branch") as file:
+        branch = file.load()
+    path.unlink()
+    points = [SimpleNamespace(energy=energy, period=1.0, index=0) for energy in np.linspace(1.0, 3.0, 7)]
+    write_netcdf(path, branch.assign(stored_states(points, range(4), np.ones((7, 4, 1)))))
+
+    with style.rc_style():
+        figure = registry.branch([path])
+    frequency, elongation, motions = figure.axes
+    assert len([line for line in frequency.lines if line.get_marker() == "x"]) == 7
+    for axes in (elongation, motions):
+        assert len({(line.get_color(), line.get_linestyle()) for line in axes.lines}) == 7
 
 
 def test_a_branch_without_points_is_no_file(tmp_path):

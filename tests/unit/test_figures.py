@@ -1,6 +1,7 @@
 """Every picture of a run and its analysis, from small run files of every shape that a run can have."""
 
 import json
+import re
 from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
@@ -17,9 +18,10 @@ from vipetsc.case import Case
 from vipetsc.figures import style
 from vipetsc.figures.lattice_strip import draw_lattice
 from vipetsc.figures.log_ticks import label_log_axis
+from vipetsc.figures.panels import label_panels
 from vipetsc.figures.registry import draw, draw_bands, drawings, figure_names
 from vipetsc.figures.schematics import draw_unit_cell
-from vipetsc.figures.sources import BRANCHES
+from vipetsc.figures.sources import BRANCHES, OPTIMUM
 from vipetsc.figures.style import SCREEN, new_figure, rc_style, save
 from vipetsc.figures.sweep_members import Files
 from vipetsc.figures.without_picture import reasons_without_pictures
@@ -271,9 +273,28 @@ def test_a_misspelt_figure_is_refused_with_the_nearest_name(tmp_path):
         draw("run", [tmp_path], ["leger"])
 
 
-def test_a_figure_that_branches_do_not_have_is_refused():
-    with pytest.raises(KeyError, match="no figure 'brunch' of branches; did you mean 'branch'"):
-        figure_names(BRANCHES, ["brunch"])
+@pytest.mark.parametrize(
+    ("source", "name", "message"),
+    [
+        (BRANCHES, "brunch", "no figure 'brunch' of branches; did you mean 'branch'"),
+        (OPTIMUM, "converge", "no figure 'converge' of an optimum; did you mean 'convergence'"),
+    ],
+)
+def test_a_figure_that_a_source_does_not_have_is_refused(source, name, message):
+    with pytest.raises(KeyError, match=re.escape(message)):
+        figure_names(source, [name])
+
+
+def test_panels_of_a_large_grid_have_letters_as_far_as_there_are_numerals():
+    """Fourteen rows, as of a sweep over as many wavenumbers."""
+    with rc_style():
+        grid = new_figure(4, 14).subplots(14, 2)
+        for axes in grid.flat:
+            axes.set_title("title")
+        label_panels(grid)
+    titles = [axes.get_title("left") for axes in grid[:, 1]]
+    assert titles[0] == "(b.i) title"
+    assert titles[11:] == ["(b.xii) title", "title", "title"]
 
 
 def test_a_file_that_is_no_run_is_not_measured(tmp_path):

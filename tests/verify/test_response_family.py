@@ -89,6 +89,18 @@ def test_a_folder_with_one_curve_has_no_common_picture(family, tmp_path):
     assert reasons == {"responses": "needs several curves of nfrc"}
 
 
+def test_curves_of_several_folders_have_a_common_picture(family, tmp_path):
+    """One curve in each: what is drawn is not reported as missing."""
+    folder, _ = family
+    folders = []
+    for path in sorted(folder.glob("branch-*.h5"))[:2]:
+        folders.append(tmp_path / path.stem)
+        folders[-1].mkdir()
+        (folders[-1] / path.name).write_bytes(path.read_bytes())
+    assert reasons_without_pictures("branches", folders, Files(), ["responses"]) == {}
+    assert [path.stem for path in draw("branches", folders, ["responses"])] == ["responses"]
+
+
 def test_a_family_is_read_back_and_goes_on(family):
     folder, curves = family
     case = family_case({"contacts": {"clearance": {"linear": [0.8, 0.7], "count": 2}}, MASS: [1.0, 1.1]})

@@ -1,4 +1,8 @@
-"""The curve of a branch as it is drawn: smooth through its points, coloured by stability; its lowest states."""
+"""The curve of a branch as it is drawn: smooth through its points, coloured by stability; its lowest states.
+
+A branch is a curve of periodic motions over their energy E (J) and frequency f (Hz), in the order in which it was
+followed: several points may have one energy. The file has its tangent as dT/ds, of the period T, and the slope df/dE.
+"""
 
 from itertools import pairwise
 
@@ -11,15 +15,18 @@ from vipetsc.figures import style
 # Points of the curve drawn for each step of a branch. A step turns by about 0.2 rad at most (``nnm.guards``): the
 # corners between its eight chords are 0.025 rad, which no eye sees.
 FINE = 8
-UNSTABLE = 1.0 + 1e-6  # with a Floquet multiplier of a larger modulus an orbit is unstable, beyond rounding
+# An orbit with a Floquet multiplier of a larger modulus is drawn as unstable: a stable one has some of modulus 1, which
+# come out with rounding errors.
+UNSTABLE = 1.0 + 1e-6
 
 
 def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Return energies and frequencies (point,), ``FINE`` a step: cubic Hermite curves through points and tangents.
+    """Return energies in J and frequencies in Hz (point,), ``FINE`` a step, on a smooth curve through the points.
 
-    The curves are those of ln E and ln f, each over its range, and their parameter is the length of the chord. Where a
-    contact grazes, the branch may have a corner: one curve ends there and the next begins with a tangent of its own.
-    Branches of less than three points, or without tangents, come back as they are.
+    Each step is a cubic Hermite curve in the plane of ln E and ln f, both divided by their ranges; its tangents are
+    those of the branch, as long as the chord. Where a contact grazes, the branch may have a corner: the curves on both
+    sides have different tangents there. Branches of fewer than three points, or without tangents, come back as they
+    are.
     """
     energy = branch["energy"].values
     frequency = branch["frequency"].values
@@ -27,7 +34,7 @@ def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
         return energy, frequency
 
     points = np.log(np.column_stack([energy, frequency]))
-    # Over their ranges: chords of a long branch would otherwise have the direction of the energy alone.
+    # Divided by their ranges: the energy ranges much farther, and would set the direction of all chords alone.
     extent = np.ptp(points, axis=0)
     scale = np.where(extent > 0, extent, 1)
     points /= scale
@@ -36,7 +43,8 @@ def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     unit_chord = chords / length
     begin, end = _end_tangents(branch, scale, unit_chord)
 
-    # The basis of a cubic Hermite curve; (step, FINE) points become one list, which ends with the last point itself.
+    # p(t) = p_0 + (3 t^2 - 2 t^3) (p_1 - p_0) + L [t (1 - t)^2 b - t^2 (1 - t) e] with unit tangents b and e, chord L,
+    # an array (FINE, step, 2). It becomes one list of points, which ends with the last one of the branch.
     t = (np.arange(FINE) / FINE)[:, None, None]
     cubic = points[:-1] + t**2 * (3 - 2 * t) * chords + length * (t * (1 - t) ** 2 * begin - t**2 * (1 - t) * end)
     fine = np.vstack([cubic.swapaxes(0, 1).reshape(-1, 2), points[-1:]])
@@ -45,7 +53,7 @@ def smooth(branch: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _end_tangents(branch: xr.Dataset, scale: np.ndarray, unit_chord: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit tangents (step, 2) at the beginning and the end of every step, in logarithms over ``scale``."""
+    """Return unit tangents (step, 2) at the beginning and the end of every step, in (ln E, ln f) over ``scale``."""
     energy = branch["energy"].values
     frequency = branch["frequency"].values
 
@@ -58,7 +66,8 @@ def _end_tangents(branch: xr.Dataset, scale: np.ndarray, unit_chord: np.ndarray)
     tangents[~np.isfinite(tangents).all(axis=1) | ~tangents.any(axis=1)] = np.nan
     tangents /= np.linalg.norm(tangents, axis=1)[:, None]
 
-    # All tangents point in the direction in which the branch was followed; the points may be listed in the other one.
+    # All tangents point in the direction in which the branch was followed; the points may be listed the other way
+    # round.
     tangents *= np.sign(np.nansum(tangents[:-1] * unit_chord)) or 1.0
 
     # At a grazing point the tangent is that of one side: neither step takes it.
@@ -70,10 +79,10 @@ def _end_tangents(branch: xr.Dataset, scale: np.ndarray, unit_chord: np.ndarray)
 
 
 def _completed(tangent: np.ndarray, other: np.ndarray, unit_chord: np.ndarray) -> np.ndarray:
-    """Return the ``tangent`` at one end of every step, completed where it is NaN.
+    """Return the ``tangent`` (step, 2) at one end of every step, completed where it is NaN.
 
-    With the tangent ``other`` of the other end the step is a parabola, whose two tangents have the chord as their mean;
-    without, it is straight.
+    If the tangent ``other`` at the other end is known, the step becomes a parabola, whose two tangents have the chord
+    as their mean; if not, it becomes straight.
     """
     by_other = np.where(np.isnan(other), unit_chord, 2 * unit_chord - other)
     return np.where(np.isnan(tangent), by_other, tangent)
@@ -90,15 +99,18 @@ def lowest(branch: xr.Dataset) -> np.ndarray:
     least = frequency[order].copy()
     for i, (rank, next_rank) in enumerate(pairwise(ranks)):
         between = slice(min(rank, next_rank) + 1, max(rank, next_rank))
-        ends = np.sort([i, i + 1])[np.argsort(energy[i : i + 2])]
+        ends = i + np.argsort(energy[i : i + 2])
         on_line = np.interp(energy[order[between]], energy[ends], frequency[ends])
         least[between] = np.minimum(least[between], on_line)
-    # The tolerance is that of the interpolation of a point of the branch onto its own steps.
+    # A point with the energy of an end of a step is compared with that end, up to the rounding of the interpolation.
     return frequency <= least[np.argsort(order)] * (1 + 1e-9)
 
 
 def draw_branch(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
-    """Draw the whole branch in blue; over it vermilion where it is unstable, grey where no multiplier was computed."""
+    """Draw the whole branch in blue; over it vermilion where it is unstable, grey where no multiplier was computed.
+
+    A step between a stable and an unstable point is blue.
+    """
     energy, frequency = smooth(branch)
     multiplier = branch["multiplier_max"].values
     stable_label = "stable" if np.any(multiplier <= UNSTABLE) else None
@@ -108,7 +120,9 @@ def draw_branch(axes: Axes, branch: xr.Dataset, width: float = 1.1) -> None:
     parts = ((multiplier > UNSTABLE, style.VERMILION, "unstable"), (np.isnan(multiplier), style.GREY, "not computed"))
     for is_part, colour, label in parts:
         if len(energy) > len(is_part):
-            # The curve has been smoothed: the points of a step belong to the part if both of its ends do.
-            is_part = np.append(np.repeat(is_part[:-1] & is_part[1:], FINE), is_part[-1])
+            # The curve has been smoothed: the points of a step, and the one at its end, belong to the part if both ends
+            # of the step do.
+            step_is_part = np.repeat(is_part[:-1] & is_part[1:], FINE)
+            is_part = np.append(step_is_part, False) | np.append(False, step_is_part)
         if is_part.any():
             axes.plot(energy, np.where(is_part, frequency, np.nan), color=colour, lw=1.3 * width, zorder=3, label=label)

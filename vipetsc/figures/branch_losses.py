@@ -7,21 +7,26 @@ from matplotlib.axes import Axes
 from vipetsc.figures import style
 from vipetsc.figures.panels import annotate_empty
 
-LEAST_ROOM = 0.1  # above and below the damping ratio, over its largest value
+ROOM = 0.1  # above and below the curve of the damping ratio, over its range
+LEAST_ROOM = 0.1  # the same over its largest value: of a branch without contact the ratio is constant but for rounding
 
 
 def draw_losses(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw the damping ratio of a ``branch`` over the energy, and the force in resonance on an axis of its own."""
+    """Draw the damping ratio of a ``branch`` over the energy (J), and the force in resonance (N) on an axis of its own.
+
+    The force is that of the drive that makes up for the losses, if the file has it.
+    """
     if "damping_ratio" not in branch:
         annotate_empty(axes, "nothing dissipates")
         return
     energy = branch["energy"].values
+    # A curve of one point is no line.
     marker = "." if len(energy) == 1 else ""
+
     ratio = branch["damping_ratio"].values
     axes.plot(energy, ratio, color=style.BLUE, lw=1.0, marker=marker, label="damping ratio")
     axes.set(xscale="log", ylabel="damping ratio")
-    # Of a branch without contact the ratio is constant: its rounding is not magnified.
-    room = max(0.1 * float(np.ptp(ratio)), LEAST_ROOM * float(ratio.max()))
+    room = max(ROOM * float(np.ptp(ratio)), LEAST_ROOM * float(ratio.max()))
     if np.isfinite(room) and room > 0:
         axes.set_ylim(ratio.min() - room, ratio.max() + room)
     if "force" not in branch or not np.isfinite(branch["force"].values).any():
@@ -30,6 +35,6 @@ def draw_losses(axes: Axes, branch: xr.Dataset) -> None:
     of_forces = axes.twinx()
     of_forces.plot(energy, branch["force"].values, color=style.VERMILION, lw=1.0, ls="--", marker=marker)
     of_forces.set(yscale="log", ylabel="force in resonance (N)")
-    # One legend for both axes.
+    # An empty curve for the legend, which is one for both axes.
     axes.plot([], [], color=style.VERMILION, lw=1.0, ls="--", label="force")
     axes.legend(fontsize=5.5)

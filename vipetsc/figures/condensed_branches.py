@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -18,25 +19,35 @@ from vipetsc.figures.panels import annotate_empty, label_panels
 from vipetsc.io.netcdf import open_netcdf
 from vipetsc.lattice import pass_bands
 
+# Of contacts and of stored motions. More of them have the same colours again, with other dashes.
 COLOURS = style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE
-# Fraction of the largest displacement that the shape's axis shows: localised motions decay to rounding, 1e-16.
+DASHES = "-", style.DASHED, style.DOTTED
+# Smallest displacement that is drawn, over the largest: localised motions decay to rounding, 1e-16.
 SMALLEST = 1e-12
-# Ratios of the largest to the smallest energy: below the first a logarithmic axis would have one label, above the
-# second labels at 2 and 5 between the powers of ten would touch.
+# Ratios of the largest to the smallest energy. Below the first an axis is linear, since a logarithmic one would have
+# one label; above the second it has labels at powers of ten only, since those at 2 and 5 would touch.
 NARROW = 3.0
-DECADES = 30.0
+WIDE = 30.0
 
 
 def condensed_branches(paths: Sequence[Path]) -> Figure:
-    """Draw frequency and elongation at phase 0 over energy, and stored motions over the cells; a row for each file."""
+    """Draw frequency and elongation at phase 0 over energy, and stored motions over the cells; a row for each file.
+
+    If one of the branches has losses, their damping is drawn as well. Raises OSError or ValueError for a file that
+    holds no condensed branch.
+    """
     branches = []
     for path in paths:
         with open_netcdf(path, "branch", ("harmonics", "elongation", "kind")) as file:
             names = np.array(file["kind"].attrs["flag_meanings"].split())
             branches.append(file.load().assign(kind=("point", names[file["kind"].values])))
+
+    # All rows have the panels that one of them needs, so that their axes stand below each other.
+    columns = 3
+    if any("damping_ratio" in branch for branch in branches):
+        columns = 4
     figure = style.new_figure(style.PAGE, 2.5 * len(branches))
-    has_losses = any("damping_ratio" in branch for branch in branches)
-    grid = figure.subplots(len(branches), 4 if has_losses else 3, squeeze=False)
+    grid = figure.subplots(len(branches), columns, squeeze=False)
     for (frequency, elongation, *losses, motions), branch in zip(grid, branches, strict=True):
         case = NnmCase.from_toml(branch.attrs["case"])
         # A user-defined system has neither cells nor pass bands.
@@ -52,8 +63,9 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
             draw_losses(axes, branch)
         for axes in (frequency, elongation, *losses):
             _set_energy_axis(axes, branch)
+
         if "states/number" not in branch:
-            # They are stored when a branch ends: this one was interrupted.
+            # Motions are stored when a branch ends: this one was interrupted.
             annotate_empty(motions, "no motions stored")
         elif is_lattice or branch.sizes["states/cell"] > 1:
             _draw_over_cells(motions, branch)
@@ -61,6 +73,12 @@ def condensed_branches(paths: Sequence[Path]) -> Figure:
             _draw_over_masses(motions, branch)
     label_panels(grid)
     return figure
+
+
+def _look(number: int) -> dict[str, Any]:
+    """Return colour and dashes of a contact's or a motion's curve; ``number`` counts from 0."""
+    dashes = DASHES[number // len(COLOURS) % len(DASHES)]
+    return {"color": COLOURS[number % len(COLOURS)], "ls": dashes}
 
 
 def _draw_frequency(axes: Axes, branch: xr.Dataset) -> None:
@@ -78,26 +96,27 @@ def _draw_frequency(axes: Axes, branch: xr.Dataset) -> None:
             axes.plot(energy[at], frequency[at], mark, label=label, ms=3, mfc="white", mec=style.BLACK, mew=0.6)
 
     if "states/number" in branch:
-        stored = zip(branch["states/energy"].values, branch["states/period"].values, COLOURS, strict=False)
-        for state_energy, period, colour in stored:
-            axes.plot(state_energy, 1 / period, "x", color=colour, ms=5, mew=1.2)
+        stored = zip(branch["states/energy"].values, branch["states/period"].values, strict=True)
+        for number, (state_energy, period) in enumerate(stored):
+            axes.plot(state_energy, 1 / period, "x", color=_look(number)["color"], ms=5, mew=1.2)
     axes.set_ylabel("frequency (Hz)")
 
 
 def _shade_pass_bands(axes: Axes, case: NnmCase) -> None:
     """Shade the pass bands as far as they reach into the panel, whose limits stay those of the branch."""
+    # A pass band far from the branch must not squeeze the curve.
     limits = axes.get_ylim()
     for band in pass_bands(case.lattice.unit_cell()):
         axes.axhspan(band.low / (2 * np.pi), band.high / (2 * np.pi), color=style.PALE, lw=0, zorder=0)
-    # A pass band far from the branch must not squeeze the curve.
     axes.set_ylim(limits)
 
 
 def _draw_elongation(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw the elongation of every contact or spring at phase 0, where all is at rest, over energy; in mm."""
+    """Draw the elongation in mm of every contact or spring at phase 0, where all masses are at rest, over energy."""
     energy = branch["energy"].values
-    for place, values, colour in zip(branch["place"].values, branch["elongation"].values.T, COLOURS, strict=False):
-        axes.plot(energy, 1e3 * values, color=colour, lw=1.0, label=f"place {place}")
+    places = zip(branch["place"].values, branch["elongation"].values.T, strict=True)
+    for number, (place, values) in enumerate(places):
+        axes.plot(energy, 1e3 * values, lw=1.0, label=f"place {place}", **_look(number))
     axes.set_ylabel("elongation at rest (mm)")
     if branch.sizes["place"] > 1:
         axes.legend(fontsize=5.5)
@@ -110,7 +129,7 @@ def _set_energy_axis(axes: Axes, branch: xr.Dataset) -> None:
     high = energy.max()
     if high > low and high > NARROW * low:
         subdivisions: tuple[float, ...] = (1, 2, 5)
-        if high > DECADES * low:
+        if high > WIDE * low:
             subdivisions = (1,)
         axes.set(xscale="log")
         axes.xaxis.set_major_locator(LogLocator(subs=subdivisions))
@@ -137,7 +156,7 @@ def _draw_over_masses(axes: Axes, branch: xr.Dataset) -> None:
 
 def _draw_shapes(axes: Axes, x: np.ndarray, shapes: np.ndarray, branch: xr.Dataset) -> None:
     """Draw ``shapes`` (motion, x) of the stored motions on a logarithmic axis, named by their frequencies."""
-    for values, period, colour in zip(shapes, branch["states/period"].values, COLOURS, strict=False):
+    for number, (values, period) in enumerate(zip(shapes, branch["states/period"].values, strict=True)):
         relative = values / values.max()
-        visible = np.where(values > SMALLEST * values.max(), relative, np.nan)
-        axes.semilogy(x, visible, ".-", color=colour, ms=3, lw=0.8, label=f"{1 / period:.4g} Hz")
+        visible = np.where(relative > SMALLEST, relative, np.nan)
+        axes.semilogy(x, visible, marker=".", ms=3, lw=0.8, label=f"{1 / period:.4g} Hz", **_look(number))

@@ -67,12 +67,11 @@ CURVE_POINTS = 4000
 def backbone(paths: Sequence[Path]) -> Figure:
     """Draw frequency, slope, differences of flows, damping and phase portraits of the branches in ``paths``.
 
-    Each branch has a column, and panels are there if one of the branches has their quantities.
-
-
-    Raises OSError or ValueError for a file that holds no branch.
+    Each branch has a column. A panel is there if one of the branches has what it shows. Raises OSError or ValueError
+    for a file that holds no branch.
     """
     branches = [_read(path) for path in paths]
+
     # All columns have the panels that one of them needs, so that their axes are side by side.
     has_flows = any(_holds(branch, "flows/") for branch in branches)
     has_orbits = any(_holds(branch, "orbits/number") for branch in branches)
@@ -95,19 +94,19 @@ def backbone(paths: Sequence[Path]) -> Figure:
         upper, *lower = column.subfigures(len(page_heights), 1, squeeze=False, height_ratios=page_heights)[:, 0]
         panels = upper.subplots(len(heights), 1, sharex=True, height_ratios=heights)
 
-        # The energies' limits come first: the inset looks for room between them.
+        # The limits of the energy are set first, because the inset looks for room between them.
         energy = branch["energy"].values
         panels[0].set(xscale="log", xlim=(energy.min(), energy.max()))
         for axes, draw_panel in zip(panels, draw_panels, strict=True):
             draw_panel(axes, branch)
 
-        heading = _heading(branch, with_law=len(branches) > 1)
-        panels[0].set_title(heading)
+        panels[0].set_title(_heading(branch, with_law=len(branches) > 1))
         panels[-1].set(xlabel="energy (J)")
+        _label_narrow_energies(panels[-1], energy)
+
         letters = list(ascii_lowercase) if is_alone else [f"{tag}.{number}" for number in ROMAN]
         for panel_tag, axes in zip(letters, panels, strict=False):
             axes.set_title(f"({panel_tag}) {axes.get_title('left')}".rstrip())
-        _label_narrow_energies(panels[-1], energy)
         for part in lower:
             portraits(part, branch, letters[len(panels)])
     return figure
@@ -152,7 +151,10 @@ def _label_narrow_energies(axes: Axes, energy: np.ndarray) -> None:
 
 
 def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw frequency over energy: few special points are marked, with an inset on grazing; else tongues labelled."""
+    """Draw frequency over energy.
+
+    Special points are marked if there are few, and an inset shows grazing; otherwise tongues are labelled instead.
+    """
     energy = branch["energy"].values
     frequency = branch["frequency"].values
     kind = branch["kind"].values
@@ -179,7 +181,7 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
         axes.legend(loc="upper left", fontsize=5.5, bbox_to_anchor=(0, 0.93))
         _grazing_inset(axes, branch, touched[0])
     else:
-        # A branch that rises leaves the lower right free, a constant frequency does not, and tongues may not.
+        # The lower right is free below a branch that rises; a constant frequency lies there, and tongues may.
         lower_right_is_free = np.ptp(frequency) > 0 and (few_marks or not touched.size)
         axes.legend(loc="lower right" if lower_right_is_free else "best", fontsize=5.5)
 
@@ -188,8 +190,8 @@ def _label_tongue(axes: Axes, branch: xr.Dataset, order: int) -> None:
     """Write "k:1" for k = ``order`` above the fold of this tongue with the highest frequency, if the branch has one."""
     k = branch["resonance"].values
 
-    # Tongues are expected in the order of k. Folds with this k that come after a fold with a higher one are no
-    # tips of this tongue: they lie between one tongue and the next.
+    # Tongues follow each other in the order of k. A fold with this k after one with a higher k is not the tip of this
+    # tongue: it lies between one tongue and the next.
     higher = np.nonzero(k > order)[0]
     end = higher[0] if higher.size else len(k)
     tongue = branch.isel(point=(k == order) & (np.arange(len(k)) < end))
@@ -200,10 +202,10 @@ def _label_tongue(axes: Axes, branch: xr.Dataset, order: int) -> None:
 
 
 def slope(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw |df/dE| over energy at regular points: those with contact, or all of a branch that has no contact anywhere.
+    """Draw |df/dE| over energy at regular points: at those with contact, or at all if the branch has no contact.
 
-    Where several states of the branch have one energy, all but that of the lowest frequency are pale. The pale line
-    joins the points shown, also across those that are left out.
+    Where the branch has several states of one energy, that of the lowest frequency is blue and the others are pale. The
+    pale line joins all points that are shown.
     """
     _shade(axes, branch)
     shown = branch["kind"].values == "regular"
@@ -225,7 +227,10 @@ def slope(axes: Axes, branch: xr.Dataset) -> None:
 
 
 def flow_differences(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw how far orbits of other flows are from the branch at one amplitude: frequency full, energy open marks."""
+    """Draw how far orbits of other flows are from the branch at one amplitude, relative to it, over energy.
+
+    Marks of the frequency are full, those of the energy are open.
+    """
     paths = [str(name) for name in branch.variables if str(name).startswith("flows/")]
     flows = list(dict.fromkeys(path.split("/")[1] for path in paths))
     if not flows:
@@ -245,7 +250,7 @@ def flow_differences(axes: Axes, branch: xr.Dataset) -> None:
 
 
 def portraits(part: SubFigure, branch: xr.Dataset, tag: str) -> None:
-    """Draw the first two masses of the first four orbits stored, which begin with one of every region there is."""
+    """Draw the first two masses of the first four orbits in the file, where one of every region comes first."""
     if "orbits/number" not in branch:
         annotate_empty(part.subplots(), "no orbits stored")
         return
@@ -277,10 +282,10 @@ def _draw_orbit(axes: Axes, u: np.ndarray, v: np.ndarray) -> None:
 
 
 def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
-    """Draw the neighbourhood of grazing, point ``first``, where it covers nothing of the branch, or least.
+    """Draw the neighbourhood of the point ``first``, where contact begins, in an inset that covers least of the branch.
 
-    It reaches to where the frequency is a tenth above that of the last energy fold, or of grazing if there is no fold,
-    but at least three points further than grazing.
+    The inset shows the branch up to where the frequency is a tenth above that of the last energy fold, or of the point
+    ``first`` if there is no fold, but at least three points beyond ``first``.
     """
     energy = branch["energy"].values
     frequency = branch["frequency"].values
@@ -304,16 +309,16 @@ def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
 def _free_place(axes: Axes, curve: np.ndarray) -> tuple[float, float, float, float]:
     """Return left, bottom, width and height, in fractions of ``axes``, of an inset off the drawn ``curve`` (point, 2).
 
-    The largest that is free, and of these the one nearest to the lower right corner; else the one that covers least.
+    It is the largest that covers nothing of the curve, and of several the rightmost, then the lowest; if all cover
+    something, it is the one that covers least.
     """
     corners = axes.transAxes.inverted().transform(axes.transData.transform(curve))
-    # As many points on each step of the curve as its length deserves.
+    # Points at equal distances along the curve: the number of them in a place says how much of the curve is there.
     position = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
     along = np.linspace(0.0, position[-1], CURVE_POINTS)
     points = np.column_stack([np.interp(along, position, values) for values in corners.T])
 
-    # From the lower right corner on and from the largest size down: the first position that covers nothing is the
-    # best.
+    # From the largest size down, and from the right to the left: the first position that covers nothing is the best.
     least = (len(points) + 1, (0.0, 0.0, *INSET))
     for scale in SHRINKING:
         size = scale * np.array(INSET)
@@ -321,7 +326,7 @@ def _free_place(axes: Axes, curve: np.ndarray) -> tuple[float, float, float, flo
         for left in np.linspace(1 - high[0] - size[0], low[0], PLACES):
             for bottom in np.linspace(low[1], 1 - high[1] - size[1], PLACES):
                 begin = np.array([left, bottom])
-                # The legend stands in the upper left corner.
+                # Not over the legend, which stands in the upper left corner.
                 if left < LEGEND[0] and bottom + size[1] > LEGEND[1]:
                     continue
                 inside = np.all((points > begin - low) & (points < begin + size + high), axis=1)
@@ -334,7 +339,10 @@ def _free_place(axes: Axes, curve: np.ndarray) -> tuple[float, float, float, flo
 
 
 def _shade(axes: Axes, branch: xr.Dataset) -> None:
-    """Shade regions as bands of energy, if there is a III: where internal resonances go on, region II has no end."""
+    """Shade the regions as bands of energy, unless region III is missing.
+
+    A branch that internal resonances lead through tongue after tongue stays in region II, which then has no end.
+    """
     energy = branch["energy"].values
     region = branch["region"].values
     if np.any(region == 3):

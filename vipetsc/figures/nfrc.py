@@ -1,4 +1,7 @@
-"""Nonlinear frequency-response curves: displacement, stability, folds, slow sweeps, and fractions of the energy."""
+"""Nonlinear frequency-response curves: displacement, stability, folds, slow sweeps, and fractions of the energy.
+
+A curve is a list of steady states under a harmonic drive, over its amplitude or frequency or another key of the case.
+"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -27,13 +30,14 @@ SPECIAL = {
     3: ("period doubling", "^", 3.8),
     4: ("branch point", "s", 3.2),
 }
-LEAST_FRACTION = 1e-3  # of the energy: below it a line looks like that of zero
+LEAST_FRACTION = 1e-3  # of the energy: a smaller one cannot be told from zero in the panel
 
 
 def frequency_response(paths: Sequence[Path]) -> Figure:
-    """Draw displacement over amplitude or frequency, and below it phases or fractions of the energy; a column a file.
+    """Draw displacement over amplitude or frequency, and below it phases and fractions of the energy; a column a file.
 
-    Phases are drawn of a force over its frequency, as experiments show a response, fractions where there are some.
+    Phases are drawn if a force drives the lattice over its frequency, as in experiments, fractions if there are any.
+    Raises OSError or ValueError for a file that holds no response.
     """
     branches = responses_in(paths, "share")
     rows = [_draw_displacement]
@@ -56,7 +60,11 @@ def has_fractions(branch: xr.Dataset) -> bool:
 
 
 def responses_in(paths: Sequence[Path], *needs: str) -> list[xr.Dataset]:
-    """Return the frequency responses in files, read completely; each must have the variables ``needs``."""
+    """Return the frequency responses in the files ``paths``, read completely.
+
+    Raises OSError for a file that cannot be opened, ValueError for one that holds no response, or lacks a variable of
+    ``needs``.
+    """
     curves = []
     for path in paths:
         with open_netcdf(path, "branch", (*needs, "unstable", "over")) as file:
@@ -67,7 +75,7 @@ def responses_in(paths: Sequence[Path], *needs: str) -> list[xr.Dataset]:
 def response_page(
     curves: Sequence[xr.Dataset], rows: Sequence[Callable[[Axes, xr.Dataset], None]], height: float
 ) -> Figure:
-    """Return a page of ``height`` in with a column for each of ``curves``, whose panels ``rows`` draw."""
+    """Return a page, ``height`` inches high, with a column for each of ``curves``, whose panels ``rows`` draw."""
     width = style.COLUMN
     if len(curves) > 1:
         width = style.PAGE
@@ -118,28 +126,34 @@ def largest_motions(branch: xr.Dataset) -> np.ndarray:
 
 
 def lag_of(branch: xr.Dataset) -> np.ndarray:
-    """Return the phase (point,) in degrees of the fundamental of the first site, or spring, behind the drive."""
+    """Return the phase (point,) in degrees by which the first site, or else spring, is behind the drive.
+
+    It is that of the fundamental Z_1 in w(t) = Re sum Z_k exp(i k Omega t), under a drive cos(Omega t). Along the curve
+    it is continuous, and in the first state between -180 and 180 degrees.
+    """
     name = "harmonics" if branch.sizes["site"] else "spring_harmonics"
-    # Index 1: harmonics count from the mean, which is number 0.
+    # The mean is harmonic 0.
     fundamental = branch[name].values[:, 0, 1] + 1j * branch[f"{name}_imaginary"].values[:, 0, 1]
     lag = -np.degrees(np.unwrap(np.angle(fundamental)))
-    # The first state lags by less than a turn.
-    return np.asarray(lag - 360 * np.floor((lag[0] + 180) / 360))
+    turns = np.floor((lag[0] + 180) / 360)
+    return np.asarray(lag - 360 * turns)
 
 
 def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
-    """Draw the first site: stable states as a line, unstable ones dashed, slow sweeps broad; thin lines for others."""
+    """Draw the largest motion of the first site, and in thin lines that of the others, over the parameter.
+
+    Stable states are a line, unstable ones dashes; broad pale lines show where slow sweeps up and down went.
+    """
     parameter = parameter_of(branch)
     stable = branch["unstable"].values == 0
-    # Contacts that touch at rest have no clearance to compare with.
-    clearance = branch["clearance"].values
-    label = "largest |w| / clearance"
     largest = largest_motions(branch)
-    if not clearance.size:
-        clearance = np.zeros(largest.shape[1])
-    relative = largest / np.where(clearance > 0, clearance, 1.0)  # (point, site)
-    # Along a curve over a key of the case they may not stay what they are at its beginning.
-    if "parameter" in branch or not np.all(clearance > 0):
+    clearance = branch["clearance"].values
+    # Springs and contacts that touch at rest have no clearance to compare with, and along a curve over another key the
+    # clearances may change.
+    if clearance.size and np.all(clearance > 0) and "parameter" not in branch:
+        label = "largest |w| / clearance"
+        relative = largest / clearance
+    else:
         label = "largest elongation (mm)"
         if branch.sizes["site"]:
             label = "largest |w| (mm)"
@@ -154,7 +168,7 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
         axes.plot(parameter, other, color=style.GREY, lw=0.6, label=others)
         others = None
 
-    # Sweeps lie beneath the branch, the one down narrower, so that both are seen where they coincide.
+    # Sweeps lie beneath the curve, the one down narrower than the one up: all are seen where they coincide.
     for name, colour, width in (("up", style.GREEN, 6.0), ("down", style.PURPLE, 3.0)):
         points = branch[f"{name}_point"].values
         if points.size > 1:
@@ -166,7 +180,7 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
         stable_label = "stable"
     axes.plot(parameter, np.where(stable, size, np.nan), color=style.BLACK, lw=1.3, label=stable_label)
     if not stable.all():
-        # With the stable points next to them, so that the dashed line meets the full one.
+        # The stable points next to unstable ones too, so that the dashed line meets the full one.
         after = np.insert(~stable[:-1], 0, False)
         before = np.append(~stable[1:], False)
         dashed = np.where(~stable | before | after, size, np.nan)
@@ -178,7 +192,7 @@ def _draw_displacement(axes: Axes, branch: xr.Dataset) -> None:
 
 
 def draw_special(axes: Axes, branch: xr.Dataset, values: np.ndarray, labelled: bool = False) -> None:
-    """Mark the special points of a curve that shows ``values`` (point,)."""
+    """Mark the special points of a curve that shows ``values`` (point,), ``labelled`` for a legend if asked for."""
     parameter = parameter_of(branch)
     for code, (label, marker, size) in SPECIAL.items():
         (places,) = np.nonzero(branch["kind"].values == code)
@@ -208,7 +222,7 @@ def _draw_energies(axes: Axes, branch: xr.Dataset) -> None:
     for i, name in enumerate(branch["way"].values.astype(str)):
         label, colour, line = ENERGIES[name]
         fraction = branch["share"].values[:, i]
-        # Of a finite lattice only the losses are computed: no wave leaves it.
+        # No wave leaves a finite lattice: of its fractions only the losses are finite.
         if np.isfinite(fraction).any():
             axes.plot(parameter, fraction, color=colour, lw=0.5, ls=line)
             axes.plot(parameter, np.where(stable, fraction, np.nan), color=colour, lw=1.4, ls=line, label=label)

@@ -17,11 +17,11 @@ from vipetsc.case import Model
 from vipetsc.figures import style
 from vipetsc.lattice import UnitCell, bloch, gaps, pass_bands
 
-DECADES = 5  # of energy that a map shows: neighbouring decades are 50 of its 256 colours apart
-# Most rows and columns of a map: twice as many as the pixels of a panel at the resolution of the screen. A page of maps
-# takes 153 kB as a PDF; at half as many 117 kB, and blocks can be seen.
+DECADES = 5  # of energy that a map shows: a decade then has 50 of its 256 colours
+# Most rows and columns of a map. A page of maps takes 153 kB as a PDF; at half as many 117 kB, and blocks can be seen.
 PIXELS = 600
 MOST_LINES = 30  # of sites in a map; more lines would hide it
+# Numerals of the rows of a grid of panels. Further rows have none.
 ROMAN = ("i", "ii", "iii", "iv", "v", "vi", "vii", "viii", "ix", "x", "xi", "xii")
 REGIONS = ("", "I", "II", "III", "IV")  # of a frequency-energy branch, by number
 REGION_SHADES = ("", "#FFFFFF", "#EAEAEA", "#FFFFFF", "#EEEEEE")
@@ -50,11 +50,14 @@ def annotate_empty(axes: Axes, reason: str) -> None:
 def label_panels(panels: Iterable[Axes]) -> None:
     """Begin the titles of ``panels`` with (a), (b), ...; panels beyond the 26th have no letter.
 
-    In a grid (row, column) of several rows and columns the letter is that of the column and a numeral that of the row,
-    (b.iii). Titles stand at the left, where the style puts them.
+    In a grid (row, column) of several rows and columns each has the letter of its column and the numeral of its row,
+    (b.iii); panels beyond the last letter or numeral have none. Titles stand at the left, where the style puts them.
     """
     if isinstance(panels, np.ndarray) and panels.ndim == 2 and min(panels.shape) > 1:
-        tags = {axes: f"{ascii_lowercase[column]}.{ROMAN[row]}" for (row, column), axes in np.ndenumerate(panels)}
+        tags = {}
+        for row, row_tag in zip(panels, ROMAN, strict=False):
+            for axes, column_tag in zip(row, ascii_lowercase, strict=False):
+                tags[axes] = f"{column_tag}.{row_tag}"
     else:
         tags = dict(zip(np.ravel(list(panels)).tolist(), ascii_lowercase, strict=False))
     for axes, tag in tags.items():
@@ -69,12 +72,12 @@ def block_means(values: np.ndarray) -> np.ndarray:
 
 
 def log_norm(*fields: ArrayLike, decades: float = DECADES) -> LogNorm:
-    """Return logarithmic colours over ``decades`` below the largest value of the ``fields``.
+    """Return logarithmic colours over ``decades`` below the largest value of all ``fields``.
 
-    Fields without a largest value, since all of them vanish or one is not finite, have colours up to 1.
+    Colours go up to 1 if all fields vanish, or one has a value that is not finite.
     """
-    # One largest value for all fields: what differs between their colours is energy.
-    top = max(float(np.max(np.asarray(field))) for field in fields)
+    # One scale for all fields, so that equal colours are equal energies.
+    top = float(np.max([np.max(np.asarray(field)) for field in fields]))
     if not (np.isfinite(top) and top > 0):
         top = 1.0
     return LogNorm(top * 10.0**-decades, top, clip=True)
@@ -84,7 +87,7 @@ def percentile_norm(fields: Iterable[xr.DataArray]) -> Normalize:
     """Return colours from the 2nd to the 99.8th percentile of what is finite in the ``fields``."""
     values = np.concatenate([np.ravel(field) for field in fields])
     finite = values[np.isfinite(values)]
-    # Entropies have a few outliers at both ends, which would take most of the colours.
+    # Entropies have a few outliers at both ends, for which most of the colours would be used.
     low, high = np.percentile(finite if finite.size else 0, (2, 99.8))
     return Normalize(low, high if high > low else low + 1)
 
@@ -92,7 +95,10 @@ def percentile_norm(fields: Iterable[xr.DataArray]) -> Normalize:
 def draw_map(
     axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, norm: Normalize, cmap: str = "inferno"
 ) -> AxesImage:
-    """Draw an image of ``values`` (y, x) at evenly spaced positions, pooled to what a printed page can show."""
+    """Draw an image of ``values`` (y, x) at evenly spaced positions ``x`` and ``y``.
+
+    Of more than ``PIXELS`` rows or columns it shows means over blocks.
+    """
     extent = (*_edges(x), *_edges(y))
     return axes.imshow(block_means(values), norm=norm, cmap=cmap, extent=extent)
 
@@ -100,7 +106,8 @@ def draw_map(
 def _edges(positions: np.ndarray) -> tuple[float, float]:
     """Return where an image of pixels centred on evenly spaced ``positions`` begins and ends."""
     spacing = (positions[-1] - positions[0]) / max(len(positions) - 1, 1)
-    half = 0.5 * spacing or 0.5  # a single position has a pixel of its own
+    # A single position has a pixel of the width 1.
+    half = 0.5 * spacing or 0.5
     return positions[0] - half, positions[-1] + half
 
 
@@ -136,9 +143,10 @@ def recorded_sites(run: xr.Dataset, cells: np.ndarray | None = None) -> np.ndarr
 def mark_sites(
     axes: Axes, run: xr.Dataset, colour: str = "white", along: str = "y", cells: np.ndarray | None = None
 ) -> None:
-    """Draw triangles at the edge at the ``recorded_sites``, and dotted lines as well if these are few.
+    """Draw triangles on the edge of a map at the sites of a ``run``, and dotted lines across it if these are few.
 
-    ``along`` is the axis of the cells, "x" or "y"; sites out of the range of ``cells`` (cell,) are left out.
+    ``along`` is the axis of the cells, "x" or "y"; sites out of the range of ``cells`` (cell,), by default the recorded
+    ones, are left out.
     """
     sites = recorded_sites(run, cells)
     edge = np.full(len(sites), 0.02)
@@ -160,8 +168,8 @@ def indentations(run: xr.Dataset, model: Model) -> np.ndarray:
     stops = model.gaps or [(gap, gap) for gap in chain.clearances]
     depth = []
     for cell, pair, (plus, minus) in zip(chain.sites, chain.contact_pairs, stops, strict=True):
-        # Cells from 0. The resonator may be in the next cell, that of a ring's last cell in its first; a case has no
-        # contact to the next cell in the last one of a lattice with ends.
+        # Cells from 0. The resonator may be in the next cell, which of a ring's last cell is the first one. A lattice
+        # with ends has no such contact in its last cell.
         w = u[:, (cell + pair.next_cell) % chain.cells, pair.resonator]
         if pair.host >= 0:  # a contact with the ground has no host
             w = w - u[:, cell, pair.host]
@@ -180,7 +188,7 @@ def dispersion_map(axes: Axes, spectrum: xr.DataArray, norm: Normalize, cell: Un
     wavenumber = spectrum["wavenumber"].values / np.pi
     frequency = spectrum["frequency"].values / 1e3
     image = draw_map(axes, wavenumber, frequency, spectrum.values.T, norm)
-    # One degree of phase a cell: the steepest branches are smooth.
+    # At intervals of one degree of phase a cell, at which the steepest branches look smooth.
     kappa = np.linspace(0, np.pi, 181)
     axes.plot(kappa / np.pi, bloch(cell, kappa).frequency / 1e3, color="white", lw=0.5, ls=(0, (4, 3)), alpha=0.75)
     axes.set(xlim=(0, wavenumber[-1]), ylim=(0, frequency[-1]), xlabel=KAPPA, ylabel=OMEGA)
@@ -207,7 +215,7 @@ def shade_bands(axes: Axes, spans: Iterable[tuple[float, float]], along: str = "
 
 
 def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> None:
-    """Draw the colour bar of a map at one or several axes; its lowest colour stands for what is below it as well."""
+    """Draw the colour bar of a map at one or several axes, with an arrow for values below the lowest colour's."""
     panels = np.ravel(axes).tolist()
     options = {"pad": 0.02, "extend": "min"} | options
     panels[0].figure.colorbar(image, ax=panels, label=label, **options)
@@ -216,7 +224,7 @@ def colour_bar(image: Any, axes: Any, label: str, **options: Any) -> None:
 def mark_degrees(axes: Axes) -> None:
     """Put few ticks on a vertical axis in degrees: multiples of 1, 1.5, 3, 4.5 or 9 times a power of ten.
 
-    Over a revolution these are multiples of 45 or 90 degrees, and over small ranges plain numbers.
+    Over a revolution these are multiples of 45 or 90 degrees, over small ranges round numbers.
     """
     axes.yaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 3, 4.5, 9, 10]))
 

@@ -1,4 +1,4 @@
-"""Figures of users' modules: those of the modules that a result's case names."""
+"""Figures that users have registered in modules of their own, which the case of a result names."""
 
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
@@ -19,10 +19,10 @@ RESULTS = ("run.h5", "ensemble.h5", "branch-*.h5", "design.h5", "optimum.h5", "l
 
 
 def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, Callable[..., Any]], str]:
-    """Functions of the figures of a ``source`` by name, and why modules cannot be imported, if one cannot.
+    """The functions of registered figures of a ``source`` by name, and a message why modules cannot be imported, or "".
 
-    The modules are those of the case of the results in the first of ``folders``. A ``source`` is as in
-    ``vipetsc.figures.registry``.
+    The modules are those that the case of the results in the first of ``folders`` names. Sources are those of
+    ``vipetsc.figures.sources``, functions those of ``vipetsc.figures.registry.FigureSpec``.
     """
     figures: dict[str, Callable[..., Any]] = {}
     reasons = []
@@ -40,13 +40,13 @@ def registered_figures(source: str, folders: Sequence[Path]) -> tuple[dict[str, 
 
 
 def _modules(folder: Path) -> list[str]:
-    """The modules that the case of the results in ``folder`` names."""
+    """The modules that the case of the results in ``folder`` names; none if they cannot be read."""
     for pattern in RESULTS:
         # All branches of a folder have one case: the first one stands for them.
         for path in sorted(folder.glob(pattern))[:1]:
             try:
                 case = tomllib.loads(root_attributes(path, "result").get("case", ""))
-            # What cannot be read is reported where it is drawn.
+            # A file that cannot be read is reported when it is drawn.
             except (OSError, ValueError):
                 return []
             return [plugins.located(name, folder) for name in module_names(case)]
@@ -62,6 +62,6 @@ def _drawn(part: FigurePart, *results: Any) -> Figure:
 
 
 def _of_sweeps(draw: Callable[[xr.Dataset], Figure], sweeps: Sequence[xr.Dataset]) -> Iterator[Drawing]:
-    """A drawing of each ensemble."""
+    """Yield the drawing of each ensemble; a registered figure of a sweep is drawn of one at a time."""
     for ensemble in sweeps:
         yield Drawing("", partial(draw, ensemble))

@@ -48,11 +48,20 @@ from vipetsc.register import FIGURE, reserve
 class FigureSpec(NamedTuple):
     """A figure: its ``name``, the ``source`` that it is drawn from, and the ``function`` that draws it.
 
-    ``function`` is (run, analysis or None) -> Figure of a run, (data) -> Figure of a source in ``FILES``, (paths) ->
-    Figure of branches. Of sweeps it is (sweeps) -> iterator of Drawing, called with those sweeps that take ``measure``;
-    the stem of such a drawing follows the figure's name, and ``needs`` says what a sweep must hold for it.
-    ``without`` is (run, analysis or None), or (branches), -> the reason why there is no such picture, or an empty text.
-    ``together``: one picture shows all branches of all folders.
+    Attributes
+    ----------
+    function
+        Of a run, (run, analysis or None) -> Figure. Of a source in ``FILES``, (data) -> Figure. Of branches, (paths) ->
+        Figure. Of sweeps, (sweeps) -> iterator of Drawing; the name of such a drawing's file is that of the figure,
+        followed by the drawing's stem.
+    measure
+        Of sweeps, a word that ``sweep.measures`` of the case must have; the function gets no other sweeps.
+    needs
+        Of sweeps, what a message says that they must hold.
+    without
+        Of runs (run, analysis or None), of branches (branches), -> the reason why there is no such picture, or "".
+    together
+        Whether one picture shows all branches of all folders.
     """
 
     name: str
@@ -71,7 +80,7 @@ def branch(paths: Sequence[Path]) -> Figure:
         with open_netcdf(path, "branch") as file:
             kinds.append(branch_kinds.branch_kind(file))
 
-    # Folders on one page may hold branches of one name and several kinds; the first one decides what is shown.
+    # Folders on one page may hold branches of one name and different kinds: those of the first one's kind are shown.
     same = [path for path, kind in zip(paths, kinds, strict=True) if kind == kinds[0]]
     return BRANCH_FIGURES[kinds[0]](same)
 
@@ -91,7 +100,7 @@ THREE_AMPLITUDES = "members with their fields ([sweep] fields = true) at three v
 BRANCHES_TOO = "branches of the same law, in a further folder, and a sweep over drive.amplitude"
 
 _SPECS = (
-    # The dearest of a run first, so that ranks which divide the work among them finish together.
+    # Of a run those that take longest come first, so that ranks which divide them end at about the same time.
     FigureSpec("modal_energies", RUN, modal.modal_energies, without=modal.without_modal_energies),
     FigureSpec("spacetime", RUN, runs.spacetime, without=runs.without_spacetime),
     FigureSpec("dispersion", RUN, runs.dispersion, without=runs.without_dispersion),
@@ -136,7 +145,7 @@ reserve(FIGURE, FIGURES)
 
 
 def figures_of(source: str, folders: Sequence[Path]) -> dict[str, FigureSpec]:
-    """Return the figures of ``source`` by name, those of modules among them that the results in ``folders`` name."""
+    """Return the figures of ``source`` by name, with those of the modules that the results in ``folders`` name."""
     registered, _ = registered_figures(source, folders)
     specs = {name: spec for name, spec in FIGURES.items() if spec.source == source}
     return specs | {name: FigureSpec(name, source, function) for name, function in registered.items()}
@@ -145,9 +154,9 @@ def figures_of(source: str, folders: Sequence[Path]) -> dict[str, FigureSpec]:
 def figure_names(
     source: str, names: Sequence[str] | None = None, folders: Sequence[Path] = (), files: Files | None = None
 ) -> list[str]:
-    """Return ``names``, by default those of all figures of ``source``; raise KeyError for one that is not of it.
+    """Return ``names``, or by default those of all figures of ``source``; raise KeyError for an unknown one.
 
-    The measures in the ``folders`` of sweeps are names of figures too; by default those that most readers look at.
+    Each measure in the ``folders`` of sweeps is a figure too; by default those are returned that most readers look at.
     ``files`` are results that the caller has opened and will close.
     """
     specified = [*figures_of(source, folders)]
@@ -164,12 +173,17 @@ def figure_names(
     valid = [*measures, *specified]
     for name in names:
         if name not in valid:
-            # However far it is: to a reader who knows no name, a guess shows what names look like.
+            # Even a name far from all gets a guess, which shows what names look like.
             (nearest,) = difflib.get_close_matches(name, valid, n=1, cutoff=0) or valid[:1]
-            holder = source if source == BRANCHES else f"a {source}"
+            holder = source
+            if source != BRANCHES:
+                article = "an" if source[0] in "aeiou" else "a"
+                holder = f"{article} {source}"
             listed = ", ".join(valid)
             _, missing = registered_figures(source, folders)
-            reason = f"; a module of the case cannot be used: {missing}" if missing else ""
+            reason = ""
+            if missing:
+                reason = f"; a module of the case cannot be used: {missing}"
             raise KeyError(f"no figure {name!r} of {holder}; did you mean {nearest!r}? There are {listed}{reason}")
     return list(names)
 
@@ -195,8 +209,9 @@ def draw(
     Parameters
     ----------
     source
-        Contents of the folders: "run" (one folder), "sweep" (perhaps with branches), "branches" (of the same
-        names, side by side), "design", "optimum", "law" or "prediction" (one folder).
+        Contents of the folders, as in ``vipetsc.figures.sources``: "sweep" or "paper" (perhaps with folders of
+        branches), "branches" (those of one name side by side); of one folder "run", "design", "optimum",
+        "identification", "law" or "prediction".
     names
         Figures, and of sweeps measures; by default all figures, and the measures that most readers look at.
     turns
@@ -240,10 +255,10 @@ def draw_bands(cell: UnitCell, path: str | Path, frequency: float | None = None)
 def drawings(
     source: str, folders: Sequence[Path], files: Files, names: Sequence[str] | None = None, omit: Collection[str] = ()
 ) -> Iterator[Drawing]:
-    """Return the drawings of what the ``folders`` hold, in the order in which ``draw`` draws them, but for ``omit``.
+    """Return the drawings that ``draw`` draws with these arguments, in its order.
 
-    Warnings in the files are the figures' labels. A drawing can be called as long as its ``files`` are open. Raises
-    KeyError as ``figure_names``.
+    A figure has the warnings in its files as its label. A drawing can be called as long as its ``files`` are open.
+    Raises KeyError as ``figure_names``.
     """
     chosen = [name for name in figure_names(source, names, folders, files) if name not in omit]
     if source == SWEEP:
@@ -300,21 +315,20 @@ def specified_drawings(spec: FigureSpec, ensembles: Sequence[xr.Dataset], files:
 
 
 def _branch_drawings(specs: Sequence[FigureSpec], folders: Sequence[Path], files: Files) -> Iterator[Drawing]:
-    """Yield drawings of the branches of the first folder, next to those of their names in the others; then of all."""
-    for first in sorted(folders[0].glob("branch-*.h5")):
+    """Yield drawings of the branches of each name that the first folder has, from all folders; then of all together."""
+    for paths in branches_by_name(folders):
         for spec in specs:
             if not spec.together:
-                yield from _branch_drawing(spec, of_one_name(folders, first.name), len(folders), files)
+                yield from _branch_drawing(spec, paths, len(folders), files)
 
-    every = [path for folder in folders for path in sorted(folder.glob("branch-*.h5")) if point_count(path)]
     for spec in specs:
         if spec.together:
-            for drawing in _branch_drawing(spec, every, len(folders), files):
+            for drawing in _branch_drawing(spec, every_branch(folders), len(folders), files):
                 yield drawing._replace(stem=spec.name)
 
 
 def _branch_drawing(spec: FigureSpec, paths: Sequence[Path], folders: int, files: Files) -> Iterator[Drawing]:
-    """Yield the drawing of the branches in ``paths``, from so many ``folders``; none where it has nothing to show."""
+    """Yield the drawing of the branches in ``paths``, from so many ``folders``; none if there is nothing to show."""
     if not all(point_count(path) for path in paths):
         return
     branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
@@ -342,9 +356,17 @@ def point_count(path: Path) -> int:
         return int(file.sizes["point"])
 
 
-def of_one_name(folders: Sequence[Path], name: str) -> list[Path]:
-    """Return the files of that ``name`` in the ``folders`` that have one."""
-    return [folder / name for folder in folders if (folder / name).exists()]
+def branches_by_name(folders: Sequence[Path]) -> list[list[Path]]:
+    """Return for each branch of the first of ``folders`` the files of its name in all that have one."""
+    groups = []
+    for first in sorted(folders[0].glob("branch-*.h5")):
+        groups.append([folder / first.name for folder in folders if (folder / first.name).exists()])
+    return groups
+
+
+def every_branch(folders: Sequence[Path]) -> list[Path]:
+    """Return the files of all branches in ``folders`` that have a point."""
+    return [path for folder in folders for path in sorted(folder.glob("branch-*.h5")) if point_count(path)]
 
 
 def _run_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> Iterator[Drawing]:
@@ -365,7 +387,7 @@ def run_and_analysis(folder: Path, files: Files) -> tuple[xr.Dataset, xr.Dataset
 
 
 def _file_drawings(specs: Sequence[FigureSpec], folder: Path, files: Files) -> Iterator[Drawing]:
-    """Yield every figure of the one file in ``folder`` that holds all of its results."""
+    """Yield every figure of ``specs`` from the one file in ``folder`` that has its results."""
     for spec in specs:
         file = FILES[spec.source]
         data = files.get(folder / file.name, partial(open_netcdf, kind="search", needs=file.needs))

@@ -20,13 +20,13 @@ from vipetsc.figures.nfrc import draw_special, lag_of, largest_motions, paramete
 from vipetsc.figures.swept_axes import SweptKey
 from vipetsc.io.branch_kinds import RESPONSES, branch_kind
 
-MOST_LOCATIONS = 4  # that have a row of their own: with the sites and the phase they fill the height of a page
-MOST_CURVES = 24  # of a legend, three inches; others have no line in it
-LEGEND_LINE = 0.13  # inches of a legend's line
+MOST_LOCATIONS = 4  # that have a row each: with those of the site and the phase they fill the height of a page
+MOST_CURVES = 24  # that the legend names, which is then three inches high
+LEGEND_LINE = 0.13  # height in inches of a line of the legend
 
 
 def without_family(curves: Sequence[xr.Dataset]) -> str:
-    """Return why some branches have no common picture; empty where they have one."""
+    """Return why the branches ``curves`` have no common picture; empty if they have one."""
     if len(curves) < 2 or any(branch_kind(curve) != RESPONSES for curve in curves):
         return "needs several curves of nfrc"
     if len({str(curve.attrs["over"]) for curve in curves}) > 1:
@@ -77,7 +77,7 @@ def legend_of(curves: Sequence[xr.Dataset]) -> list[str]:
     """Return a text for each of ``curves``: the keys that differ among them, with values and units."""
     keys = [_keys_of(curve) for curve in curves]
     parts: list[list[str]] = [[] for _ in curves]
-    # In the order of the first curve; a key that all have with one value says nothing.
+    # In the order of the first curve. A key that has one value in all curves tells none from another.
     for path in dict.fromkeys(path for of_curve in keys for path in of_curve):
         values = [of_curve.get(path, ("", ""))[0] for of_curve in keys]
         if len({repr(value) for value in values}) == 1:
@@ -88,7 +88,7 @@ def legend_of(curves: Sequence[xr.Dataset]) -> list[str]:
             part.append(text)
     texts = []
     for part, curve in zip(parts, curves, strict=True):
-        # An isolated curve has the keys of its main curve, from which only its number tells it.
+        # An isolated curve has the keys of its main curve: its number tells it from that.
         isola = curve.attrs.get("isola")
         named = [*part, f"isola {isola}"] if part and isola else part
         texts.append(", ".join(named) or str(curve.attrs["name"]))
@@ -96,9 +96,10 @@ def legend_of(curves: Sequence[xr.Dataset]) -> list[str]:
 
 
 def _keys_of(curve: xr.Dataset) -> dict[str, tuple[Any, str]]:
-    """Return what makes a curve one of several: value and unit by the path of the key."""
+    """Return the keys by which a curve may differ from others: value and unit by the key's path."""
     case = NfrcCase.of(curve)
     table = case.model_dump(by_alias=True, exclude_none=True)
+    # The keys that [nfrc.family] varies, as JSON.
     family = json.loads(curve.attrs.get("family", "{}"))
     keys = {path: (value, unit_of(path, table)) for path, value in family.items()}
     # An amplitude or frequency that does not vary is that of all points.
@@ -133,7 +134,10 @@ def _displacement(curve: xr.Dataset, name: str) -> np.ndarray:
 
 
 def _draw_curve(axes: Axes, curve: xr.Dataset, values: np.ndarray, name: str, colour: Any) -> None:
-    """Draw ``values`` of a curve: stable states broad, unstable ones thin and dashed, special points are marked."""
+    """Draw ``values`` (point,) of a curve: stable states as a broad line, unstable ones thin and dashed.
+
+    Special points are marked.
+    """
     parameter = parameter_of(curve)
     stable = curve["unstable"].values == 0
     axes.plot(parameter, values, color=colour, lw=0.5, ls="--")
@@ -142,7 +146,7 @@ def _draw_curve(axes: Axes, curve: xr.Dataset, values: np.ndarray, name: str, co
 
 
 def _colours(count: int) -> list[Any]:
-    """Return a colour for each curve: those of the house if these are enough, else a scale from dark to bright."""
+    """Return a colour for each of ``count`` curves: those of bands if these are enough, else a scale."""
     if count <= len(style.BAND_COLOURS):
         return [style.band_colour(number) for number in range(1, count + 1)]
     return [colormaps["viridis"](place) for place in np.linspace(0, 0.9, count)]

@@ -19,27 +19,35 @@ DASHES = ("-", style.DASHED, "-.", style.DOTTED)
 
 
 def without_outputs(branches: Sequence[xr.Dataset]) -> str:
-    """Return why some ``branches`` have no such page; empty where they have one."""
-    if all("lag" in branch or "largest_force" in branch for branch in branches):
+    """Return why ``branches`` have no such page together; empty if they have one."""
+    if _all_have(branches, "lag") or _all_have(branches, "largest_force"):
         return ""
     return "needs [output] points or forces = true in the case of nfrc"
 
 
+def _all_have(branches: Sequence[xr.Dataset], name: str) -> bool:
+    """Return whether each of ``branches`` has the variable ``name``."""
+    return all(name in branch for branch in branches)
+
+
 def response_outputs(paths: Sequence[Path]) -> Figure:
-    """Draw amplitudes and phase of the named masses, and forces, over amplitude or frequency; a column a file."""
+    """Draw amplitudes and phase of the named masses, and forces, over amplitude or frequency; a column a file.
+
+    Of several files masses or forces are drawn if all have them; one of both must be so (``without_outputs``).
+    """
     curves = responses_in(paths)
     rows: list[Callable[[Axes, xr.Dataset], None]] = []
-    if "lag" in curves[0]:
+    if _all_have(curves, "lag"):
         rows += [partial(_draw_amplitude, quantity=quantity) for quantity in AMPLITUDES]
         rows.append(_draw_lag)
-    if "largest_force" in curves[0]:
+    if _all_have(curves, "largest_force"):
         rows.append(_draw_forces)
 
     return response_page(curves, rows, height=1.45 * len(rows) + 0.3)
 
 
 def _draw_amplitude(axes: Axes, curve: xr.Dataset, quantity: str) -> None:
-    """Draw the largest value of a ``quantity`` at each location, and its first harmonic thin."""
+    """Draw the largest value of a ``quantity`` at each location, and thin the amplitude of its first harmonic."""
     for number, name in enumerate(curve["location"].values.astype(str)):
         _draw_states(axes, curve, curve[f"peak_{quantity}"].values[:, number], number, label=name)
         first = curve[f"first_{quantity}"].values[:, number]
@@ -51,9 +59,9 @@ def _draw_amplitude(axes: Axes, curve: xr.Dataset, quantity: str) -> None:
 
 
 def _draw_lag(axes: Axes, curve: xr.Dataset) -> None:
-    """Draw the phase of each location's first harmonic behind the drive."""
+    """Draw the phase in degrees by which each location's fundamental is behind the drive."""
     for number in range(curve.sizes["location"]):
-        # Files hold lags within one revolution: a curve through a resonance would jump across the panel.
+        # Files have lags from 0 to 360 degrees, between which a curve would jump across the panel.
         lag = np.degrees(np.unwrap(np.radians(curve["lag"].values[:, number])))
         _draw_states(axes, curve, lag, number)
     axes.set_ylabel("phase lag (degrees)")

@@ -1,4 +1,4 @@
-"""Why something has no picture: what cannot be drawn is no file, and a sentence says so."""
+"""Why something has no picture: nothing is written for what cannot be drawn, and a message gives the reason."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -10,9 +10,10 @@ from vipetsc.figures import measure_pages, transfer_curves
 from vipetsc.figures.registry import (
     BRANCH,
     OVER_BRANCHES,
+    branches_by_name,
+    every_branch,
     figure_names,
     figures_of,
-    of_one_name,
     point_count,
     run_and_analysis,
     specified_drawings,
@@ -27,11 +28,11 @@ from vipetsc.io.read import open_ensemble
 def reasons_without_pictures(
     source: str, folders: Sequence[Path], files: Files, names: Sequence[str] | None = None
 ) -> dict[str, str]:
-    """Return why figures of what the ``folders`` hold are not drawn, by name; of branches by the names of their files.
+    """Return the reasons why figures of what the ``folders`` hold are not drawn, by name.
 
-    They are those in ``names``, by default all; of sweeps by default measures, and what lays branches over them where
-    ``folders`` hold any. Results are opened as ``files``, open for those who draw them. Raises KeyError as
-    ``figure_names``.
+    The figures are those in ``names``, by default all; of sweeps by default measures, and the figure that shows
+    branches too if ``folders`` hold any. A branch of which nothing is drawn has the name of its file. Results are
+    opened as ``files``, and stay open for those who draw them. Raises KeyError as ``figure_names``.
     """
     if source == SWEEP:
         return _reasons_of_sweeps(folders, files, names)
@@ -51,22 +52,25 @@ def reasons_without_pictures(
 def _reasons_of_branches(folders: Sequence[Path], files: Files, names: Sequence[str]) -> dict[str, str]:
     """Return why branches of the first folder are not drawn, by the names of files, and why figures in ``names``."""
     reasons = {}
-    paths = sorted(folders[0].glob("branch-*.h5"))
-    for path in paths:
-        has_points = all(point_count(path) for path in of_one_name(folders, path.name))
-        reasons[path.stem] = "" if has_points else "no point of the branch was computed"
-    if paths and all(reasons.values()):
+    for paths in branches_by_name(folders):
+        has_points = all(map(point_count, paths))
+        reasons[paths[0].stem] = "" if has_points else "no point of the branch was computed"
+    if reasons and all(reasons.values()):
         reasons = {BRANCH: "no branch has a point"}
 
     specs = figures_of(BRANCHES, folders)
     for name in names:
         spec = specs.get(name)
         if spec and spec.without:
-            branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
-            of_branch = [branches] if spec.together else [[branch] for branch in branches]
-            missing = [spec.without(shown) for shown in of_branch]
-            # One branch with a picture is enough: the figure is then not missing.
-            reasons[name] = missing[0] if all(missing) else ""
+            # The pictures that there would be, as the drawing has them.
+            pictures = [every_branch(folders)] if spec.together else branches_by_name(folders)
+            missing = []
+            for paths in pictures:
+                branches = [files.get(path, partial(open_netcdf, kind="branch")) for path in paths]
+                missing.append(spec.without(branches))
+            # The figure is missing only if it has not a single picture.
+            if missing and all(missing):
+                reasons[name] = missing[0]
     return reasons
 
 
@@ -87,7 +91,7 @@ def _reasons_of_sweeps(folders: Sequence[Path], files: Files, names: Sequence[st
             continue
 
         by_sweep = [_reason(ensemble, name, by_name=names is not None) for ensemble in ensembles]
-        # The sweeps are asked one by one: a measure that one of them has gives the figure pages.
+        # A measure that one of the sweeps has gives the figure pages.
         if all(by_sweep):
             reasons[name] = by_sweep[0]
     return reasons
