@@ -321,6 +321,14 @@ def test_a_logarithmic_axis_has_three_labels_at_least(low, ratio):
     assert max(ticks) <= low * ratio * 1.001
 
 
+def test_a_short_logarithmic_axis_has_three_labels_within_its_ends():
+    """Of the ticks of a linear axis two lie inside, 7.5 and 9."""
+    ticks = log_ticks(6.05, 10.1)
+    assert len(ticks) >= 3
+    assert min(ticks) >= 6.05
+    assert max(ticks) <= 10.1
+
+
 def test_labels_of_a_logarithmic_axis_are_round():
     assert log_ticks(1.0, 12.0) == [1, 3, 10]
     assert log_ticks(0.9, 1100.0) == [1, 10, 100, 1000]

@@ -197,6 +197,15 @@ def test_a_gif_holds_every_frame_for_its_time(clear, stage):
     assert lasts == round(1000 * count / 3, -1)
 
 
+def test_frames_have_even_sides(opened):
+    """An MP4 has one colour for two by two pixels, and ffmpeg refuses odd sides."""
+    run, analysis = opened
+    content = movie_frames(run, analysis, Shot(speed=0.016, rate=3.0))
+    with rc_style():
+        frame = movie.MovieFigure(run, content, width=341).frame(0)
+    assert frame.shape[:2] == (192, 342)
+
+
 def test_an_mp4_is_written_by_ffmpeg_or_not_at_all(clear, stage, tmp_path, monkeypatch):
     """ffmpeg gets every frame as it is; where it fails, its words are raised and the old movie stays."""
     # In place of ffmpeg: a script that writes what it reads into the last of its arguments.

@@ -1,4 +1,10 @@
-"""The (lambda, eta) search: Bloch deflections, cost maps with optima, dispersion against the parameters (Fig. S3)."""
+"""The (lambda, eta) search: Bloch deflections, cost maps with optima, dispersion against the parameters (Fig. S3).
+
+The search and its costs are those of ``vipetsc.paper.cell_costs``. Of the four masses u1 to u4 of a cell, u2 is the
+host of the resonator u3; lambda is the stiffness of the resonator's spring over that of a spring of the lattice, eta
+the resonator's part of the mass of both. A cell is feasible if host and resonator move out of phase at every wavenumber
+of the second band.
+"""
 
 import matplotlib as mpl
 import numpy as np
@@ -10,14 +16,14 @@ from matplotlib.figure import Figure
 from vipetsc.figures import style
 from vipetsc.figures.panels import KAPPA, colour_bar, draw_map, label_panels
 
-WEIGHTED = 2  # index of the weighted cost
+WEIGHTED = 2  # index of the weighted cost along the dimension ``cost``
 TITLES = {"deflection": "Deflection", "group_velocity": "Group velocity", "weighted": "Weighted"}
 LABELS = {"deflection": "max w (1)", "group_velocity": "Σ max |v$_g$| (cells/s)", "weighted": "cost (cells/s)"}
 SYMBOLS = {"lambda": "λ", "eta": "η"}
 MASSES = ("$u_1$", "$u_2$", "$u_3$, negative if out of phase with $u_2$", "$u_4$")
-LINES = 10  # values of the parameter that is followed: neighbouring colours of the scale can be distinguished
-# Frequencies are shown up to this many times the highest one of the best cell: some cells of the grid have bands
-# that are many times higher, and would press all others together.
+LINES = 10  # values of the parameter that have a curve in a panel: colours of more could not be told apart
+# Frequencies are shown up to this many times the highest one of the best cell: some cells of the grid have bands that
+# are many times higher, in whose panels all others would be flat.
 HEADROOM = 1.9
 
 
@@ -30,13 +36,15 @@ def deflections(search: xr.Dataset) -> Figure:
         cell = optimum.isel(reading=i, band=j)
         deflection = cell["optimum_deflection"].values
         amplitude = cell["optimum_amplitude"].values.copy()
-        # Amplitudes are moduli: the sign shows whether the resonator moves against its host.
+        # Amplitudes are moduli, 0 or more. The resonator's is given a sign: negative where it moves against its host,
+        # for which the deflection in the file is positive.
         amplitude[:, 2] = np.where(deflection > 0, -amplitude[:, 2], amplitude[:, 2])
 
         axes.axhline(0, color=style.GREY, lw=0.5)
         axes.plot(kappa, np.abs(deflection), color=style.BLACK, lw=1.6, label="w = |$u_3 - u_2$|")
         *_, last = axes.plot(kappa, amplitude, label=MASSES)
-        last.set_linestyle("--")  # it often lies on that of the first mass
+        # The curve of the last mass often lies on that of the first.
+        last.set_linestyle("--")
         axes.set_title(f"Band {cell['band'].item()}")
         if j == 0:
             best = f"λ = {cell['optimum_lambda'].item():.3g}, η = {cell['optimum_eta'].item():.3g}"
@@ -79,11 +87,14 @@ def _draw_cost(axes: Axes, result: xr.Dataset, cost: str) -> None:
     """Draw the map of a ``cost``, its colours from the feasible cells alone, and a veil over the others."""
     feasible = result["out_of_phase"].values.T.astype(bool)
     values = result[cost].values.T
-    judged = values[feasible] if feasible.any() else values
-    norm = Normalize(judged.min(), judged.max())
+    # Without a feasible cell all of them set the colours.
+    in_range = values[feasible] if feasible.any() else values
+    norm = Normalize(in_range.min(), in_range.max())
 
-    # Elsewhere the sign makes a cost that knows the deflection meaningless.
-    shown = values if cost == "group_velocity" else np.where(feasible, values, np.nan)
+    # The other costs hold the signed deflection, whose largest value means nothing where the sign changes.
+    shown = values
+    if cost != "group_velocity":
+        shown = np.where(feasible, values, np.nan)
     image = draw_map(axes, result["lambda"].values, result["eta"].values, shown, norm, "viridis")
     veil = np.ma.masked_where(feasible, np.zeros(feasible.shape))
     axes.imshow(veil, extent=image.get_extent(), alpha=0.75, cmap=ListedColormap([style.PALE]))
@@ -91,7 +102,7 @@ def _draw_cost(axes: Axes, result: xr.Dataset, cost: str) -> None:
 
 
 def _draw_best(axes: Axes, result: xr.Dataset, best: dict[str, float]) -> None:
-    """Mark the best cell, and draw its dispersion in the corner where cells are veiled."""
+    """Mark the best cell, and draw its dispersion in the lower right corner, where cells are veiled."""
     look = {"color": "red", "mec": "white", "mew": 0.6, "ms": 5, "clip_on": False, "zorder": 5}
     axes.plot(best["lambda"], best["eta"], "s", **look)
     cell = result.sel(best, method="nearest")
@@ -102,17 +113,22 @@ def _draw_best(axes: Axes, result: xr.Dataset, best: dict[str, float]) -> None:
 
 
 def dispersions(search: xr.Dataset, along: str, other: str) -> Figure:
-    """Draw bands of cells from the least to the greatest ``along``; columns for the least, best, greatest ``other``."""
+    """Draw the bands of ``LINES`` cells between the least and the greatest value of the parameter ``along``.
+
+    A row for each reading has panels for the least, the best and the greatest value of the parameter ``other``.
+    """
     values = search[along].values
     lines = np.unique(np.round(np.linspace(0, len(values) - 1, min(LINES, len(values)))).astype(int))
-    shades = ListedColormap(mpl.colormaps["plasma"](np.linspace(0, 0.93, 256)))  # without what paper swallows
+    # Without the brightest yellow, which is not seen on white paper.
+    shades = ListedColormap(mpl.colormaps["plasma"](np.linspace(0, 0.93, 256)))
     colours = mpl.cm.ScalarMappable(Normalize(values[0], values[-1]), shades)
-    figure, grid = _grid(search, columns=3, margin=0.6, height=2.0, xlabel=KAPPA)
+    # Each row has limits of its own, those for the best cell of its reading.
+    figure, grid = _grid(search, columns=3, margin=0.6, height=2.0, xlabel=KAPPA, sharey="row")
     for i, row in enumerate(grid):
         result = search.isel(reading=i)
         best = _best_cell(result)
         last = search.sizes[other] - 1
-        # An optimum at the edge of the search is the first or the last column already.
+        # If the best value is the least or the greatest, it has a panel already.
         middle = best[other] if 0 < best[other] < last else last // 2
 
         top = HEADROOM * float(result["frequency"].isel(best).max()) / 1e3
@@ -123,6 +139,7 @@ def dispersions(search: xr.Dataset, along: str, other: str) -> Figure:
             for line in lines:
                 axes.plot(kappa, frequency[line], color=colours.to_rgba(values[line]), lw=0.7)
             axes.set_title(f"{SYMBOLS[other]} = {cells[other].item():.3g}")
+            # Curves that leave the panel are announced with how far they go.
             if frequency.max() > top:
                 axes.set_title(f"up to {frequency.max():.3g} krad/s ↑", loc="right", fontsize=6.5)
         row[0].set(ylabel=f"{result['reading'].item().capitalize()}\nω (krad/s)", ylim=(0, top))
@@ -141,9 +158,15 @@ def _best_cell(result: xr.Dataset) -> dict[str, int]:
     return {name: int(np.abs(result[name].values - value).argmin()) for name, value in optimum.items()}
 
 
-def _grid(search: xr.Dataset, columns: int, margin: float, height: float, xlabel: str) -> tuple[Figure, np.ndarray]:
-    """Return a page with a row of panels, ``height`` inches each, for every reading; ``xlabel`` stands below all."""
+def _grid(
+    search: xr.Dataset, columns: int, margin: float, height: float, xlabel: str, sharey: bool | str = True
+) -> tuple[Figure, np.ndarray]:
+    """Return a page with a row of panels (row, column), ``height`` inches high, for every reading.
+
+    ``margin`` in inches is room for what stands above and below all, such as ``xlabel``; ``sharey`` is that of
+    ``Figure.subplots``.
+    """
     rows = search.sizes["reading"]
     figure = style.new_figure(style.PAGE, margin + height * rows)
     figure.supxlabel(xlabel)
-    return figure, figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    return figure, figure.subplots(rows, columns, sharex=True, sharey=sharey, squeeze=False)

@@ -1,4 +1,8 @@
-"""Program of the process that ``SecondProcess`` starts: it draws the requests one after the other."""
+"""Program of the process that ``SecondProcess`` starts: it draws what it is asked for, one request after the other.
+
+Requests and answers are lines of JSON on a socket. A request has the arguments of ``vipetsc.figures.registry.draw`` in
+``options``, and ``divided``; the answer is the list of the files, or null if drawing failed.
+"""
 
 import gc
 import json
@@ -16,18 +20,20 @@ from vipetsc.process import collect_seldom
 
 
 def serve(turns: int) -> None:
-    """Answer each request, a line on the socket that is this process's standard input; end with the process that asks.
+    """Answer the requests from the socket that is this process's standard input, until the process that asks ends.
 
-    ``turns`` is the descriptor of the file of turns.
+    ``turns`` is the descriptor of the file of `CommonTurns`, by which both processes share the pictures of a request
+    that is divided.
     """
     collect_seldom()
     channel = socket.socket(fileno=0)
     requests: SimpleQueue[str] = SimpleQueue()
     Thread(target=_receive, args=(channel, requests), daemon=True).start()
-    # Before the first request, as the process that asks is still computing.
+    # Loaded before the first request, while the process that asks is still computing.
     load_matplotlib()
     from vipetsc.figures.registry import draw
 
+    # What is loaded stays to the end: no collection need look at it.
     gc.freeze()
     while True:
         request = json.loads(requests.get())
@@ -37,7 +43,7 @@ def serve(turns: int) -> None:
             options["turns"] = CommonTurns(turns)
 
         answer: Any = None
-        # The process that asks draws by itself where this fails, and says what is wrong.
+        # If this fails, the process that asks draws by itself, and reports the error.
         with suppress(Exception):
             answer = [str(path) for path in draw(**options)]
         channel.sendall(f"{json.dumps(answer)}\n".encode())
@@ -48,5 +54,5 @@ def _receive(channel: socket.socket, requests: SimpleQueue[str]) -> None:
     with channel.makefile(encoding="utf-8") as lines:
         for line in lines:
             requests.put(line)
-    # At once, in the middle of a picture too: nobody waits for it any more.
+    # At once, even in the middle of a picture, for which nobody waits any more.
     os._exit(0)

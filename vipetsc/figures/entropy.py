@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from vipetsc.case.sweep import coordinate
 from vipetsc.figures import panels, style
+from vipetsc.figures.measure_panels import cell_edges
 from vipetsc.figures.panels import band_of, percentile_norm
 from vipetsc.figures.style import Drawing
 from vipetsc.figures.sweep_members import AMPLITUDE, Sweeps, grouped, in_pi, reading_of, suffix, table
@@ -25,15 +26,17 @@ AVERAGES = {"energy_weighted": "energy-weighted", "masked": "masked", "joint": "
 COLOURS = {"energy_weighted": style.BLUE, "masked": style.VERMILION, "joint": style.GREEN}
 FACETS = ("reading", "wavenumber")
 SPAN = 4e-3, 40.0  # limits of logarithmic axes of values from 0.01 to 1: room for the text above the peak
-FEWEST = 4  # amplitudes: the least by which a peak and a power law beyond it can be seen
+FEWEST = 4  # amplitudes of a sweep with pages: with fewer, a peak and a power law beyond it cannot be seen
 MOST_COLUMNS = 3  # of histories: each is then as wide as a third of a page
 FIT_VALUES = ("factor", "exponent", "peak_amplitude", "points", "r2_log_log", "r2_nonlinear")
 
 
 class EntropyCurve(NamedTuple):
-    """Mean entropy over the amplitude (N), normalised to [0.01, 1], its deviation over the cells, its power law.
+    """Mean entropy over the amplitude, normalised to [0.01, 1], and its power law.
 
-    ``band`` has the lowest and the highest quantile over the samples, on the same scale.
+    ``amplitude`` (member,) is in N and rises, ``value`` (member,) is the entropy, ``error`` (member,) its standard
+    deviation over the cells, ``fit`` the values of ``FIT_VALUES`` by name. ``band`` are the lowest and the highest
+    quantile (member,) over samples of disorder, on the scale of ``value``; None without samples.
     """
 
     amplitude: np.ndarray
@@ -44,14 +47,17 @@ class EntropyCurve(NamedTuple):
 
     @classmethod
     def of(cls, row: xr.Dataset, average: str) -> Self | None:
-        """Return the curve of an average; None where fewer than two members came out, or all are equal."""
+        """Return the curve of an ``average``, a key of ``AVERAGES``, over the members in ``row``.
+
+        None if fewer than two members have a value, or all have the same.
+        """
         entropy = row[f"entropy/{average}"].values
         valid = np.isfinite(entropy)
         value = entropy[valid]
         if valid.sum() < 2 or np.ptp(value) == 0:
             return None
 
-        # The deviation and the quantiles are scaled as ``normalised`` scales the values, to between 0.01 and 1.
+        # ``normalised`` gives 0.01 + 0.99 (value - least) / range; the deviation and the quantiles are scaled alike.
         scale = 0.99 / np.ptp(value)
         ends = band_of(row, f"entropy/{average}")
         return cls(
@@ -64,9 +70,9 @@ class EntropyCurve(NamedTuple):
 
 
 class Facet(NamedTuple):
-    """The configurations of an ``ensemble`` on one page; the members of each are a row over rising amplitude.
+    """The configurations of an ``ensemble`` on one page: each of ``rows`` has its members over rising amplitude.
 
-    ``name`` identifies the facet in a file's name.
+    ``name`` tells the page from others in a file's name.
     """
 
     ensemble: xr.Dataset
@@ -102,14 +108,14 @@ class Facet(NamedTuple):
 
 
 def entropy(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer each reading, wavenumber and average: entropy against amplitude, below in logarithms with fits."""
+    """Offer a page for each reading, wavenumber and average: entropy over amplitude, below in logarithms with fits."""
     for facet in _facets(sweeps):
         for average in facet.averages:
             yield Drawing(f"{facet.name}-{average}", partial(_entropy, facet, average))
 
 
 def entropy_all(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer every wavenumber (rows) and configuration (columns), log-log, with fits and both adjusted R^2."""
+    """Offer a page for each reading and average: wavenumbers in rows, configurations in columns, log-log, with fits."""
     for facet in _facets(sweeps, names=("reading",)):
         if len({_driven_wavenumber(row, facet.ensemble) for row in facet.rows}) > 1:
             for average in facet.averages:
@@ -117,7 +123,7 @@ def entropy_all(sweeps: Sweeps) -> Iterator[Drawing]:
 
 
 def entropy_history(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer H(t) against amplitude as an image for every configuration of a reading and wavenumber."""
+    """Offer a page for each reading and wavenumber: of each configuration an image of H(t) over the amplitude."""
     for facet in _facets(sweeps, needs="entropy/history"):
         measured = [row for row in facet.rows if np.isfinite(row["entropy/history"]).any()]
         if measured:
@@ -125,7 +131,10 @@ def entropy_history(sweeps: Sweeps) -> Iterator[Drawing]:
 
 
 def _facets(sweeps: Sweeps, names: Collection[str] = FACETS, needs: str = "entropy/energy_weighted") -> Iterator[Facet]:
-    """Yield every ensemble with entropies at ``FEWEST`` amplitudes or more, by those of the axes ``names`` it has."""
+    """Yield the pages of every ensemble with entropies at ``FEWEST`` amplitudes or more, and the variable ``needs``.
+
+    Configurations on one page have the same values of those of the axes ``names`` that the ensemble has.
+    """
     measured = []
     for ensemble in sweeps:
         has_entropy = "entropy/energy_weighted" in ensemble and AMPLITUDE in axes_of(ensemble)
@@ -233,8 +242,9 @@ def _curve_or_reason(axes: Axes, row: xr.Dataset, average: str) -> EntropyCurve 
     curve = EntropyCurve.of(row, average)
     if curve is None:
         # The axes stay: those of the last row have the labels of all.
-        none_came_out = np.isfinite(row[f"entropy/{average}"]).sum() < 2
-        reason = "no members" if none_came_out else "nothing touches"
+        reason = "nothing touches"
+        if np.isfinite(row[f"entropy/{average}"]).sum() < 2:
+            reason = "no members"
         axes.text(0.5, 0.5, reason, ha="center", va="center", color=style.GREY, transform=axes.transAxes)
     return curve
 
@@ -276,7 +286,7 @@ def _draw_log_panel(axes: Axes, curve: EntropyCurve, average: str, size: float) 
         text = f"$A^{{{fit['exponent']:.2f}}}$\n$R^2$ {fit['r2_log_log']:.3f} ({fit['r2_nonlinear']:.3f})"
         axes.text(0.04, 0.97, text, transform=axes.transAxes, va="top", fontsize=6)
     else:
-        # Out of the layout, which would make room for a long reason by narrowing all panels.
+        # Not part of the layout, which would narrow all panels for the sake of a long reason.
         text = f"no power law:\n{doubts}"
         axes.text(0.04, 0.97, text, transform=axes.transAxes, va="top", color=style.GREY, fontsize=6, in_layout=False)
     _scale_logarithmic(axes, amplitude)
@@ -295,7 +305,8 @@ def _history(facet: Facet) -> Figure:
     figure = style.new_figure(width, 0.7 + 1.9 * rows, facet.heading("entropy H(t) at each amplitude"))
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
 
-    # One scale for all, of the times that are averaged: from the wave's arrival at the first site on.
+    # One scale of colours for all panels, from the times over which averages are taken: from the wave's arrival at the
+    # first site on.
     starts = [float(np.nanmin(row["entropy/start"].values)) for row in facet.rows]
     norm = percentile_norm(
         row["entropy/history"].where(row["entropy/time"] >= start)
@@ -318,21 +329,39 @@ def _history(facet: Facet) -> Figure:
 
 
 def _draw_history(axes: Axes, row: xr.Dataset, norm: Normalize) -> QuadMesh:
-    """Draw H(t) of every amplitude of ``row``, and a dotted line where contact begins."""
-    times = row["entropy/time"].values
+    """Draw H(t) of every amplitude of ``row`` as an image, and a dotted line where contact begins."""
+    # A logarithmic axis has no place for a member without a drive.
+    row = row.isel({AMPLITUDE: row[AMPLITUDE].values > 0})
     amplitude = row[AMPLITUDE].values
 
     # Members that failed have no times; the others have the same ones.
+    times = row["entropy/time"].values
     time = times[np.argmax(np.isfinite(times).sum(axis=1))]
     finite = np.isfinite(time)
     history = row["entropy/history"].values[:, finite]
-    image = axes.pcolormesh(time[finite], amplitude, history, norm=norm, rasterized=True)
+    # Edges halfway on the logarithmic axis. Halfway on a linear one, the first edge is negative where the second
+    # amplitude is more than three times the first.
+    edges = cell_edges(time[finite], "linear"), cell_edges(amplitude, "log")
+    image = axes.pcolormesh(*edges, history, norm=norm, rasterized=True)
     axes.set(yscale="log", xlim=time[finite][[0, -1]])
 
-    touched = row["contact_episodes"].values > 0
-    if touched.any() and not touched.all():
-        first = int(np.argmax(touched))
-        # Between the last member without contact and the first one with it, halfway on the logarithmic axis.
-        onset = np.sqrt(amplitude[first - 1] * amplitude[first])
+    onset = _contact_onset(amplitude, row["contact_episodes"].values)
+    if onset is not None:
         axes.axhline(onset, color="white", lw=0.8, ls=":")
     return image
+
+
+def _contact_onset(amplitude: np.ndarray, episodes: np.ndarray) -> float | None:
+    """Return the amplitude at which contact begins, between the last member without contact and the first one with it.
+
+    ``amplitude`` (member,) rises; ``episodes`` (member,) are numbers of contact episodes, NaN for a member that failed.
+    None if there is no such pair of members.
+    """
+    touching = amplitude[episodes > 0]
+    if not touching.size:
+        return None
+    free = amplitude[(episodes == 0) & (amplitude < touching[0])]
+    if not free.size:
+        return None
+    # Halfway on the logarithmic axis.
+    return float(np.sqrt(free[-1] * touching[0]))

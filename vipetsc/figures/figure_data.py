@@ -1,6 +1,6 @@
 """A figure as numbers: positions, scales and labels of its axes, their curves, the values of a map's colours.
 
-A page places these data over the picture, so that values can be read and curves drawn again.
+A page of a report lays these data over the picture, so that a reader can read values off and draw curves again.
 """
 
 import re
@@ -13,19 +13,22 @@ from matplotlib.colors import Normalize, to_hex
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 
-# Pixels that a curve may move for the sake of fewer points: half a pixel cannot be seen. The energies of a run then
-# take 14 kB of a page; at a quarter of a pixel they take 25 kB, at a whole one 5 kB.
+# Pixels by which a curve may move when points of it are left out: half a pixel cannot be seen. The energies of a run
+# then take 14 kB of a page; at a quarter of a pixel they take 25 kB, at a whole one 5 kB.
 CLOSE = 0.5
-FEW = 100  # points of a curve, of which none is left out: a reader may want each of them
-# Colours of a map whose values are listed, the others between them by interpolation: a colour is off by at most 7 of
-# its 255 levels (twice as many: the same, half as many: 8, a quarter: 23).
+FEW = 100  # points up to which a curve keeps all of them: a reader may want each
+# Colours of a map that are listed with their values. A page interpolates the others, which are then off by at most 7 of
+# the 255 levels (with twice as many stops by as much, with half as many by 8, with a quarter by 23).
 STOPS = 33
-SCALES = {"linear", "log"}  # of axes that a page can lay values over
+SCALES = {"linear", "log"}  # of axes whose values a page can compute from the positions
 MARKUP = re.compile(r"[${}]|\\[a-z]+ ?|\\[,;]")
 
 
 class DrawnCurve(NamedTuple):
-    """A line or scattered points of an axes as matplotlib holds them: ``points`` (n, 2) in the data's coordinates."""
+    """A line or scattered points of an axes: ``label`` and ``colour`` as matplotlib has them.
+
+    ``points`` (n, 2) are in the units of the axes; ``joined``: whether a line joins them.
+    """
 
     label: Any
     colour: Any
@@ -34,14 +37,18 @@ class DrawnCurve(NamedTuple):
 
 
 def figure_data(figure: Figure, strip: float) -> list[dict[str, Any]]:
-    """Describe every axes of a laid-out ``figure`` under whose picture a ``strip`` (in) stands, insets last.
+    """Describe every axes of a laid-out ``figure``, insets last; a ``strip`` in inches stands below its picture.
 
-    ``box``: left, top, right and bottom as fractions of the picture; ``title``; ``x`` and ``y``: low, high, whether
-    logarithmic, label; ``curves``: label, colour, whether points are joined, x and y in four digits, None for a gap;
-    ``map`` of axes with one: its label, ``colours`` (rrggbb one after another, lowest first), and their ``values``.
+    An entry of the list has these keys:
+
+    - ``box``: left, top, right and bottom as fractions of the picture with its strip, from its upper left corner;
+    - ``title``;
+    - ``x`` and ``y``: low, high, whether logarithmic, label;
+    - ``curves``: label, colour, whether points are joined, x and y in four digits with None for a gap;
+    - ``map``, of axes that show one: its label, ``colours`` (rrggbb one after another, lowest first), their ``values``.
     """
     height = figure.get_figheight()
-    # The strip lengthens the picture at its lower edge, so that heights shrink by this factor.
+    # The strip lengthens the picture at its lower edge: as fractions of it, heights are smaller by this factor.
     without_strip = height / (height + strip)
 
     outer = figure.get_axes()
@@ -85,7 +92,7 @@ def _axis(axes: Axes, name: str) -> dict[str, Any]:
     """Describe the axis ``name`` ("x" or "y"): limits, scale and label."""
     low, high = getattr(axes, f"get_{name}lim")()
 
-    # Of axes with a common scale the outer one has the label, or else the figure.
+    # Where axes share a scale, only one of them has the label, or the figure has it.
     shared = getattr(axes, f"get_shared_{name}_axes")().get_siblings(axes)
     labels = [getattr(other, f"get_{name}label")() for other in (axes, *shared)]
     figure_label = getattr(axes.figure, f"_sup{name}label")
@@ -106,12 +113,12 @@ def _maps(axes: Axes) -> list[Any]:
 
 
 def _content(axes: Axes, bars: dict[Normalize, Axes]) -> dict[str, Any]:
-    """Describe the curves of ``axes``, or its map by the colour bar for it; ``bars`` has those of the figure."""
+    """Describe the curves of ``axes``, or its map; ``bars`` are the figure's colour bars by their scales."""
     maps = _maps(axes)
     if not maps:
         return {"curves": [_describe(axes, curve) for curve in _curves(axes) if len(curve.points)]}
 
-    # A veil over a map is an image as well, and has no values of its own.
+    # The lowest image is the map: another one is a veil over it, which has no values of its own.
     lowest = maps[0]
     bar = bars.get(lowest.norm)
     label = ""
@@ -164,13 +171,13 @@ def _thinned(axes: Axes, points: np.ndarray, joined: bool) -> np.ndarray:
     with np.errstate(all="ignore"):
         pixels = axes.transData.transform(points)
 
-    # Of the points of a gap the one after the last finite point stays.
+    # Of a gap the first point stays, which follows a finite one.
     finite = np.isfinite(pixels).all(axis=1)
     keep = ~finite & np.append(False, finite[:-1])
 
     ends = np.flatnonzero(np.diff(finite, prepend=False, append=False))
     for first, end in zip(ends[::2], ends[1::2], strict=True):
-        # Between the points that stay a joined curve is a line; scattered points have nothing between them.
+        # A line joins the points that stay, and hides what is left out; scattered points have no such line.
         if joined and end - first > FEW:
             keep[first:end] = _needed(pixels[first:end])
         else:
@@ -180,14 +187,14 @@ def _thinned(axes: Axes, points: np.ndarray, joined: bool) -> np.ndarray:
 
 
 def _needed(pixels: np.ndarray) -> np.ndarray:
-    """Return which points (n) of a curve in ``pixels`` (n, 2) are to stay so that it moves by CLOSE at most.
+    """Return which points (n,) of a curve in ``pixels`` (n, 2) are to stay so that it moves by ``CLOSE`` at most.
 
     D. H. Douglas and T. K. Peucker, Cartographica 10 (1973) 112-122.
     """
     keep = np.zeros(len(pixels), bool)
     keep[[0, -1]] = True
 
-    # A list of the chords to be judged rather than a recursion: a noisy curve would be too deep for Python.
+    # A list of the chords to be examined rather than a recursion, which of a noisy curve would be too deep for Python.
     chords = [(0, len(pixels) - 1)]
     while chords:
         first, last = chords.pop()

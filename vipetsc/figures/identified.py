@@ -9,12 +9,17 @@ from vipetsc.case.identify import IdentifyCase
 from vipetsc.figures import panels, style
 
 MOST_CHANNELS = 8  # on a page, which is 15 inches high then
-MOST_NAMES = 12  # parameters whose correlations are written into the cells: numbers of more would overlap
-MOST_LAGS = 40  # samples over which residuals of neglected physics are correlated: a few periods of the record
+MOST_NAMES = 12  # parameters that are named in a legend, and whose correlations are written out: more would overlap
+# Samples to which the correlation of residuals is drawn: a few periods of a record, in which physics that the model
+# neglects shows.
+MOST_LAGS = 40
 
 
 def record_and_model(identified: xr.Dataset) -> Figure:
-    """Draw every channel: measured values and the model on each other, and the residuals below."""
+    """Draw every channel: measured values with the model over them, and next to these the residuals.
+
+    Grey is one standard deviation of the noise; p is the probability that white noise has residuals so much correlated.
+    """
     count = min(identified.sizes["channel"], MOST_CHANNELS)
     figure = style.new_figure(style.PAGE, 1.9 * count)
     rows = figure.subplots(count, 2, squeeze=False, width_ratios=(3, 2))
@@ -24,6 +29,7 @@ def record_and_model(identified: xr.Dataset) -> Figure:
         time = 1e3 * identified["data/time"].values[chosen]
         measured = identified["data/measured"].values[chosen]
         model = identified["data/model"].values[chosen]
+
         unit = channel["channels/unit"].item()
         motion.plot(time, measured, ".", color=style.GREY, ms=2.5, label="measured")
         motion.plot(time, model, color=style.BLUE, lw=0.8, label="model")
@@ -47,7 +53,7 @@ def residual_correlations(identified: xr.Dataset) -> Figure:
     for number, panel in enumerate(axes):
         chosen = identified["data/channel"].values == number
         residuals = identified["data/measured"].values[chosen] - identified["data/model"].values[chosen]
-        # An offset would correlate all lags and hide what varies.
+        # Without their mean, which would make the values at all lags alike and hide what varies.
         residuals = residuals - residuals.mean()
         lags = np.arange(1, min(MOST_LAGS, len(residuals) // 2) + 1)
         values = np.array([residuals[lag:] @ residuals[:-lag] for lag in lags])
@@ -67,7 +73,10 @@ def residual_correlations(identified: xr.Dataset) -> Figure:
 
 
 def misfit_profiles(identified: xr.Dataset) -> Figure:
-    """Draw the misfit with each parameter held at values near the best one, and all others fitted."""
+    """Draw how the misfit grows when each parameter is held at values off the best one, and all others are fitted.
+
+    Dashed is the parabola ((value - best) / standard error)^2 of a model that is linear in its parameters.
+    """
     count = identified.sizes["parameter"]
     columns = min(count, 4)
     rows = -(-count // columns)
@@ -83,14 +92,15 @@ def misfit_profiles(identified: xr.Dataset) -> Figure:
 
 
 def _draw_profile(axes: Axes, parameter: xr.Dataset) -> None:
-    """Draw the profile of one parameter, and the parabola of its standard error."""
+    """Draw the profile of one ``parameter``, and the parabola of its standard error; see ``misfit_profiles``."""
     axes.set_title(str(parameter["parameter"].values))
     if not parameter.sizes["place"]:
         panels.annotate_empty(axes, "[identify] profile = 0")
         return
+
     value = float(parameter["value"])
     error = float(parameter["standard_error"])
-    # In percent: the digits in which clearances differ would not fit below an axis.
+    # In percent of the best value: the digits in which clearances differ would not fit below an axis.
     places = 100 * (parameter["profile/value"].values / value - 1)
     axes.plot(places, parameter["profile/cost"].values, "o-", color=style.BLUE, ms=3, lw=0.8)
     if np.isfinite(error) and error > 0:
@@ -105,7 +115,11 @@ def _draw_profile(axes: Axes, parameter: xr.Dataset) -> None:
 
 
 def parameter_correlation(identified: xr.Dataset) -> Figure:
-    """Draw the correlation of the errors, and the error along each direction of the parameters."""
+    """Draw the correlation of the parameters' errors, and the error along each direction in their space.
+
+    Directions are the right singular vectors of the Jacobian; dashed is the error above which a parameter counts as not
+    determined (``vipetsc.identification.uncertainty.DETERMINED``).
+    """
     names = identified["parameter"].values
     count = len(names)
     figure = style.new_figure(style.PAGE, 3.2)
@@ -123,7 +137,7 @@ def parameter_correlation(identified: xr.Dataset) -> Figure:
             value = float(identified["correlation"].values[row, column])
             matrix.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=4.5)
 
-    # A direction that the record does not determine has a singular value of 0 and no error that an axis could show.
+    # A direction that the record says nothing about has the singular value 0: its error is drawn as 1e6.
     singular = np.maximum(identified["singular"].values, 1e-6)
     directions.semilogy(identified["direction"].values, 1 / singular, "o", color=style.BLUE, ms=4)
     directions.axhline(0.5, color=style.GREY, lw=0.7, ls=style.DASHED)
@@ -133,7 +147,12 @@ def parameter_correlation(identified: xr.Dataset) -> Figure:
 
 
 def growing_windows(identified: xr.Dataset) -> Figure:
-    """Draw the misfit and the parameters over the windows, and the deviance of all starts."""
+    """Draw the misfit and the parameters over the growing windows of the record, and how well each start ended.
+
+    Parameters are drawn as coordinates, in which the fit takes its steps, from their last values. The deviance of a
+    start is minus twice the logarithm of its likelihood, less that of the best; starts that end in one valley have one
+    number.
+    """
     plan = IdentifyCase.of(identified)
     figure = style.new_figure(style.PAGE, 2.6)
     misfit, course, starts = figure.subplots(1, 3)
@@ -141,6 +160,7 @@ def growing_windows(identified: xr.Dataset) -> Figure:
     misfit.semilogy(windows, identified["windows/misfit"].values, "o-", color=style.BLUE, ms=3, lw=0.8)
     for number, impacts in zip(windows, identified["windows/impacts"].values, strict=True):
         misfit.annotate(str(impacts), (number, 0.02), xycoords=("data", "axes fraction"), fontsize=5, ha="center")
+    # At the foot of the panel are the numbers of contact episodes that the windows have.
     misfit.set(xlabel="window (below: contacts)", ylabel="misfit / noise", title="Misfit")
 
     values = identified["windows/value"].values

@@ -11,11 +11,12 @@ from vipetsc.case import Case, Model
 from vipetsc.figures import panels, style
 from vipetsc.io.read import field_time
 
-MOST_ROWS = 16  # sites with a row of their own
-# Episodes with a marker of their own. More cover each other, and cost more: 8,000 markers take as long as the rest of
+MOST_ROWS = 16  # most sites that have a row each, with a marker for each episode; of more there is a map
+# Most episodes that have a marker each. More cover each other, and take time: 8,000 markers take as long as the rest of
 # the picture, 16,000 twice as long.
 MOST_MARKERS = 2000
-# Rows and columns of the map in place of markers: a row is at least 0.02 inches high, as a site must be to be seen.
+# Rows and columns of the map, at most. The page is 4.5 inches high at most, so that a row has at least .02 inches, four
+# pixels of a picture, which can be seen.
 MAP_ROWS = 150
 MAP_COLUMNS = 300
 MOST_LABELS = 12  # of sites next to a map
@@ -23,10 +24,11 @@ SPEEDS = "viridis_r"
 
 
 class Episodes(NamedTuple):
-    """Contact episodes of a run (episode), and the sites (site) where they may be.
+    """Contact episodes of a run, and the sites where they may be.
 
-    ``site`` counts from 1; ``side`` is 1 or -1; ``onset`` in s, ``speed`` of the approach in m/s,
-    ``loss`` in J, 0 where it is missing; ``cells`` from 1; ``span`` is the first and the last time of the run.
+    Of each episode (episode,): the ``site``, from 1; its ``side``, 1 or -1; the ``onset`` in s; the ``speed`` of
+    approach in m/s; the ``loss`` in J, 0 where it is missing. Of each site (site,) its cell, from 1, in ``cells``.
+    ``span`` is the first and the last time of the run in s.
     """
 
     site: np.ndarray
@@ -52,12 +54,12 @@ class Episodes(NamedTuple):
 
     @property
     def site_index(self) -> np.ndarray:
-        """The site (episode) of each, from 0."""
+        """The site (episode,) of each episode, from 0."""
         return self.site.astype(int) - 1
 
     @property
     def rows(self) -> np.ndarray:
-        """The heights (site) in the panels, which have a common axis of sites."""
+        """The height (site,) of each site on the common axis of the panels."""
         return np.arange(1, len(self.cells) + 1)
 
     @property
@@ -76,14 +78,18 @@ def without_impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
 def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw the onset of every contact episode by site and side, coloured by approach speed; energy lost per site.
 
-    More sites or episodes than ``MOST_ROWS`` and ``MOST_MARKERS`` become a map of the largest approach speed. Contacts
-    that touch or are pressed from the beginning have no impacts: a map of their indentation.
+    With more than ``MOST_ROWS`` sites or ``MOST_MARKERS`` episodes there is a map of the largest approach speed
+    instead. Where all contacts touch or are pressed from the beginning, there are no impacts: the map is one of their
+    indentation, if all displacements were recorded.
     """
     episodes = Episodes.of(run)
     model = Case.of(run).model()
     are_pressed = bool(model.gaps) and max(min(gap) for gap in model.gaps) <= 0 and "displacement" in run
     has_indentation = are_pressed and len(run["cell"]) == model.chain.cells
     has_rows = episodes.are_few and not has_indentation
+    every = 1
+    if not has_rows:
+        every = -(-len(episodes.cells) // MOST_LABELS)
 
     figure = style.new_figure(style.PAGE, min(1.3 + 0.24 * len(episodes.cells), 4.5))
     raster, bars = figure.subplots(1, 2, sharey=True, width_ratios=(4, 1))
@@ -93,7 +99,7 @@ def impacts(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
         _draw_markers(raster, episodes)
     else:
         _draw_speed_map(raster, episodes)
-    _label_sites(raster, episodes, every=1 if has_rows else -(-len(episodes.cells) // MOST_LABELS))
+    _label_sites(raster, episodes, every)
     force = np.abs(run["impacts/force"].values) if are_pressed else None
     _draw_bars(bars, episodes, has_rows, force)
     return figure
@@ -131,7 +137,8 @@ def _draw_speed_map(axes: Axes, episodes: Episodes) -> None:
     column = (episodes.onset - begin) / (end - begin) * MAP_COLUMNS
     column = np.minimum(column, MAP_COLUMNS - 1).astype(int)  # an onset at the end of the run is in the last one
 
-    # fmax passes over the NaN of a place without an episode so far.
+    # fmax takes the speed where there is only a NaN, of a place without an episode so far. By ``at``, since several
+    # episodes may fall on one place.
     largest = np.full((rows, MAP_COLUMNS), np.nan)
     np.fmax.at(largest, (episodes.site_index // sites_per_row, column), episodes.speed)
 

@@ -6,8 +6,8 @@ from functools import lru_cache
 
 from matplotlib.mathtext import MathTextParser
 
-# Labels at their sizes and resolutions: matplotlib keeps 50, of which the pages of a sweep have more. A formula takes
-# 2 ms to parse and some kB.
+# Formulas that are kept, each at a size and a resolution. Matplotlib keeps 50, fewer than the pages of a sweep have. To
+# parse one takes 2 ms, to keep it some kB.
 MOST_FORMULAS = 2000
 
 

@@ -17,7 +17,11 @@ Boxes = tuple[list[Bbox], list[Bbox]]  # of the labels on both sides
 
 @contextmanager
 def kept_ticks(figure: Figure) -> Iterator[None]:
-    """Let a ``_Ticks`` of each axis of ``figure`` answer for it within the block, in which only axes may move."""
+    """Place and measure the ticks of ``figure`` once within the block, as long as an axis stays where it is.
+
+    In the block only the axes' places and limits may change, not what is written on them.
+    """
+    # Two methods of each axis are replaced by those of an object that remembers what they returned.
     every = [axis for axes in figure.get_axes() for axis in (axes.xaxis, axes.yaxis)]
     for axis in every:
         ticks = _Ticks(axis)
@@ -32,7 +36,7 @@ def kept_ticks(figure: Figure) -> Iterator[None]:
 
 
 class _Ticks:
-    """The ticks of an ``axis`` and the boxes of their labels, until the frame or the limits change."""
+    """The ticks of an ``axis`` and the boxes of their labels, kept until the frame or the limits change."""
 
     def __init__(self, axis: Axis) -> None:
         self._axis = axis
@@ -52,7 +56,7 @@ class _Ticks:
 
     def boxes(self, ticks: list[Tick], renderer: Any = None) -> Boxes:
         """The boxes of the labels of ``ticks`` in pixels, as of ``Axis._get_ticklabel_bboxes``."""
-        # Ticks that others have placed are not these.
+        # The caller may have placed other ticks, whose boxes are not kept.
         if ticks is not self.placed():
             return type(self._axis)._get_ticklabel_bboxes(self._axis, ticks, renderer)
         if self._measured is None or self._measured[0] is not renderer:

@@ -12,17 +12,20 @@ from vipetsc.lattice import Chain
 def draw_lattice(axes: Axes, chain: Chain, drive_cell: int = 0, gaps: Gaps = ()) -> None:
     """Draw the lattice as a strip: its ends, drive (0-based cell) and contacts with their cells and clearances.
 
-    ``gaps`` in m are those of the sides + and -, where they differ.
+    ``gaps`` (site, 2) in m are the clearances of each site's sides + and -, where these differ. Cells have a width of 1
+    on the axis, and the strip a height of 1.
     """
     n = chain.cells
     axes.add_patch(Rectangle((0.5, 0), n, 1, fc="#EEEEEE", ec=style.BLACK, lw=0.6))
-    if n <= 150:  # borders of more cells would merge
+    # Borders of more cells would merge.
+    if n <= 150:
         axes.vlines(np.arange(1, n) + 0.5, 0, 1, color="white", lw=0.5)
     if chain.ends == "fixed":
         for wall in (0.5 - 0.02 * n, n + 0.5):
             draw_wall(axes, (wall, -0.25), 0.02 * n, 1.5)
         axes.vlines([0.5, n + 0.5], -0.25, 1.25, color=style.BLACK, lw=1.0)
-    # Above the number of a site in the driven cell, or of a neighbour.
+
+    # The arrow of the drive ends on the strip, or above the number of a site in the driven cell or next to it.
     near = min((abs(site - drive_cell) for site in chain.sites), default=n)
     tip = 1.8 if near < 0.03 * n else 1.0
     arrow = {"arrowstyle": "-|>", "color": style.BLUE, "lw": 0.8, "shrinkA": 0, "shrinkB": 0}
@@ -44,12 +47,12 @@ def _draw_sites(axes: Axes, chain: Chain, gaps: Gaps) -> None:
         texts = [_gap_label(plus, minus) for plus, minus in gaps]
     else:
         texts = [f"{1e3 * clearance:#.3g}" for clearance in chain.clearances]
-    # From the left on: sites are sorted, and the first of a group has the label.
+    # From the left to the right, so that the first of a group of sites has the label.
     last_labelled = -np.inf
     for site, text in sorted(zip(chain.sites, texts, strict=True)):
         axes.add_patch(Rectangle((site + 1 - width / 2, 0), width, 1, fc=style.VERMILION, lw=0))
 
-        # Labels need about a twentieth of the strip each; neighbouring sites go without.
+        # A label takes about a twentieth of the strip: sites next to one with a label have none.
         if site - last_labelled > 0.06 * n:
             axes.text(site + 1, 1.2, f"{site + 1}", ha="center", va="bottom", fontsize=7)
             below = {"color": style.VERMILION, "ha": "center", "va": "top", "linespacing": 1.0}
@@ -62,7 +65,7 @@ def _gap_label(plus: float, minus: float) -> str:
     lines = []
     for side, gap in (("+", plus), ("-", minus)):
         if np.isfinite(gap):
-            # The side + is where the clearance is positive: a stop that is pressed has a sign of its own.
+            # "+ 0.5": the stop on the side +, 0.5 mm away. The clearance of a pressed stop is negative: "+ -0.5".
             lines.append(f"{side} {1e3 * gap:.4g}" if gap else "0")
     return "\n".join(lines)
 

@@ -19,12 +19,12 @@ ENERGIES: dict[str, dict[str, Any]] = {
     "dissipated": {"label": "L, dissipated", "color": style.ORANGE, "ls": "-."},
 }
 DASHPOTS: dict[str, Any] = {"label": "D, dashpots", "color": style.GREEN, "ls": style.DASHED}
-FLOOR = 1e-5  # of the energy that arrives, which a logarithmic axis shows
+FLOOR = 1e-5  # least fraction of the energy that arrives that a logarithmic axis shows
 MARKS: dict[str, dict[str, Any]] = {
     "forward": {},
     "backward": {"marker": "o", "ms": 3, "mfc": "white", "mew": 0.7, "markevery": 0.1},
 }
-FEW_DECADES = 20  # largest z up to which 2 and 5 are labelled between the powers of ten
+LABELS_TO = 20  # largest z of an axis that has labels at 2 and 5 too: on a longer one they would touch
 
 
 class LawCurve(NamedTuple):
@@ -35,7 +35,11 @@ class LawCurve(NamedTuple):
 
 
 def law(data: xr.Dataset) -> Figure:
-    """Draw over z: T, R, U, L (and D); what leaves by band and direction; T, U and U/(1-T) from the onset on."""
+    """Draw over z: T, R, U, L (and D); what leaves by band and direction; T, U and U/(1-T) from the onset on.
+
+    z is the largest relative displacement that the wave would cause at the site without contact, over the clearance:
+    contact begins at z = 1. Dotted is z*, of the points with nearly the largest U/(1-T) that with the largest T.
+    """
     z = data["z"].values
     figure = style.new_figure(style.PAGE, 2.9)
     all_energies, by_band, onset = figure.subplots(1, 3)
@@ -55,7 +59,7 @@ def law(data: xr.Dataset) -> Figure:
 
     for axes in (all_energies, by_band):
         axes.set(xscale="log", xlabel="z = linear displacement / clearance", xlim=(0.9, z[-1]))
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if z[-1] > FEW_DECADES else (1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if z[-1] > LABELS_TO else (1.0, 2.0, 5.0)))
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
     all_energies.set(ylim=(0, 1.02), ylabel="fraction of the incident energy")

@@ -1,7 +1,8 @@
 """The layout of a figure, for which the text next to its axes is measured once.
 
-Constrained layout goes twice over a figure, because the ticks depend on the sizes of the axes, and these on the labels
-of the ticks. Nearly all of its time measures text, which is the same in both passes where the ticks are.
+Matplotlib's constrained layout goes over a figure twice, because the ticks depend on the sizes of the axes, and these
+on the labels of the ticks. Nearly all of its time goes into measuring text, which is the same in both passes if the
+ticks are.
 """
 
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ from vipetsc.figures.kept_ticks import kept_ticks
 
 
 def lay_out(figure: Figure) -> None:
-    """Place the axes of ``figure`` by its layout engine, which it loses: they stay where they are."""
+    """Place the axes of ``figure`` by its layout engine, and remove the engine: they then stay where they are."""
     with kept_ticks(figure), _measured_once(figure):
         figure.get_layout_engine().execute(figure)
     remove_engine(figure)
@@ -27,21 +28,21 @@ def lay_out(figure: Figure) -> None:
 
 def remove_engine(figure: Figure) -> None:
     """Leave ``figure`` without a layout engine: its axes stay where they are."""
-    # The engine that "none" puts in place of another does nothing, but ``savefig`` draws a figure that has it twice.
-    # None stands for the engine of the settings, which are not asked here.
+    # ``set_layout_engine("none")`` would give the figure an engine that does nothing, with which ``savefig`` draws it
+    # twice. None gives it the engine that the settings ask for, here none.
     with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
         figure.set_layout_engine(None)
 
 
 def apply_aspects(figure: Figure) -> None:
-    """Give all axes of ``figure`` the frames that they are drawn with, before it is drawn."""
+    """Give all axes of ``figure`` the frames that matplotlib gives them when it draws the figure."""
     renderer = pixel_canvas(figure).get_renderer()
     for axes in figure.get_axes():
         _apply_aspect(axes, renderer)
 
 
 def pixel_canvas(figure: Figure) -> FigureCanvasAgg:
-    """The canvas of ``figure``, or a new one in place of one that draws no pixels, as a user's module may have it."""
+    """The canvas of ``figure`` if it draws pixels, else a new one: a user's module may have made another canvas."""
     canvas = figure.canvas
     if not isinstance(canvas, FigureCanvasAgg):
         canvas = FigureCanvasAgg(figure)
@@ -49,16 +50,16 @@ def pixel_canvas(figure: Figure) -> FigureCanvasAgg:
 
 
 def _apply_aspect(axes: Axes, renderer: Any) -> None:
-    """Give ``axes`` the frame that their aspect and their locator, which colour bars have, leave of their place."""
+    """Give ``axes`` the frame that their aspect leaves of their place, and their locator, which colour bars have."""
     locator = axes.get_axes_locator()
     axes.apply_aspect(locator(axes, renderer) if locator else None)
 
 
 @contextmanager
 def _measured_once(figure: Figure) -> Iterator[None]:
-    """Let a ``_Measurement`` of each of the axes of ``figure`` answer for them within the block."""
-    # The engine asks the axes themselves; a class of axes would have to be named wherever axes are created. An aspect
-    # changes the frame within its place, so that such axes answer themselves.
+    """Measure the text next to the axes of ``figure`` once within the block, as long as the ticks stay the same."""
+    # A method of each object is replaced, since a class of axes of our own would have to be named wherever axes are
+    # created. Axes with an aspect keep theirs: their frame changes within its place.
     stretched = [axes for axes in figure.get_axes() if axes.get_aspect() == "auto" and axes.get_visible()]
     for axes in stretched:
         axes.get_tightbbox = _Measurement(axes)
@@ -70,7 +71,7 @@ def _measured_once(figure: Figure) -> Iterator[None]:
 
 
 class _Measurement:
-    """Boxes of ``axes`` with all that is next to them, which is measured again only when the ticks are others."""
+    """The box of ``axes`` with all that is written next to them, measured again only when the ticks have changed."""
 
     def __init__(self, axes: Axes) -> None:
         self._axes = axes
@@ -83,7 +84,7 @@ class _Measurement:
         frame = self._axes.get_window_extent(renderer).get_points()
 
         ticks = [axis.get_majorticklocs().tolist() for axis in (self._axes.xaxis, self._axes.yaxis)]
-        # The labels' texts follow from the ticks, and their sizes from the texts.
+        # The sizes of labels follow from their texts, and these from the ticks.
         if ticks != self._ticks:
             box = type(self._axes).get_tightbbox(self._axes, renderer, **options)
             self._around = box.get_points() - frame

@@ -2,14 +2,14 @@
 
 
 def load_matplotlib() -> None:
-    """Load matplotlib without the lists of properties in the help texts of its classes, a third of its loading.
+    """Load matplotlib without the lists of properties in the docstrings of its classes, a third of its loading time.
 
-    Where it is loaded already, nothing changes.
+    Nothing changes if it is loaded already.
     """
     from matplotlib import artist
 
     compose = artist.kwdoc
-    # Called for each class of artists when it is defined.
+    # Matplotlib calls the function for each class of artists when it defines the class.
     artist.kwdoc = lambda kind: ""
     try:
         import matplotlib.figure  # noqa: F401

@@ -7,19 +7,19 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogFormatter, LogLocator, MaxNLocator, NullFormatter
 
-LEAST_TICKS = 3  # two labels do not tell a logarithmic axis from a linear one
+LEAST_TICKS = 3  # of an axis: two labels do not tell a logarithmic scale from a linear one
 MOST_TICKS = 8
 LETTER = 0.062  # width in inches of a letter of a tick's label, in the type of the house style
 LINE = 0.14  # height in inches of a tick's label
-PLAIN = 1e-3, 1e4  # numbers that need no power of ten
+PLAIN = 1e-3, 1e4  # numbers from the first up to the second are written without a power of ten
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-# Fraction of the room of axes before they are laid out that is left once their labels stand: ticks are chosen before
-# the layout, which depends on them.
+# Fraction of the length of an axis that the layout leaves it when it makes room for labels. Ticks are chosen before the
+# layout, which depends on them.
 PART = 0.8
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return three numbers or more between ``low`` and ``high``, both positive, for a logarithmic scale."""
+    """Return three numbers or more between ``low`` and ``high``, 0 < ``low`` < ``high``, for a logarithmic scale."""
     exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     # The roundest numbers first, finer ones only where these are too few.
     for steps in ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 5, 7)):
@@ -27,7 +27,16 @@ def log_ticks(low: float, high: float) -> list[float]:
         inside = [tick for tick in ticks if low * (1 - 1e-9) <= tick <= high * (1 + 1e-9)]
         if len(inside) >= LEAST_TICKS:
             return inside[:: -(-len(inside) // MOST_TICKS)]
-    return [float(tick) for tick in MaxNLocator(4).tick_values(low, high) if low <= tick <= high]
+
+    # Over so short a range the scale is nearly linear. The locator's outermost ticks may lie beyond the ends, so that
+    # fewer than three are inside: it is asked for more.
+    inside = []
+    intervals = LEAST_TICKS + 1
+    while len(inside) < LEAST_TICKS:
+        values = MaxNLocator(intervals).tick_values(low, high)
+        inside = [float(tick) for tick in values if low <= tick <= high]
+        intervals += 1
+    return inside
 
 
 def tick_text(value: float) -> str:
@@ -41,8 +50,9 @@ def tick_text(value: float) -> str:
 def power_text(value: float) -> str:
     """Return a number that is not 0 with a power of ten: 10⁻³, 2·10⁵.
 
-    These are letters of the font: to typeset formulas for them takes longer than all else in the layout of a picture.
+    Exponents are letters of the font: to typeset formulas takes longer than all else in the layout of a picture.
     """
+    # The logarithm of a power of ten may come out below its exponent by a rounding.
     exponent = int(np.floor(np.log10(abs(value)) + 1e-9))
     factor = f"{value / 10.0**exponent:.3g}"
     power = f"10{str(exponent).translate(RAISED)}"
@@ -50,7 +60,10 @@ def power_text(value: float) -> str:
 
 
 def has_room(positions: np.ndarray, texts: Sequence[str], length: float, is_horizontal: bool) -> bool:
-    """Return whether labels ``texts`` at ``positions`` (label,) that span ``length`` inches of an axis stand apart."""
+    """Return whether labels ``texts`` at ``positions`` (label,), which span ``length`` inches of an axis, stand apart.
+
+    ``positions`` are on the scale of the axis, for a logarithmic one logarithms.
+    """
     if len(positions) < 2:
         return True
     order = np.argsort(positions)
@@ -62,8 +75,8 @@ def has_room(positions: np.ndarray, texts: Sequence[str], length: float, is_hori
 def label_log_axis(axis: Axis, low: float, high: float, length: float) -> None:
     """Label round numbers between ``low`` and ``high`` on a logarithmic ``axis`` on which they span ``length`` inches.
 
-    They are thinned where there is no room, as long as three are left; the others stay as minor ticks, for three of
-    four are not evenly spaced.
+    Where there is no room for all, some lose their labels, as long as three are left: they stay as minor ticks, which
+    show a reader where the numbers are that have none.
     """
     ticks = log_ticks(low, high)
     without_label = set(ticks)
@@ -83,7 +96,7 @@ def label_log_axis(axis: Axis, low: float, high: float, length: float) -> None:
 def label_log_axes(figure: Figure) -> None:
     """Label the logarithmic axes of ``figure``, with powers of ten where three or more of these lie on an axis.
 
-    Eight minor ticks a decade would be most of what a page of panels costs to draw: two stay.
+    Of the minor ticks of a decade those at 2 and 5 stay: to draw eight would take most of the time of a page of panels.
     """
     for axes in figure.get_axes():
         if not axes.axison:
@@ -99,7 +112,7 @@ def label_log_axes(figure: Figure) -> None:
 
             low, high = sorted(axis.get_view_interval())
             ticks = np.asarray(axis.get_majorticklocs())
-            # Those that a figure has set are its own affair.
+            # Ticks that the figure has set stay.
             is_set = isinstance(axis.get_major_locator(), FixedLocator)
             inside = ((ticks >= low * (1 - 1e-9)) & (ticks <= high * (1 + 1e-9))).sum()
             if inside < LEAST_TICKS and not is_set and 0 < low < high:

@@ -1,7 +1,8 @@
 """Pages of a sweep's measures over whatever keys it sweeps: curves over one number, maps over two, panels for more.
 
-A measure is any variable of ``ensemble.h5`` over all axes of its sweep, perhaps over parts of the frequency axis too.
-Numbers are positions on an axis; words, lists and numbers with two values are curves; samples of disorder are a band.
+A measure is any variable of ``ensemble.h5`` over all axes of its sweep, perhaps over parts of the frequency axis (pass
+bands and gaps) too. Keys with numbers are the axes of panels; keys with words or lists, or with two numbers, are
+curves, panels or pages (see ``measure_roles``). Samples of disorder become a mean and a band.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,12 +32,13 @@ from vipetsc.io.read import axes as axes_of
 from vipetsc.io.read import over_samples
 from vipetsc.wording import with_unit
 
-MOST_PAGES = 12  # of a measure, as many as a reader turns over; a longer study is cut through its largest value
-BAND = "band"  # begins the names of those parts of the frequency axis that are pass bands
-LONGEST_STEM = 150  # letters: file systems take 255, and figures of a report have prefixes
+MOST_PAGES = 12  # of a measure, as many as a reader turns over; of more only the one with the largest value is drawn
+BAND = "band"  # the first word in the names of those parts of the frequency axis that are pass bands
+LONGEST_STEM = 150  # letters of a file's name: file systems take 255, and a report puts something before it
 
-# About the members and their accuracy, not about the lattice's motion.
+# Variables of an ensemble that are no measures.
 ABOUT_MEMBERS = {"status", "number"}
+# Measures that are drawn only if they are asked for by name, because few readers look at them.
 ON_REQUEST = {
     "ledger_error",
     "work",
@@ -54,7 +56,12 @@ ON_REQUEST = {
 
 
 class Measure(NamedTuple):
-    """A measure of a sweep: its ``values`` over the dimensions of ``axes``, and the ends of its band over samples."""
+    """A measure of a sweep over the dimensions of ``axes``.
+
+    ``values`` are the measure, NaN where it is not finite; ``band`` the lowest and the highest quantile over
+    ``samples`` samples of disorder, None without samples; ``failed`` tells which members failed. ``text`` says what the
+    measure is.
+    """
 
     name: str
     unit: str
@@ -78,8 +85,8 @@ class Measure(NamedTuple):
         axes = SweptAxis.all_of(means)
         place: dict[str, Any] = {}
         if PART in values.dims:
-            numbers, bands = _bands_of(values)
             # Gaps and what lies above the bands are left out: a transfer is one between pass bands.
+            numbers, bands = _bands_of(values)
             place[PART] = numbers
             axes += [bands]
         # Axes of one value have no part in a picture.
@@ -88,9 +95,10 @@ class Measure(NamedTuple):
         first = {str(dimension): 0 for dimension in values.dims if dimension not in shown}
         values, *ends = (item.isel(place).isel(first) for item in (values, *ends))
 
+        # Files have the unit "1" where texts have none.
         unit = str(values.attrs.get("units", "1"))
         if unit == "1":
-            unit = ""  # as texts have it
+            unit = ""
         band = None
         if ends:
             band = (ends[0], ends[1])
@@ -135,7 +143,7 @@ def _bands_of(values: xr.DataArray) -> tuple[list[int], SweptAxis]:
     parts = [str(part) for part in np.atleast_1d(values.attrs["parts"])]
     indices = [index for index, part in enumerate(parts) if part.startswith(BAND)]
     numbers = np.array([parts[index].removeprefix(f"{BAND} ") for index in indices], dtype=object)
-    return indices, SweptAxis(PART, (SweptKey(BAND, "", numbers),))
+    return indices, SweptAxis(dimension=PART, keys=(SweptKey(path=BAND, unit="", values=numbers),))
 
 
 def _seeds(ensemble: xr.Dataset) -> np.ndarray:
@@ -211,7 +219,10 @@ def measure_pages(
 
 
 def _common_axes(measure: Measure, others: Sequence[Measure]) -> CommonAxes | None:
-    """Return what the pages of a measure have in common with those of ``others`` over the same keys; None of none."""
+    """Return what the pages of a measure have in common with those of ``others`` over the same keys.
+
+    None if no other one is over the same keys.
+    """
     roles = Roles.of(measure.axes)
     together = [measure]
     for other in others:
@@ -270,10 +281,10 @@ def _samples_page(ensemble: xr.Dataset, measure: Measure, heading: str) -> Figur
         labels.append(f"{name}mean {np.nanmean(samples):.4g}, 5 to 95 % of samples: {low:.4g} to {high:.4g}")
     page = MeasurePage(measure.label, [heading, f"of {measure.samples} samples"], labels)
     page.lay_out([""])
-    drawn = [
-        Curve(f"samples {i}", i, samples, None, colour)
-        for i, (samples, colour) in enumerate(zip(series, colours, strict=True))
-    ]
+    drawn = []
+    for number, (samples, colour) in enumerate(zip(series, colours, strict=True)):
+        curve = Curve(label=f"samples {number}", number=number, values=samples, band=None, colour=colour)
+        drawn.append(curve)
     figure = draw_samples(page, _seeds(ensemble), drawn)
     page.write_legend()
     return figure
@@ -282,7 +293,7 @@ def _samples_page(ensemble: xr.Dataset, measure: Measure, heading: str) -> Figur
 def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAxes | None) -> Figure:
     """Draw a measure in the panels of a page, its largest value marked, on axes ``common`` to several pages."""
     best = measure.largest()
-    # Of the bands the driven one has most: to mark its largest value would say nothing.
+    # If bands are compared, the largest value is in the driven one, and to mark it says nothing.
     marks_largest = all(axis.dimension != PART for axis in measure.axes)
     lines = _lines_above(measure, roles, title)
     if marks_largest:
@@ -304,10 +315,9 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAx
         marked = measure.place_text({axis.dimension: best[axis.dimension] for axis in roles.panels})
     if roles.y:
         fields = [panel.values.transpose(roles.y.dimension, roles.x.dimension).values for panel in panels.values()]
-        # The ring is on the panel of the largest value, which another page may hold.
         ring = None
         if marked is not None:
-            ring = LargestOnMap(best[roles.x.dimension], best[roles.y.dimension], list(panels).index(marked))
+            ring = LargestOnMap(x=best[roles.x.dimension], y=best[roles.y.dimension], panel=list(panels).index(marked))
         return draw_maps(page, roles.x, roles.y, fields, ring, common)
 
     for axes, (text, panel) in zip(page.panels, panels.items(), strict=True):
@@ -342,7 +352,7 @@ def _lines_above(measure: Measure, roles: Roles, title: Sequence[str]) -> list[s
 
 
 def _by_place(measure: Measure, axes: Sequence[SweptAxis]) -> dict[str, Measure]:
-    """Return the measure at every combination of the values of ``axes``, by what these are."""
+    """Return the measure at every combination of the values of ``axes``, by the text of the combination."""
     indices = product(*(range(axis.size) for axis in axes))
     places = [dict(zip((axis.dimension for axis in axes), index, strict=True)) for index in indices]
     return {measure.place_text(place): measure.at(place) for place in places}
@@ -357,7 +367,8 @@ def _curves(panel: Measure, compared: Sequence[SweptAxis]) -> list[Curve]:
     curves = []
     for number, (label, one) in enumerate(_by_place(panel, compared).items()):
         ends = one.band and (one.band[0].values, one.band[1].values)
-        curves.append(Curve(label, number, one.values.values, ends, colours[number]))
+        curve = Curve(label=label, number=number, values=one.values.values, band=ends, colour=colours[number])
+        curves.append(curve)
     return curves
 
 

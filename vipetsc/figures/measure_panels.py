@@ -18,28 +18,29 @@ from vipetsc.figures.log_ticks import has_room, label_log_axis, log_ticks
 from vipetsc.figures.panels import colour_bar
 from vipetsc.figures.swept_axes import SweptAxis
 
-MARKERS = "os^Dv*"  # of curves
+MARKERS = "os^Dv*"  # of curves, in their order
 SINGLE = 4.8  # width in inches of a page with one panel
-LETTERS = 17  # of a title on an inch
-PANEL_LETTERS = 15  # of that of a panel, which stands next to others
+LETTERS = 17  # of a page's title on an inch
+PANEL_LETTERS = 15  # of a panel's title on an inch; fewer, since the titles of panels side by side must not touch
 LEGEND_LETTERS = 17  # of a legend on an inch
-MOST_COLUMNS = 4
-MOST_TICKS = 8  # values of a key that are all ticks
+MOST_COLUMNS = 4  # of panels
+MOST_TICKS = 8  # values of a key up to which each is a tick with a label
 SIDES = 0.9  # inches of a page's width that its labels and its colour bar take
-PANEL_HEIGHT = 1.4  # inches, at least
-USED = 0.85  # of an axis that lies between the first and the last position
-# Ratio of the largest to the smallest value of a measure above which its scale is logarithmic: on a linear one the
-# lower of its two decades would be a tenth of the axis.
+PANEL_HEIGHT = 1.4  # inches that a panel is high at least
+USED = 0.85  # fraction of the length of an axis between the first and the last position
+# Ratio of the largest to the smallest value of a measure above which its scale is logarithmic: of the two decades the
+# lower one would have a tenth of a linear scale.
 LOG_RATIO = 100.0
-CONTOURS = 6, 3  # at most, of a map alone and of one of several, whose labels have less room
+CONTOURS = 6, 3  # on a map at most: on a single one, and on one of several, whose labels have less room
 BAND = "band "
 TOGETHER = "band\u00a0"  # no line ends between a band and its number
 
 
 class Curve(NamedTuple):
-    """A curve of a panel: its ``label``, its ``number`` among those of all panels, values, and ends of its band.
+    """A curve of a panel: ``values`` (position,), and the ends of its ``band`` (position,) over samples or None.
 
-    ``colour`` is that of the pass band that it shows, if that tells it from the others.
+    ``number`` is that of the curve among those of its panel, from 0, which are the same in all panels. ``colour`` is
+    that of the pass band that the curve shows, or empty where curves are no bands.
     """
 
     label: str
@@ -50,13 +51,16 @@ class Curve(NamedTuple):
 
     @property
     def look(self) -> dict[str, Any]:
-        """The colour and the marker of the curve on all panels."""
+        """The colour, the marker and the line of the curve in all panels."""
         colour = self.colour or f"C{self.number}"
         return {"color": colour, "marker": MARKERS[self.number % len(MARKERS)], "ms": 3, "lw": 0.9}
 
 
 class CommonAxes(NamedTuple):
-    """Axes that pages of one measure of several sweeps share: all ``values``, and positions along x (and y)."""
+    """What the axes of one measure have to show on the pages of several sweeps: values, and positions along x (and y).
+
+    Each is a list of all numbers (n,), in no order.
+    """
 
     values: np.ndarray
     x: np.ndarray
@@ -65,7 +69,11 @@ class CommonAxes(NamedTuple):
 
 @dataclass
 class MeasurePage:
-    """A page of panels of a measure with its ``label``, under a ``title`` and over a legend of ``legend_labels``."""
+    """A page of panels of a measure with its ``label``, under the lines of a ``title``, over a legend.
+
+    ``legend_labels`` are the texts of the legend, empty for none. ``lay_out`` makes the ``figure`` and its ``panels``,
+    which stand in ``body``, the figure without the strip of the legend; ``width`` is in inches.
+    """
 
     label: str
     title: Sequence[str]
@@ -77,7 +85,7 @@ class MeasurePage:
     width: float = field(init=False)
 
     def lay_out(self, titles: Sequence[str], columns: int = 0) -> None:
-        """Make the page with a panel for each of ``titles``, in ``columns`` if these are few."""
+        """Make the page with a panel for each of ``titles``, in so many ``columns`` unless they are 0 or too many."""
         count = len(titles)
         if not 0 < columns <= MOST_COLUMNS:
             # As few rows as possible, and these equally long: five panels are three and two, not four and one.
@@ -101,20 +109,15 @@ class MeasurePage:
         self.body.suptitle("\n".join(heading))
 
         grid = self.body.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+        letters = int(PANEL_LETTERS * (self.width - 0.6) / columns)
         for tag, axes, title in zip(ascii_lowercase, grid, titles, strict=False):
             if title:
-                axes.set_title(
-                    "\n".join(
-                        wrap(
-                            f"({tag}) {title.replace(BAND, TOGETHER)}",
-                            int(PANEL_LETTERS * (self.width - 0.6) / columns),
-                        )
-                    )
-                )
+                lines = wrap(f"({tag}) {title.replace(BAND, TOGETHER)}", letters)
+                axes.set_title("\n".join(lines))
         for axes in grid[count:]:
             axes.set_axis_off()
         for index, axes in enumerate(grid[:count]):
-            # A panel above an empty one is the last of its column.
+            # The last panel of each column has the labels of the ticks, also above an empty place.
             axes.tick_params(labelbottom=index + columns >= count)
         self.panels = list(grid[:count])
 
@@ -137,23 +140,23 @@ class MeasurePage:
         self.body.supylabel("\n".join(wrap(y, int(LETTERS * self.figure.get_figheight()))))
 
     def finish_curves(self, x: SweptAxis, values: np.ndarray, common: CommonAxes | None = None) -> Figure:
-        """Label and scale the axes of all panels of curves, whose ``values`` (...) these are, and write the legend.
+        """Label and scale the axes of all panels of curves, and write the legend; return the figure.
 
-        With pages of other sweeps the axes are ``common`` to all.
+        ``values`` (...) are those of all curves. With pages of other sweeps the axes are ``common`` to all.
         """
         if common:
             values = common.values
         finite = values[np.isfinite(values)]
         first = self.panels[0]
 
-        # The axes of all panels are shared: scales and limits of the first are those of all.
+        # The panels share their axes: scales and limits of the first one are those of all.
         if common and x.is_number:
             first.update_datalim([(common.x.min(), finite.min()), (common.x.max(), finite.max())])
             first.autoscale_view()
         if finite.min() > 0 and finite.max() > LOG_RATIO * finite.min():
             first.set_yscale("log")
             label_log_axis(first.yaxis, float(finite.min()), float(finite.max()), USED * PANEL_HEIGHT)
-        # From 0 on where that costs less than half of the axis: ratios can then be read off.
+        # From 0 on, where that takes less than half of the axis: ratios can then be read off.
         elif 0 <= finite.min() < 0.5 * finite.max():
             first.set_ylim(bottom=0)
 
@@ -170,8 +173,8 @@ class MeasurePage:
 
 
 def draw_curves(axes: Axes, x: SweptAxis, curves: Sequence[Curve], ring: tuple[int, float] | None) -> None:
-    """Draw ``curves`` over ``x``, points alone over categories, and a ``ring`` at an index and value."""
-    # A key's values may stand in any order in the case.
+    """Draw ``curves`` over ``x``, without lines over categories, and a ring at the position and value of ``ring``."""
+    # A case may have the values of a key in any order.
     order = np.argsort(x.positions, kind="stable")
     for curve in curves:
         shift = 0.0
@@ -184,6 +187,7 @@ def draw_curves(axes: Axes, x: SweptAxis, curves: Sequence[Curve], ring: tuple[i
         axes.plot(positions, curve.values[order], label=curve.label, **curve.look | {"ls": line})
         if curve.band:
             _draw_band(axes, x, positions, *(end[order] for end in curve.band), colour=curve.look["color"])
+        # Of the curves the ring belongs to the one that has this value.
         if ring and curve.values[ring[0]] == ring[1]:
             at = x.positions[ring[0]] + shift, ring[1]
             axes.plot(*at, "o", mfc="none", mec=style.BLACK, ms=8, mew=0.8)
@@ -194,7 +198,7 @@ def draw_curves(axes: Axes, x: SweptAxis, curves: Sequence[Curve], ring: tuple[i
 def _draw_band(
     axes: Axes, x: SweptAxis, positions: np.ndarray, low: np.ndarray, high: np.ndarray, *, colour: str
 ) -> None:
-    """Draw what lies between the ends ``low`` and ``high`` at the ``positions``."""
+    """Draw the band between ``low`` and ``high`` (position,): an area, or over categories a bar at each."""
     if x.is_number:
         axes.fill_between(positions, low, high, color=colour, alpha=0.25, lw=0)
     else:
@@ -202,7 +206,7 @@ def _draw_band(
 
 
 class LargestOnMap(NamedTuple):
-    """Where the largest value of a page of maps is: indices along x and y, and of its panel."""
+    """Place of the largest value on a page of maps: its index along ``x`` and ``y``, and that of its ``panel``."""
 
     x: int
     y: int
@@ -217,9 +221,9 @@ def draw_maps(
     ring: LargestOnMap | None,
     common: CommonAxes | None = None,
 ) -> Figure:
-    """Draw ``fields`` (y, x) in the panels of ``page`` with one scale of colours, contours on them, and a ring.
+    """Draw ``fields`` (y, x) in the panels of ``page`` with one scale of colours and contours; return the figure.
 
-    With pages of other sweeps, axes and colours are ``common`` to all.
+    A ``ring`` marks the largest value. With pages of other sweeps, axes and colours are ``common`` to all.
     """
     x_order = np.argsort(x.positions, kind="stable")
     y_order = np.argsort(y.positions, kind="stable")
@@ -240,7 +244,7 @@ def draw_maps(
 
     if ring:
         at = x.positions[ring.x], y.positions[ring.y]
-        # White below the red, so that the ring is seen on any colour of the map.
+        # A white ring below the red one, which is then seen on any colour of the map.
         for colour, thickness in (("white", 2.2), (style.RED, 1.2)):
             page.panels[ring.panel].plot(*at, "o", mfc="none", mec=colour, mew=thickness, ms=9)
     page.label_axes(x, y.label)
@@ -258,8 +262,9 @@ def _norm(values: np.ndarray) -> Normalize:
     high = float(finite.max())
     if low > 0 and high > LOG_RATIO * low:
         return LogNorm(low, high)
+    # A field of one value still needs a scale.
     if high == low:
-        high = low + 1  # a field of one value still has a scale
+        high = low + 1
     return Normalize(low, high)
 
 
@@ -268,6 +273,7 @@ def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray,
     finite = values[np.isfinite(values)]
     if len(finite) < 4 or np.ptp(finite) == 0:
         return
+
     locator: Locator = MaxNLocator(most)
     if isinstance(norm, LogNorm):
         locator = LogLocator(numticks=most)
@@ -281,7 +287,10 @@ def _draw_contours(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray,
 
 
 def draw_samples(page: MeasurePage, seeds: np.ndarray, series: Sequence[Curve]) -> Figure:
-    """Draw every sample over its seed (sample,), with mean and band of each of ``series``, named in the legend."""
+    """Draw the samples of each of ``series`` over their ``seeds`` (sample,), with their mean and the band of 5 to 95 %.
+
+    Return the figure.
+    """
     (axes,) = page.panels
     for curve in series:
         look = curve.look
@@ -294,7 +303,10 @@ def draw_samples(page: MeasurePage, seeds: np.ndarray, series: Sequence[Curve]) 
 
 
 def cell_edges(positions: np.ndarray, scale: str) -> np.ndarray:
-    """Return the edges (n + 1,) of a map's cells about rising ``positions`` (n,), halfway on the ``scale``."""
+    """Return the edges (n + 1,) of a map's cells around two or more rising ``positions`` (n,).
+
+    They are halfway between the positions on the ``scale``, "linear" or "log"; the outermost cells are symmetric.
+    """
     if scale == "log":
         return np.exp(cell_edges(np.log(positions), "linear"))
     middles = 0.5 * (positions[1:] + positions[:-1])
@@ -304,9 +316,9 @@ def cell_edges(positions: np.ndarray, scale: str) -> np.ndarray:
 
 
 def label_positions(axis: Axis, swept: SweptAxis, length: float) -> None:
-    """Put ticks at the values of a ``swept`` axis if these are few, else where a scale of numbers has them.
+    """Put ticks at all values of a ``swept`` axis if their labels have room, else where a scale of numbers has them.
 
-    ``length`` in inches is that of the axis, on which the labels must have room.
+    ``length`` in inches is that of the axis. Categories all have ticks.
     """
     positions = swept.positions
     texts = swept.value_texts
@@ -323,11 +335,9 @@ def label_positions(axis: Axis, swept: SweptAxis, length: float) -> None:
     if swept.scale == "log":
         on_scale = np.log(positions)
     number = swept.first_number
-    if (
-        number
-        and len(positions) <= MOST_TICKS
-        and has_room(on_scale, number.value_texts, USED * length, axis.axis_name == "x")
-    ):
+    assert number is not None
+    are_few = len(positions) <= MOST_TICKS
+    if are_few and has_room(on_scale, number.value_texts, USED * length, axis.axis_name == "x"):
         axis.set_ticks(positions, number.value_texts)
         axis.set_minor_locator(NullLocator())
     elif swept.scale == "log":

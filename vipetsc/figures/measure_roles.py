@@ -1,4 +1,9 @@
-"""Roles of the axes of a measure in its pictures: positions, curves of a panel, panels of a page, pages."""
+"""Roles of the axes of a measure in its pictures: positions, curves of a panel, panels of a page, pages.
+
+A measure has as many axes as its sweep has keys that vary independently, and perhaps one of pass bands. One or two of
+them become axes of the panels. Values along the others are compared: as curves in a panel, as panels on a page, and for
+those for which there is no room, on pages of their own.
+"""
 
 import math
 from collections.abc import Sequence
@@ -8,7 +13,7 @@ from vipetsc.figures.swept_axes import SweptAxis
 
 MOST_CURVES = 6  # of a panel: as many as there are markers
 MOST_PANELS = 16  # of a page: four by four are an inch and a half wide each
-LEAST_ON_A_MAP = 3  # values of a number that is an axis of a map; two values are compared better as curves
+LEAST_ON_A_MAP = 3  # values of a key that is an axis of a map; two values are better compared as curves
 PART = "part"  # the dimension of parts of the frequency axis
 
 
@@ -34,9 +39,13 @@ class Roles(NamedTuple):
 
     @classmethod
     def of(cls, axes: Sequence[SweptAxis]) -> Self:
-        """Return the roles of ``axes``, of which there is at least one."""
-        # The axis with most values is the one that a reader follows; a stable sort keeps the case's order of equal
-        # ones.
+        """Return the roles of ``axes``, of which there is at least one; ``y`` is None for curves.
+
+        Of the axes with numbers, or of all if none has, the longest is ``x``; the next one with numbers is ``y`` if
+        both have ``LEAST_ON_A_MAP`` values. Of the others the last ones become curves, unless there is a map, those
+        before them panels, and the first ones pages.
+        """
+        # Of axes of one length the first one in the case comes first: the sort is stable.
         longest_first = sorted(axes, key=lambda axis: -axis.size)
         numbers = [axis for axis in longest_first if axis.is_number]
         of_a_map = [axis for axis in numbers if axis.size >= LEAST_ON_A_MAP]
@@ -47,21 +56,23 @@ class Roles(NamedTuple):
             y = of_a_map[1]
             taken.add(y.dimension)
 
+        # The last axes of a case vary fastest: what they compare stands closest together. Pass bands are no curves if
+        # there is anything else to compare: they differ by orders of magnitude, and members are compared band by band.
         others = [axis for axis in axes if axis.dimension not in taken]
-        # The last axes of a case vary fastest: what they compare stands closest together.
-        # Bands differ by orders of magnitude: members are compared band by band.
         keys = [axis for axis in others if axis.dimension != PART]
         curves: tuple[SweptAxis, ...] = ()
         if y is None:
             curves = _last_of(keys or others, MOST_CURVES)
         taken |= {axis.dimension for axis in curves}
+
         others = [axis for axis in others if axis.dimension not in taken]
         panels = _last_of(others, MOST_PANELS)
-        return cls(x, y, curves, panels, pages=tuple(others[: len(others) - len(panels)]))
+        pages = tuple(others[: len(others) - len(panels)])
+        return cls(x=x, y=y, curves=curves, panels=panels, pages=pages)
 
 
 def _last_of(axes: Sequence[SweptAxis], most: int) -> tuple[SweptAxis, ...]:
-    """Return the last of the ``axes`` that have ``most`` combinations or fewer."""
+    """Return as many of the last ``axes`` as have ``most`` combinations of values or fewer together."""
     count = 0
     while count < len(axes) and math.prod(axis.size for axis in axes[-count - 1 :]) <= most:
         count += 1

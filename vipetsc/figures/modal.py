@@ -1,4 +1,9 @@
-"""The energies of a run's linear modes: their steps at impacts, and the energy that each site transferred."""
+"""The energies of a run's linear modes: their steps at impacts, and the energy that each site transferred.
+
+Without contacts each mode of the lattice keeps its energy. The modes are put together by the pass band or gap in which
+their frequencies lie (*parts* of the spectrum). A *cluster* is a group of contact episodes between the same samples,
+whose transfers cannot be told apart.
+"""
 
 from typing import Any, NamedTuple, Self
 
@@ -11,16 +16,19 @@ from matplotlib.figure import Figure
 from vipetsc.case import Case
 from vipetsc.figures import panels, style
 
-LEAST = 1e-4  # of the largest energy, at the end or in transfers, below which a gap is not drawn: its line is flat
-MOST_ROWS = 24  # sites of a matrix, whose rows are a letter high then; of more, those with the largest transfers
-MOST_TICKS = 6  # of sites next to the raster of impacts, which is an inch high
-SEVERAL = "several"  # sites in contact between the same samples
+# Least energy of a gap that is drawn, at the end or summed over its transfers, over the largest energy of all modes: a
+# line of less would be flat.
+LEAST = 1e-4
+# Sites of the matrix: its rows are then a letter high. Of more, those with the largest transfers are shown.
+MOST_ROWS = 24
+MOST_TICKS = 6  # labels of sites next to the panel of impacts, which is an inch high
+SEVERAL = "several"  # the label of the row for clusters with episodes of several sites
 
 
 class MovedEnergies(NamedTuple):
-    """Energies (row, part) in J that each site transferred to the parts of the spectrum; the last column is its loss.
+    """``energy`` (row, part + 1) in J that each site transferred to the parts of the spectrum; the last column is lost.
 
-    ``labels`` (row) are cells, or ``SEVERAL`` for episodes that cannot be separated by site.
+    ``labels`` (row) are the cells of the sites, or ``SEVERAL`` for clusters that cannot be separated by site.
     """
 
     labels: list[str]
@@ -28,20 +36,22 @@ class MovedEnergies(NamedTuple):
 
     @classmethod
     def of(cls, run: xr.Dataset, analysis: xr.Dataset, parts: list[int]) -> Self:
-        """Return the energies that at most ``MOST_ROWS`` sites of ``run`` transferred to ``parts``."""
-        transfer = analysis["bands/transfer"].values  # (cluster, part)
+        """Return the energies that at most ``MOST_ROWS`` sites of ``run`` transferred to the ``parts``, by index."""
+        # (cluster, part): the change of each part's energy during a cluster.
+        transfer = analysis["bands/transfer"].values
         cluster = analysis["bands/cluster_of_episode"].values - 1
         site = run["impacts/site"].values.astype(int) - 1
         sites = run["sites/cell"].values
 
-        # A cluster is of one site if the lowest and the highest of its episodes are the same.
+        # A cluster is of one site if the lowest and the highest site of its episodes are the same. By ``at``, since
+        # several episodes change the entry of one cluster.
         lowest = np.full(len(transfer), len(sites))
         highest = np.full(len(transfer), -1)
-        # Unbuffered: several episodes of a cluster change the same entry.
         np.minimum.at(lowest, cluster, site)
         np.maximum.at(highest, cluster, site)
         row = np.where(lowest == highest, lowest, len(sites))
 
+        # What all parts together lost was dissipated. Clusters of several sites have a row behind those of the sites.
         moved = np.zeros((len(sites) + 1, len(parts) + 1))
         np.add.at(moved, row, np.column_stack([transfer[:, parts], -transfer.sum(axis=1)]))
 
@@ -67,9 +77,9 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     energy = analysis["bands/modal_energy"]
     largest = float(energy.sum("bands/part").max())
 
-    # Bands are always drawn, gaps where they have or had any energy to speak of.
+    # Bands are always drawn, gaps only if their energy can be seen. A gap may have given back by the end all that it
+    # took: its transfers count as well.
     names = list(energy.attrs["parts"])
-    # A gap may have given back by the end all that it took.
     weight = np.maximum(energy.values[:, -1], np.abs(analysis["bands/transfer"].values).sum(axis=0))
     parts = [p for p, name in enumerate(names) if "band" in name or weight[p] > LEAST * largest]
     moved = MovedEnergies.of(run, analysis, parts)
@@ -95,7 +105,7 @@ def modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 
 
 def _draw_steps(axes: Axes, run: xr.Dataset, analysis: xr.Dataset, parts: list[int]) -> None:
-    """Draw the energies of ``parts`` over time, with their fractions of all modal energy at the end."""
+    """Draw the energies of ``parts`` over time; the legend has their fractions of all modal energy at the end."""
     energy = analysis["bands/modal_energy"]
     names = list(energy.attrs["parts"])
     at_end = energy[:, -1].sum()
@@ -107,7 +117,7 @@ def _draw_steps(axes: Axes, run: xr.Dataset, analysis: xr.Dataset, parts: list[i
 
 
 def _looks(names: list[str], parts: list[int]) -> list[dict[str, Any]]:
-    """Return colour and dashes for each part: those of its band, dotted black for what is no band."""
+    """Return colour and dashes for each of ``parts``: those of its band, or black and dotted for a gap."""
     looks = []
     for part in parts:
         number = style.band_number(names[part])
@@ -145,7 +155,7 @@ def _draw_matrix(axes: Axes, rows: list[str], columns: list[str], percent: np.nd
 
 
 def _in_cell(value: float, is_wide: bool) -> str:
-    """Return a percentage in two decimals, or in one where a wide matrix has no room for more."""
+    """Return a percentage with its sign and two decimals, or one where a wide matrix has no room for five letters."""
     if abs(value) < 0.005:
         return "0"
     decimals = 1 if is_wide and abs(value) >= 9.995 else 2

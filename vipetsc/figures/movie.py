@@ -24,15 +24,17 @@ from vipetsc.lattice import UnitCell, bloch
 
 SHAPE = 9 / 16  # height over width, that of screens
 INCHES = 8.0  # the width that type is set for
-DECADES = 4  # of energy that are shown, each on half an inch of the panel
-FAINTEST = 0.05  # light that is shown: less cannot be seen, and would change pixels that a GIF has to store
+DECADES = 4  # of energy that are shown: each then has half an inch of the panel
+# Opacity of an impact's light below which it is not drawn: it could not be seen, and would change pixels that a GIF has
+# to store.
+FAINTEST = 0.05
 LARGEST = 60.0  # area in square points of the dot of the wave with the most energy
-UNCHANGED = 255  # the colour of pixels of a GIF that stay as they are, the last one of 256
+UNCHANGED = 255  # the last colour of the 256 of a GIF, for pixels that stay as they are from frame to frame
 REMEDY = "an MP4 needs ffmpeg: apt-get install --no-install-recommends ffmpeg, or pip install imageio-ffmpeg"
 
 
 class EnergyCurve(NamedTuple):
-    """An ``energy`` in J over ``time`` in s that a line grows along."""
+    """The ``energy`` (t,) in J over ``time`` (t,) in s of which a line shows more from frame to frame."""
 
     name: str
     time: np.ndarray
@@ -47,11 +49,17 @@ class Moving(NamedTuple):
 
 
 class MovieFigure:
-    """The figure of ``content``, ``width`` pixels wide; ``frame`` draws what moves."""
+    """The figure of ``content``, ``width`` pixels wide, or one more if that is odd; ``frame`` draws a frame.
+
+    It has three panels: the wave over the cells, with a light at a site for each impact; the dispersion with a dot for
+    every wave, larger with more energy; and the energies of the bands over time.
+    """
 
     def __init__(self, run: xr.Dataset, content: MovieFrames, width: int = WIDTH) -> None:
         self.content = content
-        height = round(width * SHAPE / 2) * 2  # even, as the colours of an MP4 need it
+        # Both even: an MP4 has one colour for two by two pixels.
+        width += width % 2
+        height = round(width * SHAPE / 2) * 2
         figure = style.new_figure(INCHES, height * INCHES / width)
         figure.set_dpi(width / INCHES)
         ratios = {"width_ratios": (1.6, 1), "height_ratios": (1.4, 1)}
@@ -70,7 +78,7 @@ class MovieFigure:
         self._background = self._canvas.copy_from_bbox(figure.bbox)
 
     def _add(self, axes: Any, artist: Any) -> Any:
-        """Take ``artist`` out of the background, and return it."""
+        """Leave ``artist`` out of the background, to draw it in every frame; return it."""
         artist.set_animated(True)
         self._moving.append(Moving(axes, artist))
         return artist
@@ -78,8 +86,9 @@ class MovieFigure:
     def _draw_wave(self, axes: Any, name: str) -> None:
         """Draw the panel of the wave over the cells, with sites, impacts and the time."""
         content = self.content
-        across = axes.get_xaxis_transform()
         largest = float(np.abs(content.wave).max()) or 1.0
+        # Cells along x, the height of the panel along y.
+        across = axes.get_xaxis_transform()
         self._light = self._add(axes, axes.vlines(content.sites, 0, 1, lw=2.5, transform=across))
 
         nothing = np.full((len(content.cells), content.wave.shape[1]), np.nan)
@@ -152,12 +161,13 @@ class MovieFigure:
         if self._waves is not None:
             # Over the largest of all frames: a dot that shrinks has lost energy.
             relative = content.waves[k].ravel() / (content.waves.max() or 1.0)
-            level = np.log10(np.maximum(relative, 1e-30)) / DECADES + 1  # 1 of the largest, 0 of the least shown
+            # 1 for the largest energy, 0 for one ``DECADES`` below it, which is not shown.
+            level = np.log10(np.maximum(relative, 1e-30)) / DECADES + 1
             self._waves.set_sizes(LARGEST * np.maximum(level, 0.0) ** 2)
 
         for line, curve in self._growing:
             past = slice(0, int(np.searchsorted(curve.time, now, side="right")))
-            # Between samples, so that the line ends where the frame is.
+            # With a point between samples, so that the line ends at the time of the frame.
             energy_now = np.interp(now, curve.time, curve.energy)
             line.set_data(np.append(curve.time[past], now), np.append(curve.energy[past], energy_now))
 
@@ -195,12 +205,15 @@ def write_movie(movie: MovieFigure, rate: float, paths: Sequence[Path]) -> list[
 
 
 def _write_gif(movie: MovieFigure, rate: float, path: Path) -> None:
-    """Write a GIF that repeats: one palette; pixels that stay are transparent, which makes it several times smaller."""
+    """Write a GIF that repeats, with one palette for all frames.
+
+    Pixels that do not change from one frame to the next are transparent, which makes the file several times smaller.
+    """
     count = len(movie.content.time)
     palette = _palette(movie)
 
     def images() -> Iterator[Image.Image]:
-        # No pixel of the first frame has this index: all are stored.
+        # No pixel has this index, so that all pixels of the first frame are stored.
         before: Any = -1
         for k in range(count):
             frame = Image.fromarray(movie.frame(k)[..., :3])
@@ -210,7 +223,8 @@ def _write_gif(movie: MovieFigure, rate: float, path: Path) -> None:
             before = index
             yield image
 
-    # The format counts hundredths of a second: frames differ by one where that keeps the whole in time.
+    # The format counts hundredths of a second. The ends of the frames are rounded, not their lengths, so that errors do
+    # not add up.
     ends = np.rint(np.arange(count + 1) * 100 / rate)
     durations = [10 * int(length) for length in np.diff(ends)]
     following = images()
@@ -234,8 +248,9 @@ def _palette(movie: MovieFigure) -> Image.Image:
     chosen = np.linspace(0, count - 1, 4).astype(int)
     frames = np.concatenate([movie.frame(k)[..., :3].copy() for k in chosen])
     palette = Image.fromarray(frames).quantize(UNCHANGED, dither=Image.Dither.NONE)
+    # White comes out as a grey near 252: what is nearly white becomes white.
     colours = np.reshape(palette.getpalette(), (-1, 3))
-    colours[colours.min(axis=1) > 247] = 255  # Pillow takes the nearest to 252 for white
+    colours[colours.min(axis=1) > 247] = 255
     palette.putpalette(colours.ravel().tolist())
     return palette
 
@@ -250,12 +265,13 @@ def _write_mp4(movie: MovieFigure, rate: float, path: Path) -> None:
     target = ["-an", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(path)]
 
     with ExitStack() as stack:
-        # Its messages go to a file: a pipe that nobody reads would fill up and stop it.
+        # Messages of ffmpeg go to a file: a pipe that nobody reads would fill up and stop it.
         messages = stack.enter_context(tempfile.TemporaryFile())
         call = [command, "-y", "-loglevel", "error", *source, *target]
         process = stack.enter_context(subprocess.Popen(call, stdin=subprocess.PIPE, stderr=messages))
         assert process.stdin is not None
-        with suppress(BrokenPipeError):  # the messages say why
+        # If ffmpeg ends early, its messages say why.
+        with suppress(BrokenPipeError):
             for k in range(len(movie.content.time)):
                 process.stdin.write(movie.frame(k).data)
             process.stdin.close()

@@ -16,17 +16,18 @@ LENGTH = 10.0  # s
 RATE = 15.0  # frames a second; fewer are seen one by one
 WIDTH = 960  # pixels
 
-MOST_FRAMES = 5000  # five minutes at the default rate
-# Every frame transforms the motion of all shown cells, which are more than there are pixels.
+MOST_FRAMES = 5000  # of a movie: five and a half minutes at the default rate
+# Cells of a movie. It has fewer pixels, and every frame takes a Fourier transform over all of them.
 MOST_CELLS = 20_000
-FADE = 0.6  # factor of an impact's light from frame to frame: 0.4 s until it is too faint to be drawn
+# Factor of an impact's light from frame to frame: after six, 0.4 s at the default rate, it is too faint to be drawn.
+FADE = 0.6
 
 
 class Shot(NamedTuple):
-    """A request for a movie of ``quantity`` ("energy" or "velocity"), from ``start`` to ``stop`` in s.
+    """A request for a movie of ``quantity`` ("energy" or "velocity"), from ``start`` to ``stop`` in s of the run.
 
-    ``speed`` in s of the run a second; ``rate`` in frames a second; ``cells``: the first and the last one, from 1;
-    ``width`` in pixels.
+    ``speed`` is in s of the run a second of the movie, ``rate`` in frames a second, ``width`` in pixels; ``cells`` are
+    the first and the last one, from 1. What is None is chosen: the whole record, all cells, a movie of ``LENGTH``.
     """
 
     quantity: str = "energy"
@@ -39,9 +40,10 @@ class Shot(NamedTuple):
 
 
 class CheckedShot(NamedTuple):
-    """A shot that a run allows: a ``window`` of its recorded cells and the ``time`` (frame) in s.
+    """What a run has for a shot: the ``window`` of the recorded cells that it shows, and the ``time`` (frame,) in s.
 
-    ``has_waves``: whether waves can be separated, which takes displacement and velocity of cells side by side.
+    ``has_waves`` is whether the motion can be separated into Bloch waves, which needs displacement and velocity of
+    cells side by side.
     """
 
     window: slice
@@ -50,7 +52,7 @@ class CheckedShot(NamedTuple):
 
 
 class BandEnergies(NamedTuple):
-    """Energies (part, instant) in J of ``parts`` at ``instants`` in s."""
+    """``energy`` (part, instant) in J of the ``parts`` of the spectrum at ``instants`` (instant,) in s."""
 
     parts: tuple[str, ...]
     instants: np.ndarray
@@ -58,12 +60,27 @@ class BandEnergies(NamedTuple):
 
 
 class MovieFrames(NamedTuple):
-    """The content of frames: ``wave`` (frame, curve, cell), ``waves`` (frame, wavenumber, band) in J.
+    """The content of the frames of a movie.
 
-    ``time`` (frame) in s; ``cells`` (cell) from 1; ``wave`` is the energy in J of the bands by cell or the velocity in
-    m/s of the host; ``wavenumber`` in rad/cell, empty if waves cannot be separated; ``flash`` (frame, site), the light
-    of impacts at the cells ``sites``: 1 for one since the frame before, fading then. Where cells differ ``cell`` has
-    the means of those shown, and masses are their own.
+    Attributes
+    ----------
+    quantity
+        "energy" or "velocity", the quantity that ``wave`` is.
+    cell
+        The unit cell whose Bloch waves are shown. Where cells differ it has the means of those shown; in kinetic
+        energies each cell has its own masses.
+    time, cells
+        Times (frame,) in s, and cells (cell,) from 1.
+    wave
+        Energy in J of each pass band in each cell (frame, band, cell), or velocity in m/s of the host (frame, 1, cell).
+    wavenumber, waves
+        Wavenumbers (wavenumber,) in rad/cell and energies (frame, wavenumber, band) in J of the Bloch waves; empty if
+        waves cannot be separated.
+    sites, flash
+        Cells (site,) from 1 of the contact sites, and the light (frame, site) of their impacts: 1 in the first frame
+        after an impact, then fading.
+    energies
+        Energies of the whole lattice over time.
     """
 
     quantity: str
@@ -79,7 +96,7 @@ class MovieFrames(NamedTuple):
 
 
 def check(run: xr.Dataset, shot: Shot) -> CheckedShot:
-    """Return what ``run`` has of a ``shot``; raise ValueError that names the option that cannot be."""
+    """Return what ``run`` has for a ``shot``; raise ValueError, which names the option, if it cannot be made."""
     if "velocity" not in run:
         raise ValueError("--movie: the run recorded no velocity")
     window = _check_cells(run, shot)
@@ -99,7 +116,7 @@ def _check_cells(run: xr.Dataset, shot: Shot) -> slice:
     if shot.cells and not recorded[0] <= first < last <= recorded[-1]:
         raise ValueError(f"--cells {first}:{last}: the run recorded cells {recorded[0]} to {recorded[-1]}")
 
-    # By number, since a run may have recorded every n-th cell.
+    # The places of these numbers, since a run may have recorded every n-th cell.
     begin, end = np.searchsorted(recorded, (first, last + 1)).tolist()
     if end - begin > MOST_CELLS:
         raise ValueError(f"--movie: {end - begin} cells are more than {MOST_CELLS}; select some with --cells A:B")
@@ -114,7 +131,7 @@ def _check_times(run: xr.Dataset, shot: Shot) -> np.ndarray:
     if not time[0] <= start < stop <= time[-1] * (1 + 1e-12):
         raise ValueError(f"--from {start:g} --to {stop:g}: the run recorded {time[0]:g} to {time[-1]:g} s")
 
-    # A frame at the end as well, although rounding may put it a little behind.
+    # With a frame at the end as well, which rounding may put a little beyond it.
     step = (shot.speed or (stop - start) / LENGTH) / shot.rate
     count = (stop - start) / step * (1 + 1e-9) + 1
     if not 2 <= count < MOST_FRAMES + 1:
@@ -124,7 +141,10 @@ def _check_times(run: xr.Dataset, shot: Shot) -> np.ndarray:
 
 
 def movie_frames(run: xr.Dataset, analysis: xr.Dataset | None, shot: Shot) -> MovieFrames:
-    """Return the content of the frames, from the samples nearest to them; others are not read. Raise as ``check``."""
+    """Return the content of the frames, from the samples nearest to their times; no others are read.
+
+    Raises ValueError as ``check``.
+    """
     checked = check(run, shot)
     time = field_time(run)
     cells = run["cell"].values[checked.window]
@@ -132,7 +152,7 @@ def movie_frames(run: xr.Dataset, analysis: xr.Dataset | None, shot: Shot) -> Mo
     shown = int(cells[0]) - 1, int(cells[-1])
     cell = chain.mean_cell(*shown)
 
-    # A cell with its own masses moves as one with the mean masses and the same kinetic energy.
+    # A cell with masses of its own counts as one with the mean masses whose motion has the same kinetic energy.
     weight = np.ones(1)
     if checked.has_waves and cell is not chain.cell:
         weight = np.sqrt(chain.coefficients(*shown).masses / cell.masses)
@@ -141,7 +161,9 @@ def movie_frames(run: xr.Dataset, analysis: xr.Dataset | None, shot: Shot) -> Mo
 
     wave = []
     waves = []
-    for row in np.rint((checked.time - time[0]) / (time[1] - time[0])).astype(int):  # samples are even in time
+    # Samples lie at equal intervals.
+    rows = np.rint((checked.time - time[0]) / (time[1] - time[0])).astype(int)
+    for row in rows:
         velocity = run["velocity"][row, checked.window].values
         if not checked.has_waves:
             wave.append(velocity[None, :, cell.host])
@@ -157,14 +179,16 @@ def movie_frames(run: xr.Dataset, analysis: xr.Dataset | None, shot: Shot) -> Mo
             wave.append(velocity[None, :, cell.host])
 
     sites = panels.recorded_sites(run, cells)
-    wavenumber = 2 * np.pi * np.fft.fftfreq(len(taper), 1.0)
+    wavenumber = np.zeros(0)
+    if checked.has_waves:
+        wavenumber = 2 * np.pi * np.fft.fftfreq(len(taper), 1.0)
     return MovieFrames(
         quantity=shot.quantity,
         cell=cell,
         time=checked.time,
         cells=cells,
         wave=np.array(wave),
-        wavenumber=wavenumber if checked.has_waves else np.zeros(0),
+        wavenumber=wavenumber,
         waves=np.array(waves),
         sites=sites,
         flash=_flash(run, sites, checked.time),
@@ -173,13 +197,17 @@ def movie_frames(run: xr.Dataset, analysis: xr.Dataset | None, shot: Shot) -> Mo
 
 
 def _taper(run: xr.Dataset, chain: Chain, cells: int) -> np.ndarray:
-    """Return the weights (cell, 1) of the shown cells, and of those at rest behind them, in a transform."""
-    # A part of the recorded cells is cut out of a wave, the whole is not.
-    weights = np.ones(cells) if cells == run.sizes["cell"] else spectra.taper(cells, spectra.TAPER)
+    """Return the weights (cell, 1) in a transform of the shown ``cells``, and 0 for cells at rest behind them."""
+    # A window cuts off the waves at its ends, whose spectrum would then be wide; all recorded cells are not cut.
+    weights = np.ones(cells)
+    if cells < run.sizes["cell"]:
+        weights = spectra.taper(cells, spectra.TAPER)
 
-    # A transform joins the ends, which only a ring has joined: cells at rest between them.
-    is_ring = chain.ends == "periodic" and cells == chain.cells
-    beyond = 0 if is_ring else cells // 8 + 1
+    # The transform takes the last cell for a neighbour of the first, which it is in a whole ring only. Elsewhere cells
+    # at rest, an eighth more, separate them.
+    beyond = cells // 8 + 1
+    if chain.ends == "periodic" and cells == chain.cells:
+        beyond = 0
     return np.pad(weights, (0, beyond))[:, None]
 
 
@@ -192,14 +220,17 @@ def _flash(run: xr.Dataset, sites: np.ndarray, time: np.ndarray) -> np.ndarray:
     light = np.zeros(len(sites))
     for k, now in enumerate(time):
         struck = np.isin(sites, struck_cell[(onset > now - step) & (onset <= now)])
-        # An impact lasts less than a frame: without the afterglow most would be seen by nobody.
+        # The light fades slowly, since one that lasts a single frame would hardly be seen.
         light = np.where(struck, 1.0, FADE * light)
         flash[k] = light
     return flash
 
 
 def _energies(run: xr.Dataset, analysis: xr.Dataset | None) -> BandEnergies:
-    """Return energies of bands without gaps, of linear modes or else kinetic ones; or else that of the lattice."""
+    """Return the energies of the pass bands over time: of linear modes, or if there are none kinetic energies.
+
+    Of a run without an analysis of bands, return the energy of the whole lattice.
+    """
     for name, axis in (("bands/modal_energy", "bands/instant"), ("bands/energy", "bands/sample")):
         if analysis is not None and name in analysis:
             names = np.array(analysis[name].attrs["parts"])

@@ -23,7 +23,7 @@ SYMBOLS = {
     "ibtet": "ibtet",
     "entropy": "entropy (bit)",
 }
-MOST_LINES = 12  # variables whose names have the usual size
+MOST_LINES = 12  # variables whose names have the usual size: those of more would touch
 
 
 class ComparedDesign(NamedTuple):
@@ -34,7 +34,7 @@ class ComparedDesign(NamedTuple):
 
 
 def _label(objective: ObjectiveTable) -> str:
-    """Return what an objective measures, for an axis."""
+    """Return what an objective measures, with its unit, as the label of an axis."""
     if objective.is_of_responses:
         return objective.name.replace(RESPONSE, "")
     if objective.is_of_runs:
@@ -52,19 +52,22 @@ def _misses_constraint(optimum: xr.Dataset) -> np.ndarray:
 
 
 def _compared(optimum: xr.Dataset) -> list[ComparedDesign]:
-    """Return the compared designs, once each; what is drawn last lies on top."""
+    """Return the compared designs in the order of drawing, so that the best one lies on top, each once."""
     numbers = dict(zip(optimum["compared"].values, optimum["comparison/number"].values.tolist(), strict=True))
     best = numbers.get("best")
     compared = []
     for name in COLOURS:
-        # Of two names of one design, as of the case where nothing is better, "best" is shown.
+        # A design that has two names, as the case has if no design is better, is shown as "best".
         if name in numbers and (name == "best" or numbers[name] != best):
             compared.append(ComparedDesign(name, numbers[name]))
     return compared
 
 
 def convergence(optimum: xr.Dataset) -> Figure:
-    """Draw the values of all designs, in their order or over both objectives, and what else became of them."""
+    """Draw the values of all designs: one objective in the designs' order, or two over each other.
+
+    If they come from runs, there is a panel with the energies of the upper bands and the losses.
+    """
     plan = OptimiseCase.of(optimum)
     options = plan.options
     objectives = options.objective
@@ -113,7 +116,7 @@ def _draw_one_objective(axes: Axes, optimum: xr.Dataset, objective: ObjectiveTab
 
     failed = optimum["reason"].values != ""
     if failed.any():
-        # They have no value: on the lower edge of the panel.
+        # Designs that failed have no value: they are marked on the lower edge of the panel.
         look = {"color": style.RED, "ms": 3, "clip_on": False, "label": "failed"}
         axes.plot(number[failed], np.zeros(failed.sum()), "x", transform=axes.get_xaxis_transform(), **look)
     axes.set(xlabel="Design", ylabel=_label(objective), title="Objective")
@@ -122,10 +125,10 @@ def _draw_one_objective(axes: Axes, optimum: xr.Dataset, objective: ObjectiveTab
 
 
 def _draw_two_objectives(axes: Axes, optimum: xr.Dataset, first: ObjectiveTable, second: ObjectiveTable) -> None:
-    """Draw one objective over the other, later designs darker, and the front of those that no other one dominates."""
+    """Draw one objective over the other, later designs darker, and the Pareto front."""
     number = optimum["design"].values
     value = optimum["value"].values
-    # The scale of colours begins below zero: the first designs would be white.
+    # The scale of colours begins at a negative number: at 0 the first designs would be white.
     shades = {"c": number, "cmap": "Blues", "vmin": -0.5 * len(number)}
     axes.scatter(value[:, 0], value[:, 1], s=6, label="designs (later: darker)", **shades)
     misses = _misses_constraint(optimum)
@@ -140,13 +143,13 @@ def _draw_two_objectives(axes: Axes, optimum: xr.Dataset, first: ObjectiveTable,
 
 
 def _mark(axes: Axes, design: ComparedDesign, x: float, y: float) -> None:
-    """Draw the marker of a compared design, named with its number."""
+    """Draw the marker of a compared design at ``x`` and ``y``; the legend has its name and number."""
     look = {"color": COLOURS[design.name], "mec": "white", "mew": 0.5, "ms": 6}
     axes.plot(x, y, MARKERS[design.name], label=f"{design.name} ({design.number})", **look)
 
 
 def compared_designs(optimum: xr.Dataset) -> Figure:
-    """Draw clearances over the cells of the sites, and where within its bounds all that varies lies."""
+    """Draw the compared designs: clearances over the cells of the sites, and each variable between its bounds."""
     plan = OptimiseCase.of(optimum)
     figure = style.new_figure(style.PAGE, 2.6)
     sites, variables = figure.subplots(1, 2)
@@ -174,9 +177,9 @@ def compared_designs(optimum: xr.Dataset) -> Figure:
 
 
 def compared_curves(optimum: xr.Dataset) -> Figure:
-    """Draw what the objectives measure, over the amplitude or along responses, and energies, of compared designs."""
+    """Draw what the objectives measure of the compared designs, over the amplitude or along responses; and energies."""
     plan = OptimiseCase.of(optimum)
-    # Objectives of one measure, at different amplitudes, have one panel and the curve of the last of them.
+    # Objectives that measure the same at different amplitudes have one panel, with the curve of the last of them.
     measures = {objective.name: i for i, objective in enumerate(plan.options.objective)}
     has_energies = plan.options.measures_runs
     figure = style.new_figure(style.PAGE, 2.6)
@@ -194,7 +197,7 @@ def compared_curves(optimum: xr.Dataset) -> Figure:
 
 
 def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: int) -> None:
-    """Draw the frequency responses of which objective number ``index`` is a number; unstable states thin."""
+    """Draw the frequency responses from which objective number ``index`` is taken; unstable states are thin."""
     objective = plan.options.objective[index]
     of_line = optimum["response/of"].values
     lines = optimum["response/compared"].values
@@ -207,7 +210,8 @@ def _draw_response(axes: Axes, optimum: xr.Dataset, plan: OptimiseCase, index: i
             is_stable = optimum["response/unstable"].values[points] == 0
             axes.plot(parameter, value, color=COLOURS[design.name], lw=0.4)
             axes.plot(parameter, np.where(is_stable, value, np.nan), color=COLOURS[design.name], lw=1.2, label=label)
-            label = "_"  # of several curves the first one is named
+            # Of several curves of a design the first one is named.
+            label = "_"
 
     for bound in objective.part or []:
         axes.axvline(bound, color=style.GREY, lw=0.5, ls=style.DOTTED)

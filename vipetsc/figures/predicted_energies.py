@@ -1,4 +1,4 @@
-"""A prediction over the simulated transfer: upper bands, each band, what is dissipated, how hard sites are met."""
+"""A prediction next to simulated runs: energies of the upper bands and of each band, losses, the wave at each site."""
 
 from typing import Any
 
@@ -10,21 +10,24 @@ from matplotlib.figure import Figure
 from vipetsc.figures import panels, style
 
 LEAST = 1e-4  # of the work, the smallest energy shown
-MOST_SITES = 6  # with a name in the legend: as many as there are dashes
+MOST_SITES = 6  # that have a name in the legend: as many as there are dashes
 LOOKS: dict[str, dict[str, Any]] = {"predicted": {"lw": 1.2}, "simulated": {"ls": "", "marker": "o", "ms": 3.2}}
 LOSSES: dict[str, dict[str, Any]] = {
     "dissipated": {"label": "contacts", "color": style.BLACK, "ls": "-"},
     "dashpots": {"label": "dashpots", "color": style.GREEN, "ls": style.DASHED},
     "absorbed": {"label": "those of the ends", "color": style.ORANGE, "ls": style.DOTTED},
 }
-MARKERS = "os^Dvp"  # of the simulated energies of bands, which differ in grey as the lines do
+MARKERS = "os^Dvp"  # of the simulated energies of bands, so that they too can be told apart in greyscale print
 ROW = 0.075  # height of a legend's row, as a fraction of the height of the axes
 SIDES = 0.04  # left and right of all amplitudes, as a fraction of their range in logarithms
 MARGIN = 0.04  # above and below a legend together
 
 
 def prediction(data: xr.Dataset) -> Figure:
-    """Draw energies at the end over the drive's work against amplitude, predicted (lines) and simulated (points)."""
+    """Draw energies at the end over the drive's work against amplitude, predicted (lines) and simulated (points).
+
+    A fourth panel has the predicted displacement of the wave that arrives at each site, over the clearance.
+    """
     bands = data["band"].values
     name = "upper" if int(data.attrs["drive_band"]) < len(bands) else "other"
     title = "Bands above the driven one" if name == "upper" else "All bands except the driven one"
@@ -34,7 +37,7 @@ def prediction(data: xr.Dataset) -> Figure:
 
     _draw_total(transferred, data, name)
     transferred.set(title=title, ylabel="Energy at the end / work", xscale="log", yscale="log")
-    # Members without contact transfer nothing; they would stretch the axis to rounding.
+    # The axis begins at what contacts transfer: members without contact have rounding errors, far below.
     transferred.set_ylim(max(LEAST, _least(data, name) / 1.5), None)
     _put_legend_above(transferred, columns=2)
 
@@ -78,19 +81,19 @@ def _draw_total(axes: Axes, data: xr.Dataset, name: str, color: str = style.BLAC
 
 
 def _draw_losses(axes: Axes, data: xr.Dataset) -> None:
-    """Draw what contacts dissipate, and in a lattice with dashpots what all of them, and absorbing ends alone, take."""
+    """Draw what contacts dissipate, what dashpots do if there are any, and those of absorbing ends alone."""
     losses = [name for name in LOSSES if f"predicted/{name}" in data]
     for name in losses:
         _draw_total(axes, data, name, LOSSES[name]["color"], LOSSES[name]["ls"])
     if len(losses) > 1:
-        # One entry a loss: lines and points are explained in the first panel.
+        # One entry for each loss; the first panel explains lines and points.
         handles = [axes.plot([], [], **LOSSES[name])[0] for name in losses]
         axes.set_ylim(0, 1.25)
         axes.legend(handles=handles, loc="upper left", ncols=len(losses), columnspacing=0.8)
 
 
 def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
-    """Draw the energy of every band in its colour, predicted and simulated, with both under one label."""
+    """Draw the energy of every band in its colour, predicted and simulated, with one label for both."""
     amplitude = data["amplitude"].values
     for i, band in enumerate(data["band"].values):
         look = style.band_look(int(band)) | LOOKS["predicted"]
@@ -103,7 +106,7 @@ def _draw_bands(axes: Axes, data: xr.Dataset) -> None:
 
 
 def _draw_sites(axes: Axes, data: xr.Dataset) -> None:
-    """Draw the wave that arrives at every site; few sites have names, and lines that differ in grey."""
+    """Draw the wave that arrives at every site; if the sites are few, each has a name and dashes of its own."""
     few = data.sizes["site"] <= MOST_SITES
     for i, (site, z) in enumerate(zip(data["sites/cell"].values, data["predicted/z"].values.T, strict=True)):
         label = f"cell {site}" if few else None
@@ -112,18 +115,18 @@ def _draw_sites(axes: Axes, data: xr.Dataset) -> None:
 
 
 def _show_amplitudes(axes: Axes, amplitudes: np.ndarray) -> None:
-    """Give a logarithmic axis limits apart from all that it shows: a line on the frame of the axes is not seen."""
+    """Set the limits of a logarithmic axis a little beyond all ``amplitudes``: a line on the frame is not seen."""
     shown = amplitudes[amplitudes > 0]
     margin = (shown.max() / shown.min()) ** SIDES
     axes.set_xlim(shown.min() / margin, shown.max() * margin)
 
 
 def _put_legend_above(axes: Axes, columns: int) -> None:
-    """Put the legend of logarithmic ``axes`` above all that they show, which their limits make room for."""
+    """Put the legend of logarithmic ``axes`` above all that they show, and raise their upper limit to make room."""
     entries = len(axes.get_legend_handles_labels()[0])
     room = MARGIN + ROW * -(-entries // columns)
     low, high = axes.get_ylim()
-    # The old range is then the fraction 1 - room of the new one, in logarithms.
+    # ln(new / low) = ln(high / low) (1 + room / (1 - room)): the old range is the fraction 1 - room of the new one.
     axes.set_ylim(low, high * (high / low) ** (room / (1 - room)))
     axes.legend(loc="upper left", ncols=columns, columnspacing=0.8, handlelength=style.DASHES_SEEN)
 

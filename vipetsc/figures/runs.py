@@ -21,12 +21,14 @@ CELLS = {
     "dispersion_after": ("After the first site", style.VERMILION),
     "dispersion": ("All cells", style.BLACK),
 }
-LARGEST_RESIDUAL = 1e-8  # of the ledger, over the work of the drive, in a run at the default tolerances
-MOST_OF_A_RECORD = 0.05  # that a mean over two periods of the drive may take; a longer mean would hide the transient
-# Points of a phase portrait drawn for each sample, 60 a period of the top band: the corners are 0.1 rad. They are free:
-# the picture takes 0.26 s of CPU with 5, 10 or 20 of them.
+LARGEST_RESIDUAL = 1e-8  # of the ledger of a sound run at the default tolerances, over the work of the drive
+# Fraction of a record that two periods of the drive may take for energies to be drawn as means over them: a longer mean
+# would hide the transient.
+MOST_OF_A_RECORD = 0.05
+# Points of a phase portrait for each sample. By default there are six samples or more in a period of the top band: the
+# corners of the curve are then at most 2 pi/60 = 0.1 rad. The picture takes 0.26 s of CPU with 5, 10 or 20.
 REFINE = 10
-COLOURS = 256  # by which time is drawn in a phase portrait: as many as the colour map has
+COLOURS = 256  # of time in a phase portrait: as many as the colour map has
 
 
 def without_spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
@@ -55,7 +57,7 @@ def spacetime(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 
 
 def _draw_energy(axes: Axes, run: xr.Dataset, analysis: xr.Dataset) -> None:
-    """Draw a map of the kinetic energy over cells and time; of a single cell a curve."""
+    """Draw a map of the kinetic energy (J) of each cell over time; of a single cell a curve."""
     energy = analysis["kinetic_energy"]
     cells = analysis["cell"].values
     time = analysis["time"].values
@@ -85,17 +87,20 @@ def without_dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
 
 def _left_out(analysis: xr.Dataset | None, measure: str) -> str:
     """Return the sentence of an ``analysis`` about a ``measure`` that it has left out; empty for none."""
-    sentences = "" if analysis is None else str(analysis.attrs.get("left_out", ""))
+    if analysis is None:
+        return ""
+    # The attribute has a sentence for each measure that was left out.
+    sentences = str(analysis.attrs.get("left_out", ""))
     return next((sentence for sentence in sentences.split("; ") if measure in sentence), "")
 
 
 def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     """Draw 2-D spectra of the cells before and after the first site, and their sums over wavenumber."""
     assert analysis is not None
-    measured = [name for name in CELLS if name in analysis]
-    # Spectra of all cells together only where there are none before and after a site.
     model = Case.of(run).model()
     cell = model.chain.cell
+    # The spectrum of all cells together is drawn only if there are none of those before and after a site.
+    measured = [name for name in CELLS if name in analysis]
     parts = [name for name in measured if name != "dispersion"]
     spectra = panels.below_cutoff(analysis, cell, parts or measured)
     norm = panels.log_norm(*spectra.values())
@@ -103,7 +108,7 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     figure = style.new_figure(style.PAGE if len(spectra) > 1 else 5.0, 3.2)
     widths = [1.0] * len(spectra) + [0.55]
     *maps, side = figure.subplots(1, len(spectra) + 1, sharey=True, width_ratios=widths)
-    # In sums over the wavenumber what reaches the upper bands can be read off.
+    # The pass bands are shaded, so that the energy that each has received can be read off the sums.
     panels.shade_bands(side, ((band.low, band.high) for band in pass_bands(cell)))
     for axes, tag, (name, spectrum) in zip(maps, "ab", spectra.items(), strict=False):
         text, colour = CELLS[str(name)]
@@ -123,7 +128,7 @@ def dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 
 
 def _mark_drive(axes: Axes, model: Model) -> None:
-    """Draw a dotted line at the frequency of the drive or, of a run without one, of the initial motion."""
+    """Draw a dotted line at the frequency of the drive or, if there is none, of the initial motion."""
     frequency = model.drive.frequency / 1e3
     axes.axhline(frequency, color=style.BLACK, lw=0.6, ls=":")
     text = "drive" if model.drive.amplitude else "motion"
@@ -144,7 +149,7 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
     figure = style.new_figure(style.COLUMN, 3.3)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1))
     _draw_ledger(upper, run)
-    # Above the work each row of the legend has its room.
+    # Room for the legend above the curves, 0.12 of the work for each of its rows.
     rows = -(-len(upper.get_lines()) // 2)
     top = (1.04 + 0.12 * rows) * largest
     upper.set(ylabel="Energy", xlim=run["time"].values[[0, -1]], ylim=(-0.03 * largest, top))
@@ -158,14 +163,15 @@ def ledger(run: xr.Dataset, analysis: xr.Dataset | None) -> Figure:
 
 
 def _draw_ledger(axes: Axes, run: xr.Dataset) -> None:
-    """Draw what came in, what is stored and in which parts, and what was lost."""
+    """Draw energies (J) over time: what came in, what is stored and in which parts, and what was lost."""
     time = run["time"].values
     case = Case.of(run)
     kinetic = run["energy/kinetic"]
     contact = run["energy/contact"]
     stored = kinetic + run["energy/spring"] + contact
 
-    # Both swing at twice the drive's frequency, which no page can resolve; means over two periods can be seen.
+    # Kinetic and spring energy swing at twice the drive's frequency, which no page can resolve: means over two periods
+    # are drawn instead.
     two_periods = 4 * np.pi / case.model().drive.frequency
     window = int(np.ceil(two_periods / (time[1] - time[0])))
     parts = run[["energy/kinetic", "energy/spring"]]
@@ -180,7 +186,7 @@ def _draw_ledger(axes: Axes, run: xr.Dataset) -> None:
         ("kinetic + potential", stored, style.BLUE, "-"),
         (f"kinetic{mean}", parts["energy/kinetic"], style.SKY, "-"),
     ]
-    # What a lattice does not have stands nowhere.
+    # A lattice without springs, sites or dashpots has no curve of their energy.
     if case.model().chain.cell.springs:
         curves.append((f"springs{mean}", parts["energy/spring"], style.GREEN, (0, (3, 1.5))))
     if run.sizes["site"]:
@@ -193,7 +199,10 @@ def _draw_ledger(axes: Axes, run: xr.Dataset) -> None:
 
 
 def _draw_residual(axes: Axes, run: xr.Dataset, largest: float) -> None:
-    """Draw what the balance of energies leaves over the ``largest`` work, and the limit of a sound run."""
+    """Draw the residual of the balance of energies over the ``largest`` work (J), and the limit of a sound run.
+
+    It is |work - dissipated in contacts - dissipated in dashpots - stored|, 0 but for errors of the integration.
+    """
     work = run["energy/work"]
     damped = run.get("energy/dissipated_by_damping", 0.0 * work)
     stored = run["energy/kinetic"] + run["energy/spring"] + run["energy/contact"]
@@ -210,7 +219,10 @@ def _draw_residual(axes: Axes, run: xr.Dataset, largest: float) -> None:
 
 
 class Motion(NamedTuple):
-    """A mass, or the relative motion of two, over time: ``u`` in m and ``v`` in m/s, and its names in a portrait."""
+    """The motion of a mass, or of one mass relative to another: ``u`` (t,) in m and ``v`` (t,) in m/s.
+
+    ``title`` and ``symbol`` (LaTeX) are its names in a portrait.
+    """
 
     title: str
     symbol: str
@@ -284,7 +296,7 @@ def _draw_portrait(axes: Axes, motion: Motion, time: np.ndarray, first_contact: 
 
 
 def _stops(run: xr.Dataset, site: int) -> list[float]:
-    """Return the relative displacements in mm at which the contact of ``site`` (0-based) closes; one may be missing."""
+    """Return the relative displacements in mm at which the contact of ``site`` (from 0) closes, on one side or both."""
     plus = 1e3 * float(run["sites/clearance"][site])
     minus = plus
     if "sites/clearance_minus" in run:
@@ -293,7 +305,7 @@ def _stops(run: xr.Dataset, site: int) -> list[float]:
 
 
 def _mark_stops(axes: Axes, stops: list[float]) -> None:
-    """Draw the ``stops`` (mm) as dashed lines, in limits that hold them."""
+    """Draw the ``stops`` (mm) as dashed lines, and widen the limits of the axis to show them."""
     reach = max(axes.get_xlim()[1], *(1.15 * abs(stop) for stop in stops))
     axes.set_xlim(-reach, reach)
     axes.vlines(stops, *axes.get_ylim(), color=style.VERMILION, lw=0.8, ls=style.DASHED)
@@ -303,14 +315,20 @@ def _mark_stops(axes: Axes, stops: list[float]) -> None:
 
 
 def refined(u: np.ndarray, v: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return ``u`` and ``v`` (time, ...) and time (time,) on a finer grid: fast turns at stops are no polygons."""
+    """Return ``u`` and ``v`` (time, ...) and ``time`` (time,) with ``REFINE`` points for each sample.
+
+    Curves through them are smooth also where the motion turns fast at a stop.
+    """
     if len(time) < 2:
         return u, v, time
     sample = np.arange((len(time) - 1) * REFINE + 1) / REFINE
     fine = np.interp(sample, np.arange(len(time)), time)
-    # Displacements have their slopes in the file; the velocity has none, and Akima's curve does not overshoot at a
-    # stop.
-    return CubicHermiteSpline(time, u, v, axis=0)(fine), Akima1DInterpolator(time, v)(fine), fine
+
+    # The slopes of the displacement are the velocities. Those of the velocity are not in the file: Akima's curve takes
+    # them from its neighbours, and does not overshoot where the velocity jumps at a stop.
+    fine_u = CubicHermiteSpline(time, u, v, axis=0)(fine)
+    fine_v = Akima1DInterpolator(time, v)(fine)
+    return fine_u, fine_v, fine
 
 
 def centre_axes(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
@@ -323,7 +341,7 @@ def centre_axes(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
 def bands(cell: UnitCell, frequency: float | None = None) -> Figure:
     """Draw frequency against wavenumber and group velocity; gaps shaded, a drive's ``frequency`` (rad/s) marked.
 
-    Of a damped cell also against the decay along the lattice of the wave that goes farthest.
+    If the cell is damped, a third panel has the decay along the lattice, |Im kappa| of the wave that goes farthest.
     """
     passing = pass_bands(cell)
     widths = [1.3, 1]
@@ -348,7 +366,7 @@ def bands(cell: UnitCell, frequency: float | None = None) -> Figure:
 
     for axes in decay:
         omega = np.linspace(0, 1.08 * passing[-1].high, 541)[1:]
-        # The rate, not the length: an undamped wave in a band has an infinite length.
+        # The rate of decay rather than its length, which is infinite for an undamped wave in a band.
         rates = [1 / decay_length(cell, w) for w in omega.tolist()]
         axes.semilogx(rates, omega / 1e3, color=style.BLACK)
         axes.set(title="(c) Decay along the lattice", xlabel="|Im κ| (1/cell)")

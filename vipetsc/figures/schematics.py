@@ -32,7 +32,7 @@ SIDE = 0.5  # half the side of a mass of the reduced model
 
 STRIP = 0.52  # height in inches of a lattice drawn as a strip of cells
 LEGEND = "above: cell; below: clearance in mm; arrow: drive"
-ROD = {"color": style.BLACK, "lw": 0.7}
+ROD = {"color": style.BLACK, "lw": 0.7}  # the look of a spring's line
 
 Point = tuple[float, float]
 
@@ -77,7 +77,10 @@ def lattice_page(case: Case, sites: tuple[int, ...]) -> Figure:
 
 
 def reduced_model(masses: tuple[float, float], springs: tuple[float, float], clearance: float) -> Figure:
-    """Draw the 2-DoF model: host held by a wall, resonator on it by a spring and the contact; kg, N/m, m."""
+    """Draw the 2-DoF model: a host held by a wall, and a resonator joined to it by a spring and the contact.
+
+    ``masses`` in kg and ``springs`` in N/m are those of host and resonator, ``clearance`` is in m.
+    """
     figure = style.new_figure(style.PAGE * 0.72, 1.7)
     axes = figure.subplots()
     host = 2.6
@@ -99,6 +102,7 @@ def reduced_model(masses: tuple[float, float], springs: tuple[float, float], cle
     text = f"contact on both sides, Δ = {1e3 * clearance:.4g} mm"
     axes.text(middle, -0.56, text, ha="center", va="top", color=style.VERMILION)
 
+    # The arrows show the directions of the displacements.
     for i, (x, mass, colour) in enumerate(zip((host, resonator), masses, (style.SKY, style.ORANGE), strict=True)):
         _draw_mass(axes, (x, 0), SIDE, i, colour)
         axes.text(x, -SIDE - 0.06, with_prefix(1e3 * mass, "g"), ha="center", va="top")
@@ -110,7 +114,7 @@ def reduced_model(masses: tuple[float, float], springs: tuple[float, float], cle
 
 
 class SpringEnd(NamedTuple):
-    """The end of a spring: the middle of a mass and half the mass's width, which is 0 for the cell's border."""
+    """The end of a spring: the middle of a mass and half the mass's width, or a place on the cell's border and 0."""
 
     x: float
     y: float
@@ -118,7 +122,10 @@ class SpringEnd(NamedTuple):
 
 
 class CellLayout(NamedTuple):
-    """The centres of masses, half their widths, the cell's borders; ``nested``: the resonator sits inside its host."""
+    """The centres of masses and half their widths, by number, and the cell's borders ``left`` and ``right`` along x.
+
+    ``nested``: whether the resonator sits inside its host.
+    """
 
     centre: dict[int, Point]
     half: dict[int, float]
@@ -132,12 +139,14 @@ class CellLayout(NamedTuple):
         return SpringEnd(x, y, self.half[mass])
 
     def corners(self, first: SpringEnd, second: SpringEnd, level: float) -> list[Point]:
-        """Return the line of a spring, which goes at the height ``level`` where masses stand between its ends."""
+        """Return the line of a spring, which goes round masses between its ends at the height ``level``."""
         a, b = sorted((first, second))
-        if abs(a.x - b.x) < 0.1:  # b stands above
+        if abs(a.x - b.x) < 0.1:
+            # b stands above a.
             below_b = TALL if b.half == WIDE else HALF
             return [(b.x, b.y - below_b), (a.x, a.y + HALF)]
         if abs(a.y - b.y) >= 0.1:
+            # From corner to corner of the two masses.
             dx, dy = 1.3 * HALF * np.array([b.x - a.x, b.y - a.y]) / np.hypot(b.x - a.x, b.y - a.y)
             return [(a.x + dx, a.y + dy), (b.x - dx, b.y - dy)]
 
@@ -160,9 +169,9 @@ class CellLayout(NamedTuple):
 
 
 def draw_unit_cell(axes: Axes, cell: UnitCell, pairs: Sequence[Pair] = ()) -> None:
-    """Draw masses and springs of ``cell``, and the contacts of its ``pairs``, by default its host and resonator.
+    """Draw masses and springs of ``cell``, and the contacts of ``pairs``, by default of its host and resonator.
 
-    A resonator held by its host alone sits inside it.
+    A resonator that is joined to its host alone is drawn inside it.
     """
     layout = _layout(cell)
     nested_pair = {cell.host, cell.resonator} if layout.nested else set()
@@ -255,7 +264,7 @@ def _draw_springs(axes: Axes, cell: UnitCell, layout: CellLayout, nested_pair: s
 
 
 def _draw_contact(axes: Axes, host: Point, resonator: Point) -> None:
-    """Draw a bowed double arrow between a pair whose resonator other masses hold too."""
+    """Draw a bowed double arrow between the masses of a contact whose resonator is not inside its host."""
     arrow = {
         "arrowstyle": "<->",
         "color": style.VERMILION,
@@ -271,9 +280,9 @@ def _draw_contact(axes: Axes, host: Point, resonator: Point) -> None:
 
 
 def _layout(cell: UnitCell) -> CellLayout:
-    """Return a layout with the shortest chain through the cell on one line, the other masses below it.
+    """Return a layout with the shortest chain of springs through the cell on one line, the other masses below it.
 
-    A mass stands as far along as it has springs to where the chain begins.
+    The place of a mass along the line is the number of springs from where the chain begins to the mass.
     """
     held_by = [spring for spring in cell.springs if cell.resonator in (spring.start, spring.end)]
     pair = {cell.host, cell.resonator}
@@ -283,16 +292,17 @@ def _layout(cell: UnitCell) -> CellLayout:
     for spring in cell.springs:
         joined[spring.start, spring.end] |= not spring.next_cell
     through = next((s for s in cell.springs if s.next_cell), Spring(cell.dofs - 1, 0, 1.0, next_cell=True))
-    # Steps from where a wave comes in, and to where it leaves: a mass on the shortest chain has the least sum of
-    # both.
+    # A wave comes into the cell at the end of the spring to the next cell, and leaves at its start. The numbers of
+    # springs from the one and to the other have the least sum for masses on the shortest chain.
     ends = [through.end, through.start]
     passed, ahead = shortest_path(csr_array(joined), directed=False, unweighted=True, indices=ends)
 
-    # What no spring inside the cell holds stands at its end.
+    # A mass that no spring within the cell joins to the others stands behind them.
     reached = np.isfinite(passed)
     depth = np.where(reached, passed, np.max(passed, where=reached, initial=0) + 1)
 
-    # A host that holds its resonator is wider: it moves on by half of that, what stands behind it by the whole.
+    # A host with its resonator inside is wider by 2 ``extra``: its centre moves by ``extra``, what stands behind it by
+    # twice as much.
     extra = WIDE - HALF if nested else 0.0
     centre: dict[int, Point] = {}
     for mass in range(cell.dofs):
@@ -301,7 +311,7 @@ def _layout(cell: UnitCell) -> CellLayout:
         x = PITCH * depth[mass] + extra * (1 + np.sign(depth[mass] - depth[cell.host]))
         on_line = passed[mass] + ahead[mass] == passed[through.start]
         y = 0.0 if on_line else -0.75 * PITCH
-        # Masses at one depth hang below each other.
+        # Masses at one place along the line hang below each other.
         while (x, y) in centre.values():
             y -= 0.75 * PITCH
         centre[mass] = (x, y)
@@ -356,18 +366,21 @@ def _draw_host_with_resonator(axes: Axes, centre: Point, cell: UnitCell) -> None
 def _draw_spring(
     axes: Axes, corners: Sequence[Point], text: str, turns: int = 5, height: float = 0.13, zorder: int = 2
 ) -> None:
-    """Draw a line through ``corners``, a zigzag with straight leads on its longest leg, and its stiffness there."""
+    """Draw a spring along ``corners``: a zigzag with straight leads on the longest leg, and ``text`` next to it.
+
+    The zigzag has ``turns`` turns, ``height`` to either side.
+    """
     legs = np.stack([corners[:-1], corners[1:]], axis=1)
     lengths = np.hypot(*(legs[:, 1] - legs[:, 0]).T)
     longest = int(np.argmax(lengths))
     for leg in np.delete(legs, longest, axis=0):
         axes.plot(*leg.T, zorder=2, **ROD)
 
-    # Turning points half a pitch apart, on either side of the leg in turn.
     start = legs[longest, 0]
     along = legs[longest, 1] - start
     across = np.array([-along[1], along[0]]) / np.hypot(*along)
-    # Straight leads of a fifth at either end, and turning points between them.
+    # Straight leads of a fifth of the leg at either end; between them two turning points for each turn, at equal
+    # distances, on either side of the leg alternately.
     position = np.concatenate([[0, 0.2], 0.2 + 0.6 * (np.arange(2 * turns) + 0.5) / (2 * turns), [0.8, 1]])
     swing = np.zeros(len(position))
     swing[2:-2] = height * (-1.0) ** np.arange(2 * turns)

@@ -14,16 +14,18 @@ from typing import Any, Self
 from vipetsc.figures.common_turns import CommonTurns
 from vipetsc.io.atomic import remove_abandoned
 
-# With the places where this process finds modules: a module of a case may be next to it.
+# The program of the second process. It finds modules where this process does: a module that the case names may be in
+# the working folder.
 SERVE = "import sys; sys.path[:] = {path!r}; from vipetsc.figures.draw_requests import serve; serve({turns})"
 
 
 class SecondProcess:
-    """A process that draws what it is asked to as ``vipetsc.figures.registry.draw``, one request after the other.
+    """A process that draws what it is asked for, as ``vipetsc.figures.registry.draw``, one request after the other.
 
-    It loads what it needs while this process computes. It holds no lock and no open file of this process, and ends
-    with it, however that ends. Whatever fails there fails without a message: who asks draws then by itself, and meets
-    the error. ``turns`` are for pictures that both processes draw.
+    It loads the tools for pictures while this process computes. It holds no lock and no open file of this process, and
+    ends with it, however that ends. It gives no message if anything fails: `drawn` then returns None, and the caller,
+    who draws by itself, meets the error. ``turns`` are the numbers of the pictures of a request that both processes
+    share.
     """
 
     def __init__(self) -> None:
@@ -43,12 +45,12 @@ class SecondProcess:
 
     @staticmethod
     def is_useful() -> bool:
-        """Whether there is an idle core for it, and this process would load the tools for pictures too.
+        """Whether a second process saves time: there is an idle core, and the tools for pictures are not loaded here.
 
-        Where they are loaded, as in a test or a notebook, pictures are drawn before a second process could begin. Where
-        other work takes all cores, loading the program twice would take its time from both.
+        If they are loaded, as in a test or a notebook, this process has drawn before a second one could begin. If other
+        work takes all cores, a second process that loads the program takes time from the first.
         """
-        # macOS has neither affinities nor files in memory.
+        # macOS has neither affinities nor files in memory (``os.memfd_create``).
         if not sys.platform.startswith("linux"):
             return False
         has_idle_core = len(os.sched_getaffinity(0)) > 1 and os.getloadavg()[0] < (os.cpu_count() or 1)
@@ -56,24 +58,24 @@ class SecondProcess:
 
     @property
     def is_asked(self) -> bool:
-        """Whether it was asked for anything that `drawn` has not waited for."""
+        """Whether the process was asked for anything for which `drawn` has not waited."""
         return self._asked > 0
 
     def ask(self, source: str, folders: Sequence[Path], divided: bool = False, **options: Any) -> None:
-        """Ask for what ``vipetsc.figures.registry.draw`` draws with these arguments; returns at once.
+        """Ask for what ``vipetsc.figures.registry.draw`` draws with these arguments; return at once.
 
-        Of pictures that are ``divided`` it draws those whose turns this process does not take.
+        If the pictures are ``divided``, the process draws those whose ``turns`` this process does not take.
         """
         self._folders |= {*folders}
         self._asked += 1
         options |= {"source": source, "folders": [str(folder) for folder in folders]}
         text = json.dumps({"divided": divided, "options": options})
-        # If it has ended, `drawn` will find no answer.
+        # If the process has ended, `drawn` will find no answer.
         with suppress(OSError):
             self._channel.sendall(f"{text}\n".encode())
 
     def drawn(self) -> list[Path] | None:
-        """Wait for all that was asked for; returns the files, or None if anything failed."""
+        """Wait for all that was asked for, and return the files; None if anything failed."""
         with self._channel.makefile(encoding="utf-8") as answers:
             try:
                 lines = [answers.readline() for _ in range(self._asked)]
@@ -83,7 +85,7 @@ class SecondProcess:
 
         files: list[Path] = []
         for line in lines:
-            # Without an answer it has ended, with null a picture has failed.
+            # An empty line means that the process has ended, null that a picture has failed.
             names = json.loads(line or "null")
             if names is None:
                 return None
@@ -101,6 +103,6 @@ class SecondProcess:
         os.close(self._file)
         self._process.kill()
         self._process.wait()
-        # Of a picture that it was drawing.
+        # It may have been writing a picture.
         for folder in self._folders:
             remove_abandoned(folder / "figures")

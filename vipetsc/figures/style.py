@@ -27,9 +27,9 @@ from vipetsc.io.atomic import atomic_write, write_text
 COLUMN = 3.4  # width of one journal column in inches
 PAGE = 7.0  # width of two
 NOTE = 0.165  # height in inches of the strip that a line of a note takes below a picture
-LETTERS = 19  # of a note on an inch
-HEADING_LETTERS = 15  # of a heading
-COMPRESSION = 3  # of a PNG, of 1 to 9: files are 4 % larger than at 6, with which a picture takes a sixth longer
+LETTERS = 19  # of a note on an inch of its width
+HEADING_LETTERS = 15  # of a heading on an inch
+COMPRESSION = 3  # of a PNG, from 1 to 9: files are 4 % larger than with 6, with which a picture takes a sixth longer
 # Dots per inch of a PNG. The maps of a run take 379 kB and 0.21 s; at 100 they take 145 kB, and small type is blurred;
 # at 400 they take 644 kB and 0.33 s, and a report of many pages loads slowly.
 SCREEN = 200
@@ -49,24 +49,25 @@ PALE = "#DDDDDD"
 RED = "#CC0000"
 DASHED = (0, (4, 2))
 DOTTED = (0, (1, 2))
-DASHES_SEEN = 2.4  # length of a line in a legend, in letters' heights, that shows which dashes it has
+DASHES_SEEN = 2.4  # length of a line in a legend, in heights of its letters, at which its dashes can be recognised
 
-# Pass bands, from the lowest; beyond the sixth they come round. The dashes are for greyscale print.
+# Of pass bands, from the lowest one; the seventh has the look of the first. The dashes are for greyscale print.
 BAND_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 BAND_DASHES = ("-", (0, (6, 1)), (0, (4, 1, 1, 1)), (0, (1.5, 0.8)), (0, (6, 1, 1, 1, 1, 1)), (0, (3, 2)))
 
 
 class Shown(NamedTuple):
-    """A member that a picture shows: the files of its ``results``, and the ``name`` that tells it from the others."""
+    """A member that a picture shows: its ``results``, opened files, and the ``name`` that tells it from the others."""
 
     name: str
     results: Sequence[xr.Dataset]
 
 
 class Drawing(NamedTuple):
-    """A picture to come: the ``stem`` of its file's name; ``draw`` is called before the next drawing is asked for.
+    """A picture that can be drawn: ``draw`` returns the figure, ``stem`` is the name of its file without the suffix.
 
-    ``shown`` are the members that the picture shows, where these are not all of what the figure was offered from.
+    ``draw`` has to be called before the next drawing is asked for. ``shown`` are the members that the picture shows, or
+    empty if it shows all results that the figure was given.
     """
 
     stem: str
@@ -85,20 +86,25 @@ def band_look(number: int) -> dict[str, Any]:
 
 
 def band_number(part: str) -> int | None:
-    """The pass band that a ``part`` of the frequency axis is ("band 2"), the lowest of several; else None."""
+    """The number of the pass band that a ``part`` of the frequency axis is, 2 for "band 2"; None for a gap.
+
+    Of bands that overlap, as in "band 2+3", it is the lowest.
+    """
     kind, _, numbers = part.partition(" ")
-    return int(numbers.split("+")[0]) if kind == "band" else None
+    if kind != "band":
+        return None
+    return int(numbers.split("+")[0])
 
 
 @contextmanager
 def rc_style() -> Iterator[None]:
-    """The house style, for making and for saving figures; leaves matplotlib's settings as they were."""
+    """Make and save figures in the house style within the block; then matplotlib's settings are as before."""
     with mpl.rc_context(fname=Path(__file__).with_name("house.mplstyle")), kept_formulas():
         yield
 
 
 def with_prefix(value: float, unit: str) -> str:
-    """A value in four digits with the prefix that keeps it readable: 20 kN/m, 2.5 g."""
+    """A value in four digits with its unit and an SI prefix: 20 kN/m, 2.5 g."""
     return EngFormatter(unit)(float(f"{value:.4g}"))
 
 
@@ -113,10 +119,11 @@ def new_figure(width: float, height: float, heading: str = "") -> Figure:
 
 
 def save(figure: Figure, path: Path, note: str = "") -> Path:
-    """Write ``figure`` to ``path`` in the format of its suffix, atomically, with a ``note`` in a strip below it.
+    """Write ``figure`` to ``path`` in the format of its suffix, whole or not at all, and return the path.
 
-    The figure's label stands there as well, in lines of the figure's width. What has been laid out for one format stays
-    so for the next. A JSON file holds what the picture shows as numbers: ``vipetsc.figures.figure_data``.
+    In a strip below the picture are the ``note`` and the figure's label, in lines of its width. A figure is laid out
+    once, for the first of its formats. A JSON file holds what the picture shows as numbers, see
+    ``vipetsc.figures.figure_data``. Raises OSError, which names the file, if it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     if figure.get_layout_engine():
@@ -141,7 +148,7 @@ def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
     text = figure.text(0.05 / width, -0.3 * NOTE / height, "\n".join(lines), **look)
 
     with kept_ticks(figure), atomic_write(path) as partial_path:
-        # The figure's own canvas suffices where nothing is added to its box, and takes less time than ``savefig``.
+        # Without a strip the canvas can print by itself, which takes less time than ``savefig``.
         if path.suffix == ".pdf" and not lines:
             # Imported here: the tools for fonts take a quarter of the time that matplotlib itself takes.
             from matplotlib.backends.backend_pdf import FigureCanvasPdf
@@ -152,27 +159,30 @@ def _print(figure: Figure, path: Path, lines: Sequence[str]) -> None:
             figure.set_dpi(SCREEN)
             canvas = pixel_canvas(figure)
             canvas.draw()
-            # A page is opaque: without the channel for transparency it takes half the time, and less room.
+            # The page is opaque: without the channel for transparency it is written in half the time, and smaller.
             pixels = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
             pixels.convert("RGB").save(partial_path, "png", dpi=(SCREEN, SCREEN), compress_level=COMPRESSION)
         else:
-            # A box of its own keeps axes where they are now, colour bars without their aspect too.
+            options: dict[str, Any] = {}
+            if lines:
+                options["bbox_inches"] = Bbox([[0, -NOTE * len(lines)], [width, height]])
+            if path.suffix == ".png":
+                options |= {"dpi": SCREEN, "pil_kwargs": {"compress_level": COMPRESSION}}
+            # With such a box ``savefig`` keeps all axes in the frames that they have now.
             apply_aspects(figure)
-            box = Bbox([[0, -NOTE * len(lines)], [width, height]]) if lines else None
-            dpi = SCREEN if path.suffix == ".png" else None
-            options = {"pil_kwargs": {"compress_level": COMPRESSION}} if path.suffix == ".png" else {}
-            figure.savefig(partial_path, format=path.suffix[1:], dpi=dpi, bbox_inches=box, **options)
+            figure.savefig(partial_path, format=path.suffix[1:], **options)
 
-    # The next format of the figure has a strip of its own.
+    # The next format of the figure gets a text of its own.
     text.remove()
 
 
 def _lay_out(figure: Figure) -> None:
-    """Label the logarithmic axes of the figure, and lay it out, once for all formats."""
+    """Label the logarithmic axes of ``figure``, and lay it out, once for all formats."""
     label_log_axes(figure)
     figure.set_dpi(SCREEN)
     lay_out(figure)
-    # In fractions of the figure, not of its box: that grows by the strip of a note.
+    # Legends are placed in fractions of the figure, not of the box that is printed, which is higher by the strip of a
+    # note.
     for legend in figure.legends:
         legend.set_bbox_to_anchor((0, 0, 1, 1), figure.transFigure)
 
@@ -190,8 +200,9 @@ def draw_each(
     Parameters
     ----------
     turns
-        Rising numbers, the next one asked for when a picture is done: every ``size``-th from a rank on divides
-        the work evenly, a counter that all ranks draw from divides it by cost.
+        Rising numbers of the pictures to draw, from 0; the next one is asked for when a picture is done. Every n-th
+        number for each of n ranks divides the pictures evenly. A counter that all ranks share (`CommonTurns`) divides
+        their cost: a rank with cheap pictures gets more of them.
     note
         A line of text below every picture, above the figure's label.
     keep

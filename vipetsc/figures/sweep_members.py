@@ -26,20 +26,21 @@ from vipetsc.wording import counted
 
 AMPLITUDE = "amplitude"
 SITES = "contacts.sites"
-NAMED = {"contacts.law", "lattice.reading", SITES, "drive.cycles", "drive.amplitude"}  # keys in the names of a case
+# Keys that the names of a case have anyway (`Labels`).
+NAMED = {"contacts.law", "lattice.reading", SITES, "drive.cycles", "drive.amplitude"}
 LEVELS = ("Low", "Medium", "High")
 T = TypeVar("T")
 
 
 class Files(ExitStack):
-    """Results opened as they are asked for, each once, until the block ends; xarray keeps few of the files open."""
+    """Results, each opened once, when it is asked for, until the block ends; xarray keeps few of the files open."""
 
     def __init__(self) -> None:
         super().__init__()
         self._opened: dict[Path, Any] = {}
 
     def get(self, path: Path, opener: Callable[[Path], AbstractContextManager[T]]) -> T:
-        """Return what ``opener`` gives for ``path``, from an earlier call if there was one; raise as it does."""
+        """Return what ``opener`` gives for ``path``, now or in an earlier call; raise as ``opener``."""
         if path not in self._opened:
             self._opened[path] = self.enter_context(opener(path))
         return cast(T, self._opened[path])
@@ -48,7 +49,7 @@ class Files(ExitStack):
 class Sweeps(list[xr.Dataset]):
     """Finished sweeps, each an ensemble of `vipetsc.io.read.open_ensemble`; ``files`` are those of their members.
 
-    Of a sweep over samples means stand for what was measured of each, and the first sample for their runs.
+    Of a sweep over samples of disorder the measures are means over the samples, and the runs those of the first sample.
     """
 
     def __init__(self, ensembles: Iterable[xr.Dataset], files: Files) -> None:
@@ -57,9 +58,10 @@ class Sweeps(list[xr.Dataset]):
 
 
 class MemberRun(NamedTuple):
-    """A member of a sweep with its fields: its case, in the lattice's own terms (0-based) too, and its files.
+    """A member of a sweep with its fields: its ``case``, resolved to a ``model`` (which counts from 0), and its files.
 
-    ``varied`` says what the keys are that the sweep varies, but for those that all names of cases have.
+    ``varied`` is a text with the keys that the sweep varies and their values, without those that names of cases have
+    anyway.
     """
 
     folder: Path
@@ -92,16 +94,16 @@ def transfer_members(sweeps: Sweeps) -> Iterator[MemberRun]:
     for ensemble in sweeps:
         for row, folder in whole_members(ensemble):
             member = sweeps.files.get(folder, MemberRun.open)._replace(varied=varied_at(row["number"].item(), ensemble))
-            # The transfer of a lattice without a higher band is not a number.
+            # Without a band above the driven one the transfer is NaN, which is not >= 0.
             if member.analysis.get("ibtet", -1) >= 0 and member.run.sizes["site"]:
                 yield member
 
 
 def varied_at(number: int, ensemble: xr.Dataset) -> str:
-    """Return the keys of an ``ensemble`` that are not among ``NAMED``, with their values in member ``number`` of it."""
+    """Return the keys that vary in an ``ensemble`` and are not ``NAMED``, with their values in member ``number``."""
     texts = []
     for axis in SweptAxis.all_of(ensemble):
-        # Equal numbers of sites in other cells have one name.
+        # Names have the number of the sites: lists of their cells are told apart by the key.
         keys = [key for key in axis.keys if key.path not in NAMED or (key.values.dtype == object and key.path == SITES)]
         texts += [key.texts[_place(number, ensemble)[axis.dimension]] for key in keys]
     return ", ".join(texts)
@@ -136,9 +138,10 @@ class DrivenWave(NamedTuple):
 
 
 class AmplitudeSeries(NamedTuple):
-    """One configuration at a low, a medium and a high amplitude; ``wave`` is the linear one at the drive's frequency.
+    """One configuration of a sweep at a low, a medium and a high amplitude, in ``runs``.
 
-    ``suffix`` is its part of file names; its ``title`` has reading, sites, wavenumber and what else varies.
+    ``suffix`` is its part of file names, ``title`` the heading of its pages, ``wave`` the linear wave at the drive's
+    frequency.
     """
 
     suffix: str
@@ -172,9 +175,9 @@ class AmplitudeSeries(NamedTuple):
         return figure, grid
 
     def snapshot_times(self) -> np.ndarray:
-        """Return times (4,) in s, from the linear wave: midway to the first site, at it, past the last, near the end.
+        """Return times (4,) in s of the linear wave: midway to the first site, at it, past the last one, near the end.
 
-        The packet's middle leaves the driven cell when half the burst is over.
+        The middle of the packet leaves the driven cell when half the burst is over.
         """
         member = self.runs[0]
         chain = member.model.chain
@@ -191,11 +194,11 @@ class AmplitudeSeries(NamedTuple):
 def from_series(
     *needs: str, needs_wave: bool = False, needs_sites: bool = False, medium_alone: bool = False
 ) -> Callable[..., Any]:
-    """Decorate a figure of an `AmplitudeSeries`: it offers one picture a series whose analyses hold ``needs``.
+    """Return a decorator of a function that draws an `AmplitudeSeries`: the result offers a picture for each series.
 
-    ``needs`` are names of variables of ``analysis.h5``. A figure that ``needs_wave`` is offered of series that drive a
-    pass band, one that ``needs_sites`` of those that recorded contact sites and other cells. Of other series there is
-    no such picture, and no error. A figure may show the run at the ``medium_alone``, and none of the others' warnings.
+    Series whose analyses lack a variable of ``needs`` have no such picture, which is no error; if it ``needs_wave``
+    neither those that do not drive a pass band, if it ``needs_sites`` those that did not record contact sites and other
+    cells. A picture of the run at ``medium_alone`` has no warnings of the others.
     """
 
     def decorate(page: Callable[[AmplitudeSeries], Figure]) -> Callable[[Sweeps], Iterator[Drawing]]:
@@ -223,9 +226,9 @@ class _MemberFolder(NamedTuple):
 
 
 def series_of(sweeps: Sweeps, *needs: str) -> Iterator[AmplitudeSeries]:
-    """Yield every configuration of the sweeps with full fields at its lowest, middle and highest amplitude.
+    """Yield every configuration of the sweeps that has fields at three amplitudes: the lowest, a middle, the highest.
 
-    ``needs`` names what their analyses must hold.
+    ``needs`` are variables that the analyses of all three must have.
     """
     measured = [(ensemble, _triples(ensemble)) for ensemble in sweeps]
     several_sweeps = sum(bool(triples) for _, triples in measured) > 1
@@ -256,9 +259,9 @@ def _series_title(member: xr.Dataset, ensemble: xr.Dataset, case: Case, wave: Dr
 
 
 def _triples(ensemble: xr.Dataset) -> list[list[_MemberFolder]]:
-    """Return the members at the lowest, middle and highest amplitude of every configuration that has three.
+    """Return the members at the lowest, a middle and the highest amplitude of every configuration that has three.
 
-    A member of the amplitude 0 is left out: figures show what is divided by the amplitude.
+    Members without a drive are left out, since figures show what is divided by the amplitude.
     """
     if AMPLITUDE not in axes(ensemble):
         return []
@@ -272,13 +275,13 @@ def _triples(ensemble: xr.Dataset) -> list[list[_MemberFolder]]:
     for group in grouped(members, configuration).values():
         if len(group) >= len(LEVELS):
             group.sort(key=lambda member: member.row[AMPLITUDE].item())
-            # The middle one by rank: amplitudes may be linear, logarithmic or a list.
+            # The middle one in their order, since amplitudes may be evenly spaced on any scale, or a list.
             triples.append([group[0], group[len(group) // 2], group[-1]])
     return triples
 
 
 def _in_words(member: xr.Dataset, name: str, joint: str) -> str:
-    """Return the value of a swept key; a number after the key's name."""
+    """Return the value of a swept key as text: a word alone, a number joined to the key's name by ``joint``."""
     value = member[name].item()
     if isinstance(value, str):
         return value
@@ -313,10 +316,10 @@ def reading_of_case(case: Case) -> str:
 
 
 def suffix(member: xr.Dataset, ensemble: xr.Dataset, named: bool, dims: Collection[str] | None = None) -> str:
-    """Return the text that distinguishes ``member`` (or a row of them) in a file's name, without the amplitude.
+    """Return the text that tells a ``member`` of an ensemble, or a row of members, from others in a file's name.
 
-    The sweep's name if it is to be ``named``, the reading, and whatever else has several values; of the axes only
-    ``dims``, by default all.
+    It has the sweep's name if that is to be ``named``, the reading, the wavenumber, and whatever else but the amplitude
+    has several values; of the axes only those in ``dims``, by default all.
     """
     parts = []
     if named:
@@ -326,7 +329,7 @@ def suffix(member: xr.Dataset, ensemble: xr.Dataset, named: bool, dims: Collecti
     parts = [part for part in parts if part]
 
     for name in axes(ensemble):
-        # Sweeps of one reading or wavenumber are drawn next to others, so these are always named.
+        # A sweep with one reading or wavenumber may be drawn next to one with another: these are always named.
         tells = name in ("reading", "wavenumber") or ensemble.sizes[name] > 1
         if name == AMPLITUDE or not tells or (dims is not None and name not in dims):
             continue
@@ -349,7 +352,7 @@ def sites_of(case: Case) -> list[int]:
 
 
 class Labels(NamedTuple):
-    """The names of a case on pages and, as a ``stem``, in their files' names: of what applies to it, nothing else."""
+    """The names of a case on pages, and as a ``stem`` in the names of files; empty where something does not apply."""
 
     law: str  # Hertz
     configuration: str  # 5 sites, 30 cycles

@@ -12,12 +12,12 @@ from vipetsc.case.keys import unit_of
 from vipetsc.io.read import axes as axes_of
 from vipetsc.wording import with_unit
 
-FEW_TOGETHER = 6  # values of keys that vary together and stand as categories
+FEW_TOGETHER = 6  # values up to which keys that vary together are categories; of more they are numbers
 FRACTION_LIMIT = 36  # largest denominator of a wavenumber over pi that is written as a fraction: 5 degrees of phase
-LONGEST = 24  # letters of a list that stands in a legend
-DIGITS = range(3, 18)  # of a number, as many as tell the values apart; 17 tell all doubles apart
-NO_BREAK = "\u00a0"  # the space between a value and its unit
-LEAST_RATIO = 5.0  # of a logarithmic axis, largest over smallest value: over less the two scales look alike
+LONGEST = 24  # letters of a list in a legend
+DIGITS = range(3, 18)  # of a number, as few as tell the values apart; 17 tell all doubles apart
+NO_BREAK = "\u00a0"  # the space between a value and its unit, at which no line breaks
+LEAST_RATIO = 5.0  # of the largest to the smallest value of a logarithmic axis: over less the two scales look alike
 
 
 class SweptKey(NamedTuple):
@@ -46,7 +46,7 @@ class SweptKey(NamedTuple):
             return _number_texts(self.values)
         texts = [str(value) for value in self.values]
         shortened = [_shortened(text) for text in texts]
-        # Lists may differ beyond the letters that a legend has room for.
+        # Lists may differ only beyond the letters for which a legend has room.
         if len(set(shortened)) < len(set(texts)):
             shortened = [f"{text} (no. {number})" for number, text in enumerate(shortened, 1)]
         return shortened
@@ -69,10 +69,11 @@ def _number_texts(values: np.ndarray) -> list[str]:
 
 
 def _number_text(value: float, digits: int) -> str:
-    """Return ``value`` in ``digits``, without a power of ten where a few zeros do."""
+    """Return ``value`` in ``digits`` significant digits, with a power of ten only below 1e-4 and from 1e6 on."""
     text = f"{value:.{digits}g}"
-    if "e" in text and 1e-4 <= abs(value) < 1e6:
-        text = f"{float(text):.0f}" if abs(value) > 1 else f"{float(text):.{digits + 4}f}".rstrip("0")
+    # The format has one from 10**digits on already: zeros take its place.
+    if "e" in text and 1 <= abs(value) < 1e6:
+        text = f"{float(text):.0f}"
     return text
 
 
@@ -85,7 +86,7 @@ def _shortened(text: str) -> str:
 
 
 class SweptAxis(NamedTuple):
-    """An axis of a measure along which keys vary: its ``dimension``, and the ``keys`` that vary along it."""
+    """An axis of a sweep: its ``dimension``, and the ``keys`` that vary along it, with as many values each."""
 
     dimension: str
     keys: tuple[SweptKey, ...]
@@ -97,14 +98,14 @@ class SweptAxis(NamedTuple):
 
     @property
     def first_number(self) -> SweptKey | None:
-        """The key whose values are positions on an axis of numbers; None where the values are categories."""
+        """The key whose values are positions on an axis of numbers; None if the values are categories."""
         if len(self.keys) > 1 and self.size <= FEW_TOGETHER:
             return None
         return next((key for key in self.keys if key.is_number), None)
 
     @property
     def is_number(self) -> bool:
-        """Whether the axis has positions, and is not one of categories."""
+        """Whether the axis has positions rather than categories."""
         return self.first_number is not None
 
     @property
@@ -165,7 +166,7 @@ def _swept_key(values: xr.DataArray, case: dict[str, Any]) -> SweptKey:
 def even_scale(values: np.ndarray) -> str:
     """Return the scale, "linear" or "log", on which ``values`` (value,) lie more evenly."""
     ordered = np.unique(values)
-    # Two values are even on both scales.
+    # Two values lie evenly on any scale.
     if len(ordered) < 3 or ordered[0] <= 0 or ordered[-1] < LEAST_RATIO * ordered[0]:
         return "linear"
     linear = np.diff(ordered)
@@ -180,10 +181,10 @@ def _unevenness(steps: np.ndarray) -> float:
 
 
 def in_pi(wavenumber: float) -> str:
-    """Return a wavenumber in rad/cell as 5π/9, or as a decimal where no such fraction is near."""
+    """Return a ``wavenumber`` in rad/cell as a fraction of π such as 5π/9, or as a decimal if it is none."""
     multiple = float(wavenumber) / np.pi
     near = Fraction(multiple).limit_denominator(FRACTION_LIMIT)
-    # Fractions with small denominators are near any number: only one that is the number itself is written.
+    # Such fractions are near any number: only one that equals the number is written.
     if abs(float(near) - multiple) > 1e-6:
         return f"{multiple:.3f}π"
     text = "π"
@@ -195,5 +196,5 @@ def in_pi(wavenumber: float) -> str:
 
 
 def joined(parts: Sequence[str]) -> str:
-    """Return the ``parts`` as a phrase: ``a``, ``a and b``, ``a, b and c``."""
+    """Return the ``parts`` as a phrase: "a", "a and b", "a, b and c"."""
     return " and ".join(filter(None, [", ".join(parts[:-1]), *parts[-1:]]))

@@ -1,4 +1,9 @@
-"""Inter-band transfer: nine panels of a run (paper, Figs. 7, S6), dispersions (Fig. 8), energies of bands (A3)."""
+"""Inter-band transfer: nine panels of a run (paper, Figs. 7, S6), dispersions (Fig. 8), energies of bands (A3).
+
+The *parts* of the frequency axis are pass bands, the gaps between them and what lies above; their energies are those of
+the velocities filtered to each part. IBTET is the paper's inter-band targeted energy transfer: the fraction of the
+energy that is in the bands above the driven one, as a mean over time.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
@@ -24,8 +29,10 @@ from vipetsc.io.read import field_interval, field_time, leading_site, nearest_ce
 from vipetsc.lattice import pass_bands
 from vipetsc.spectra import TAPER, taper
 
-FIELD = "bands/kinetic_energy"  # (band, t, cell)
-INPUT_CELL = 5  # the paper's cell before the sites; the one behind them is the middle of the lattice, its cell 150
+FIELD = "bands/kinetic_energy"  # (band, t, cell) in J
+# Cell whose spectrum before the sites the paper shows. The other one, behind them, is its cell 150, the middle of the
+# lattice.
+INPUT_CELL = 5
 
 
 class SegmentLook(NamedTuple):
@@ -35,32 +42,37 @@ class SegmentLook(NamedTuple):
     colour: str
 
 
-# By the spectra of the analysis.
+# By the names of their spectra in the analysis.
 SEGMENTS = {
     "dispersion_before": SegmentLook("Input segment", style.SKY),
     "dispersion_after": SegmentLook("Output segment", "white"),
 }
 OUTLINE = [withStroke(linewidth=3.4, foreground=style.BLACK)]  # seen on bright and dark places of a map
 TEXT_OUTLINE = [withStroke(linewidth=1.4, foreground=style.BLACK)]
-ROOM = 1e4  # of a spectrum's axis above its peak, for the time history
+ROOM = 1e4  # factor from a spectrum's peak to the end of its axis, where the time history is inset
 GAPS = (style.DASHED, (0, (1, 1.5)), (0, (4, 1.5, 1, 1.5)), (0, (6, 3)))
-MOST_COLUMNS = 4  # of dispersions
-MOST_PANELS = 12
-LETTERS = 14  # of their titles on an inch
-DECADES = 6  # below the total energy, that parts of it are shown over
-LARGEST_ERROR = 0.01  # of the sum of the parts, in the paper's terms 1 %
-LEAST_TOTAL = 1e-3  # of the largest total: below it the error of a sum of parts is that of the filters' tails
+MOST_COLUMNS = 4  # of dispersions on a page
+MOST_PANELS = 12  # on a page of members that have nothing in common
+LETTERS = 14  # of the titles of dispersions on an inch
+DECADES = 6  # below the total energy, over which energies of parts are shown
+LARGEST_ERROR = 0.01  # of the sum of the parts over the total, the paper's 1 %
+# Total energy over its largest, below which the sum of the parts is not compared with it: there the error of the sum is
+# that of the filters' tails.
+LEAST_TOTAL = 1e-3
 
 
 def transfer(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer for every whole member: energy in space-time, dispersion and spectra before and behind the first site."""
+    """Offer a page for every whole member: energy in space-time, dispersion and spectra before and behind a site."""
     for member in transfer_members(sweeps):
         if "velocity" in member.run and all(name in member.analysis for name in (FIELD, *SEGMENTS)):
             yield Drawing(member.labels.member_stem, partial(nine_panels, member), [member.shown()])
 
 
 def nine_panels(member: MemberRun) -> Figure:
-    """Draw (a) all energy, (b-e) that of every pass band, (f, g) both segments, (h, i) spectra of two cells."""
+    """Draw energy in space-time, of all frequencies and of each pass band; dispersions; spectra of two cells.
+
+    A cell with four bands has nine panels.
+    """
     run = member.run
     cell = member.model.chain.cell
     tags = iter(ascii_lowercase)
@@ -68,7 +80,7 @@ def nine_panels(member: MemberRun) -> Figure:
     upper, middle, lower = figure.subfigures(3, 1, height_ratios=(1.15, 0.85, 1))
     _draw_space_time(upper, member, tags)
 
-    # Both segments to one scale, each with the mark that it has next to the space-time map.
+    # Both segments have one scale, and each the mark that it has in the space-time map.
     spectra = panels.below_cutoff(member.analysis, cell, list(SEGMENTS))
     norm = panels.log_norm(*spectra.values())
     maps = middle.subplots(1, 2, sharey=True)
@@ -91,7 +103,7 @@ def nine_panels(member: MemberRun) -> Figure:
 
 
 def _draw_space_time(page: SubFigure, member: MemberRun, tags: Iterator[str]) -> None:
-    """Draw kinetic energy of all frequencies next to that of each pass band, to one scale; segments marked."""
+    """Draw kinetic energy of all frequencies and of each pass band with one scale of colours; segments are marked."""
     run = member.run
     energy = member.analysis["kinetic_energy"]
     fields = member.analysis[FIELD]
@@ -132,11 +144,14 @@ def _mark_segments(axes: Axes, member: MemberRun) -> None:
 
 
 def _draw_spectra(axes: Axes, member: MemberRun, velocity: np.ndarray) -> None:
-    """Draw amplitude spectra of the masses of one cell, ``velocity`` (t, dof); pass bands shaded, history inset."""
+    """Draw amplitude spectra of the masses of one cell by their ``velocity`` (t, dof) in m/s, which is in an inset.
+
+    Pass bands are shaded and numbered.
+    """
     cell = member.model.chain.cell
     step = field_interval(member.run)
     frequency = 2e-3 * np.pi * np.fft.rfftfreq(len(velocity), step)  # krad/s
-    # Times the step: the transform approximates the integral over time, whatever the sample interval is.
+    # Times the step, so that the sum approximates the integral over time, and does not depend on the sample interval.
     spectrum = np.abs(np.fft.rfft(velocity * taper(len(velocity), TAPER)[:, None], axis=0)) * step
     bands = pass_bands(cell)
     shown = frequency <= 1.1e-3 * bands[-1].high
@@ -167,7 +182,7 @@ def _draw_spectra(axes: Axes, member: MemberRun, velocity: np.ndarray) -> None:
 
 
 class CaseFolder(NamedTuple):
-    """A member before its fields are read again: its case, its names and the folder of its files."""
+    """A member of which case, names and folder are kept; its fields are read again when a picture needs them."""
 
     case: Case
     labels: Labels
@@ -182,9 +197,10 @@ class DispersionPanel(NamedTuple):
 
 
 def transfer_dispersions(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer every reading and configuration: laws in rows, amplitudes in columns; members that would be alone together.
+    """Offer a page for each reading and configuration, with its laws and amplitudes, and others for single members.
 
-    More amplitudes than ``MOST_COLUMNS`` go on in the next row.
+    Amplitudes are in columns and laws in rows, if there are ``MOST_COLUMNS`` amplitudes or fewer; more go on in the
+    next row. Configurations with one member are put together on pages of ``MOST_PANELS``.
     """
     members = [CaseFolder(m.case, m.labels, m.folder) for m in transfer_members(sweeps) if "dispersion" in m.analysis]
     pages = grouped(members, lambda member: member.labels.page_stem)
@@ -202,7 +218,7 @@ def transfer_dispersions(sweeps: Sweeps) -> Iterator[Drawing]:
 
 
 def _shown(members: Sequence[CaseFolder], files: Files) -> list[Shown]:
-    """Return ``members`` under what of their names is not the page's."""
+    """Return ``members`` for the warnings of a page, named by what its heading does not say."""
     is_of_one_page = len({member.labels.page_stem for member in members}) == 1
     shown = []
     for member in members:
@@ -214,7 +230,7 @@ def _shown(members: Sequence[CaseFolder], files: Files) -> list[Shown]:
 
 
 def _dispersion_table(members: Sequence[CaseFolder], files: Files) -> Figure:
-    """Draw one panel a member of a page: laws in rows, amplitudes in columns, in further rows if these are many."""
+    """Draw a panel for each law and amplitude of ``members``, which have one heading."""
     laws = sorted({member.case.contacts.law for member in members}, reverse=True)
     amplitudes = sorted({member.case.drive.amplitude for member in members})
     at = {(member.case.contacts.law, member.case.drive.amplitude): member for member in members}
@@ -228,13 +244,13 @@ def _dispersion_table(members: Sequence[CaseFolder], files: Files) -> Figure:
 
 
 def _dispersion_page(members: Sequence[CaseFolder], files: Files) -> Figure:
-    """Draw one panel a member, under its name."""
+    """Draw a panel for each of ``members``, with its name as the title."""
     panels_of_page = [DispersionPanel(member, member.labels.member) for member in members]
     return _dispersion_panels("", panels_of_page, MOST_COLUMNS - 1, files)
 
 
 def _dispersion_panels(heading: str, shown: Sequence[DispersionPanel], columns: int, files: Files) -> Figure:
-    """Draw panels in rows of ``columns``; colours run over five decades below each panel's own largest value."""
+    """Draw panels in rows of ``columns``; colours are over five decades below the largest value of each panel."""
     columns = min(len(shown), columns, MOST_COLUMNS)
     rows = -(-len(shown) // columns)
     figure = style.new_figure(style.PAGE, 0.4 + 2.1 * rows, heading)
@@ -257,7 +273,7 @@ def _dispersion_panels(heading: str, shown: Sequence[DispersionPanel], columns: 
     for axes in grid.flat[len(shown) :]:
         axes.set_axis_off()
     if columns == MOST_COLUMNS:
-        # Narrow panels have no room for it.
+        # Narrow panels have no room for labels of their own.
         figure.supxlabel(panels.KAPPA)
         for axes in grid.flat:
             axes.set_xlabel("")
@@ -268,14 +284,14 @@ def _dispersion_panels(heading: str, shown: Sequence[DispersionPanel], columns: 
 
 
 def band_energies(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer energies of all parts and their sum over time for every whole member."""
+    """Offer a page for every whole member: energies of all parts and their sum over time."""
     for member in transfer_members(sweeps):
         if member.analysis.sizes["bands/part"] and "bands/total" in member.analysis:
             yield Drawing(member.labels.member_stem, partial(energies_over_time, member), [member.shown()])
 
 
 def band_shares(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer mean fractions of all parts over the amplitude, a page a configuration and reading."""
+    """Offer a page for each configuration and reading: mean fractions of all parts over the amplitude."""
     with_fractions = (curve for curve in transfer_curves(sweeps) if "bands/share" in curve.data)
     for name, curves in grouped(with_fractions, lambda curve: Labels.of(curve.case).page_stem).items():
         page = partial(columns_of_laws, curves, "Mean fraction of the energy (1)", _draw_fractions)
@@ -283,27 +299,32 @@ def band_shares(sweeps: Sweeps) -> Iterator[Drawing]:
 
 
 def closing_error(parts: np.ndarray, total: np.ndarray, samples: int) -> np.ndarray:
-    """Return |sum of ``parts`` (part, t) - ``total`` (t)| over the total, each a running mean over ``samples`` (t').
+    """Return |sum of ``parts`` - ``total``| / total (t - samples + 1,) of running means over ``samples``.
 
-    Energies beat twice a period, and so do the cross terms that a sum of parts lacks: a mean over a period of the
-    drive is what an energy of a part means. NaN where the total is below 1e-3 of its largest.
+    ``parts`` (part, t) and ``total`` (t,) are energies. The total has products of velocities of different parts, which
+    a sum of the parts' energies lacks. They oscillate, as energies do: over a period of the drive they nearly cancel.
+    NaN where the total is below ``LEAST_TOTAL`` of its largest value.
     """
     samples = max(min(samples, len(total)), 1)
     energies = np.stack([parts.sum(axis=0), total])
-    # Means of both, then their difference: the error of a mean, not the mean of errors of either sign.
+    # The difference of means, not the mean of differences without their signs.
     together, whole = sliding_window_view(energies, samples, axis=1).mean(axis=2)
     above_threshold = whole > LEAST_TOTAL * whole.max()
     return np.divide(np.abs(together - whole), whole, out=np.full_like(whole, np.nan), where=above_threshold)
 
 
 def energies_over_time(member: MemberRun) -> Figure:
-    """Draw the parts and their sum against the total (mean over a period of the drive), and how far they miss it."""
+    """Draw the energies of the parts, their sum and the total over time, and the error of the sum.
+
+    All are running means over a period of the drive.
+    """
     analysis = member.analysis
     time = analysis["bands/sample"].values
     parts = analysis["bands/energy"].values
     total = analysis["bands/total"].values
+    # A record may be shorter than a period of the drive.
     period = 2 * np.pi / member.model.drive.frequency
-    samples = max(round(period / (time[1] - time[0])), 1)
+    samples = int(np.clip(round(period / (time[1] - time[0])), 1, len(time)))
     series = np.stack([time, total, parts.sum(axis=0), *parts])
     mean_time, mean_total, mean_sum, *mean_parts = sliding_window_view(series, samples, axis=1).mean(axis=2)
 
@@ -331,7 +352,7 @@ def energies_over_time(member: MemberRun) -> Figure:
 
 
 def _draw_fractions(axes: Axes, curve: TransferCurve) -> str:
-    """Draw the mean fraction of every part after the wave's arrival against the amplitude; return the law's name."""
+    """Draw the mean fraction of every part after the arrival of the wave over the amplitude; return the law's name."""
     amplitude = curve.data["amplitude"]
     fraction = curve.data["bands/share"]
     draw_parts(axes, amplitude, fraction.attrs["parts"], np.maximum(fraction.values.T, 1e-300))
@@ -343,7 +364,7 @@ def _draw_fractions(axes: Axes, curve: TransferCurve) -> str:
 
 
 def draw_parts(axes: Axes, x: ArrayLike, names: ArrayLike, energies: Iterable[np.ndarray]) -> None:
-    """Draw each part's curve (x,): a colour for each pass band, grey dashes for each gap and for what lies above."""
+    """Draw a curve (x,) for each part: a colour for a pass band, grey dashes for a gap and for what lies above."""
     gap_dashes = cycle(GAPS)
     for name, energy in zip(np.atleast_1d(names), energies, strict=True):
         band = style.band_number(name)

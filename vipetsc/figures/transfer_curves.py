@@ -1,4 +1,9 @@
-"""Inter-band transfer over the amplitude (paper, Fig. 9), next to a branch (Figs. 12, S7, S8), and its regimes."""
+"""Inter-band transfer over the amplitude (paper, Fig. 9), next to a branch (Figs. 12, S7, S8), and its regimes.
+
+The *floor* of a curve is the transfer without any contact. A curve that is *related* to a branch is drawn over the work
+of the drive, scaled so that contact begins at the branch's energy of grazing, next to the branch's slope df/dE
+(``vipetsc.studies.backbone``).
+"""
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -34,14 +39,14 @@ from vipetsc.io.read import curves, field_interval, field_time
 from vipetsc.spectra import doubt
 
 MARKERS = "os^Dv"  # of configurations
-FEWEST = 6  # amplitudes that make a curve: below, at and beyond the peak, two each
-PERIODS = 10  # of the drive that a phase portrait shows: more turns would cover each other
-REACH = 6  # times the amplitude of the peak, to which the linear panels go; the logarithmic ones show the rest
+FEWEST = 6  # amplitudes of a curve: two each below, near and beyond the peak
+PERIODS = 10  # of the drive in a phase portrait: more turns would cover each other
+REACH = 6  # end of the linear panels over the amplitude of the peak; the logarithmic ones show all
 BACKBONE_LABEL = "Inter-band transfer, normalised slope (1)"
 
 
 class TransferCurve(NamedTuple):
-    """The measures of one law, reading and configuration, by name; ``case`` stands for its members."""
+    """Measures (member,) of one law, reading and configuration by name; ``case`` is that of one of its members."""
 
     case: Case
     data: Mapping[Any, Any]
@@ -69,7 +74,7 @@ def transfer_curves(sweeps: Sweeps) -> Iterator[TransferCurve]:
 
 
 def columns_of_laws(shown: Sequence[TransferCurve], ylabel: str, panel: Callable[[Axes, TransferCurve], str]) -> Figure:
-    """Draw a page of one configuration: a column a law, drawn by ``panel``, which returns the column's title."""
+    """Draw a page of one configuration: a column for each law, drawn by ``panel``, which returns its title."""
     shown = sorted(shown, key=lambda curve: curve.case.contacts.law, reverse=True)
     width = 4.3
     if len(shown) > 1:
@@ -87,7 +92,7 @@ def columns_of_laws(shown: Sequence[TransferCurve], ylabel: str, panel: Callable
 
 
 def sampled_points(sweeps: Sweeps) -> Iterator[TransferCurve]:
-    """Yield the configurations that were sampled at single amplitudes, each as a curve of one point."""
+    """Yield the configurations of sweeps over samples of disorder at one amplitude, each as a curve of one point."""
     for ensemble in sweeps:
         if "statistics/ibtet/mean" in ensemble and AMPLITUDE not in ensemble.sizes:
             numbers = ensemble["number"]
@@ -97,7 +102,7 @@ def sampled_points(sweeps: Sweeps) -> Iterator[TransferCurve]:
 
 
 def ibtet(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer one page a reading, a column a law: about the peaks on linear scales, all amplitudes in logarithms."""
+    """Offer a page for each reading, with a column for each law: linear near the peaks, and logarithmic throughout."""
     points = list(sampled_points(sweeps))
     by_reading = grouped(transfer_curves(sweeps), lambda curve: curve.case.lattice.reading)
     for reading, page_curves in by_reading.items():
@@ -172,7 +177,7 @@ def _draw_sampled(axes: Axes, point: TransferCurve, look: _Look) -> None:
 
 
 def _mark_peak(axes: Axes, curve: TransferCurve, look: _Look, row: int) -> None:
-    """Mark the largest value by a ring, and write what it is in the text's line ``row``."""
+    """Mark the largest value by a ring, and write it in line ``row``, from 0, of the text in the panel."""
     peak = curve.data["peak"]
     amplitude = np.asarray(curve.data[AMPLITUDE])[peak]
     largest = np.asarray(curve.data["ibtet"])[peak]
@@ -182,7 +187,7 @@ def _mark_peak(axes: Axes, curve: TransferCurve, look: _Look, row: int) -> None:
 
 
 def ibtet_backbone(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer every reading and configuration of ``backbone.h5``, laws in columns; not those of another sweep."""
+    """Offer a page for each reading and configuration in ``backbone.h5``, with laws in columns."""
     for ensemble in sweeps:
         path = Path(ensemble.attrs["folder"]) / "backbone.h5"
         if not path.exists():
@@ -202,12 +207,12 @@ def ibtet_backbone(sweeps: Sweeps) -> Iterator[Drawing]:
 
 
 def _backbone_page_stem(curve: TransferCurve) -> str:
-    """Return the stem of the page that a related curve stands on, by whatever its sweep varies but the law."""
+    """Return the stem of the page of a related curve: by all that its sweep varies but the law."""
     return Labels.of(curve.case, curve.data["varied"]).page_stem
 
 
 def curves_left_out(folders: Iterable[Path]) -> str:
-    """Return which curves of the sweeps in ``folders`` could not be laid over branches, and why; empty for none."""
+    """Return a message on the curves of the sweeps in ``folders`` that could not be related to branches; or ""."""
     sentences: list[str] = []
     for path in (folder / "backbone.h5" for folder in folders):
         if path.exists():
@@ -227,9 +232,10 @@ def _groups(values: Mapping[Any, Any]) -> list[dict[str, Any]]:
 
 
 def _superposition(axes: Axes, aligned: TransferCurve) -> str:
-    """Draw a lattice's transfer over its branch's slope, and return the panel's title.
+    """Draw a lattice's transfer and its branch's slope over normalised energy, and return the panel's title.
 
-    Points of the lattice, red where fitted; the slope over the divisor dashed, with the floor grey; the fit green.
+    Points are the lattice's transfer, red where it was fitted in region III, with the fit in green. Dashed is the slope
+    over the divisor with which it fits the transfer; grey is the same with the floor added.
     """
     curve = aligned.data
     energy = curve["energy"]
@@ -243,7 +249,7 @@ def _superposition(axes: Axes, aligned: TransferCurve) -> str:
     left = 0.5 * min(energy.min(), 0.1 * grazing)
     right = 2 * energy.max()
 
-    # Region I goes on to the left: below the first point of the branch its slope is zero as well.
+    # Region I goes on to the left of the branch, with a slope of zero as well.
     extended = np.append(left, branch)
     with_floor = floor + np.append(0.0, scaled_slope)
     axes.plot(extended, with_floor, color=style.GREY, lw=2.2, alpha=0.55, label="slope + floor")
@@ -272,7 +278,7 @@ def _superposition(axes: Axes, aligned: TransferCurve) -> str:
 
 
 class ContactMotion(NamedTuple):
-    """Displacement in m and velocity in m/s (t, 2) of host and resonator of the contact cell, and the transfer."""
+    """``displacement`` in m and ``velocity`` in m/s (t, 2) of a contact's host and resonator, and the transfer."""
 
     case: Case
     displacement: np.ndarray
@@ -297,13 +303,13 @@ class ContactMotion(NamedTuple):
 
 
 def phase_regimes(sweeps: Sweeps) -> Iterator[Drawing]:
-    """Offer trajectories of one embedded contact cell, for every law and reading, next to the transfer curve."""
+    """Offer a page for each law and reading: trajectories of the one contact cell, next to the transfer curve."""
     folders: dict[tuple[str, Labels], list[Path]] = {}
     for member in transfer_members(sweeps):
         run = member.run
         shows_its_site = len(recorded_sites(run)) == run.sizes["site"] == 1
         if shows_its_site and "displacement" in run and "velocity" in run:
-            # The names of a page are those of its members but for the amplitude.
+            # Members that differ in the amplitude only are on one page.
             labels = member.labels._replace(member="", member_stem="", amplitude="")
             folders.setdefault((f"{member.case.contacts.law}-{labels.page_stem}", labels), []).append(member.folder)
 
@@ -312,7 +318,7 @@ def phase_regimes(sweeps: Sweeps) -> Iterator[Drawing]:
         for curve in transfer_curves(sweeps)
     }
     for (name, labels), page_folders in folders.items():
-        # A page of members at one value of a further key has a name that no curve has.
+        # Where the sweep varies a further key, curves have other names than the page: it is then drawn without one.
         members = [sweeps.files.get(folder, MemberRun.open) for folder in page_folders]
         (site,) = sites_of(members[0].case)
         curve = curves_by_site.get((name, site))

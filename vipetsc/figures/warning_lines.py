@@ -1,4 +1,4 @@
-"""The lines below a picture: warnings that the results it shows carry, each with the members that it is about."""
+"""The lines below a picture: warnings in the results that it shows, each with the names of the members that have it."""
 
 import json
 import re
@@ -10,14 +10,15 @@ from vipetsc.figures.style import Shown
 from vipetsc.wording import counted
 
 NUMBER = re.compile(r"\d[\d.e+-]*")
-MOST_WARNINGS = 4  # below a picture, whose strip must not be higher than its panels
-MOST_NAMES = 4  # of members before a warning, and the number of the others
+MOST_WARNINGS = 4  # below a picture: the strip must not be higher than the panels
+MOST_NAMES = 4  # of members before a warning; of more their number is given
 
 
 def warned(make: Callable[[], Figure], shown: Sequence[Shown]) -> Callable[[], Figure]:
-    """Return ``make`` so that its figure is labelled with the warnings of the results that it has ``shown``.
+    """Return a function like ``make`` whose figure has as its label the warnings of the results ``shown``.
 
-    They stand as JSON in the attribute ``warnings``; `vipetsc.figures.style.save` prints the label below the picture.
+    Results have them as JSON in the attribute ``warnings``; `vipetsc.figures.style.save` prints the label below the
+    picture.
     """
     lines = warning_lines(shown)
 
@@ -30,9 +31,9 @@ def warned(make: Callable[[], Figure], shown: Sequence[Shown]) -> Callable[[], F
 
 
 def warning_lines(shown: Sequence[Shown]) -> list[str]:
-    """Return the warnings of the results ``shown``, each once; of several members with the names of those that have it.
+    """Return the warnings of the results ``shown``, each once; if several are shown, with the names of its members.
 
-    Of sentences that differ in numbers alone one stands for all.
+    Of sentences that differ only in numbers the first is given.
     """
     by_kind: dict[str, list[str]] = {}
     names: dict[str, list[str]] = {}
@@ -57,7 +58,7 @@ def _warnings(member: Shown) -> list[str]:
 
 
 def _listed(names: Sequence[str], sentences: Sequence[str]) -> str:
-    """Return the ``names`` of the members of the ``sentences``, each once, before the first of these."""
+    """Return the text before a warning: the ``names`` of the members that have one of its ``sentences``, each once."""
     distinct = list(dict.fromkeys(names))
     text = ", ".join(distinct[:MOST_NAMES])
     if len(distinct) > MOST_NAMES:
