@@ -10,6 +10,7 @@ from scipy.special import ellipj
 from tests.unit.propagator_parts import MASS, RATE, SPEED, mass_on_cubic_spring, mass_on_stop
 from vipetsc.contact.law import FREE
 from vipetsc.dynamics.propagator.collocation import (
+    _replace,
     accumulate_moments,
     collocate,
     error_ratio,
@@ -115,7 +116,7 @@ def cluster_on(part: str) -> Cluster:
 
 @pytest.mark.parametrize("part", ["stop", "spring"])
 def test_a_substep_that_does_not_converge_leaves_nothing_to_the_next_one(part):
-    """Picard's iteration contracts up to h omega = 12: of 60 nothing is kept, and a shorter substep has the same bits.
+    """Picard's iteration contracts below h omega = 13: of 60 nothing is kept, and a shorter substep has the same bits.
 
     Forces that have grown may still converge in the next substep; its rounding would then depend on a trial in vain.
     """
@@ -128,6 +129,23 @@ def test_a_substep_that_does_not_converge_leaves_nothing_to_the_next_one(part):
     fresh = one_substep(cluster_on(part), Substep(PLAIN, 0.3))
     for name in ("force", "w", "v", "taylor"):
         np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
+
+
+def test_a_motion_that_overflows_does_not_stop_the_next_substep():
+    """Beside motions near the largest float every change is infinite, over a scale below 1 m."""
+    cluster = mass_on_stop()
+    cluster.contacts["scale"] = 1e-4
+    assert not collocate(cluster, cluster.trial, Substep(PLAIN, 1e5 / RATE / cluster.interval))
+    assert collocate(cluster, cluster.trial, Substep(PLAIN, 0.3))
+
+
+def test_a_spring_that_comes_to_rest_has_changed_by_its_elongation_over_the_scale():
+    """As any other change: the size of waves, 1e-5 m, is the scale of an elongation of 0."""
+    cluster = mass_on_cubic_spring(1.0)
+    cluster.springs["scale"] = 1e-5
+    cluster.trial.w[0] = 3e-6
+    nothing = np.zeros(NODES)
+    assert _replace(cluster, 0, nothing, nothing, cluster.trial) == pytest.approx(0.3)
 
 
 def test_springs_accelerate_the_sites_next_to_them():

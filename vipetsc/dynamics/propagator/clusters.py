@@ -17,20 +17,25 @@ Powers of A bear H^2m already; ``factors`` H^(k mod 2)/k! add what the power s^k
     u(s) = sum_k s^k/k! (P_k u_0 + Q_k H v_0),   P_(k+1) = -Q_k H^2 M^-1 K,   Q_(k+1) = P_k - Q_k H M^-1 C,
 
 from P_0 = 1 and Q_0 = 0, and the rows are c P_k and c Q_k, two for each power of time. ``StepSeries`` says how many
-powers count (``terms``, twice as many with dashpots) and at how many cells' distance they end (``reach``).
+powers of A count, ``terms``, which make twice as many powers of s (with dashpots there is a row for each of these), and
+at how many cells' distance they end, ``reach``.
 
 **Numbers of DoFs** are those of ``contact_dofs``: 0 to n - 1 the n sites, then the springs that are not linear, and
 -1 - i for the i-th drive. Its array has the drives last and in reverse, so that a negative number is an index from the
 end.
 
 **Rows that serve both ways** (Maxwell's reciprocity). M and K are symmetric, so that (-A)^m M^-1 is: what the force on
-x leaves in every displacement, (-A)^m M^-1 c^T, is M^-1 times the row c (-A)^m, by which x is read from every
-displacement. With dashpots C is symmetric, too, and so is Q_k M^-1, the series of the inverse of M p^2 + C p + K. A
-force changes velocities alone at once; what follows is the motion from these velocities, for which the Q_k stand: no
-P_k is needed. The velocity, the derivative of sum_k Q_k s^k H/k!, has the same Q_k with the factor 1/(k-1)!.
+x leaves in every displacement, (-A)^m M^-1 c^T, is M^-1 times the transposed row c (-A)^m, by which x is read from
+every displacement. With dashpots C is symmetric, too, and so is Q_k M^-1, the series of the inverse of M p^2 + C p + K,
+p being Laplace's variable. A force changes velocities alone at once; what follows is the motion from these velocities,
+for which the Q_k stand: no P_k is needed. The velocity, the derivative of sum_k Q_k s^k H/k!, has the same Q_k with the
+factor 1/(k-1)!.
 
-**Words.** A *group* is a set of DoFs of the lattice that are solved for together, as numbers (``Groups``); a *cluster*
-is such a group on a rank that has cells within reach of it, with its tables (``DofTables``). ``groups`` finds them.
+**Words.** The *form* of a DoF is its c, the weights of the masses of its cell and, if forces join cells, of the next
+one. A *group* is a set of DoFs of the lattice that are solved for together, as numbers (``Groups``); a *cluster* is
+such a group on a rank that has cells within reach of it, with its tables (``DofTables``). ``groups`` finds them. Every
+rank within reach solves a cluster for itself, from the same halo, and applies the impulses to its own cells alone: no
+forces are sent.
 """
 
 from typing import NamedTuple
@@ -111,8 +116,9 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     # Cells that a form has weights for: 2 if forces join cells, else 1.
     span = dofs["form"].shape[1]
 
-    # DoFs of equal form have one table in common where their cells have equal rows. ``representatives`` gives the first
-    # cell with the rows of each.
+    # DoFs of equal form have one table in common where their cells have equal rows. ``representatives`` gives for each
+    # the first cell with the same masses, springs and dashpots up to ``reach`` + 1 cells away: both the rows and all
+    # masses that the table holds are then the same, as the second cell of a form is one cell further on.
     form_cells = np.stack([dofs["cell"], dofs["last"] % layout.cells][:span], axis=1)
     weights = dofs["form"].reshape(len(dofs), span * layout.dofs)
     representatives = series.representatives(form_cells.ravel()).reshape(form_cells.shape)
@@ -120,20 +126,22 @@ def create_dof_tables(groups: Groups, model: Model, layout: Layout, series: Step
     cells = kinds[:, :span].astype(np.int64)
     forms = kinds[:, span:].reshape(len(kinds), span, layout.dofs)
 
-    # Masses near a representative are those near all DoFs of its table. Beyond an end of the lattice the numbers are
-    # those of an endless one, and none is used: rows have zeros there.
+    # Masses near a representative are those near all DoFs of its table. On a ring ``coefficients`` goes round. Beyond
+    # an end of the lattice the numbers are those of an endless one, and none is used: rows have zeros there.
     masses = np.zeros((len(kinds), layout.dofs, series.width))
     for i, cell in enumerate(cells[:, 0].tolist()):
         leftmost = cell - series.reach
         masses[i] = model.chain.coefficients(leftmost, leftmost + series.width).masses.T
 
-    # Sites and drives of the rank's ledger, in its order, by their place in ``numbers``.
+    # Sites and drives of the rank's ledger, in its order, by their place in ``numbers``. All of them lie in the rank's
+    # own cells, and so in its groups: none has the place -1.
     places = np.full(len(all_dofs), -1)
     places[numbers] = np.arange(len(numbers))
     ledger = places[[*(-1 - i for i in layout.drives), *layout.sites]]
 
     leftmost_cells = dofs["cell"] - series.reach
-    # Beyond the cells that forces reach lie those that move the dashpots there, which losses are computed from.
+    # What losses are computed from lies further out. A force reaches dashpots that begin one cell before ``leftmost``,
+    # and their rates follow from the free motion of ``reach`` cells on either side of them.
     margin = 0
     if layout.damped:
         margin = series.reach + 1
@@ -241,15 +249,16 @@ def create_responses(groups: Groups, tables: DofTables, model: Model, series: St
 def expand_free_motion(dofs: DofTables, c: int, columns: np.ndarray, taylor: np.ndarray) -> bool:
     """Expand the free motion of the DoFs of cluster ``c`` in powers of t/H; whether a force may act on one of them.
 
-    A force may act on a site or spring that reaches its clearance. Coefficients in m go into ``taylor`` (dof,
-    coefficient); ``columns`` (2 mass, column) hold the lattice's state at the beginning of the step.
+    A force may act on a site or spring that reaches its clearance; when drives are on the caller knows. Coefficients in
+    m go into ``taylor`` (dof, coefficient); ``columns`` (2 mass, column) hold the lattice's state at the beginning of
+    the step.
     """
-    _, masses, width, terms = dofs.rows.shape
     # With dashpots there are rows for displacements and rows for velocities, as many as ``columns`` has; without, the
     # rows of displacements serve for both, and are half as many.
-    if masses == columns.shape[0]:
+    if dofs.rows.shape[1] == columns.shape[0]:
         return _expand_damped_motion(dofs, c, columns, taylor)
 
+    _, masses, width, terms = dofs.rows.shape
     even = np.empty(terms)
     odd = np.empty(terms)
     may_touch = False
@@ -320,12 +329,12 @@ def apply_impulses(dofs: DofTables, first: int, moments: np.ndarray, out: np.nda
     Row i of ``moments`` (dof, k) in N s belongs to the DoF ``first`` + i: integrals of its force times (1 - t/H)^k dt
     over the step. Displacements in m come before velocities in m/s.
     """
-    masses, width, terms = dofs.rows.shape[1:]
     # With dashpots: see ``expand_free_motion``.
-    if masses == out.shape[0]:
+    if dofs.rows.shape[1] == out.shape[0]:
         _apply_damped_impulses(dofs, first, moments, out)
         return
 
+    masses, width, terms = dofs.rows.shape[1:]
     for i in range(moments.shape[0]):
         if is_zero(moments[i]):
             continue

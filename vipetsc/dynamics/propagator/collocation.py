@@ -10,16 +10,17 @@ adds the forces to the moments by which the step will move the lattice (sec. 5).
 **Notation.** H is the linear step in s, s the position in it in units of H; a substep has its ``length`` d in these
 units and nodes of one of three kinds, ``substep.kind``: plain ones, or ones that crowd where a force of Hertz begins or
 ends; z in [0, 1] is the variable in which they are Gauss's (``nodes``). A DoF is the relative displacement w of a
-contact site, the elongation of a spring that is not linear, or the displacement of a driven mass; those on which a
-force acts in a substep are ``trial.active``: the sites in contact, ``trial.closed``, all springs, ``trial.springs``,
-and the masses whose drive is on. The *free motion* of a DoF is its motion from here on if no force acted on any DoF. A
-``Cluster`` holds what has been taken, a ``Trial`` a substep that may still be thrown away.
+contact site, the elongation of a nonlinear spring, or the displacement of a driven mass. Forces act on those that are
+``trial.active``: ``trial.closed``, the sites in contact and, open or closed, those that touch or are pressed at rest;
+all springs, ``trial.springs``; and the masses whose drive is on. The *free motion* of a DoF is its motion from here on
+if no force acted on any DoF. A ``Cluster`` holds what has been taken, a ``Trial`` what may still be thrown away.
 
 **Sums at the nodes.** H times the displacement of DoF i after a unit impulse on DoF l is the sum over p of g_p s^p, g_p
-in m/N (``Cluster.response``). With Lagrange's polynomials l_k of the nodes s_k, s from 0 to 1 in the substep, a unit
-force of l at node k moves i at node j by
+in m/N (``Cluster.response``). A force F acts for ds as the impulse F H ds, so that H cancels in displacements. With x
+from 0 to 1 in the substep and l_k Lagrange's polynomials of its nodes, of degree 7 in z, a unit force of l at node k
+moves i at node j by
 
-    to_w[k, j] = sum over p of g_p d^(p + 1) powers[p, k, j],   powers[p, k, j] = integral_0^s_j (s_j - s)^p l_k(s) ds,
+    to_w[k, j] = sum over p of g_p d^(p + 1) powers[p, k, j],   powers[p, k, j] = integral_0^x_j (x_j - x)^p l_k(x) dx,
 
 and its rate by to_v[k, j], the same with the derivative p g_p d^p/H and the power p - 1. The tables ``powers`` do not
 depend on the lattice.
@@ -27,16 +28,16 @@ depend on the lattice.
 **Picard's iteration** puts the motion at the nodes into the force law, the forces into the integrals, and so on. With a
 contact of stiffness k on a mass m each sweep leaves 0.006 (h omega)^2 of the error, omega^2 = k/m, h the substep's
 length in s. 0.006 is the spectral radius of the tables' double integral ``powers[1]`` of plain nodes: the iteration
-contracts up to h omega = 12, and in the substeps that the error estimate allows, of h omega = 1 to 2, ten sweeps or so
+contracts up to h omega = 12.9, and in the substeps that the error estimate allows, h omega = 1 to 2, ten sweeps or so
 reach rounding. Of a force -c w' each sweep leaves 0.09 h c/m, by the single integral ``powers[0]``. Newton's method
 would need fewer sweeps, but in each the law's derivatives and the solution of a linear system of 8 equations for each
 active DoF.
 
 **Moments.** The integrals of a force times powers of the lag to the substep's end are sums over the nodes with Gauss's
-weights. They are those of the interpolant, a polynomial of degree 7 in z, as long as the integrand's degree in z is at
-most 15: up to the 8th power with plain nodes, where the lag is linear in z; up to the 3rd with the others, where the
-lag is quadratic and ds = s'(z) dz adds one degree more, 7 + 2 x 3 + 1 = 14. For higher powers, which the response
-multiplies by its high, small terms, they err as Gauss's rule does.
+weights times dx/dz. They are those of the interpolant, a polynomial of degree 7 in z, as long as the integrand's degree
+in z is at most 15: up to the 8th power with plain nodes, where the lag is linear in z; up to the 3rd with the others,
+where the lag is quadratic and dx/dz adds one degree more, 7 + 2 x 3 + 1 = 14. For higher powers, which the response
+multiplies by its high, small terms, they err as Gauss's rule does; so do energies, integrals of force times rate.
 
 Whether a function is a ``kernel`` or ``inlined``, put in place of its calls, matters for speed alone: see
 ``vipetsc.compiled``.
@@ -61,7 +62,7 @@ MOST_SWEEPS = 60
 CONVERGED = 1e-15
 # It has also converged when the change is below this and no smaller than in the sweep before: that is rounding.
 STAGNANT = 1e-13
-# A response's terms smaller than this, relative to its first one, are left out.
+# Terms of a response are left out where their bound is below this, relative to the first terms of own responses.
 SMALLEST_RESPONSE = 1e-18
 # The error in w' at a substep's end is taken to be this times (|c_6| + |c_7|) d g_1/H, with the last two Legendre
 # coefficients in z of the force at the nodes. Gauss's rule integrates these two exactly, so that the end errs by later,
@@ -79,7 +80,7 @@ def _force_on_site(contacts: np.ndarray, i: int, w: float, rate: float) -> float
 
     ``contact_force`` is that on the host. It pushes the other mass the opposite way, and w is the other mass's
     displacement less the host's: so the sign. The load of a contact that is pressed at rest, ``preload``, is balanced
-    there by static loads: only what the force differs from it moves w.
+    there by static loads: only the difference moves w, which is the load alone while the contact is open.
     """
     on_host, _ = contact_force(contacts, i, w, rate)
     return -(on_host - contacts[i].preload)
@@ -97,7 +98,6 @@ def evaluate_site_motion(cluster: Cluster, taylor: np.ndarray, out: np.ndarray) 
 
     ``taylor`` (dof, coefficient) is the series of the free motion from that position on, in m.
     """
-    # A record in an array of one: compiled code can change it in place.
     state = cluster.state[0]
     sites = cluster.contacts.size
     h = cluster.interval
@@ -135,7 +135,7 @@ def _stride(cluster: Cluster) -> int:
 def node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.ndarray, to_v: np.ndarray) -> bool:
     """Fill ``to_w`` and ``to_v`` (node k, node) with what a unit force of DoF ``j`` at node k adds to w, w' of ``i``.
 
-    They are in m/N and m/s/N, the sums of the module's docstring. Returns whether ``j`` moves ``i`` at all.
+    They are in m/N and m/s/N, the sums of the module's docstring. Returns whether any term of them counts.
     """
     to_w[:] = 0.0
     to_v[:] = 0.0
@@ -149,8 +149,8 @@ def node_responses(cluster: Cluster, substep: Substep, i: int, j: int, to_w: np.
     if stride == 2:
         ratio *= substep.length
 
-    # Terms fall as those of the fastest mode's sine do, with dashpots as those of its exponential function: from one
-    # power p to the next by theta d/(p + 1), with theta = ``omega_max_h`` its radians in the step.
+    # Terms have a bound that falls as those of the fastest mode's sine, with dashpots of its exponential function: from
+    # one power p to the next by theta d/(p + 1), theta = ``omega_max_h``. It begins at (g_ii g_jj)^1/2, counted as 1.
     size = 1.0
     radians = cluster.omega_max_h * substep.length
     for m in range(cluster.response.shape[2]):
@@ -263,8 +263,7 @@ def _replace(cluster: Cluster, i: int, w: np.ndarray, v: np.ndarray, trial: Tria
             largest = max(largest, abs(w[node]))
         trial.w[i, node] = w[node]
         trial.v[i, node] = v[node]
-    # Without motion nothing has changed.
-    if largest > 0.0:
+    if contacts.size <= i < first_drive(cluster):
         change /= largest + cluster.springs[i - contacts.size].scale
     return change
 
@@ -294,8 +293,10 @@ def collocate(cluster: Cluster, trial: Trial, substep: Substep) -> bool:
             for node in range(NODES):
                 trial.force[i, node] = _force_of_spring(cluster, i, trial.w[i, node])
 
-    # The shorter substep that is tried next must not begin with forces that diverged.
+    # The shorter substep that is tried next must not begin with forces that diverged, or with motions that did.
     trial.force[: first_drive(cluster)] = 0.0
+    trial.w[:] = 0.0
+    trial.v[:] = 0.0
     return False
 
 
@@ -343,11 +344,12 @@ def update_taylor(cluster: Cluster, trial: Trial, substep: Substep) -> None:
 def error_ratio(cluster: Cluster, trial: Trial, length: float) -> float:
     """Estimated error of a substep of ``length`` over the allowed one, by the forces' last two Legendre coefficients.
 
-    Both count, for in a force that is symmetric about the substep's middle every other coefficient vanishes. The error
-    of a force becomes one of the site's velocity by the first term g_ii s of the site's own response, the sum of
-    H^2/mass over the site's masses. The first term of another site's response is no larger, the same sum over the
-    masses that belong to both; later terms bear higher powers of the length. Allowed are ``rtol`` |w'_minus| + ``atol``
-    in m/s; for a spring the largest rate at the nodes takes the place of the approach velocity w'_minus.
+    ``advance`` accepts a ratio up to 1, and the next length follows from it. Both coefficients count, for in a force
+    that is symmetric about the substep's middle every other one vanishes. The error of a force becomes one of velocity
+    by the first term g_ii s of the site's own response, the sum of H^2/mass over the site's masses. The first term of
+    another site's response is no larger, the same sum over the masses that belong to both, and the velocity that the
+    force gives this site is smaller in the same ratio. Later terms bear higher powers of the length. Allowed are
+    ``rtol`` |w'_minus| + ``atol`` in m/s, w'_minus the approach velocity, for a spring the largest rate at the nodes.
     """
     worst = 0.0
     for i in trial.closed:

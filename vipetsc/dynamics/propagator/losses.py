@@ -1,9 +1,25 @@
 """Compiled losses of dashpots in a step, by the tables of ``loss_tables`` and the stencil of ``free_losses``.
 
-The loss in a step is a sum of three parts (sec. 10 of the derivation in the package's docstring): that of free motion,
-a quadratic form of the state at the beginning; that of the forces' motion times free motion; and that of pairs of
-forces, a double integral over their two times. In the last two the forces enter through moments, integrals of the force
-times Legendre's polynomials of what remains of the step: each substep adds to them by the force's values at its nodes.
+The loss in a step is the integral of v^T C v, C the matrix of dashpots. The velocities v consist of those of free
+motion from the state y at the step's beginning and of those that the forces F_l on the DoFs l have left, so that the
+loss has three parts (sec. 10 of the derivation in the package's docstring):
+
+    loss = y^T S y + sum_l int F_l(t) (B_l(t) y) dt + sum_lm int F_l(t) int_(t' < t) K_lm(t, t') F_m(t') dt' dt.
+
+With r_l the velocities after a unit impulse on l at the time t, r_m those after one on m at t', and v_free the free
+ones, integrals over what is left of the step after t give
+
+    B_l(t) y = 2 int r_l^T C v_free,    K_lm(t, t') = 2 int r_l^T C r_m.
+
+B_l and K_lm do not depend on the motion. They are expanded in Legendre's polynomials P_p of what remains of the step
+after the impulses, a = 1 - t/H and b = 1 - t'/H in units of its length H:
+
+    B_l = sum_p B_lp P_p(2 a - 1),    K_lm = sum_(p + q < degrees) K_lm,pq P_p(2 a - 1) P_q(2 b - 1).
+
+``FreeLosses.rows`` are the B_lp and ``PairLosses.kernels`` the K_lm,pq, from ``loss_tables``; the stencil of S is made
+in ``free_losses``. Forces enter by their moments, the integrals of F P_p dt, to which each substep adds by the values
+of F at its nodes: pairs of times need not be gone through. Of Legendre's polynomials a dozen are enough; of powers it
+would take forty, whose sums cancel (``loss_modes``).
 """
 
 from typing import NamedTuple
@@ -21,9 +37,10 @@ from vipetsc.dynamics.vectors import LANES, add_lanes, add_product, store, zeros
 class FreeLosses(NamedTuple):
     """Losses by forces on a rank's DoFs times the rates of free motion; empty without dashpots.
 
-    ``rows`` (table, 2 mass, cell, mode) give the coefficients of the loss by a unit impulse on a DoF, of which
-    ``table`` (dof,) numbers one, from the cells in the halo's columns from ``column`` (dof,) on. ``leader`` (cluster,)
-    is the rank's cell that counts the losses of a cluster's forces, -1 where another rank does.
+    ``rows`` (table, 2 mass, cell, mode) are the B_lp of the module's docstring: by the state of the cells in the halo's
+    columns from ``column`` (dof,) on, the loss in J of an impulse of 1 N s on a DoF, by modes. ``table`` (dof,) numbers
+    the DoF's rows. ``leader`` (cluster,) is the rank's cell in which ``engine`` books the losses of a cluster's forces,
+    which belong to no cell alone, and -1 on ranks that do not own it: several ranks compute the same losses.
     """
 
     column: np.ndarray
@@ -38,9 +55,9 @@ class PairLosses(NamedTuple):
     ``kernels`` (kind, mode of the later impulse, mode of the earlier one) are the coefficients of the loss in J by two
     unit impulses, both orders of a pair together; those whose modes sum to less than ``degrees`` (kind,) count.
     ``kinds`` (dof of the later impulse, dof of the earlier one) numbers the table of the pair, -1 if the two are too
-    far apart. In the present step: ``moments`` (dof, mode) in N s of the forces, ``loss`` (cluster,) in J so far.
-    ``legendre`` (mode, node) and ``before`` (dof, mode, node) are workspace. Without dashpots there are no modes, and
-    nothing here is called.
+    far apart; the earlier one is counted within the cluster. In the present step: ``moments`` (dof, mode) in N s of the
+    forces, ``loss`` (cluster,) in J so far. ``legendre`` (mode, node) and ``before`` (dof, mode, node) are workspace.
+    There are two modes at least (``mode_count``); without dashpots there are none, and nothing here is called.
     """
 
     kinds: np.ndarray
@@ -77,9 +94,10 @@ def add_free_losses(
 ) -> None:
     """Put into ``after`` (cell,) what is ``before`` and the loss in J of free motion from ``state`` (2 dof, cell).
 
-    ``columns`` (2 dof, column) are the state's halo. The loss is y . (S y) of the state y, with the stencil of half of
-    a symmetric matrix, so that each pair counts once. Each product of S y is multiplied by its y at once, and S y is
-    not stored. ``before`` and ``after`` are different arrays.
+    ``columns`` (2 dof, column) are the state's halo. The loss is y . (S y) of the state y. S is symmetric: a block of
+    the ``stencil``, displacements and velocities of two masses, has its own entries of S and, doubled, those with later
+    blocks of the cell and with cells on the right. A last mass that is alone leaves rows of zeros. Each product of S y
+    is multiplied by its y at once, and S y is not stored. ``before`` and ``after`` are different arrays.
     """
     cells = state.shape[1]
     x = state.reshape(-1)
@@ -90,7 +108,7 @@ def add_free_losses(
         after[cell] = before[cell]
     for first, stop in stencil.interior:
         for a in range(first, stop, LANES):
-            # The last vector overlaps the one before; an interior has at least so many cells.
+            # The last vector overlaps the one before. ``create_loss_stencil`` leaves shorter ranges to the borders.
             i = min(a, stop - LANES)
             loss = zeros()
             for b in range(to.shape[0]):
@@ -128,7 +146,7 @@ def loss_by_forces(free: FreeLosses, pairs: PairLosses, dofs: DofTables, c: int,
     ``columns`` (2 mass, column) hold the lattice's state at the beginning of the step.
     """
     loss = pairs.loss[c]
-    _, masses, width, modes = free.rows.shape
+    _, components, width, modes = free.rows.shape
     total = np.empty(modes)
     for i in range(dofs.first[c], dofs.first[c + 1]):
         moments = pairs.moments[i]
@@ -136,7 +154,7 @@ def loss_by_forces(free: FreeLosses, pairs: PairLosses, dofs: DofTables, c: int,
             continue
 
         total[:] = 0.0
-        for j in range(masses):
+        for j in range(components):
             for k in range(width):
                 x = columns[j, free.column[i] + k]
                 row = free.rows[free.table[i], j, k]
@@ -149,7 +167,7 @@ def loss_by_forces(free: FreeLosses, pairs: PairLosses, dofs: DofTables, c: int,
 
 @kernel
 def _fill_legendre(losses: PairLosses, cluster: Cluster, substep: Substep) -> None:
-    """Put Legendre's polynomials of what remains of the step after each node into the workspace."""
+    """Put Legendre's polynomials P_p(2 a - 1) into the workspace, a what remains of the step after each node."""
     legendre = losses.legendre
     position = cluster.state[0].position
     for node in range(NODES):
@@ -165,7 +183,10 @@ def _fill_legendre(losses: PairLosses, cluster: Cluster, substep: Substep) -> No
 
 @kernel
 def _fill_before(losses: PairLosses, cluster: Cluster, trial: Trial, substep: Substep) -> None:
-    """Put the moments that forces have up to each node, in Legendre's polynomials, into the workspace."""
+    """Put the moments that forces have up to each node, in Legendre's polynomials, into the workspace.
+
+    Within the substep F P_q is replaced by its interpolant through the nodes, as F is where it moves the lattice.
+    """
     modes = losses.moments.shape[1]
     # All DoFs, as forces that have ended within the step have moments too.
     for i in range(losses.moments.shape[0]):
@@ -196,8 +217,9 @@ def accumulate_losses(losses: PairLosses, cluster: Cluster, trial: Trial, subste
         total[:] = 0.0
         for source in range(losses.moments.shape[0]):
             number = losses.kinds[later, source]
-            # Mode 0 is the impulse, which is exactly zero of a DoF on which nothing has acted in the step.
-            if number < 0 or not losses.before[source, 0, NODES - 1]:
+            # All moments of a DoF on which nothing has acted in the step are exactly zero. The first of them alone, the
+            # impulse, may vanish after a force that has changed its sign.
+            if number < 0 or is_zero(losses.before[source, :, NODES - 1]):
                 continue
             for p in range(losses.degrees[number]):
                 part[:] = 0.0
@@ -211,7 +233,7 @@ def accumulate_losses(losses: PairLosses, cluster: Cluster, trial: Trial, subste
             weight = cluster.nodes.weight[substep.kind, node]
             losses.loss[0] += cluster.interval * substep.length * weight * trial.force[later, node] * total[node]
 
-    # The moments change only now: all forces of the substep were to see those before it.
+    # What the next substep begins with: ``before`` had the moments up to this one.
     for i in trial.active:
         for node in range(NODES):
             amount = cluster.interval * substep.length * cluster.nodes.weight[substep.kind, node] * trial.force[i, node]
