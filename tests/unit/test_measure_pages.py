@@ -450,6 +450,31 @@ def test_pages_of_several_sweeps_have_common_axes():
         assert len({mesh.get_clim() for mesh in meshes}) <= 1
 
 
+def test_pages_over_categories_have_a_common_scale_of_the_measure():
+    """Categories are each page's own; the values over them have the same limits."""
+    sweeps = [ensemble_of(SITES), ensemble_of(SITES)]
+    sweeps[1]["ibtet"] *= 7
+    limits = []
+    for ensemble, other in (sweeps, sweeps[::-1]):
+        (drawing,) = measure_pages(ensemble, "ibtet", "name", [other])
+        (axes,) = panels(drawing.draw())
+        assert axes.get_xlim() == (-0.5, 2.5)
+        limits.append(axes.get_ylim())
+    assert limits[0] == limits[1]
+    assert limits[0][1] > 0.21
+
+
+def test_a_band_that_reaches_below_zero_is_shown_whole():
+    """Means that are positive begin the axis at 0 only if their band does not go further down."""
+    ensemble = with_samples(AMPLITUDES)
+    # Less than half of the largest mean.
+    ensemble["statistics/ibtet/mean"][0] = 0.01
+    ensemble["statistics/ibtet/quantiles"][0] = -1.0
+    (axes,) = panels(only(ensemble))
+    low, _ = axes.get_ylim()
+    assert low <= -1.0
+
+
 def test_pages_can_be_read(tmp_path):
     """No text outside the page or over other text, of curves, of maps, of panels and with long names."""
     for axes in (

@@ -32,7 +32,8 @@ from vipetsc.figures.branch_losses import draw_losses
 from vipetsc.figures.panels import REGIONS, ROMAN, annotate_empty, note, shade_regions
 from vipetsc.io.netcdf import open_netcdf
 
-NEEDS = ("energy", "frequency", "slope", "multiplier_max", "region", "contacts", "kind", "resonance")
+# What the panels read; ``draw_branch`` shows by ``multiplier_max`` which orbits are stable.
+NEEDS = ("energy", "frequency", "slope", "multiplier_max", "region", "contacts", "kind", "resonance", "number")
 MARKS = {
     "fold-energy": ("o", "energy fold"),
     "fold-frequency": ("s", "frequency fold"),
@@ -116,6 +117,7 @@ def _read(path: Path) -> xr.Dataset:
     """Return the branch in ``path`` with the kinds of its points in words."""
     with open_netcdf(path, "branch", NEEDS) as file:
         branch = file.load()
+    # The kinds' numbers, ``flag_values``, are places in this list.
     kinds = np.array(branch["kind"].attrs["flag_meanings"].split())
     return branch.assign(kind=("point", kinds[branch["kind"].values]))
 
@@ -181,8 +183,10 @@ def frequency_energy(axes: Axes, branch: xr.Dataset) -> None:
         axes.legend(loc="upper left", fontsize=5.5, bbox_to_anchor=(0, 0.93))
         _grazing_inset(axes, branch, touched[0])
     else:
-        # The lower right is free below a branch that rises; a constant frequency lies there, and tongues may.
-        lower_right_is_free = np.ptp(frequency) > 0 and (few_marks or not touched.size)
+        # The lower right is free below a branch that rises over the energy; one that falls or has a constant frequency
+        # lies there, and tongues may.
+        rises = frequency[energy.argmax()] > frequency[energy.argmin()]
+        lower_right_is_free = rises and (few_marks or not touched.size)
         axes.legend(loc="lower right" if lower_right_is_free else "best", fontsize=5.5)
 
 
@@ -262,8 +266,9 @@ def portraits(part: SubFigure, branch: xr.Dataset, tag: str) -> None:
         energy = orbits["orbits/energy"].values[k]
         _draw_orbit(axes, orbits["orbits/displacement"].values[k], orbits["orbits/velocity"].values[k])
 
-        # Orbits are stored without their regions: that of the regular point with the nearest energy is theirs.
-        nearest = int(np.abs(np.log(regular["energy"].values / energy)).argmin())
+        # An orbit has the number of its regular point, or of the next one. Its energy may be that of other points, too.
+        number = orbits["orbits/number"].values[k]
+        nearest = int(np.abs(regular["number"].values - number).argmin())
         region = REGIONS[int(regular["region"][nearest])]
         axes.set_title(f"{region}\n{float(f'{energy:.2g}'):g} J", loc="center", fontsize=7)
         axes.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[-1, 1], yticks=[-1, 1], box_aspect=1)
@@ -284,15 +289,17 @@ def _draw_orbit(axes: Axes, u: np.ndarray, v: np.ndarray) -> None:
 def _grazing_inset(axes: Axes, branch: xr.Dataset, first: int) -> None:
     """Draw the neighbourhood of the point ``first``, where contact begins, in an inset that covers least of the branch.
 
-    The inset shows the branch up to where the frequency is a tenth above that of the last energy fold, or of the point
+    The inset shows the branch up to where the frequency is a tenth off that of the last energy fold, or of the point
     ``first`` if there is no fold, but at least three points beyond ``first``.
     """
     energy = branch["energy"].values
     frequency = branch["frequency"].values
     folds = np.nonzero(branch["kind"].values == "fold-energy")[0]
     last = int(folds[-1]) if folds.size else first
-    # A tenth beyond the fold the branch has its trend again, which the panel shows.
-    last += int(np.searchsorted(frequency[last:], frequency[last] * 1.1))
+    # A tenth beyond the fold the branch has its trend again, up or down, which the panel shows.
+    is_beyond = (frequency[last:] >= 1.1 * frequency[last]) | (frequency[last:] <= frequency[last] / 1.1)
+    beyond = np.flatnonzero(is_beyond)
+    last = last + int(beyond[0]) if beyond.size else len(energy)
     last = min(max(last, first + 3), len(energy) - 1)
     near = branch.isel(point=slice(max(first - 1, 0), last + 1))
 
@@ -312,6 +319,8 @@ def _free_place(axes: Axes, curve: np.ndarray) -> tuple[float, float, float, flo
     It is the largest that covers nothing of the curve, and of several the rightmost, then the lowest; if all cover
     something, it is the one that covers least.
     """
+    # ``transData`` has the limits of when they were last asked for, which may be before the curve was drawn.
+    axes.get_ylim()
     corners = axes.transAxes.inverted().transform(axes.transData.transform(curve))
     # Points at equal distances along the curve: the number of them in a place says how much of the curve is there.
     position = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))

@@ -118,6 +118,11 @@ class Measure(NamedTuple):
         """The name of the measure with its unit."""
         return with_unit(self.name, self.unit)
 
+    @property
+    def drawn(self) -> np.ndarray:
+        """All that curves show (number,): the values, and the ends of the band."""
+        return np.concatenate([part.values.ravel() for part in (self.values, *(self.band or ()))])
+
     def at(self, place: Mapping[str, int]) -> Self:
         """Return the measure at the indices ``place`` of its dimensions, without these."""
         present = {dimension: index for dimension, index in place.items() if dimension in self.failed.dims}
@@ -230,10 +235,9 @@ def _common_axes(measure: Measure, others: Sequence[Measure]) -> CommonAxes | No
             together.append(other)
     if len(together) == 1:
         return None
-    parts = [values for one in together for values in (one.values, *(one.band or ()))]
     places = [Roles.of(one.axes) for one in together]
     return CommonAxes(
-        values=np.concatenate([part.values.ravel() for part in parts]),
+        values=np.concatenate([one.drawn for one in together]),
         x=np.concatenate([place.x.positions for place in places]),
         y=np.concatenate([place.y.positions for place in places if place.y] or [np.zeros(1)]),
     )
@@ -325,7 +329,7 @@ def _page(measure: Measure, roles: Roles, title: Sequence[str], common: CommonAx
         if text == marked:
             largest_point = (best[roles.x.dimension], float(measure.values.isel(best)))
         draw_curves(axes, roles.x, _curves(panel, roles.curves), largest_point)
-    return page.finish_curves(roles.x, measure.values.values, common)
+    return page.finish_curves(roles.x, measure.drawn, common)
 
 
 def _lines_above(measure: Measure, roles: Roles, title: Sequence[str]) -> list[str]:

@@ -122,6 +122,7 @@ class MeasurePage:
         self.panels = list(grid[:count])
 
     def _legend_columns(self) -> int:
+        """Return for how many columns the longest label has room, with six letters for its mark and the gaps."""
         letters = max(map(len, self.legend_labels)) + 6
         return max(1, min(len(self.legend_labels), int(LEGEND_LETTERS * self.width / letters)))
 
@@ -142,7 +143,8 @@ class MeasurePage:
     def finish_curves(self, x: SweptAxis, values: np.ndarray, common: CommonAxes | None = None) -> Figure:
         """Label and scale the axes of all panels of curves, and write the legend; return the figure.
 
-        ``values`` (...) are those of all curves. With pages of other sweeps the axes are ``common`` to all.
+        ``values`` (...) are those of all curves and the ends of their bands. With pages of other sweeps the axes are
+        ``common`` to all, but along categories, which each page has of its own.
         """
         if common:
             values = common.values
@@ -150,8 +152,9 @@ class MeasurePage:
         first = self.panels[0]
 
         # The panels share their axes: scales and limits of the first one are those of all.
-        if common and x.is_number:
-            first.update_datalim([(common.x.min(), finite.min()), (common.x.max(), finite.max())])
+        if common:
+            corners = [(common.x.min(), finite.min()), (common.x.max(), finite.max())]
+            first.update_datalim(corners, updatex=x.is_number)
             first.autoscale_view()
         if finite.min() > 0 and finite.max() > LOG_RATIO * finite.min():
             first.set_yscale("log")
@@ -180,7 +183,8 @@ def draw_curves(axes: Axes, x: SweptAxis, curves: Sequence[Curve], ring: tuple[i
         shift = 0.0
         line = "-"
         if not x.is_number:
-            # Points over one category stand side by side, and no line joins categories.
+            # Points over one category stand side by side, and no line joins categories. The ``MOST_CURVES`` of a panel,
+            # six, take 0.6 of the distance to the next category.
             shift = 0.12 * (curve.number - 0.5 * (len(curves) - 1))
             line = ""
         positions = x.positions[order] + shift
@@ -232,6 +236,7 @@ def draw_maps(
         norm = _norm(common.values)
     for axes, unordered in zip(page.panels, fields, strict=True):
         values = unordered[np.ix_(y_order, x_order)]
+        # The ground shows where values are missing.
         axes.set(xscale=x.scale, yscale=y.scale, facecolor=style.PALE)
         edges = cell_edges(x.positions[x_order], x.scale), cell_edges(y.positions[y_order], y.scale)
         image = axes.pcolormesh(*edges, values, norm=norm, cmap="viridis", rasterized=True)

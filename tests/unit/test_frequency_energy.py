@@ -1,0 +1,94 @@
+"""Frequency-energy plots: where the inset on grazing lies and what it shows, the legend's place, an orbit's region."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from vipetsc.figures import style
+from vipetsc.figures.frequency_energy import frequency_energy, portraits
+
+POINTS = 40
+GRAZING = 8
+# Logarithm of the energy over its range, from 0 to 1.
+PLACE = np.linspace(0.0, 1.0, POINTS)
+
+
+@pytest.fixture(autouse=True)
+def house_style():
+    with style.rc_style():
+        yield
+
+
+def branch_of(frequency: np.ndarray, grazing: int = GRAZING) -> xr.Dataset:
+    """A branch with this ``frequency`` (point,) over energies from 1 to 100 J, in contact from ``grazing`` on."""
+    number = np.arange(POINTS)
+    columns = {
+        "energy": 100.0**PLACE,
+        "frequency": frequency,
+        "kind": np.full(POINTS, "regular"),
+        "region": 1 + (number >= grazing),
+        "contacts": (number >= grazing).astype(int),
+        "resonance": np.zeros(POINTS, int),
+        "multiplier_max": np.ones(POINTS),
+    }
+    return xr.Dataset({name: ("point", values) for name, values in columns.items()})
+
+
+def drawn(branch: xr.Dataset) -> Axes:
+    """The panel of frequencies of a ``branch``, with the limits of energy that its page sets."""
+    axes = Figure(figsize=(3.4, 2.3)).subplots()
+    energy = branch["energy"].values
+    axes.set(xscale="log", xlim=(energy.min(), energy.max()))
+    frequency_energy(axes, branch)
+    axes.figure.draw_without_rendering()
+    return axes
+
+
+def points_within(axes: Axes, branch: xr.Dataset, box) -> int:
+    """How many of a fine row of points on the curve of a ``branch`` lie in a ``box`` on the page."""
+    fine = np.linspace(0.0, 1.0, 1000)
+    frequency = np.interp(fine, PLACE, branch["frequency"].values)
+    points = axes.transData.transform(np.column_stack([100.0**fine, frequency]))
+    return box.count_contains(points)
+
+
+def test_the_inset_on_grazing_covers_nothing_of_the_branch():
+    """A branch that rises at its end alone lies in the lower right corner, which is tried first."""
+    branch = branch_of(100.0 + 50.0 * PLACE**8)
+    axes = drawn(branch)
+    (inset,) = axes.child_axes
+    assert points_within(axes, branch, inset.get_window_extent()) == 0
+
+
+@pytest.mark.parametrize("rise", [0.5, -0.4])
+def test_the_inset_shows_a_tenth_of_the_frequency_beyond_grazing(rise):
+    """Of a branch that rises, and of one that falls, as of a contact that is pressed at rest."""
+    branch = branch_of(100.0 * (1 + rise * np.maximum(PLACE - PLACE[GRAZING], 0.0)))
+    (inset,) = drawn(branch).child_axes
+    shown = inset.lines[0].get_ydata()
+    last = shown[-1] / 100.0
+    assert max(last, 1 / last) == pytest.approx(1.1, rel=0.015)
+
+
+def test_the_legend_is_beside_a_branch_that_falls():
+    branch = branch_of(100.0 - 50.0 * PLACE, grazing=POINTS)
+    axes = drawn(branch)
+    assert points_within(axes, branch, axes.get_legend().get_window_extent()) == 0
+
+
+def test_an_orbit_is_in_the_region_of_its_own_point():
+    """The branch comes back to the energy of an earlier point, which is in another region."""
+    branch = branch_of(100.0 + 50.0 * PLACE).assign(number=("point", np.arange(POINTS)))
+    branch["energy"][30] = branch["energy"][10]
+    branch["region"][20:] = 3
+    circle = np.exp(2j * np.pi * np.arange(16) / 16)[None, :, None] * np.ones((1, 1, 2))
+    branch["orbits/number"] = ("orbit", [30])
+    branch["orbits/energy"] = ("orbit", [float(branch["energy"][30])])
+    branch["orbits/displacement"] = (("orbit", "phase", "dof"), circle.real)
+    branch["orbits/velocity"] = (("orbit", "phase", "dof"), circle.imag)
+
+    part = Figure().subfigures(1, 1)
+    portraits(part, branch, "e")
+    assert part.axes[0].get_title().startswith("III\n")
