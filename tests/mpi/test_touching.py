@@ -8,6 +8,7 @@ from mpi4py import MPI
 
 import pytest
 
+from tests.verify.test_resonators_in_grains import grains
 from tests.verify.test_touching import bead_case, sprung_case
 from vipetsc.dynamics import simulate
 from vipetsc.io.store import RunMemory
@@ -29,7 +30,7 @@ def digest(comm, case):
 
 @pytest.mark.parallel([1, 2])
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
-@pytest.mark.parametrize("create", [sprung_case, bead_case])
+@pytest.mark.parametrize("create", [sprung_case, bead_case, grains])
 def test_touching_contacts_have_the_bits_of_one_rank(engine, create):
     comm = MPI.COMM_WORLD
     case = create(engine)

@@ -324,6 +324,24 @@ def test_a_lone_mass_is_drawn_with_what_its_contacts_join():
     assert grounded.count("$m_{1}$") == 1
 
 
+@pytest.mark.parametrize(
+    ("pairs", "has_stops"),
+    [((), True), ((Pair(0, 0, next_cell=True),), False), ((Pair(0, 0, next_cell=True), Pair(0, 1)), True)],
+)
+def test_a_resonator_in_its_host_has_stops_where_it_meets_the_host(pairs, has_stops):
+    """A grain that meets the next one alone has none around its resonator."""
+    cell = UnitCell(masses=(0.01, 0.02), springs=(Spring(0, 1, 1e3),), host=0, resonator=1)
+    with rc_style():
+        axes = new_figure(5, 2).subplots()
+        draw_unit_cell(axes, cell, pairs)
+    texts = [text.get_text() for text in axes.texts]
+    assert ("Δ" in texts) == has_stops
+    # Without other masses in contact nothing is drawn beyond the cell.
+    assert ("contact, Δ" in texts) == bool(pairs)
+    assert texts.count("$m_{1}$") == len(pairs[:1])
+    assert texts.count("$m_{2}$") == 1
+
+
 # Five masses, of which two are tied to the next cell, and a chain with a pair of masses apart from it.
 ODD_CELL = UnitCell(
     masses=(0.01, 0.02, 0.03, 0.004, 0.005),

@@ -103,6 +103,7 @@ SPRINGS = [{"start": 1, "end": 1, "stiffness": SPRING, "next_cell": True}, {"sta
 SPRUNG = {"masses": [1.0, 0.5], "springs": SPRINGS, "contact": [1, 2]}
 IN_A_CELL = {"sites": [2], "pair": [1, 2], "side": "plus", "clearance": 0.1, "precompression": None}
 GRAINS = {"masses": [1.0], "contact": [1, 1]}
+WITH_RESONATORS = {"masses": [1.0, 0.5], "springs": [SPRINGS[1]], "contact": [1, 2]}
 PRESSED = {"clearance": 0.0, "precompression": DEPTH}
 BETWEEN_CELLS = {"sites": [1, 2], "pair": [1, 1], "next_cell": True}
 RING = {"sites": [1, 2, 3], "pair": [1, 1], "next_cell": True}
@@ -119,6 +120,9 @@ BOTH_SIDES = BETWEEN_CELLS | {"side": "both", "clearance": 0.01, "precompression
         pytest.param(GRAINS, "free", {}, BETWEEN_CELLS, 0.2, id="grains without loss"),
         pytest.param(GRAINS, "periodic", {"mass": DASHPOT}, RING, 0.2, id="a ring of grains"),
         pytest.param(GRAINS, "free", {"mass": DASHPOT}, BOTH_SIDES, 0.02, id="grains apart"),
+        pytest.param(WITH_RESONATORS, "free", {"mass": DASHPOT}, BETWEEN_CELLS, 0.2, id="resonators"),
+        pytest.param(WITH_RESONATORS, "periodic", {"mass": DASHPOT}, RING, 0.2, id="a ring of resonators"),
+        pytest.param(WITH_RESONATORS, "free", {"mass": DASHPOT}, BOTH_SIDES, 0.1, id="resonators apart"),
     ],
 )
 def test_what_only_dashpots_or_nothing_holds_returns_after_a_period(cell, ends, damping, contacts, force):

@@ -11,9 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vipetsc.case.case_file import CaseFile, Problem, Section, Table, Valid, read_section
-from vipetsc.case.contacts import check_pairs, check_touching, contact_of, gaps_of_sites, laws_of_sites
+from vipetsc.case.contacts import check_joined, check_pairs, check_touching, contact_of, gaps_of_sites, laws_of_sites
 from vipetsc.case.disorder import DisorderTable, with_drawn
-from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_wave, driven_wave, packet_frequency
+from vipetsc.case.drive import DriveTable, build_drives, check_drives, check_waves, driven_wave, packet_frequency
 from vipetsc.case.features import refusals
 from vipetsc.case.html import case_html
 from vipetsc.case.inhomogeneity import check_inhomogeneity, check_right_wall
@@ -25,7 +25,6 @@ from vipetsc.case.resolve import (
     cells_of_sites,
     check_cell,
     check_contacts,
-    check_unsprung,
     clearances,
     contact_frequency,
     reference_drive,
@@ -123,6 +122,8 @@ class Case(CaseFile):
             yield from check_contacts(lattice, contacts, initial, valid)
             if cell and valid("contacts"):
                 yield from check_pairs(lattice, contacts, cell, site_cells(lattice, contacts))
+            if valid("lattice", "contacts"):
+                yield from check_joined(lattice, contacts, len(site_cells(lattice, contacts)))
         if valid("initial.kind") and "initial" in sections:
             yield from check_initial(sections["initial"], lattice, cell, valid)
         yield from refusals(cls, sections, valid)
@@ -135,12 +136,10 @@ class Case(CaseFile):
         problems = list(check_drives(drive, lattice, cell, length, valid))
         yield from problems
         # Only for drives without problems, since the waves of the first one are computed.
-        if cell and not problems and drive.wave_choices and valid("lattice", "drive", "time.end"):
-            yield from check_wave(cell, drive, time)
-        if cell and not cell.springs and valid("drive", "time"):
-            yield from check_unsprung(drive, time)
-            # Without springs there are no bands that samples could be too coarse for.
-            cell = None
+        if cell and cell.joins_cells and not problems and drive.wave_choices and valid("lattice", "drive", "time.end"):
+            yield from check_waves(cell, drive, time)
+        if cell and not cell.joins_cells and valid("drive", "time"):
+            yield from check_waves(cell, drive, time)
         yield from _check_sampling(time, cell, valid)
 
     def model(self) -> Model:
@@ -373,12 +372,16 @@ def _check_sampling(time: TimeTable, cell: UnitCell | None, valid: Valid) -> Ite
 def _too_coarse(cell: UnitCell, interval: float, key: str, value: Any) -> list[Problem]:
     """The problem of samples at an ``interval`` in s that is not below the top band's Nyquist interval.
 
-    ``key`` is the key by which the case asks for them, and ``value`` its value.
+    Of cells that contacts alone join it is that of a cell's highest mode. ``key`` is the key by which the case asks for
+    samples, and ``value`` its value.
     """
     top = pass_bands(cell)[-1].high
+    # Without springs nothing oscillates between contacts.
     if top == 0 or interval < np.pi / top:
         return []
     remedy = f"too coarse for the bands; the top band's Nyquist interval is {np.pi / top:.4g} s"
+    if not cell.joins_cells:
+        remedy = f"too coarse for the springs of a cell; its highest mode's Nyquist interval is {np.pi / top:.4g} s"
     if interval != value:
         remedy = f"an interval of {interval:.4g} s is {remedy}"
     return [Problem(key, value, remedy)]

@@ -12,6 +12,7 @@ from vipetsc.case.registered import check_factors, check_law, check_law_paramete
 from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable, PerSiteTable
 from vipetsc.lattice import Contact, UnitCell, contact_stiffness
+from vipetsc.lattice.cell import connected_groups
 from vipetsc.lattice.chain import Pair
 from vipetsc.lattice.contact import PARAMETERS, least_restitution, registered_law
 
@@ -285,10 +286,36 @@ def check_pairs(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
     twice = [at for (at, _), count in times.items() if count > 1]
     if has_pair and twice:
         yield Problem("contacts.sites", twice, "given twice with the same contact pair")
-    if not cell.springs and cells and not any(pair.next_cell for pair in pairs):
-        yield Problem(
-            "lattice.cell.springs", None, "neither springs nor contacts (contacts.next_cell) connect the cells"
-        )
+    if cell.springs and not cell.joins_cells and any(pair.next_cell for pair in pairs):
+        yield from _check_loose(cell, pairs)
+
+
+def check_joined(lattice: LatticeTable, contacts: ContactsTable, count: int) -> Iterator[Problem]:
+    """The problem of cells of one's own, valid or not, that neither springs nor contacts, ``count`` sites, join."""
+    if lattice.cell is None or not (lattice.cell.springs or count):
+        return
+    by_springs = any(spring.next_cell for spring in lattice.cell.springs)
+    by_contacts = any(values_of_sites(contacts, "next_cell", count))
+    if not (by_springs or by_contacts):
+        remedy = "neither springs (next_cell) nor contacts (contacts.next_cell) connect the cells"
+        yield Problem("lattice.cell.springs", None, remedy)
+
+
+def _check_loose(cell: UnitCell, pairs: Sequence[Pair]) -> Iterator[Problem]:
+    """The problem of masses of a ``cell`` that neither springs nor the contacts of ``pairs`` hold in the lattice."""
+    # Node 0 stands for the next cell and for the ground: a mass that is not joined to it is part of no lattice.
+    joined = [(spring.start + 1, spring.end + 1) for spring in cell.springs]
+    for pair in pairs:
+        other = pair.resonator + 1
+        if pair.next_cell:
+            other = 0
+        # The host of a contact with the ground is -1: it is joined to node 0, too.
+        joined.append((pair.host + 1, other))
+    group = connected_groups(cell.dofs + 1, tuple(joined))
+    loose = [str(mass) for mass, number in enumerate(group) if number != group[0]]
+    if loose:
+        remedy = f"mass {', '.join(loose)} is not connected to the next cell: add springs, or a contact with next_cell"
+        yield Problem("lattice.cell.springs", None, remedy)
 
 
 def gaps_of_sites(contacts: ContactsTable, gaps: list[float]) -> Gaps:

@@ -11,7 +11,7 @@ from vipetsc.case.registered import check_parameters
 from vipetsc.case.samples import SamplesTable
 from vipetsc.case.schema import LatticeTable, TimeTable
 from vipetsc.case.waveforms import DEFAULT, OneDrive, waveform_of
-from vipetsc.lattice import Chain, Drive, UnitCell, bloch, fastest_speed, max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice import Chain, Drive, UnitCell, bloch, fastest_speed, max_group_velocity, wave_bands, waves_at
 
 # A wave with less than this fraction of the cell's largest group velocity counts as standing: it would cross the
 # lattice in a million times the usual time. A rounded wavenumber or frequency at a band's edge leaves up to 1e-8.
@@ -127,8 +127,9 @@ def _check_place(
         yield Problem(
             f"{path}.end", drive.end, "a wall can only move a linear spring: omit damping, quadratic and cubic"
         )
-    if cell and not cell.springs:
-        yield Problem(f"{path}.end", drive.end, "a wall moves the springs attached to it, but the cell has none")
+    if cell and not cell.joins_cells:
+        remedy = "a wall moves the springs from cell to cell that end at it, but the cell has none"
+        yield Problem(f"{path}.end", drive.end, remedy)
     elif cell and length:
         place = _place_at_wall(cell, drive.end, length)
         for key in sorted(place.keys() & drive.model_fields_set):
@@ -161,8 +162,10 @@ def frequency_of(cell: UnitCell, drive: OneDrive) -> float:
     """
     if drive.wave_choices or drive.record.frequency is None:
         return driven_wave(cell, drive)[0]
-    # A cell without springs has no bands, and contacts can follow any frequency.
-    highest = pass_bands(cell)[-1].high or np.inf
+    bands = wave_bands(cell)
+    highest = np.inf  # contacts can follow any frequency
+    if bands:
+        highest = bands[-1].high
     return drive.record.frequency(drive, highest)
 
 
@@ -204,7 +207,15 @@ def wave_speed(cell: UnitCell, frequency: float) -> float:
     return speed or fastest_speed(cell)
 
 
-def check_wave(cell: UnitCell, drive: OneDrive, time: TimeTable) -> Iterator[Problem]:
+def check_waves(cell: UnitCell, drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
+    """Problems with the wave of a valid ``drive``, and with what would follow from waves that the cells do not have."""
+    if cell.joins_cells:
+        yield from _check_wave(cell, drive, time)
+    else:
+        yield from _check_without_bands(drive, time)
+
+
+def _check_wave(cell: UnitCell, drive: OneDrive, time: TimeTable) -> Iterator[Problem]:
     """Problems with a valid drive that sends out no wave, or one that never crosses the lattice."""
     frequency, speed = driven_wave(cell, drive)
     # The problem names the key by which the user has chosen the wave.
@@ -216,6 +227,24 @@ def check_wave(cell: UnitCell, drive: OneDrive, time: TimeTable) -> Iterator[Pro
     elif time.end == "traverse" and not speed > STANDING * wave_speed(cell, np.inf):
         remedy = f"the wave at {frequency:.6g} rad/s has group velocity 0 and never crosses the lattice"
         yield Problem(f"drive.{key}", getattr(drive, key), f"{remedy}; give time.end in s, or another wavenumber")
+
+
+def _check_without_bands(drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
+    """Problems with times of a lattice that contacts alone join, which has no bands from which they could follow."""
+    none = "without springs from cell to cell there are no bands"
+    remedy = f"missing; {none} from which it would follow"
+    for path, one in drive.every:
+        for key in ("wavenumber", "band"):
+            if getattr(one, key) is not None:
+                yield Problem(f"{path}.{key}", getattr(one, key), f"{none}; give {path}.frequency")
+                return
+    # The frequency of a pulse follows from its own keys, and that of a struck lattice from the mass that is struck.
+    if drive.frequency is None and drive.is_sine and drive.amplitude != 0:
+        yield Problem("drive.frequency", None, remedy)
+    if time.end == "traverse":
+        yield Problem("time.end", time.end, remedy)
+    if time.sample_interval == "auto" and time.samples is None:
+        yield Problem("time.sample_interval", time.sample_interval, remedy)
 
 
 def resolve_drives(drives: DriveTable, cell: UnitCell, cells: int, frequency: float | None = None) -> DriveTable:

@@ -7,7 +7,7 @@ import numpy as np
 
 from vipetsc.case.contacts import describe_stops
 from vipetsc.case.model import Model
-from vipetsc.lattice import UnitCell, pass_bands
+from vipetsc.lattice import UnitCell, wave_bands
 from vipetsc.lattice.chain import Pair
 from vipetsc.wording import MOST_SHOWN, shortened
 
@@ -72,11 +72,9 @@ def case_html(name: str, model: Model, ends: str, drives: Sequence[str]) -> str:
 
 
 def _band_edges(cell: UnitCell) -> list[str]:
-    """The edges of the pass bands of a ``cell`` in rad/s, as text; none of a cell without springs."""
-    if not cell.springs:
-        return []
+    """The edges of the pass bands of a ``cell`` in rad/s, as text; none where contacts alone join the cells."""
     edges = []
-    for band in pass_bands(cell):
+    for band in wave_bands(cell):
         low = band.low
         # An edge at 0 has a rounding error.
         if low <= ROUNDING * band.high:

@@ -213,8 +213,9 @@ def check_initial(
         dofs = lattice.cells * cell.dofs
     if dofs and initial.number and initial.number > dofs:
         yield Problem("initial.number", initial.number, f"the lattice has {dofs} modes")
-    elif initial.kind in ("mode", "packet") and cell and not cell.springs:
-        remedy = 'a lattice without springs has no modes and no waves; kind = "velocity" gives velocities to masses'
+    elif initial.kind in ("mode", "packet") and cell and not cell.joins_cells:
+        remedy = "without springs from cell to cell a lattice has no waves, and its modes are those of single cells"
+        remedy += '; kind = "velocity" gives velocities to masses'
         yield Problem("initial.kind", initial.kind, remedy)
     elif initial.kind == "mode" and (lattice.profiles or lattice.scatter):
         remedy = "modes are not available for lattices with different cells; use a packet, or a state in a file"
@@ -288,13 +289,13 @@ def _velocity(
     _, fastest = max(initial.strikes, key=lambda item: abs(item[1].velocity))
     speed = abs(fastest.velocity)
     if not frequency:
-        # The frequency of the fastest mass on its springs while all others are held; without springs, of its contact.
+        # The frequency of the fastest mass on its springs while all others are held.
         mass = fastest.mass - 1
         stiffness = sum(end.stiffness for end in chain.cell.couplings() if end.mass == mass)
-        if stiffness > 0:
-            frequency = float(np.sqrt(stiffness / chain.cell.masses[mass]))
-        else:
-            frequency = touching(speed)
+        frequency = float(np.sqrt(stiffness / chain.cell.masses[mass]))
+        if not chain.cell.joins_cells:
+            # What goes on to other cells goes through contacts.
+            frequency = max(frequency, touching(speed))
     amplitude = initial.amplitude or speed / frequency
     return Beginning(initial.model_copy(update={"amplitude": amplitude}), frequency, fastest.cell)
 

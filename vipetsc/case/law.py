@@ -9,10 +9,10 @@ import numpy as np
 from pydantic import Field
 
 from vipetsc.case.case import Case
-from vipetsc.case.case_file import Problem, Section, Table
+from vipetsc.case.case_file import Problem, Section, Table, Valid
 from vipetsc.case.contacts import gaps_of_sites, lists_of, values_of_sites
 from vipetsc.case.kinds import SiteKinds, lesser_clearances, mean_clearance, site_kinds
-from vipetsc.case.resolve import with_preset
+from vipetsc.case.resolve import check_cell, with_preset
 from vipetsc.case.schema import PRESETS, Positive
 from vipetsc.case.sites import ContactsTable
 from vipetsc.case.study import with_fastest_engine
@@ -131,6 +131,17 @@ class LawCase(Case):
         if case.law.distance is None:
             case = cls._of_sections(sections, clearance=clearance, distance=case._default_distance())
         return sections | {"law": case.law}, case._size_problems()
+
+    @classmethod
+    def check(cls, sections: dict[str, Any], valid: Valid) -> Iterator[Problem]:
+        """Problems between keys."""
+        yield from super().check(sections, valid)
+        if not valid("lattice"):
+            return
+        cell, _ = check_cell(sections["lattice"])
+        if cell is not None and not cell.joins_cells:
+            remedy = "only contacts join the cells, so that no linear wave arrives at a site, which the law is about"
+            yield Problem("lattice.cell.springs", None, f"{remedy}; add springs with next_cell, or use run")
 
     @classmethod
     def _of_sections(cls, sections: Mapping[str, Any], **update: Any) -> Self:

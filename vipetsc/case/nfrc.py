@@ -284,8 +284,11 @@ class NfrcCase(Case):
 
 
 def has_waves(chain: Chain) -> bool:
-    """Whether motions of ``chain`` consist of Bloch waves, which are those of equal linear cells without loss."""
-    return chain.is_uniform() and chain.is_linear and not chain.is_damped
+    """Whether motions of ``chain`` consist of Bloch waves, which are those of equal linear cells without loss.
+
+    Springs must join the cells: waves do not go through contacts unchanged.
+    """
+    return chain.cell.joins_cells and chain.is_uniform() and chain.is_linear and not chain.is_damped
 
 
 def needs_modes(chain: Chain) -> bool:

@@ -3,12 +3,12 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from vipetsc.case.bodies import bodies_of, contact_ends
 from vipetsc.case.case_file import Problem
 from vipetsc.case.nfrc_table import NfrcTable
 from vipetsc.case.resolve import check_cell
 from vipetsc.case.schema import LatticeTable
 from vipetsc.lattice import Chain
-from vipetsc.lattice.cell import connected_groups
 
 
 def has_walls(nfrc: NfrcTable, lattice: LatticeTable) -> bool:
@@ -16,7 +16,7 @@ def has_walls(nfrc: NfrcTable, lattice: LatticeTable) -> bool:
     is_open = nfrc.infinite
     if nfrc.open_ends and lattice.absorbing:
         is_open = is_open or lattice.absorbing.end == "both"
-    return lattice.ends == "fixed" and bool(lattice.unit_cell().springs) and not is_open
+    return lattice.ends == "fixed" and lattice.unit_cell().joins_cells and not is_open
 
 
 def are_contacts_springs(
@@ -29,7 +29,7 @@ def are_contacts_springs(
     clearances in m of the sites of ``chain`` on both sides; () if they are equal, and then no contact is pressed.
     """
     pressed = [pair for pair, gap in zip(chain.contact_pairs, gaps, strict=False) if min(gap) < 0]
-    if not lattice.unit_cell().springs:
+    if not lattice.unit_cell().joins_cells:
         return bool(pressed)
     return any(pair.host < 0 for pair in pressed) and not has_walls(nfrc, lattice)
 
@@ -37,7 +37,9 @@ def are_contacts_springs(
 def no_waves(nfrc: NfrcTable, chain: Chain) -> Iterator[Problem]:
     """Problems with an incident wave or an infinite lattice where no motions of ``chain`` are sums of Bloch waves."""
     reason = "a wave in springs that are not linear changes its shape as it travels"
-    if chain.is_damped:
+    if not chain.cell.joins_cells:
+        reason = "no linear wave travels through cells that contacts alone join"
+    elif chain.is_damped:
         reason = "in a lattice with dashpots a wave from far away has decayed before it arrives"
     elif not chain.linearised().is_uniform():
         reason = "a wave of equal cells does not pass cells that differ as it came"
@@ -56,9 +58,9 @@ def check_ground(
     """
     if nfrc.symmetric:
         return
-    # Masses without springs must be held together by contacts that are pressed. Springs hold the masses of a lattice
-    # together, which only contacts to ground can push away.
-    if not (chain.cell.springs or nfrc.infinite):
+    # Cells that no springs join must be held together by contacts that are pressed. Springs hold the masses of other
+    # lattices together, which only contacts to ground can push away.
+    if not (chain.cell.joins_cells or nfrc.infinite):
         yield from _check_loose(chain, gaps)
         return
     to_ground = any(pair.host < 0 for pair in chain.contact_pairs)
@@ -74,24 +76,13 @@ def check_ground(
 
 
 def _check_loose(chain: Chain, gaps: Sequence[tuple[float, float]]) -> Iterator[Problem]:
-    """The problem of the first contact of masses without springs that neither is pressed nor joins what others press.
+    """The problem of the first contact of loose cells that neither is pressed nor joins what springs or others press.
 
     ``gaps`` are the clearances in m of the sites of ``chain`` on both sides; () if they are equal.
     """
-    d = chain.cell.dofs
-    ends = []
-    for site, cell, pair in zip(chain.sites, chain.resonator_cells, chain.contact_pairs, strict=True):
-        # Node 0 is the ground.
-        host = 0
-        if pair.host >= 0:
-            host = 1 + site * d + pair.host
-        ends.append((host, 1 + cell * d + pair.resonator))
-
-    pressed = [pair for pair, gap in zip(ends, gaps, strict=False) if min(gap) < 0]
-    # The ground is joined to itself, so that there is a pair even if no contact is pressed.
-    group = connected_groups(1 + chain.cells * d, ((0, 0), *pressed))
-    for number, (host, resonator) in enumerate(ends, 1):
-        if group[host] != group[resonator]:
+    body = bodies_of(chain, gaps)
+    for number, (host, resonator) in enumerate(contact_ends(chain), 1):
+        if body[host] != body[resonator]:
             cause = f"site {number} joins masses that neither springs nor pressed contacts join"
             effect = "in unsymmetric motions its mean force pushes them apart"
             remedy = "give a precompression, or equal stops on both sides"

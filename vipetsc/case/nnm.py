@@ -33,7 +33,8 @@ from vipetsc.case.nnm_checks import (
     check_shooting,
     check_size,
     check_start_sites,
-    is_held,
+    rigid_motions,
+    rigid_motions_of_pair,
 )
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.case.resolve import (
@@ -141,7 +142,10 @@ class NnmCase(CaseFile):
                 problems += _check_stops(contacts, clearances(lattice, contacts, 1), valid)
             problems += check_stiffness(contacts, True, valid)
             problems += check_forced(nnm, None, 2)
-            return problems + _check_modes(nnm, 2, 0, problems)
+            rigid = 0
+            if cell is not None:
+                rigid = rigid_motions_of_pair(cell)
+            return problems + _check_modes(nnm, 2, rigid, problems)
 
         problems += check_sites(lattice, contacts)
         if problems or cell is None:
@@ -164,7 +168,7 @@ class NnmCase(CaseFile):
         problems += check_start_sites(nnm, len(sites))
         problems += check_size(nnm, lattice, cell)
         problems += check_stiffness(contacts, bool(sites), valid)
-        rigid = int(not is_held(lattice, contacts, cell, gaps))
+        rigid = rigid_motions(lattice, contacts, cell, gaps)
         return problems + _check_modes(nnm, lattice.cells * cell.dofs, rigid, problems)
 
     def physics(self) -> tuple[Any, ...]:

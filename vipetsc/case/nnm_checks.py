@@ -2,15 +2,17 @@
 
 from collections.abc import Iterator
 
+from vipetsc.case.bodies import bodies_of
 from vipetsc.case.case_file import Problem, Valid
-from vipetsc.case.contacts import Gaps, check_pairs, lists_of, pairs_of_sites
+from vipetsc.case.contacts import Gaps, check_joined, check_pairs, lists_of, pairs_of_sites
 from vipetsc.case.inhomogeneity import check_inhomogeneity
 from vipetsc.case.nfrc import MOST_UNKNOWNS, needs_modes
 from vipetsc.case.nnm_table import MOST_MASSES, MOST_OF_LATTICE, NnmTable
-from vipetsc.case.resolve import check_stiffness, site_cells
+from vipetsc.case.resolve import build_chain, check_stiffness, site_cells
 from vipetsc.case.schema import LatticeTable
 from vipetsc.case.sites import ContactsTable
-from vipetsc.lattice import Chain, UnitCell, nonlinear_places, pass_bands
+from vipetsc.lattice import Chain, UnitCell, nonlinear_places, wave_bands
+from vipetsc.lattice.cell import connected_groups
 from vipetsc.lattice.modal_compliance import MOST_DOFS
 
 ONE_CONTACT = "the reduced model has one contact"
@@ -129,6 +131,7 @@ def check_lattice(
     if not valid("contacts"):
         return
     yield from check_pairs(lattice, contacts, cell, sites)
+    yield from check_joined(lattice, contacts, len(sites))
     if not (sites or lattice.nonlinear_keys):
         yield Problem("contacts.sites", [], f"give cells from 1 to {lattice.cells}")
 
@@ -145,6 +148,8 @@ def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
         return
 
     fixed = 'use ends = "fixed", or equal stops on both sides'
+    if not cell.joins_cells:
+        fixed = "press it against the ground (contacts.precompression), or use equal stops on both sides"
     if any(plus != minus for plus, minus in to_ground):
         remedy = "nothing holds this lattice, and a stop to ground that differs on its two sides pushes it away"
         yield Problem("contacts.pair", contacts.pair, f"{remedy}; {fixed}")
@@ -160,8 +165,34 @@ def _check_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, 
 def is_held(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> bool:
     """Whether springs to the walls, or a contact that is pressed to the ground, hold a lattice at rest."""
     # Springs tie the ends to the walls: a lattice that contacts alone join has none.
-    has_walls = lattice.ends == "fixed" and bool(cell.springs)
+    has_walls = lattice.ends == "fixed" and cell.joins_cells
     return has_walls or any(min(gap) < 0 for gap in _gaps_to_ground(contacts, cell, gaps))
+
+
+def rigid_motions(lattice: LatticeTable, contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> int:
+    """How many motions of a valid lattice are those of bodies that nothing holds, so that their frequency is 0.
+
+    Cells that contacts alone join are bodies of their own unless the contacts are pressed at rest. ``gaps`` are the
+    clearances in m of its sites on both sides.
+    """
+    if cell.joins_cells:
+        return int(not is_held(lattice, contacts, cell, gaps))
+    # One of the bodies is the ground with what is pressed against it.
+    return len(set(bodies_of(build_chain(lattice, contacts), gaps))) - 1
+
+
+def rigid_motions_of_pair(cell: UnitCell) -> int:
+    """How many motions of the reduced model of a ``cell`` are those of bodies that no spring holds."""
+    # Node 0 stands for the middle of a spring to any other mass, where the model holds it.
+    nodes = {cell.host: 1, cell.resonator: 2}
+    joined = [(0, 0)]
+    for spring in cell.springs:
+        ends = [spring.start, spring.end]
+        if not spring.next_cell and {*ends} == {*nodes}:
+            joined.append((1, 2))
+        else:
+            joined += [(0, nodes[mass]) for mass in ends if mass in nodes]
+    return len(set(connected_groups(3, tuple(joined)))) - 1
 
 
 def _gaps_to_ground(contacts: ContactsTable, cell: UnitCell, gaps: Gaps) -> list[tuple[float, float]]:
@@ -226,7 +257,7 @@ def check_condensed(nnm: NnmTable, contacts: ContactsTable, chain: Chain, valid:
             "nnm.multipliers", nnm.multipliers, f"{remedy}; multiplier_max needs only the motion of the sites"
         )
     # A motion whose frequency is in a band sends waves away, so that it is neither localised nor periodic.
-    bands = pass_bands(cell)
+    bands = wave_bands(cell)
     inside = [omega for omega in nnm.start_frequency if any(band.low <= omega <= band.high for band in bands)]
     if inside:
         edges = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands)

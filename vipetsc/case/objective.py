@@ -12,7 +12,7 @@ from vipetsc.case.case_file import Problem, Section
 from vipetsc.case.nfrc import NfrcCase
 from vipetsc.case.response_measures import RESPONSE, response_measures
 from vipetsc.case.schema import Finite, Positive
-from vipetsc.lattice import pass_bands
+from vipetsc.lattice import pass_bands, wave_bands
 from vipetsc.spectra.measures import PART, RunMeasure, measures_of
 
 # Measures that only searches have; all others are numbers of every run, by their names.
@@ -127,6 +127,10 @@ def measured_problems(
     if objective.is_of_responses:
         yield from _problems_of_responses(objective, at, responses)
         return
+    if not wave_bands(base.lattice.unit_cell()) and _is_of_bands(objective, base):
+        remedy = "only contacts join the cells, so that there are no bands; a measure of points, of contacts or of all"
+        yield Problem(f"{at}.measure", objective.measure, remedy)
+        return
     if objective.is_of_runs:
         yield from _problems_of_runs(objective, at, base)
         return
@@ -171,6 +175,14 @@ def measured_problems(
             yield Problem(
                 f"{at}.part", part, f"must be [low, high] in rad/s and meet band {band}, {low:.5g}-{high:.5g}"
             )
+
+
+def _is_of_bands(objective: MeasuredTable, base: Case) -> bool:
+    """Whether an ``objective`` of runs of ``base`` is an energy of pass bands, or another number of one."""
+    if objective.band or objective.measure in (*ABOVE_DRIVEN, "band_share"):
+        return True
+    measure = measures_of_runs(base).get(str(objective.measure))
+    return measure is not None and (measure.dimension == PART or measure.group == "transfer")
 
 
 def _problems_of_responses(objective: MeasuredTable, at: str, case: NfrcCase | None) -> Iterator[Problem]:

@@ -173,7 +173,8 @@ def check_cell(lattice: LatticeTable) -> tuple[UnitCell | None, list[Problem]]:
         return None, problems
 
     cell = lattice.unit_cell()
-    if not cell.springs:
+    # Of cells that contacts join the section of contacts decides: see ``check_pairs``.
+    if not cell.joins_cells:
         return cell, problems
 
     # Node 0 stands for the next cell: what is not joined to it belongs to no chain.
@@ -193,11 +194,12 @@ def _check_damping(damping: DampingTable, cell: UnitCell) -> Iterator[Problem]:
     bands = {str(number) for number in range(1, cell.dofs + 1)}
     fitted = (damping.grounding, damping.springs)
     expected = [cell.dofs, len(cell.springs)]
-    if loss is not None and (not loss or loss.keys() - bands or not cell.springs):
-        remedy = "a cell without springs has no bands"
-        if cell.springs:
-            remedy = f"give it by band, 1 to {cell.dofs}"
-        yield Problem("lattice.damping.loss", loss, f"{remedy}, as in loss = {{ 2 = 0.02 }}")
+    if loss is not None and not cell.joins_cells:
+        remedy = "without springs from cell to cell there are no bands; give mass and stiffness"
+        yield Problem("lattice.damping.loss", loss, remedy)
+    elif loss is not None and (not loss or loss.keys() - bands):
+        remedy = f"give it by band, 1 to {cell.dofs}, as in loss = {{ 2 = 0.02 }}"
+        yield Problem("lattice.damping.loss", loss, remedy)
     elif loss is not None and (damping.mass or damping.stiffness):
         yield Problem("lattice.damping.loss", loss, "give it, or mass and stiffness, not both")
     elif fitted != (None, None) and (loss is None or [len(values or ()) for values in fitted] != expected):
@@ -378,18 +380,6 @@ def _resolved_time(time: TimeTable, cell: UnitCell, cells: int, drive: DriveTabl
     elif interval == "auto":
         interval = _round_down(np.pi / (SAMPLES_OF_HALF_PERIOD * pass_bands(cell)[-1].high))
     return time.model_copy(update={"end": float(end), "sample_interval": float(interval), "samples": None})
-
-
-def check_unsprung(drive: DriveTable, time: TimeTable) -> Iterator[Problem]:
-    """Problems with times of a lattice that contacts alone join, which has no bands from which they could follow."""
-    remedy = "missing; without springs there are no bands from which it would follow"
-    # The frequency of a pulse follows from its own keys, and that of a struck lattice from the mass that is struck.
-    if drive.frequency is None and drive.is_sine and drive.amplitude != 0:
-        yield Problem("drive.frequency", None, remedy)
-    if time.end == "traverse":
-        yield Problem("time.end", time.end, remedy)
-    if time.sample_interval == "auto" and time.samples is None:
-        yield Problem("time.sample_interval", time.sample_interval, remedy)
 
 
 def _round_down(value: float) -> float:

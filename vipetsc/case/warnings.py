@@ -75,7 +75,7 @@ def wave_warnings(model: Model) -> Iterator[str]:
     """Warnings of evanescent and slow waves."""
     cell = model.chain.cell
     drive = model.drive
-    if not model.is_driven or not cell.springs:
+    if not model.is_driven or not cell.joins_cells:
         return
 
     waves = waves_at(cell, drive.frequency)
@@ -96,7 +96,7 @@ def wave_warnings(model: Model) -> Iterator[str]:
 def unit_warnings(drives: DriveTable, chain: Chain) -> Iterator[str]:
     """Questions about the units of samples whose spectrum lies far from all waves of the lattice."""
     cell = chain.cell
-    if not cell.springs:
+    if not cell.joins_cells:
         return
     bands = pass_bands(cell)
     highest = bands[-1].high
@@ -141,7 +141,7 @@ def length_warnings(model: Model) -> Iterator[str]:
     cell = model.chain.cell
     drive = model.drive
     cells = model.chain.cells
-    if model.is_driven and not cell.springs:
+    if model.is_driven and not cell.joins_cells:
         return
 
     waves = waves_at(cell, drive.frequency)
@@ -201,7 +201,7 @@ def field_warnings(model: Model, output: OutputTable) -> Iterator[str]:
     chain = model.chain
     top = pass_bands(chain.cell)[-1].high
     interval = output.stride * model.sample_interval
-    if output.fields and interval * top >= np.pi:
+    if output.fields and chain.cell.joins_cells and interval * top >= np.pi:
         coarse = f"fields stored every {interval:.4g} s resolve {np.pi / interval:.5g} of {top:.5g} rad/s"
         yield f"{coarse}: dispersion, bands and ibtet are not measured"
     if output.fields and output.every > 1:

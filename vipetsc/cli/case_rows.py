@@ -7,7 +7,7 @@ from vipetsc.case.absorbing import reflected, reflected_at, sections_of, sources
 from vipetsc.case.contacts import describe_stops
 from vipetsc.case.warnings import losses
 from vipetsc.cli.tables import first_few
-from vipetsc.lattice import gaps, pass_bands
+from vipetsc.lattice import gaps, wave_bands
 from vipetsc.wording import MOST_SHOWN
 
 
@@ -20,10 +20,10 @@ def lattice_rows(case: Case) -> list[tuple[str, str]]:
     lattice = f"{chain.cells} cells, {chain.cells * cell.dofs} masses, {describe_ends(case)}"
     if case.lattice.preset:
         lattice += f", reading {case.lattice.reading}"
-    band_list = "none: only contacts join the masses"
+    band_list = "none: only contacts join the cells"
     gap_list = ""
-    if cell.springs:
-        bands = pass_bands(cell)
+    bands = wave_bands(cell)
+    if bands:
         band_list = ", ".join(f"{band.low:.2f}-{band.high:.2f}" for band in bands) + " rad/s"
         gap_list = "none"
         if between := gaps(bands):

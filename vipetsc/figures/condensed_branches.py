@@ -17,7 +17,7 @@ from vipetsc.figures.branch_losses import draw_losses
 from vipetsc.figures.frequency_energy import MARKS
 from vipetsc.figures.panels import annotate_empty, label_panels
 from vipetsc.io.netcdf import open_netcdf
-from vipetsc.lattice import pass_bands
+from vipetsc.lattice import wave_bands
 
 # Of contacts and of stored motions. More of them have the same colours again, with other dashes.
 COLOURS = style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE
@@ -106,7 +106,7 @@ def _shade_pass_bands(axes: Axes, case: NnmCase) -> None:
     """Shade the pass bands as far as they reach into the panel, whose limits stay those of the branch."""
     # A pass band far from the branch must not squeeze the curve.
     limits = axes.get_ylim()
-    for band in pass_bands(case.lattice.unit_cell()):
+    for band in wave_bands(case.lattice.unit_cell()):
         axes.axhspan(band.low / (2 * np.pi), band.high / (2 * np.pi), color=style.PALE, lw=0, zorder=0)
     axes.set_ylim(limits)
 

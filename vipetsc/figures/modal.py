@@ -64,8 +64,8 @@ class MovedEnergies(NamedTuple):
 
 def without_modal_energies(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
     """Return why a run has no picture of the energies of its modes; empty where it has one."""
-    if not Case.of(run).model().chain.cell.springs:
-        return "a lattice without springs has no modes that oscillate"
+    if not Case.of(run).model().chain.cell.joins_cells:
+        return "a lattice without springs from cell to cell has no bands"
     if analysis is None or "bands/transfer" not in analysis:
         return "needs the analysis of a run with all displacements and velocities"
     return "" if analysis["bands/modal_energy"].values.any() else "the drive did no work"

@@ -78,8 +78,8 @@ def without_dispersion(run: xr.Dataset, analysis: xr.Dataset | None) -> str:
     """Return why a run has no picture of its dispersion; empty where it has one."""
     if analysis is not None and any(name in analysis for name in CELLS):
         return ""
-    if not Case.of(run).model().chain.cell.springs:
-        return "a lattice without springs has no dispersion"
+    if not Case.of(run).model().chain.cell.joins_cells:
+        return "a lattice without springs from cell to cell has no dispersion"
     if run.sizes["cell"] < 2:
         return "needs two cells or more in the record, side by side"
     return _left_out(analysis, "dispersion") or "needs the velocities of all cells"

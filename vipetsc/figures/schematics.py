@@ -187,12 +187,15 @@ def draw_unit_cell(axes: Axes, cell: UnitCell, pairs: Sequence[Pair] = ()) -> No
 
     host = layout.centre[cell.host]
     resonator = layout.centre[cell.resonator]
+    inner = Pair(cell.host, cell.resonator)
     if layout.nested:
-        _draw_host_with_resonator(axes, host, cell)
+        _draw_host_with_resonator(axes, host, cell, has_stops=not pairs or inner in pairs)
     elif cell.host != cell.resonator and not pairs:
         _draw_contact(axes, host, resonator)
     for pair in pairs:
-        _draw_pair(axes, layout, pair)
+        # The stops of a nested resonator are in its host.
+        if not (layout.nested and pair == inner):
+            _draw_pair(axes, layout, pair)
 
     low = min(y for _, y in layout.centre.values()) - TALL - 0.55
     high = highest + 0.5
@@ -334,8 +337,8 @@ def _draw_mass(axes: Axes, centre: Point, half: float, index: int, colour: str) 
     axes.text(*centre, f"$m_{{{index + 1}}}$", ha="center", va="center", zorder=4)
 
 
-def _draw_host_with_resonator(axes: Axes, centre: Point, cell: UnitCell) -> None:
-    """Draw the host as a box with two stops, the resonator between them on its spring."""
+def _draw_host_with_resonator(axes: Axes, centre: Point, cell: UnitCell, has_stops: bool) -> None:
+    """Draw the host as a box, the resonator inside on its spring, and the two stops between which it moves, if any."""
     x, y = centre
     reach = HALF * 0.82
     outer = reach + GAP
@@ -346,16 +349,17 @@ def _draw_host_with_resonator(axes: Axes, centre: Point, cell: UnitCell) -> None
     # From behind to the front: the host as a frame, its stops, the spring, the resonator.
     box(-WIDE, -TALL, 2 * WIDE, 2 * TALL, style.SKY, zorder=3)
     box(0.1 - WIDE, 0.1 - TALL, 2 * WIDE - 0.2, 2 * TALL - 0.2, "white", zorder=3)
-    for left, bottom in itertools.product((-outer - 0.1, outer), (-0.52, 0.2)):
-        box(left, bottom, 0.1, 0.32, style.SKY, zorder=4)
     _draw_spring(axes, [(x - WIDE + 0.1, y), (x - reach, y)], "", turns=3, height=0.09, zorder=6)
     box(-reach, -reach, 2 * reach, 2 * reach, style.ORANGE, zorder=5)
     axes.text(x, y, f"$m_{{{cell.resonator + 1}}}$", ha="center", va="center", zorder=6)
 
-    gap = x + reach + GAP / 2
-    line = {"arrowstyle": "-", "color": style.VERMILION, "lw": 0.6, "shrinkA": 0, "shrinkB": 0}
-    text = {"ha": "center", "fontsize": 7, "color": style.VERMILION, "zorder": 7}
-    axes.annotate("Δ", (gap, y + 0.36), (gap, y + TALL + 0.2), arrowprops=line, **text)
+    if has_stops:
+        for left, bottom in itertools.product((-outer - 0.1, outer), (-0.52, 0.2)):
+            box(left, bottom, 0.1, 0.32, style.SKY, zorder=4)
+        gap = x + reach + GAP / 2
+        line = {"arrowstyle": "-", "color": style.VERMILION, "lw": 0.6, "shrinkA": 0, "shrinkB": 0}
+        text = {"ha": "center", "fontsize": 7, "color": style.VERMILION, "zorder": 7}
+        axes.annotate("Δ", (gap, y + 0.36), (gap, y + TALL + 0.2), arrowprops=line, **text)
 
     masses = [f"$m_{{{i + 1}}}$ {with_prefix(1e3 * cell.masses[i], 'g')}" for i in (cell.host, cell.resonator)]
     stiffness = sum(s.stiffness for s in cell.springs if cell.resonator in (s.start, s.end))

@@ -12,7 +12,18 @@ Symbols throughout: displacements u, masses M, stiffness K, damping C, u = Re U 
 kappa in rad per cell, and w = u_resonator - u_host of a contact. The docstring of each module has its method.
 """
 
-from vipetsc.lattice.bands import Band, BlochPoint, bloch, fastest_speed, gaps, max_group_velocity, pass_bands, waves_at
+from vipetsc.lattice.bands import (
+    Band,
+    BlochPoint,
+    bloch,
+    fastest_speed,
+    gaps,
+    max_group_velocity,
+    modes_of_a_cell,
+    pass_bands,
+    wave_bands,
+    waves_at,
+)
 from vipetsc.lattice.cell import Spring, UnitCell, diatomic, four_band
 from vipetsc.lattice.chain import Chain
 from vipetsc.lattice.compliance import IncidentWave, WaveCompliance

@@ -26,6 +26,9 @@ BLOCK = 16  # wavenumbers whose matrices are held at once: with 8 a seventh slow
 # a speed by far less than a tenth: 0.8 and 0.95 find the same.
 NEARLY_FASTEST = 0.9
 FLAT = 1e-12  # part of a frequency by which rounding moves it
+# Part of the highest frequency of a cell's modes below which one is 0: rounding of its square, 1e-16 of the highest,
+# makes it 1e-8.
+STILL = 1e-7
 # Smallest wavenumber at which group velocities are computed. The limit at 0 changes by 9e-8 of itself with half of it,
 # by 4e-7 with twice: at smaller ones rounding of omega^2 counts, at larger ones the curvature of the band.
 OFF_ZERO = 3e-4
@@ -173,6 +176,25 @@ def pass_bands(cell: UnitCell) -> tuple[Band, ...]:
     return tuple(bands)
 
 
+def wave_bands(cell: UnitCell) -> tuple[Band, ...]:
+    """Pass bands as of ``pass_bands``; () where contacts alone join the cells, so that no linear wave travels.
+
+    What ``pass_bands`` then has are frequencies of a single cell's modes, between its two equal edges.
+    """
+    if not cell.joins_cells:
+        return ()
+    return pass_bands(cell)
+
+
+def modes_of_a_cell(cell: UnitCell) -> np.ndarray:
+    """Frequencies (dof,) in rad/s of the modes of a ``cell`` that contacts alone join to others, lowest first.
+
+    Those of a cell that moves as a whole are 0.
+    """
+    frequency = bloch(cell, 0.0).frequency
+    return np.where(frequency > STILL * frequency.max(), frequency, 0.0)
+
+
 def gaps(bands: Sequence[Band]) -> list[tuple[float, float]]:
     """Band gaps (low, high) in rad/s between consecutive pass bands; the region above is not one."""
     return [(a.high, b.low) for a, b in itertools.pairwise(bands) if b.low > a.high]
@@ -197,7 +219,12 @@ def fastest_speed(cell: UnitCell) -> float:
 
 @lru_cache
 def waves_at(cell: UnitCell, frequency: float) -> tuple[tuple[int, float, float], ...]:
-    """Propagating waves of ``frequency`` (rad/s): (band from 1, kappa in [0, pi], |v_g| in cells/s); () in a gap."""
+    """Propagating waves of ``frequency`` (rad/s): (band from 1, kappa in [0, pi], |v_g| in cells/s); () in a gap.
+
+    There are none, either, where contacts alone join the cells.
+    """
+    if not cell.joins_cells:
+        return ()
     waves = []
     grid = _grid(cell)
     for number, offset in enumerate((grid.frequency - frequency).T, 1):

@@ -101,6 +101,14 @@ class UnitCell:
         return 1 / (1 / self.masses[self.host] + 1 / self.masses[self.resonator])
 
     @property
+    def joins_cells(self) -> bool:
+        """Whether a spring runs to the next cell, so that linear waves travel through a lattice of such cells.
+
+        Other cells, with springs within them or with none, are joined by contacts alone, as grains are.
+        """
+        return any(spring.next_cell for spring in self.springs)
+
+    @property
     def is_damped(self) -> bool:
         """Whether there is a dashpot."""
         return any(self.grounding) or any(spring.damping for spring in self.springs)
@@ -170,8 +178,6 @@ def cell_problems(
     # A cell of one mass has no pair of its own: its contacts are between cells or with ground, and name their masses.
     if host == resonator and n > 1:
         problems.append(("contact", "host and resonator must be two different masses"))
-    if springs and not any(s.next_cell for s in springs):
-        problems.append(("springs", "no spring has next_cell = true, so that the cells are not connected"))
     return problems
 
 

@@ -21,7 +21,7 @@ from vipetsc.dynamics.matrices import Joint, LatticeMatrices
 from vipetsc.io.folder import provenance
 from vipetsc.io.netcdf import tabulated, write_netcdf
 from vipetsc.io.store import GATHER_LIMIT
-from vipetsc.lattice import Band, Chain, pass_bands
+from vipetsc.lattice import Band, Chain, wave_bands
 from vipetsc.parallel import on_root
 from vipetsc.spectra.modal_energies import EDGE
 
@@ -128,7 +128,7 @@ def classify(chain: Chain, frequency: np.ndarray, shape: np.ndarray) -> dict[str
     right = energy[:, -end:].sum(axis=1)
     peak = first_largest(energy)
 
-    all_bands = pass_bands(chain.cell)
+    all_bands = wave_bands(chain.cell)
     bands = [_band_of(all_bands, f) for f in frequency]
     kinds = []
     for band, cell, at_ends in zip(bands, peak, left + right, strict=True):
@@ -155,6 +155,8 @@ def first_largest(values: np.ndarray) -> np.ndarray:
 
 def _band_of(bands: Sequence[Band], frequency: float) -> int:
     """The number of the first of ``bands`` that ``frequency`` in rad/s lies in; 0 in a gap."""
+    if not bands:
+        return 0
     tolerance = EDGE * bands[-1].high
     for band in bands:
         if band.low - tolerance <= frequency <= band.high + tolerance:

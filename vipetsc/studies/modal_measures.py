@@ -80,8 +80,8 @@ def _modal_parts(run: xr.Dataset, record: VelocityRecord) -> ModalParts | None:
         reason = "the displacement was not recorded"
     elif len(record.cells) < chain.cells:
         reason = f"{chain.cells - len(record.cells)} cells were not recorded"
-    elif not chain.cell.springs:
-        reason = "a lattice without springs has no modes"
+    elif not chain.cell.joins_cells:
+        reason = "without springs from cell to cell a lattice has no bands"
     else:
         try:
             return ModalParts.of(chain)

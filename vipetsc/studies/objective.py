@@ -200,10 +200,10 @@ def _of_bands(
     """Energies of the bands over the ``work`` in J in the state ``u``, ``v`` (1, cell, dof) in m and m/s.
 
     ``bands`` (pass band), ``upper_share_at_end``, and those parts of a band that ``tables`` ask for, by their names;
-    NaN where contacts alone join the masses, so that there are no bands.
+    NaN where contacts alone join the cells, so that there are no bands.
     """
     of_a_band = [table for table in tables if table.measure == OF_A_BAND]
-    if not model.chain.cell.springs:
+    if not model.chain.cell.joins_cells:
         values: dict[str, Any] = {"bands": [np.nan] * model.chain.cell.dofs, "upper_share_at_end": np.nan}
         return values | {table.name: np.nan for table in of_a_band}
 

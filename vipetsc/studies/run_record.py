@@ -15,9 +15,9 @@ def record_of(run: xr.Dataset, case: Case, options: AnalysisTable) -> RunRecord:
     """The record of a ``run`` of ``case``, open or in memory; ``options`` say how its steady state is found."""
     output = case.output
     cell = case.lattice.unit_cell()
-    # Masses that no spring joins have no bands: the whole frequency axis is one part.
+    # Cells that contacts alone join have no bands: the whole frequency axis is one part.
     parts = Parts(np.array([0.0, np.inf]), ("above",), ((),))
-    if cell.springs:
+    if cell.joins_cells:
         parts = Parts.of(pass_bands(cell))
 
     points: dict[str, History] = {}

@@ -11,7 +11,7 @@ from vipetsc import spectra
 from vipetsc.case import Case
 from vipetsc.case.schema import AnalysisTable
 from vipetsc.io.read import field_interval, field_time, leading_site
-from vipetsc.lattice import pass_bands
+from vipetsc.lattice import wave_bands
 
 
 class VelocityRecord:
@@ -76,14 +76,15 @@ class VelocityRecord:
 
         Fields that are stored at too few samples, or of too few cells, show waves as slower or longer ones (aliasing).
         """
-        top = pass_bands(self.model.chain.cell)[-1].high
+        bands = wave_bands(self.model.chain.cell)
         every = int(np.diff(self.cells).max(initial=1))
         names: set[str] = set()
-        if top == 0:
-            self.left_out.append("dispersion, bands, ibtet: a lattice without springs has no bands")
+        if not bands:
+            self.left_out.append("dispersion, bands, ibtet: without springs from cell to cell a lattice has no bands")
             names |= {"dispersion", "bands"}
         # The Nyquist limit: the top band would appear at lower frequencies.
-        if self.interval * top >= np.pi:
+        elif self.interval * bands[-1].high >= np.pi:
+            top = bands[-1].high
             text = f"fields stored every {self.interval:.4g} s resolve {np.pi / self.interval:.5g} of {top:.5g} rad/s"
             self.warnings.append(f"{text}: dispersion, bands and ibtet are not measured")
             names |= {"dispersion", "bands"}

@@ -17,8 +17,7 @@ from vipetsc.io.atomic import write_text
 from vipetsc.io.folder import origin
 from vipetsc.io.lock import locked
 from vipetsc.io.names import path_named
-from vipetsc.lattice import UnitCell, gaps, max_group_velocity, pass_bands
-from vipetsc.lattice.bands import Band
+from vipetsc.lattice import UnitCell, gaps, max_group_velocity, modes_of_a_cell, pass_bands, wave_bands
 from vipetsc.lattice.damped import damped_bloch, decay_length
 from vipetsc.parallel import StopRequest, on_root
 
@@ -56,26 +55,39 @@ def write_bands(case: Case, folder: Path, as_json: bool) -> str:
     # With the communicator of this rank, the only one here: on another the lock would wait for all ranks.
     with locked(MPI.COMM_SELF, folder):
         picture: dict[str, str] = {}
-        if cell.springs:
+        if cell.joins_cells:
             picture["picture"] = str(draw_bands(cell, folder / "bands.png", case.wave_frequency))
         text = json.dumps(numbers | picture | origin(), indent=2)
         write_text(folder / "bands.json", text + "\n")
 
     if as_json:
         return text
+    if not cell.joins_cells:
+        return without_bands(cell)
+    return f"{bands_report(numbers)}{damping_report(numbers)}\n  {picture['picture']}"
+
+
+def without_bands(cell: UnitCell) -> str:
+    """The sentence on a cell that contacts alone join to others, with the modes that its springs give it."""
     if not cell.springs:
         return "no pass bands: only contacts join the masses, so that there are no linear waves"
-    return f"{bands_report(numbers)}{damping_report(numbers)}\n  {picture['picture']}"
+    modes = ", ".join(f"{frequency:.2f}" for frequency in modes_of_a_cell(cell))
+    return (
+        "no pass bands: only contacts join the cells, so that no linear wave travels from one to the next; each cell"
+        f" has the modes {modes} rad/s for itself"
+    )
 
 
 def bands_table(cell: UnitCell) -> dict[str, Any]:
     """The bands of a cell, each with its edges and its fastest wave, and the gaps, as for JSON; with their ``units``.
 
-    A cell without springs has neither bands nor gaps.
+    A cell that contacts alone join to others has neither bands nor gaps. If there are springs in it, the frequencies of
+    the cell alone are its ``cell_modes``.
     """
-    edges: tuple[Band, ...] = ()
-    if cell.springs:
-        edges = pass_bands(cell)
+    edges = wave_bands(cell)
+    alone: dict[str, Any] = {}
+    if cell.springs and not cell.joins_cells:
+        alone["cell_modes"] = modes_of_a_cell(cell).tolist()
     rows = []
     for band in edges:
         kappa, frequency, speed = max_group_velocity(cell, band.number)
@@ -85,6 +97,7 @@ def bands_table(cell: UnitCell) -> dict[str, Any]:
         "units": {"frequency": "rad/s", "group_velocity": "cells/s", "wavenumber": "rad/cell"},
         "bands": rows,
         "gaps": [{"low": low, "high": high} for low, high in gaps(edges)],
+        **alone,
     }
 
 
@@ -106,9 +119,9 @@ def damping_table(cell: UnitCell, frequency: float) -> dict[str, Any]:
 
     ``damping`` has the damping ratio, the damped frequency in rad/s and the time in s to decay to 1/e of each wave,
     ``decay_length`` the number of ``cells`` to 1/e of the wave that goes farthest. A time or a length without end is
-    None, since JSON has no infinite numbers. The table is empty for a cell without dashpots or without springs.
+    None, since JSON has no infinite numbers. The table is empty for a cell without dashpots or without bands.
     """
-    if not (cell.is_damped and cell.springs):
+    if not (cell.is_damped and cell.joins_cells):
         return {}
 
     rows = []

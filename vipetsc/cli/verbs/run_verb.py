@@ -172,7 +172,7 @@ def _drive_rows(case: Case) -> Rows:
 
     # Where nothing is driven, the waves are those of the motion that the lattice begins with.
     omega = case.wave_frequency
-    if omega and model.chain.cell.springs:
+    if omega and model.chain.cell.joins_cells:
         waves = [
             f"band {band}, kappa = {kappa / np.pi:.4f} pi, v_g = {speed:.2f} cells/s"
             for band, kappa, speed in waves_at(model.chain.cell, omega)

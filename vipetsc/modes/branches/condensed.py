@@ -16,7 +16,7 @@ from vipetsc.case.nfrc import needs_modes
 from vipetsc.case.nnm_table import NnmTable
 from vipetsc.io.branch_kinds import CONDENSED
 from vipetsc.io.netcdf import Variables
-from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, pass_bands
+from vipetsc.lattice import Chain, DenseCompliance, WaveCompliance, wave_bands
 from vipetsc.lattice.moments import SeriesCompliance
 from vipetsc.modes.balance.conservative import ConservativeMotions
 from vipetsc.modes.balance.harmonics import SiteForces
@@ -131,7 +131,7 @@ class CondensedMethod(NnmMethod):
         options = self.options
         if self.chain is not None:
             omega = 2 * np.pi / start.period
-            bands = pass_bands(self.chain.cell)
+            bands = wave_bands(self.chain.cell)
             # In a band the breather radiates; a gap has no end above the highest band and begins at 0 below the lowest.
             low = max((band.high for band in bands if band.high < omega), default=0.0) / (2 * np.pi)
             high = min((band.low for band in bands if band.low > omega), default=np.inf) / (2 * np.pi)

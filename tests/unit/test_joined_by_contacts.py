@@ -1,0 +1,253 @@
+"""Cells with springs of their own that contacts alone join: what they have, and what they are refused for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vipetsc.case import Case, CaseError, LawCase, NnmCase
+from vipetsc.case.bodies import bodies_of
+from vipetsc.case.nfrc import NfrcCase
+from vipetsc.case.optimise import OptimiseCase
+from vipetsc.cli.verbs.bands_verb import bands_table, without_bands
+from vipetsc.lattice import Chain, Spring, UnitCell, fastest_speed, four_band, modes_of_a_cell, wave_bands, waves_at
+from vipetsc.lattice.chain import Pair
+from vipetsc.modes.system import System
+
+INSIDE = {"start": 1, "end": 2, "stiffness": 5e3}
+CELL = UnitCell((4e-3, 2e-3), (Spring(0, 1, 5e3),), host=0, resonator=1)
+LOCAL = np.sqrt(5e3 * (1 / 4e-3 + 1 / 2e-3))  # rad/s, of grain and resonator against each other
+PRESSED = {"clearance": 0.0, "side": "minus", "precompression": 1e-4}
+APART = {"clearance": 1e-5, "precompression": None, "side": None}
+
+
+def table(**sections: dict[str, Any]) -> dict[str, Any]:
+    """Four grains with resonators, pressed together; ``sections`` update the table, and None removes a key."""
+    given: dict[str, Any] = {
+        "lattice": {"cells": 4, "ends": "free", "cell": {"masses": [4e-3, 2e-3], "springs": [INSIDE]}},
+        "contacts": {"stiffness": 1e7, "pair": [1, 1], "next_cell": True, "sites": [1, 2, 3]} | PRESSED,
+        "drive": {"amplitude": 1.0, "frequency": 1e3, "cycles": 2},
+        "time": {"end": 0.01, "sample_interval": 1e-4},
+    }
+    merged = given | {name: given.get(name, {}) | values for name, values in sections.items()}
+    return {name: {key: value for key, value in part.items() if value is not None} for name, part in merged.items()}
+
+
+def problem_of(kind: type, **sections: dict[str, Any]) -> tuple[str, str]:
+    """Key and remedy of the one problem of a case."""
+    with pytest.raises(CaseError) as error:
+        kind.from_table(table(**sections))
+    [problem] = error.value.problems
+    return problem.key, problem.remedy
+
+
+def test_springs_within_cells_join_none():
+    assert four_band().joins_cells
+    assert not CELL.joins_cells
+    assert not UnitCell((1.0,), (), 0, 0).joins_cells
+
+
+def test_a_cell_alone_has_modes_and_no_waves():
+    assert modes_of_a_cell(CELL) == pytest.approx([0.0, LOCAL], rel=1e-12)
+    assert wave_bands(CELL) == ()
+    assert fastest_speed(CELL) == 0
+    # At the frequency of its mode a band without width would have a wave at every wavenumber.
+    for frequency in (0.0, LOCAL, float(modes_of_a_cell(CELL)[1])):
+        assert waves_at(CELL, frequency) == ()
+
+
+def test_bands_say_what_there_is():
+    assert f"each cell has the modes 0.00, {LOCAL:.2f} rad/s for itself" in without_bands(CELL)
+    numbers = bands_table(CELL)
+    assert numbers["bands"] == numbers["gaps"] == []
+    assert numbers["cell_modes"] == pytest.approx([0.0, LOCAL], rel=1e-12)
+    # What a cell with bands, or without any spring, had before.
+    assert "cell_modes" not in bands_table(four_band()) | bands_table(UnitCell((1.0,), (), 0, 0))
+
+
+def test_contacts_or_springs_must_join_the_cells():
+    assert Case.from_table(table()).model().chain.is_joined
+    for contacts in ({"sites": []}, {"pair": [1, 2], "next_cell": None}, {"pair": [0, 1], "next_cell": None}):
+        key, remedy = problem_of(Case, contacts=contacts)
+        assert key == "lattice.cell.springs"
+        assert remedy.startswith("neither springs") and "connect the cells" in remedy
+
+
+def test_every_mass_belongs_to_the_lattice():
+    """A mass that neither a spring nor a contact holds is refused; one that a contact holds is not."""
+    three = {"cell": {"masses": [4e-3, 2e-3, 1e-3], "springs": [INSIDE]}}
+    key, remedy = problem_of(Case, lattice=three)
+    assert key == "lattice.cell.springs" and remedy.startswith("mass 3 is not connected")
+
+    for held in ([2, 3], [0, 3]):
+        sites = {"sites": [1, 2, 3, 2], "pair": None, "next_cell": None}
+        each = {"pair": [[1, 1]] * 3 + [held], "next_cell": [True] * 3 + [False]}
+        assert Case.from_table(table(lattice=three, contacts=sites | {"each": each}))
+
+
+@pytest.mark.parametrize(
+    ("sections", "key", "reason"),
+    [
+        ({"drive": {"frequency": None, "band": 2, "wavenumber": 1.0}}, "drive.wavenumber", "no bands"),
+        ({"drive": {"frequency": None, "band": 2, "at": "max-group-velocity"}}, "drive.band", "no bands"),
+        ({"time": {"end": "traverse"}}, "time.end", "no bands"),
+        ({"time": {"sample_interval": "auto"}}, "time.sample_interval", "no bands"),
+        ({"time": {"sample_interval": 2e-3}}, "time.sample_interval", "its highest mode's Nyquist interval"),
+        ({"lattice": {"ends": "fixed"}, "drive": {"end": "left"}}, "drive.end", "the cell has none"),
+        ({"lattice": {"cells": 9, "absorbing": {"cells": 2, "strength": 1.0}}}, "lattice.absorbing", "no linear waves"),
+        ({"lattice": {"damping": {"loss": {"2": 0.1}}}}, "lattice.damping.loss", "no bands"),
+        ({"initial": {"kind": "mode", "number": 5, "amplitude": 1e-6}}, "initial.kind", "those of single cells"),
+        (
+            {"initial": {"kind": "packet", "band": 2, "wavenumber": 1.0, "cell": 2, "width": 1.0, "amplitude": 1e-6}},
+            "initial.kind",
+            "no waves",
+        ),
+    ],
+)
+def test_what_needs_waves_is_refused(sections, key, reason):
+    found, remedy = problem_of(Case, **sections)
+    assert found == key and reason in remedy
+
+
+def test_what_springs_within_cells_have_is_accepted():
+    """Dashpots beside them, parts that are not linear, cells that differ."""
+    spring = INSIDE | {"damping": 0.1, "cubic": 1e9}
+    lattice = {
+        "cell": {"masses": [4e-3, 2e-3], "springs": [spring]},
+        "profiles": {"masses[2]": {"first": 1e-3, "last": 3e-3}},
+    }
+    chain = Case.from_table(table(lattice=lattice)).model().chain
+    assert chain.is_damped and not chain.is_linear and not chain.is_uniform()
+
+
+@pytest.mark.parametrize("speed", [1e-6, 1.0])
+def test_a_struck_grain_has_the_faster_of_its_spring_and_its_contact(speed):
+    """By the square root of the sum of its springs over its mass, or by the duration of the contact."""
+    struck = {"kind": "velocity", "cell": 1, "velocity": speed}
+    given = table(contacts=PRESSED | {"precompression": None}, initial=struck)
+    del given["drive"]
+    case = Case.from_table(given)
+    contact = np.pi / case.model().contact.impact_time(speed, 2e-3)
+    spring = np.sqrt(5e3 / 4e-3)
+    assert (contact > spring) == (speed == 1.0)
+    assert case.initial.frequency == pytest.approx(max(contact, spring), rel=1e-9)
+
+
+def test_a_law_of_waves_is_none_of_contacts():
+    key, remedy = problem_of(LawCase, law={"clearance": 1e-5}, contacts=APART)
+    assert key == "lattice.cell.springs" and "no linear wave arrives" in remedy
+
+
+@pytest.mark.parametrize(
+    "objective",
+    [
+        {"measure": "upper_share_at_end"},
+        {"measure": "ibtet"},
+        {"measure": "ibtet_whole"},
+        {"measure": "band_share", "band": 1},
+        {"measure": "bands/share", "band": 1},
+    ],
+)
+def test_no_search_is_for_energies_of_bands(objective):
+    search = {"budget": 2, "variables": {"clearance": [1e-6, 1e-4]}, "objective": [objective]}
+    key, remedy = problem_of(OptimiseCase, contacts=APART, optimise=search)
+    assert key == "optimise.objective[1].measure" and "there are no bands" in remedy
+
+
+def chain_of(pairs: tuple[Pair, ...]) -> Chain:
+    """Two cells with contacts of these ``pairs`` in the first one."""
+    return Chain(CELL, 2, "free", sites=(0,) * len(pairs), clearances=(0.0,) * len(pairs), pairs=pairs)
+
+
+def test_bodies_are_what_springs_and_pressed_contacts_hold_together():
+    """The ground first, then grain and resonator of each cell."""
+    between, ground = Pair(0, 0, next_cell=True), Pair(-1, 0)
+    pressed, apart = (-1e-5, np.inf), (1e-5, np.inf)
+    assert bodies_of(chain_of((between,)), [apart]) == [0, 1, 1, 2, 2]
+    assert bodies_of(chain_of((between,)), [pressed]) == [0, 1, 1, 1, 1]
+    assert bodies_of(chain_of((between, ground)), [pressed, pressed]) == [0, 0, 0, 0, 0]
+    assert bodies_of(chain_of((between, ground)), [apart, pressed]) == [0, 0, 0, 1, 1]
+    # With equal clearances on both sides nothing is pressed.
+    assert bodies_of(chain_of((between,)), ()) == [0, 1, 1, 2, 2]
+
+
+def modes_case(modes: list[int], contacts: dict[str, Any] | None = None, ends: str = "free") -> dict[str, Any]:
+    """The table of branches of a whole lattice of grains."""
+    given = table(contacts=contacts or {}, lattice={"ends": ends}, nnm={"system": "chain", "modes": modes})
+    return {name: given[name] for name in ("lattice", "contacts", "nnm")}
+
+
+@pytest.mark.parametrize("ends", ["free", "fixed"])
+@pytest.mark.parametrize(("contacts", "still"), [({}, 1), (APART, 4)])
+def test_branches_begin_where_a_motion_oscillates(ends, contacts, still):
+    """A pressed chain moves as a whole, whatever its ends are: no spring goes to a wall. Apart each grain does."""
+    modes = list(range(1, 9))
+    with pytest.raises(CaseError, match="can move as a rigid body") as error:
+        NnmCase.from_table(modes_case(modes, contacts, ends))
+    assert error.value.problems[0].value == modes[:still]
+
+    case = NnmCase.from_table(modes_case(modes[still:], contacts, ends))
+    frequencies = System.from_case(case).linear_modes()[0]
+    assert np.sum(frequencies < 1e-6 * frequencies[-1]) == still
+
+
+def test_modes_of_a_pressed_chain_are_those_of_masses_in_masses():
+    """With free ends kappa = j pi/n; the two branches solve (pull + k2 - m1 w^2)(k2 - m2 w^2) = k2^2."""
+    slope = 1.5 * 1e7 * 1e-4**0.5
+    expected = []
+    for j in range(4):
+        pull = 4 * slope * np.sin(j * np.pi / 8) ** 2
+        matrix = np.array([[pull + 5e3, -5e3], [-5e3, 5e3]]) / np.array([[4e-3], [2e-3]])
+        expected += np.sqrt(np.abs(np.linalg.eigvals(matrix))).tolist()
+    found = System.from_case(NnmCase.from_table(modes_case([2]))).linear_modes()[0]
+    assert found == pytest.approx(sorted(expected), rel=1e-9, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("springs", "mode", "is_still"),
+    [
+        # A spring between the pair: it moves as a whole. A third mass, at whose spring the model holds the resonator.
+        ([INSIDE], 1, True),
+        ([INSIDE], 2, False),
+        ([INSIDE, {"start": 2, "end": 3, "stiffness": 1e3}], 1, False),
+    ],
+)
+def test_the_reduced_model_of_a_cell_may_be_free(springs, mode, is_still):
+    cell = {"masses": [4e-3, 2e-3, 1e-3], "springs": springs}
+    given = {
+        "lattice": {"cell": cell, "cells": 4},
+        "contacts": {"stiffness": 1e7, "clearance": 1e-5},
+        "nnm": {"system": "reduced", "modes": [mode]},
+    }
+    if not is_still:
+        assert NnmCase.from_table(given)
+        return
+    with pytest.raises(CaseError, match="can move as a rigid body"):
+        NnmCase.from_table(given)
+
+
+def response(**sections: dict[str, Any]) -> dict[str, Any]:
+    """The table of a frequency response of grains."""
+    nfrc = {"source": "force", "range": [0.1, 1.0], "harmonics": 5} | sections.pop("nfrc", {})
+    return table(nfrc=nfrc, **sections)
+
+
+def test_responses_are_those_of_a_pressed_chain():
+    """Pressed contacts are its springs; apart on one side alone, mean forces push grains with their resonators away."""
+    case = NfrcCase.from_table(response())
+    assert case.are_contacts_springs and not case.nfrc.infinite
+    assert NfrcCase.from_table(response(contacts=APART)).nfrc.symmetric
+    with pytest.raises(CaseError, match="its mean force pushes them apart"):
+        NfrcCase.from_table(response(contacts=APART | {"side": "minus"}))
+    # Springs hold what a contact within a cell would push apart.
+    inside = {"sites": [1, 2, 3, 2], "pair": None, "next_cell": None, "precompression": None}
+    each = {"pair": [[1, 1]] * 3 + [[1, 2]], "next_cell": [True] * 3 + [False], "precompression": [1e-4] * 3 + [0.0]}
+    assert NfrcCase.from_table(response(contacts=inside | {"each": each}))
+
+
+@pytest.mark.parametrize("nfrc", [{"source": "wave"}, {"infinite": True}])
+def test_no_response_is_that_of_waves(nfrc):
+    with pytest.raises(CaseError, match="no linear wave travels through cells that contacts alone join"):
+        NfrcCase.from_table(response(nfrc=nfrc, contacts=APART))

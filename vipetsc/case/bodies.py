@@ -1,0 +1,31 @@
+"""Masses that move as one body in small motions of a lattice whose cells contacts alone join."""
+
+from collections.abc import Sequence
+
+from vipetsc.lattice import Chain
+from vipetsc.lattice.cell import connected_groups
+
+
+def contact_ends(chain: Chain) -> list[tuple[int, int]]:
+    """Numbers of the host and of the resonator of each site: 0 for the ground, masses from 1 on, cell by cell."""
+    d = chain.cell.dofs
+    ends = []
+    for site, cell, pair in zip(chain.sites, chain.resonator_cells, chain.contact_pairs, strict=True):
+        host = 0
+        if pair.host >= 0:
+            host = 1 + site * d + pair.host
+        ends.append((host, 1 + cell * d + pair.resonator))
+    return ends
+
+
+def bodies_of(chain: Chain, gaps: Sequence[tuple[float, float]]) -> list[int]:
+    """The body of the ground, and behind it that of each mass of ``chain``, by the numbers of ``contact_ends``.
+
+    Springs, which are all within cells, join the masses of a body, and so do contacts that are pressed at rest.
+    ``gaps`` are the clearances in m of the sites on both sides; () if they are equal.
+    """
+    d = chain.cell.dofs
+    pressed = [ends for ends, gap in zip(contact_ends(chain), gaps, strict=False) if min(gap) < 0]
+    sprung = [(1 + cell * d + s.start, 1 + cell * d + s.end) for cell in range(chain.cells) for s in chain.cell.springs]
+    # A node is joined to itself, so that there is a pair where nothing else is joined.
+    return connected_groups(1 + chain.cells * d, ((0, 0), *sprung, *pressed))
