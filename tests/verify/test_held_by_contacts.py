@@ -97,6 +97,8 @@ def test_what_nothing_holds_is_refused():
         held({"precompression": None, "clearance": 0.1} | {"side": "plus"})
     with pytest.raises(CaseError, match="infinite lattice without bound"):
         held(lattice={"damping": {}}, infinite=True)
+    with pytest.raises(CaseError, match=r"nfrc\.infinite.*contacts alone join"):
+        held(BETWEEN_CELLS, {"cells": 3, "cell": GRAINS, "damping": {}}, infinite=True)
 
 
 SPRINGS = [{"start": 1, "end": 1, "stiffness": SPRING, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 1.0}]
