@@ -219,9 +219,18 @@ class Case(CaseFile):
     ) -> "Case":
         """A lattice run like this case, with some values changed; the section of another verb is dropped.
 
+        ``name``, ``without`` and ``changes`` are those of ``varied_table``, ``overrides`` those of ``load``. The new
+        case is checked and resolved like any other; raises CaseError.
+        """
+        return Case.from_table(self.varied_table(name=name, without=without, **changes), overrides)
+
+    def varied_table(
+        self, *, name: str | None = None, without: Iterable[str] = (), **changes: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """The table, neither checked nor resolved, of a lattice run like this case with some values changed.
+
         ``changes`` are keys by section, as in ``drive={"amplitude": 2.0}``; the value None removes a key. Sections
-        named in ``without`` begin with their defaults instead of the values of this case. ``overrides`` are as those of
-        ``load``. The new case is checked and resolved like any other; raises CaseError.
+        named in ``without`` begin with their defaults instead of the values of this case.
         """
         table = self.model_dump(by_alias=True, exclude_none=True, include={*Case.model_fields})
         # First what is left out, then what changes: a section may be begun anew with some keys.
@@ -232,7 +241,7 @@ class Case(CaseFile):
             table[section] = {key: value for key, value in merged.items() if value is not None}
         if name is not None:
             table["name"] = name
-        return Case.from_table(table, overrides)
+        return table
 
     @property
     def contact_radius(self) -> float | None:

@@ -197,6 +197,7 @@ def packet_frequency(drive: OneDrive) -> float:
     return np.inf
 
 
+@lru_cache  # members of a sweep send the same waves
 def wave_speed(cell: UnitCell, frequency: float) -> float:
     """Group velocity in cells/s of the fastest wave at ``frequency`` in rad/s.
 

@@ -9,6 +9,7 @@ They are scaled from it.
 import itertools
 import json
 from collections.abc import Collection, Iterable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -231,20 +232,33 @@ def linear_case(case: Case) -> Case:
     Unless it ``is_proportional``, the drives are those of the case. Contacts that join other masses than the cell's
     pair may be all that joins the cells: they stay.
     """
-    amplitude = REFERENCE if is_proportional(case) else case.drive.amplitude
-    output = case.output.of_points()
-    drive = {"amplitude": amplitude}
-    if other_pairs(case):
-        return case.varied(name="linear", without=("output",), drive=drive, output=output)
-    without = ("output", "contacts")
-    # Without the whole section: cases that differ in a law or a clearance must have one linear run, and one name of
-    # it.
-    return case.varied(name="linear", without=without, drive=drive, contacts={"sites": 0}, output=output)
+    return Case.from_table(_linear_table(case))
 
 
 def linear_name(case: Case) -> str:
     """The name of the linear run of ``case``: a hash of its resolved case."""
-    return case_id(linear_case(case))
+    return _name_of(json.dumps(_linear_table(case), sort_keys=True))
+
+
+# To check and resolve a case takes ten times as long as to write its table, and members of a sweep have few linear
+# runs.
+@lru_cache(maxsize=64)
+def _name_of(table: str) -> str:
+    """The name of the linear run with this ``table`` in JSON."""
+    return case_id(Case.from_table(json.loads(table)))
+
+
+def _linear_table(case: Case) -> dict[str, Any]:
+    """The table of ``linear_case``."""
+    amplitude = REFERENCE if is_proportional(case) else case.drive.amplitude
+    output = case.output.of_points()
+    drive = {"amplitude": amplitude}
+    if other_pairs(case):
+        return case.varied_table(name="linear", without=("output",), drive=drive, output=output)
+    without = ("output", "contacts")
+    # Without the whole section: cases that differ in a law or a clearance must have one linear run, and one name of
+    # it.
+    return case.varied_table(name="linear", without=without, drive=drive, contacts={"sites": 0}, output=output)
 
 
 def leading_cell(case: Case) -> int:
