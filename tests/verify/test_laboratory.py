@@ -117,7 +117,7 @@ def test_a_site_is_of_the_masses_of_its_cell():
 @pytest.mark.slow
 def test_an_absorbing_end_is_that_of_all_drives():
     ends = {"cells": 90, "absorbing": {"cells": 10, "strength": 400.0}}
-    with pytest.raises(CaseError, match=r"lattice\.absorbing\.end.*driven cell 85"):
+    with pytest.raises(CaseError, match=r"lattice\.absorbing\.end.*cell 85, which is in the absorbing end"):
         small_case(lattice=ends, drive={"more": [{"frequency": 1500.0, "cell": 85}]})
 
     description = describe_ends(small_case(lattice=ends, drive=TWO_DRIVES))

@@ -116,9 +116,7 @@ class Case(CaseFile):
             yield from check_inhomogeneity(lattice, driven)
 
         if valid("lattice.cells", "contacts.sites"):
-            initial = None
-            if valid("initial"):
-                initial = sections.get("initial")
+            initial = sections.get("initial") if valid("initial") else None
             yield from check_contacts(lattice, contacts, initial, valid)
             if cell and valid("contacts"):
                 yield from check_pairs(lattice, contacts, cell, site_cells(lattice, contacts))
@@ -217,17 +215,16 @@ class Case(CaseFile):
         overrides: Iterable[str] = (),
         **changes: Mapping[str, Any],
     ) -> "Case":
-        """A lattice run like this case, with some values changed; the section of another verb is dropped.
+        """The lattice run of ``varied_table``, checked and resolved like any other; raises CaseError.
 
-        ``name``, ``without`` and ``changes`` are those of ``varied_table``, ``overrides`` those of ``load``. The new
-        case is checked and resolved like any other; raises CaseError.
+        ``overrides`` are as those of ``load``.
         """
         return Case.from_table(self.varied_table(name=name, without=without, **changes), overrides)
 
     def varied_table(
         self, *, name: str | None = None, without: Iterable[str] = (), **changes: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """The table, neither checked nor resolved, of a lattice run like this case with some values changed.
+        """The table of a lattice run like this case with some values changed; the section of another verb is dropped.
 
         ``changes`` are keys by section, as in ``drive={"amplitude": 2.0}``; the value None removes a key. Sections
         named in ``without`` begin with their defaults instead of the values of this case.
