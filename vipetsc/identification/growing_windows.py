@@ -329,7 +329,7 @@ class GrowingWindows:
         return solution
 
     def _solve(self, z: np.ndarray, ends: Sequence[float], active: Sequence[int], precision: Precision) -> np.ndarray:
-        """What ``solve`` returns, computed."""
+        """Compute the solution that ``solve`` returns."""
         active = list(active)
         start = z[active].copy()
         # While windows grow, parameters have a prior about the start of this fit; states always have one about rest.

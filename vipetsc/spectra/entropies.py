@@ -263,7 +263,7 @@ def _octaves(cells: int, stride: int) -> list[_FastOctave | _NarrowOctave]:
 
 
 def _lets_through(filters: np.ndarray) -> np.ndarray:
-    """At which wavenumbers (k,) any of the ``filters`` (kappa, k) exceeds the rounding of their largest value."""
+    """Whether any of the ``filters`` (kappa, k) exceeds the rounding of their largest value, by wavenumber (k,)."""
     return np.asarray(filters.max(axis=0) > np.finfo(float).eps * filters.max())
 
 
