@@ -1,4 +1,4 @@
-"""Compares hardening stops in each room with formulas written out here, for ``test_another_law``."""
+"""Comparisons for ``test_another_law`` of hardening stops in every part of the package with formulas of their own."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ from vipetsc.plugins import load
 
 K = 2e5
 B = 4e5
-# Of the stop in a steady state far below all modes, where nothing is large but its own force.
+# The stop of ``steady`` is soft: its drive lies below all modes, so that only the stop's force is large.
 SOFT = 2e3
 STEADY_B = 2e6
 D = 1e-3
 
 
 def force(x, k=K, b=B):
-    """F = k x (1 + b x^2) of an indentation."""
+    """The force F = k x (1 + b x^2) in N at an indentation ``x`` in m."""
     return k * x * (1 + b * x**2)
 
 
 def slope(x):
-    """dF/dx."""
+    """The stiffness dF/dx = k (1 + 3 b x^2) in N/m at an indentation ``x`` in m."""
     return K * (1 + 3 * B * x**2)
 
 
 def energy(x):
-    """The integral of F."""
+    """The elastic energy k x^2/2 + k b x^4/4 in J, which is the integral of the force from 0 to ``x``."""
     return K * x**2 / 2 + K * B * x**4 / 4
 
 
 def relative(a, b):
-    """The largest difference over the largest of ``b``."""
+    """The largest absolute difference of ``a`` and ``b``, divided by the largest absolute value of ``b``."""
     return float(np.abs(np.subtract(a, b)).max() / np.abs(b).max())
 
 
 def turning(t, y):
-    """Where a mass in contact comes to rest."""
+    """The velocity, which is zero where a mass in contact turns round: an event of ``solve_ivp``."""
     return y[1]
 
 
@@ -60,7 +60,7 @@ turning.terminal = True
 
 
 def twins() -> dict:
-    """The law on arrays, its compiled twin, and the duration of an impact that both compute."""
+    """Errors of the law on arrays and of its compiled twin, and those of the duration of an impact, as fractions."""
     law = Contact("hardening", K, parameters=(B,))
     x = np.linspace(1e-4, 2e-3, 7)
     on_arrays = [law.elastic_force(x), law.elastic_slope(x), law.elastic_energy(x)]
@@ -92,7 +92,7 @@ STOPS = {"law": "hardening", "parameters": {"b": B}, "stiffness": K, "sites": [4
 
 
 def stopped_run(engine: str, contacts: dict) -> tuple[np.ndarray, dict]:
-    """Velocities and statistics of a short run of a lattice with two sites."""
+    """Velocities (time, cell, dof) in m/s and the statistics of a short run of a lattice with two contact sites."""
     table = {
         "plugins": PLUGINS,
         "lattice": LATTICE,
@@ -106,7 +106,7 @@ def stopped_run(engine: str, contacts: dict) -> tuple[np.ndarray, dict]:
 
 
 def engines() -> dict:
-    """Both engines' runs, and one with a linear stop of the same stiffness."""
+    """How runs differ: by the two engines, and with linear stops of the same stiffness; episodes and ledger errors."""
     linear_stops = STOPS | {"law": "bilinear"}
     del linear_stops["parameters"]
     stepped, by_ts = stopped_run("ts", STOPS)
@@ -126,14 +126,18 @@ SPRING = 4e4
 
 
 def period(total: float) -> float:
-    """Four times the duration from the middle to the farthest point of a mass on a spring between two stops."""
+    """The period in s of a mass on a spring between two stops at a ``total`` energy in J.
+
+    It is four times the time from the middle to the farthest point, the integral of dx / sqrt(2 (E - V(x)) / m).
+    """
 
     def potential(x):
         return SPRING * x**2 / 2 + energy(max(x - D, 0.0))
 
     farthest = brentq(lambda x: potential(x) - total, 0, 1, xtol=1e-16)
 
-    # With x = farthest sin(s) the time is a smooth integral on either side of the stop.
+    # The substitution x = farthest sin(s) removes the singularity at the farthest point. The integrand dt/ds is then
+    # smooth on either side of the stop.
     def slowness(s):
         x = farthest * np.sin(s)
         return farthest * np.cos(s) / np.sqrt(2 * (total - potential(x)) / MASS)
@@ -150,7 +154,7 @@ def period(total: float) -> float:
 
 
 def normal_modes() -> dict:
-    """Periods of a branch of either method against those of the energy integral."""
+    """Errors of the periods along a branch against the energy integral, and how far the branch reaches, by method."""
     touching = SPRING * D**2 / 2
     highest = 20 * touching
     case = f"""
@@ -202,7 +206,7 @@ def periodic(omega: float, amplitude: float, chain) -> float:
     n = len(masses)
 
     def rate(t, y, strength):
-        # Of all orbits at once, which are the columns.
+        # The columns of u and v are orbits, which are integrated together.
         u, v = y.reshape(2, n, -1)
         w = pair @ u
         push = np.sign(w) * force(np.maximum(np.abs(w) - D, 0.0), SOFT, STEADY_B)
@@ -212,7 +216,8 @@ def periodic(omega: float, amplitude: float, chain) -> float:
 
     def orbits(starts, strength):
         """Displacements and velocities (2, mass, orbit, time) of orbits that begin at rest at ``starts``."""
-        # Nothing dissipates: an orbit is even in time, and so about half a period.
+        # Nothing dissipates. A periodic orbit that begins at rest is therefore even in time, and at rest again after
+        # half a period.
         times = np.linspace(0, np.pi / omega, 201)
         begin = np.concatenate([starts, 0 * starts]).ravel()
         solved = solve_ivp(rate, times[[0, -1]], begin, "DOP853", times, args=(strength,), rtol=1e-8, atol=1e-12)
@@ -221,12 +226,13 @@ def periodic(omega: float, amplitude: float, chain) -> float:
     linear = np.linalg.solve(stiffness - omega**2 * np.diag(masses), np.eye(n)[0])
     last = D / abs(pair @ linear)
     u = linear * last
-    # From the linear motion that touches in three steps: Newton's method does not reach the orbit in one.
+    # The force grows in three steps from the one at which the linear motion touches the stop: Newton's method does
+    # not reach the orbit in one step.
     for strength in np.linspace(last, amplitude, 4)[1:]:
         u = u * strength / last
         last = strength
         for _ in range(10):
-            # Differences between orbits of one integration do not contain the errors of its steps.
+            # Orbits of one integration have the same time steps, whose errors cancel in the differences.
             starts = u[:, None] + np.column_stack([np.zeros(n), 1e-6 * D * np.eye(n)])
             speeds = orbits(starts, strength)[1, :, :, -1] / (omega * D)
             if np.abs(speeds[:, 0]).max() < 1e-7:
@@ -237,7 +243,7 @@ def periodic(omega: float, amplitude: float, chain) -> float:
 
 
 def steady() -> dict:
-    """The largest |w| of a steady state of ``nfrc`` against a periodic orbit, and how much the stop hardens in it."""
+    """The error of the largest |w| of a steady state of ``nfrc`` against a periodic orbit, and the term b x^2 there."""
     lattice = {"preset": "four-band", "cells": 2}
     chain = Case.from_table({"plugins": PLUGINS, "lattice": lattice, "contacts": STOPS | {"sites": [1]}}).model().chain
     stiffness = chain.stiffness_matrix().toarray()
@@ -285,11 +291,11 @@ figures = false
         amplitude = curve["amplitude"].values
         largest = curve["largest"].values
     expected = periodic(omega, amplitude[-1], chain)
-    # The second number says that the law's own term counts.
+    # The second number shows that the cubic term of the law matters at this amplitude.
     return {"steady": abs(float(largest[-1, 0]) / expected - 1), "steady_hardens": STEADY_B * (expected - D) ** 2}
 
 
 def compare() -> dict:
-    """All comparisons, in a folder with the module ``stops.py``, which the current one is."""
+    """The results of all comparisons by name; the current folder must contain the module ``stops.py``."""
     load(str(Path("stops.py").resolve()))
     return twins() | engines() | normal_modes() | steady()

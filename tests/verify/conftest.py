@@ -32,7 +32,10 @@ class Branch(NamedTuple):
         return [point for point in self.special if point.kind == kind]
 
     def at_energy(self, energy: float) -> Point:
-        """The point at an ``energy``, corrected there; of a branch that turns, on the last stretch that passes it."""
+        """The orbit of an ``energy`` (J), corrected by Newton's method.
+
+        Where a branch passes the energy several times, the last passage at which the energy grows is taken.
+        """
         point = None
         for a, b in pairwise(self.points):
             if a.energy <= energy < b.energy:
@@ -55,7 +58,7 @@ class Branch(NamedTuple):
 
 
 def follow(system: System, mode: int, start: float, **control) -> Branch:
-    """Follow a linear ``mode`` from the energy ``start`` (J) in quarter periods; ``control`` is the table [nnm]."""
+    """Follow a linear ``mode`` from the energy ``start`` (J) by quarter-period maps; ``control`` is the table [nnm]."""
     problem = Shooting(Dop853Flow(system), MAPS["quarter"])
     first = linear_start(problem, mode, start)
     continuation = Continuation(problem, first, NnmTable(**{"points": 20000} | control))

@@ -1,4 +1,4 @@
-"""Absorbing ends: what a drive sends is its work, what comes back in a run is what is stated, and the bound is kept."""
+"""Absorbing ends: the energy that a drive sends is its work, runs reflect what is predicted, and the bound is kept."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from vipetsc.lattice.ends import Side, condensed, reflections
 from vipetsc.lattice.sent import integrate
 
 pytestmark = pytest.mark.parallel(1)
-# Twelve cycles near the lower edge of band 2, which the spectrum reaches.
+# Twelve cycles near the lower edge of band 2: their spectrum contains the edge, where waves are slow.
 BURST = {"amplitude": 1.0, "frequency": 760.0, "cycles": 12}
 
 
-# Of the run whose waves come back: cells, those of its end, those from the force to the end, duration in s, samples.
+# The run whose waves come back: the cells of the lattice, of its absorbing end, and between the force and that end; the
+# duration in s and the number of samples.
 CELLS = 740
 LENGTH = 20
 BEFORE = 3
@@ -35,30 +36,33 @@ SAMPLES = 4000
 
 
 def case(lattice, drive, stride=1, **time):
+    """A case of a four-band lattice without contacts; ``time`` updates the table [time]."""
     table = {"lattice": {"preset": "four-band", "ends": "fixed"} | lattice, "contacts": {"sites": 0}, "drive": drive}
     return Case.from_table(table | {"time": {"engine": "propagator"} | time, "output": {"stride": stride}})
 
 
 def with_returning_waves(lattice):
-    """A case whose force acts three cells before an end of 20 cells; the field is kept at its end alone."""
+    """A case whose force acts three cells before an end of 20 cells; the field is recorded at the last time only."""
     drive = BURST | {"cell": CELLS - LENGTH - BEFORE}
     return case(lattice, drive, stride=SAMPLES, end=END, sample_interval=END / SAMPLES)
 
 
 @pytest.fixture(scope="module")
 def goes_on():
-    """The chain of a lattice that goes on beyond the end, and its run."""
+    """The chain of a lattice with uniform cells in place of the absorbing end and beyond it, and its run."""
     of = with_returning_waves({"cells": 2 * CELLS})
     return of.model().chain, run(of)
 
 
 def run(of):
+    """The result of a run of the case ``of``, as a dataset."""
     memory = RunMemory(MPI.COMM_SELF)
     simulate(of, memory)
     return memory.dataset
 
 
 def source_and_sections(of):
+    """The drive of the case ``of`` as a source of waves, and its absorbing ends as sections."""
     lattice = of.lattice
     cell = lattice.unit_cell()
     end = lattice.absorbing
@@ -69,35 +73,42 @@ def source_and_sections(of):
 @pytest.mark.slow
 @pytest.mark.parametrize(("cell", "mass"), [(1, 1), (5, 2), (100, 3)])
 def test_what_a_drive_sends_is_its_work(cell, mass):
-    """At a wall, near to it, where the waves that it sends back are in phase, and far from it."""
+    """The energy of the waves that a force sends, an integral over its spectrum, is the work it does in a run.
+
+    The force acts at a wall, near to it, where it meets the waves that the wall reflects, and far from it.
+    """
     end = {"cells": 20, "strength": 200.0}
     of = case({"cells": 300, "absorbing": end}, BURST | {"cell": cell, "mass": mass}, end=0.105)
     work = run(of)["energy/work"].values[-1]
 
     source, _ = source_and_sections(of)
-    # At the right alone: a wall at the left reflects what goes there.
+    # All waves leave to the right, as the wall at the left reflects those that go there.
     (sent,) = integrate(lambda omegas: source.sent(omegas, "right").sum(axis=1)[None], source.edges())
     assert sent == pytest.approx(work, rel=1e-3)
 
 
 def stated(of):
+    """The fraction of the sent energy that the ends of the case ``of`` are predicted to reflect."""
     source, sections = source_and_sections(of)
     return reflected([source], sections)
 
 
 @cache
 def waves_of(cell, omega):
-    """The waves at a frequency, and the largest group velocity in cells/s: the same for ends of any strength."""
+    """The waves at ``omega`` (rad/s) and their largest group velocity in cells/s, which no absorbing end changes."""
     return damped_waves(cell, omega), max((wave[2] for wave in waves_at(cell, omega)), default=0.0)
 
 
 def returning(source, section, slowest):
-    """Fractions of what is sent that come back as waves faster than each of ``slowest`` (cells/s), on a fixed grid."""
+    """The fractions of the sent energy that come back as waves faster than each of ``slowest`` (cells/s).
+
+    The integral over the spectrum is a sum over a fixed grid.
+    """
     angles = (np.arange(60) + 0.5) / 60 * np.pi / 2
     sent = 0.0
     back = np.zeros(len(slowest))
     for low, high in itertools.pairwise(source.edges().tolist()):
-        # Dense near the edges of bands, where waves are slow.
+        # The grid is dense near the edges of bands, where waves are slow.
         omegas = low + (high - low) * np.sin(angles) ** 2
         weights = (high - low) * np.sin(2 * angles) * np.pi / 2 / len(angles)
         energies = source.sent(omegas, section.end)
@@ -108,7 +119,7 @@ def returning(source, section, slowest):
             waves, speed = waves_of(source.cell, omega)
             fraction = reflections(z, waves, section.end)
             sent += weight * energy.sum()
-            # Of no least speed all waves count, those of a gap as well, in which none travels.
+            # A least speed of 0 counts all waves, also those at a frequency in a gap, where no wave travels.
             back += weight * (energy @ fraction) * ((speed > np.array(slowest)) | (np.array(slowest) == 0))
     return back / sent
 
@@ -116,11 +127,12 @@ def returning(source, section, slowest):
 @pytest.mark.slow
 @pytest.mark.parametrize("strength", [60.0, 230.0])
 def test_what_comes_back_in_a_run_is_what_is_stated(goes_on, strength):
-    """The wave that comes back is the difference to a lattice that goes on.
+    """The energy that comes back in a run lies between two predictions, for fast waves alone and for all that return.
 
-    The force acts three cells before the end, and so far from the other one that nothing comes from there. Waves turn
-    somewhere in the end's 20 cells: those that come back in 2.6 s are faster than 6/2.6 cells/s, and among them are all
-    that are faster than 46 cells in what is left of it after the burst.
+    The reflected wave is the difference between the run and one of a lattice that goes on beyond the end. The force
+    acts three cells before the end, and so far from the other end that nothing returns from there. Waves turn back
+    somewhere within the end's 20 cells and travel 6 to 46 cells. All that have come back after 2.6 s are faster than
+    6/2.6 cells/s. Those that travel 46 cells in the time that the burst leaves of 2.6 s have certainly come back.
     """
     with_end = with_returning_waves({"cells": CELLS, "absorbing": {"cells": LENGTH, "strength": strength}})
     ours = run(with_end)
@@ -140,7 +152,8 @@ def test_what_comes_back_in_a_run_is_what_is_stated(goes_on, strength):
     burst = source.waveform.duration
     every, some, least = returning(source, section, [0, 2 * BEFORE / END, 2 * (BEFORE + LENGTH) / (END - burst)])
     assert reflected([source], [section]) == pytest.approx(every, rel=0.01)
-    # Slow waves are still within the end or before it: the run lies between what has come back for certain and all.
+    # Slow waves are still on their way when the run ends: what it measures lies between what has certainly come back
+    # and what may have come back.
     assert 0.98 * least < measured < 1.02 * some
     # The weak end reflects fast waves, the strong one slow waves: both bounds are tested.
     assert (least > 0.9 * every) == (strength < 100)
@@ -149,7 +162,10 @@ def test_what_comes_back_in_a_run_is_what_is_stated(goes_on, strength):
 
 @pytest.mark.slow
 def test_the_end_that_is_chosen_keeps_its_bound():
-    """Where an end was chosen by the spectrum's main lobe alone, 0.8 % came back from it."""
+    """An end chosen for this burst reflects at most 0.1 % of all that the drive sends, side lobes included.
+
+    An end chosen for the main lobe of the spectrum alone reflects 0.8 %.
+    """
     of = case({"cells": 1200, "absorbing": {}}, BURST | {"cell": 400})
     source, sections = source_and_sections(of)
     (back,) = returning(source, sections[0], [0])
@@ -165,9 +181,9 @@ def test_both_ends_absorb_what_each_of_them_gets():
         for end in ("right", "both")
     )
     fractions = [stated(of) for of in (one, both)]
-    # In proportion to what each side sends, so that a second end leaves the fraction as it is.
+    # Reflected energy is divided by all energy that is sent, so that a second end leaves the fraction as it is.
     assert fractions[1] == pytest.approx(fractions[0], rel=0.02)
-    # Next to a wall that the end does not replace, waves at the band's edge are not sent at all.
+    # A force next to the wall, which stays at the left, sends hardly any waves at the edge of the band.
     at_wall = case({"cells": 300, "absorbing": {"cells": 20, "strength": 200.0}}, BURST)
     assert stated(at_wall) < 0.2 * fractions[0]
 
@@ -179,7 +195,7 @@ def test_where_no_end_keeps_the_bound_the_message_names_the_remedy():
 
 
 def test_drives_without_an_end_or_a_sine():
-    """A sine that goes on is judged at its frequency, a force that is held by the transform of a step."""
+    """The reflection of a lasting sine is that at its frequency; that of a held force uses the transform of a step."""
     end = {"cells": 90, "absorbing": {"cells": 20, "strength": 200.0}}
     sine = case(end, {"waveform": "harmonic", "frequency": 1023.0})
     source, sections = source_and_sections(sine)
@@ -195,7 +211,7 @@ def test_drives_without_an_end_or_a_sine():
     omegas = np.array([50.0, 300.0])
     times = np.linspace(0, waveform.settled, 20001)
     sums = trapezoid(waveform.force(times) * np.exp(-1j * omegas[:, None] * times), times)
-    # The transform of a constant from there on, in the limit of a slow decay.
+    # The rest is constant; its transform is that of a decaying force as the decay tends to zero.
     tail = np.exp(-1j * omegas * waveform.settled) / (1j * omegas)
     assert waveform.spectrum(omegas) == pytest.approx(sums + tail, rel=1e-5)
     assert 0 < reflected([held], sections) < 1

@@ -1,7 +1,7 @@
-"""An elastic law that a module registers is the same in every room that asks for a contact's force.
+"""An elastic law that a user's module registers acts alike in every part of the package that computes contact forces.
 
-The module is that of the manual's chapter *extend*: hardening stops F = k x (1 + b x^2), compared with formulas that
-are written out in ``another_law``.
+The module is the one in the manual's chapter *extend*: hardening stops with F = k x (1 + b x^2). Results are compared
+with formulas that are written out in ``another_law``.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ def test_both_engines_follow_the_same_trajectory(found):
     assert found["episodes"][0] == found["episodes"][1] > 4
     assert found["engines"] < 1e-6
     assert max(found["ledgers"]) < 1e-7
-    # The run differs from that with a linear stop of the same stiffness.
+    # The hardening matters: a run with linear stops of the same stiffness differs.
     assert found["hardens"] > 1e-3
 
 
-# Harmonics that the condensed method leaves out are 1e-4 of the motion.
+# The condensed method may leave out harmonics of 1e-4 of the motion: its error is larger than that of shooting.
 @pytest.mark.parametrize(("method", "error"), [("shooting", 1e-8), ("condensed", 1e-5)])
 def test_normal_modes_have_the_period_of_the_energy_integral(found, method, error):
     assert found["reached"][method] > 0.5

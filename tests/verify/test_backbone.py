@@ -23,7 +23,7 @@ INITIATION = 0.6
 
 
 def branch(exponent: float = EXPONENT, count: int = 120) -> xr.Dataset:
-    """A branch that is linear up to GRAZING, has a peak of its slope behind it and then a power law."""
+    """A branch that is linear up to the energy GRAZING; its slope is FACTOR energy^``exponent`` beyond."""
     energy = GRAZING * np.concatenate([np.geomspace(0.01, 1.0, 10), np.geomspace(1.001, 1e7, count)])
     region = np.select([energy <= GRAZING, energy < 2 * GRAZING, energy < 1e4 * GRAZING], [1, 2, 3], 4)
     slope = np.where(region == 1, 0.0, FACTOR * energy**exponent)
@@ -34,14 +34,17 @@ def branch(exponent: float = EXPONENT, count: int = 120) -> xr.Dataset:
 
 
 def exact_transfer(divisor: float, floor: float, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Work of the drive, in the lattice's own energies, and the transfer that follows the branch exactly."""
+    """The work of the drive (J) and the transfer slope/``divisor`` + ``floor``, which follows the branch exactly.
+
+    The work is an energy of the lattice: the branch grazes at GRAZING, the lattice touches at the work INITIATION.
+    """
     work = INITIATION * np.geomspace(1e-3, 1e6, count)
     transfer = FACTOR * (work * GRAZING / INITIATION) ** EXPONENT / divisor + floor
     return work, np.where(work < INITIATION, floor, transfer)
 
 
 def test_energies_align_at_grazing(tmp_path):
-    """The energy at which the first site is touched is that at which the branch grazes."""
+    """The work at which the site nearest to the drive first touches corresponds to the energy of the grazing branch."""
     envelope = np.zeros(20)
     envelope[16] = 2e-4
     envelope[8] = 1e-4
@@ -51,7 +54,8 @@ def test_energies_align_at_grazing(tmp_path):
 
     initiation = initiation_of(tmp_path, case)
 
-    # Of 1 N cell 17 moves by a ninth of its clearance, cell 9 by a twentieth; the site met first is the nearer one.
+    # A force of 1 N moves cell 17 by a ninth of its clearance and cell 9 by a twentieth: contact begins at 9 N. The
+    # initiation is at 20 N, where the site that the wave meets first, cell 9, is touched.
     assert initiation.amplitude == pytest.approx(20.0, rel=1e-14)
     assert initiation.onset == pytest.approx(9.0, rel=1e-14)
     assert initiation.energy == pytest.approx(1.5e-3 * 20**2, rel=1e-14)
@@ -72,7 +76,7 @@ def linear_record(folder, *overrides: str) -> Case:
 
 
 def test_the_nearer_stop_is_touched_first(tmp_path):
-    """A wave has both signs: of two clearances the lesser one is met."""
+    """A wave moves a mass in both directions, so that contact begins at the smaller one of two clearances."""
     case = linear_record(tmp_path, "contacts.side='both'", "contacts.clearance=2e-3", "contacts.clearance_minus=1e-3")
     assert initiation_of(tmp_path, case).onset == pytest.approx(1e-3 / 2e-4, rel=1e-14)
 
@@ -85,7 +89,7 @@ def test_the_nearer_stop_is_touched_first(tmp_path):
     ],
 )
 def test_contacts_without_a_first_amplitude_have_no_initiation(tmp_path, override, reason):
-    """Contacts that act at any amplitude, and motions that do not grow with it."""
+    """Contacts that touch at rest act at any amplitude; a second force makes the motion not proportional to it."""
     case = linear_record(tmp_path, "contacts.side='plus'", "contacts.restitution=1.0", override)
     with pytest.raises(ValueError, match=reason):
         initiation_of(tmp_path, case)
@@ -94,7 +98,7 @@ def test_contacts_without_a_first_amplitude_have_no_initiation(tmp_path, overrid
 @settings(deadline=None, max_examples=25)
 @given(st.floats(1e2, 1e6), st.floats(1e-3, 1e3), st.floats(-2.0, -0.3), st.integers(0, 99))
 def test_power_laws_are_found(divisor, initiation, exponent, seed):
-    """A transfer that is slope/divisor gives back divisor and exponent, whatever the lattice's energies and order."""
+    """The fit to a transfer slope/divisor finds divisor and exponent, for any initiation energy and order of points."""
     slope = branch(exponent)
     work = np.random.default_rng(seed).permutation(initiation * np.geomspace(1e-2, 1e6, 50))
     law = (work * GRAZING / initiation) ** exponent * FACTOR / divisor
@@ -126,7 +130,7 @@ def test_divisor_is_the_least_squares_one():
     slope = branch()
     floor = 1e-3
     work, transfer = exact_transfer(4e3, floor)
-    # Off the law, so that no divisor meets all points.
+    # The points are moved off the law, so that no divisor fits all of them.
     transfer = transfer * np.exp(0.2 * np.sin(np.arange(len(transfer))))
 
     found = align(work, transfer, INITIATION, floor, slope)
@@ -172,7 +176,7 @@ def test_too_few_points_have_no_law_and_no_region_three_is_an_error():
 
 
 def write_branch(folder, slope, kinds=None):
-    """``branch-out-of-phase.h5`` with what the comparison reads of it."""
+    """Write ``branch-out-of-phase.h5`` with the quantities that the comparison reads; returns the file's path."""
     folder.mkdir(exist_ok=True)
     if kinds is None:
         kinds = np.zeros(slope.sizes["point"], np.int8)

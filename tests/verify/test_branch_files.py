@@ -51,7 +51,7 @@ def table_of(branch: Branch) -> str:
 def follow(folder: Path, listener=None, stop=None, resume=False, saves_all=False, **nnm) -> Branch:
     """Follow the out-of-phase branch of linear stops as a case asks for it; ``nnm`` updates its table [nnm].
 
-    One that ``saves_all`` is written after every point, which takes no test of the clock.
+    With ``saves_all`` the branch is written after every point, whatever the clock says.
     """
     folder.mkdir(exist_ok=True)
     table = {
@@ -150,10 +150,10 @@ def test_a_picture_is_drawn_from_the_file(branch, tmp_path):
 
 
 def test_orbits_have_the_energies_that_are_asked_for(tmp_path):
-    """Between its two folds, 0.0264 and 0.02934 J, the branch passes an energy three times."""
+    """A branch samples its orbits at the energies asked for: three orbits between its folds at 0.0264 and 0.02934 J."""
     branch = follow(tmp_path / "a", energy=[0.0, 0.05], orbits_at=[0.028, 0.0316, 9.0], locate=False)
 
-    # Those asked for are appended to the orbits that every branch samples.
+    # The orbits asked for come after the orbits that every branch samples.
     energies = branch.extra["orbits/energy"].values[-4:]
     periods = branch.extra["orbits/period"].values[-4:]
     assert energies == pytest.approx([0.028] * 3 + [0.0316], rel=1e-12)
@@ -163,7 +163,7 @@ def test_orbits_have_the_energies_that_are_asked_for(tmp_path):
 
 @pytest.mark.slow
 def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(tmp_path):
-    """A branch that was stopped in either half, and resumed each time, leaves the files of one that was not."""
+    """A branch that is stopped and resumed in each of its halves leaves the files of one that is never stopped."""
     nnm = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.05]}
     nnm |= {"switch": ["period-doubling"], "switch_points": 3}
     parts = tmp_path / "parts"
@@ -201,7 +201,7 @@ def test_both_halves_of_a_branch_are_stopped_saved_and_resumed_to_the_same_bits(
 
 
 class FailBelow:
-    """A listener that fails at one point below the start, with an exception of that kind."""
+    """A listener that raises ``error`` at point ``index`` of the part of a branch below its start."""
 
     def __init__(self, index: int, error: BaseException) -> None:
         self.index = index
@@ -213,12 +213,12 @@ class FailBelow:
 
 
 BOTH = {"direction": "both", "start_energy": 0.029, "energy": [0.01, 0.0295], "locate": False}
-# Without contact above the start either, and with a few points there.
+# A branch that stays without contact above its start too, and has only a few points there.
 SHORT = BOTH | {"energy": [0.015, 0.0291]}
 
 
 def files_of(folder: Path) -> dict[str, str]:
-    """The branches in a folder as text: ending, findings and table."""
+    """The files of branches in a folder by name: the text of tables, and ending, findings and table of HDF5 files."""
     found = {}
     for path in sorted(folder.glob("branch-*")):
         if path.suffix == ".h5":
@@ -230,10 +230,10 @@ def files_of(folder: Path) -> dict[str, str]:
 
 
 def test_a_branch_whose_lower_part_fails_keeps_it_and_its_upper_part(tmp_path):
-    """Both parts are in the file, which says what failed and is not complete."""
+    """The file of a branch whose lower part failed has both parts, says what failed and is not complete."""
     failed = follow(tmp_path, FailBelow(3, FlowError("the flow ends here")), **BOTH)
 
-    # From the last point below the start over the start itself to the end above it.
+    # Points go from the last one below the start through the start itself to the end above it.
     assert [point.index for point in failed.points[:5]] == [3, 2, 1, 0, 1]
     assert failed.points[0].energy < 0.029
     assert failed.points[-1].energy > 0.0295
@@ -252,9 +252,10 @@ def test_a_branch_whose_lower_part_fails_keeps_it_and_its_upper_part(tmp_path):
 
 
 def test_a_lower_part_that_failed_is_tried_again_from_its_last_point(tmp_path):
-    """A failure that comes back is told again, with the points up to it; without it the branch is as if never failed.
+    """A resumed branch goes on from the last point of the part that failed, and keeps its complete upper part.
 
-    An upper part that was complete is not followed again.
+    A second failure is reported like the first, with the points up to it. A try without a failure leaves the branch
+    that never failed.
     """
     whole = follow(tmp_path / "whole", **BOTH)
     parts = tmp_path / "parts"
@@ -276,7 +277,7 @@ def test_a_lower_part_that_failed_is_tried_again_from_its_last_point(tmp_path):
 
 
 def test_both_parts_that_failed_are_tried_again(tmp_path):
-    """The part below the start first, then the part above it, to the same bits as of a branch that never failed."""
+    """A resumed branch tries its part below the start and then that above it, and becomes one that never failed."""
     follow(tmp_path / "whole", **BOTH)
     parts = tmp_path / "parts"
 
@@ -294,13 +295,13 @@ def test_both_parts_that_failed_are_tried_again(tmp_path):
 
 @pytest.mark.parametrize("killed", [False, True])
 def test_a_lower_part_that_is_tried_again_is_stopped_and_resumed(tmp_path, killed):
-    """On request or by a kill: what has been tried again is kept, and the end is that of a branch that never failed."""
+    """A second try that a request or a kill stops keeps its points, and resumes to the branch that never failed."""
     follow(tmp_path / "whole", **SHORT)
     parts = tmp_path / "parts"
     follow(parts, FailBelow(3, FlowError("the flow ends here")), **SHORT)
 
     if killed:
-        # Any other exception than a method's ends the command wherever it is, as a kill does.
+        # An exception that is no failure of the method ends the command wherever it is, as a kill does.
         with pytest.raises(KeyboardInterrupt):
             follow(parts, FailBelow(6, KeyboardInterrupt()), resume=True, saves_all=True, **SHORT)
     else:
@@ -323,7 +324,7 @@ def test_a_lower_part_that_is_tried_again_is_stopped_and_resumed(tmp_path, kille
 
 
 def test_a_kill_after_the_lower_part_has_ended_leaves_it_as_it_is(tmp_path):
-    """It is not followed again, least of all beyond its end."""
+    """After a kill in the upper part, the lower part, which had ended, is neither followed again nor extended."""
     follow(tmp_path / "whole", **SHORT)
     parts = tmp_path / "parts"
 
@@ -341,7 +342,7 @@ def test_a_kill_after_the_lower_part_has_ended_leaves_it_as_it_is(tmp_path):
 
 
 def test_a_kill_above_a_lower_part_that_failed_costs_no_point_of_it(tmp_path):
-    """The part below goes on from the last point that it had, though it was not due to be written there."""
+    """The lower part goes on from the point at which it failed, though no write was due there when the kill came."""
     follow(tmp_path / "whole", **BOTH)
     parts = tmp_path / "parts"
 
@@ -353,7 +354,7 @@ def test_a_kill_above_a_lower_part_that_failed_costs_no_point_of_it(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         follow(parts, fail_below_and_kill_above, saves_all=True, **BOTH)
-    # The branch has been written with its part below, whose own files are still there.
+    # The branch has been written together with its lower part, whose own files still exist.
     assert {f"{NAME}-down.h5", f"{NAME}.h5"} <= set(files_of(parts))
     followed = []
     follow(parts, lambda branch, point: followed.append((branch.name, point.index)), resume=True, **BOTH)
@@ -363,7 +364,7 @@ def test_a_kill_above_a_lower_part_that_failed_costs_no_point_of_it(tmp_path):
 
 
 def test_a_step_whose_point_cannot_be_assessed_is_repeated_as_a_whole(tmp_path, monkeypatch):
-    """Special points of the step, and what was not located in it, are then there once."""
+    """A resumed branch repeats the step of a point that failed: its special points and findings appear once."""
     nnm = {"start_energy": 0.029, "energy": [0.0, 0.0291]}
     assess = ShootingMethod.assess
 
@@ -395,7 +396,7 @@ def test_a_step_whose_point_cannot_be_assessed_is_repeated_as_a_whole(tmp_path, 
 
 
 def test_a_kill_at_the_end_of_a_branch_does_not_lengthen_it(tmp_path, monkeypatch):
-    """Its last point is written only with the word that it is complete."""
+    """A branch's last point is written together with the mark that it is complete, so that a kill before adds none."""
     nnm = {"start_energy": 0.029, "energy": [0.0, 0.0291], "locate": False}
     follow(tmp_path / "whole", **nnm)
     parts = tmp_path / "parts"
@@ -415,9 +416,10 @@ def test_a_kill_at_the_end_of_a_branch_does_not_lengthen_it(tmp_path, monkeypatc
 
 @pytest.fixture
 def marked_points(monkeypatch):
-    """Special points where there are none: after the second and the fifth point of each part of a branch.
+    """Mark the second and the fifth point of each part of a branch as period doublings.
 
-    Linear motions have no special points: regular ones stand for them, and what crosses there is the branch itself.
+    Linear motions have no special points: regular points stand for them, and the branch that crosses there is the
+    branch itself.
     """
 
     def locate(problem, left, right, **options):
@@ -438,9 +440,10 @@ CROSSING = BOTH | {"locate": True, "switch": ["period-doubling"], "switch_points
 def test_crossing_branches_follow_the_numbers_of_special_points_that_a_second_try_adds(
     tmp_path, marked_points, stopped
 ):
-    """Special points are numbered from the far end below the start on: a longer part below shifts the numbers.
+    """Crossing branches are named anew when a second try lengthens the lower part and shifts special points' numbers.
 
-    That holds for a second try that is stopped after the special point, too.
+    Special points are numbered from the far end of the part below the start. A second try that is stopped after the
+    special point gives the same names.
     """
     parts = tmp_path / "parts"
     follow(tmp_path / "whole", **CROSSING)
@@ -456,7 +459,7 @@ def test_crossing_branches_follow_the_numbers_of_special_points_that_a_second_tr
 
         half = follow(parts, stop_below, stop, resume=True, **CROSSING)
         assert half.ending.startswith("stopped")
-        # Both special points below are there, so that the last try adds none: what is wrong now stays.
+        # Both special points below the start exist already. The last try adds none, and would not mend a wrong number.
         above = [point.index for point in half.points].index(0)
         assert sum(point.kind != "regular" for point in half.points[:above]) == 2
     follow(parts, resume=True, **CROSSING)
@@ -472,9 +475,9 @@ def regular_points(branch: Branch) -> int:
 
 
 def test_a_lower_part_that_is_tried_again_leaves_the_branch_its_number_of_points(tmp_path):
-    """The points above count, too; with more of them the branch is the one that never failed."""
+    """A second try counts the points above the start towards nnm.points; with more points the branch is completed."""
     whole = follow(tmp_path / "whole", **BOTH)
-    # So that the part above takes what the failure has left.
+    # Three points lie below the start at the failure, and the part above takes the one that is left.
     points = 4
     parts = tmp_path / "parts"
     first = follow(parts, FailBelow(3, FlowError("the flow ends here")), points=points, **BOTH)
@@ -491,7 +494,7 @@ def test_a_lower_part_that_is_tried_again_leaves_the_branch_its_number_of_points
 
 
 def test_a_branch_that_has_used_up_its_points_below_its_start_goes_on_there(tmp_path):
-    """Resumed with more points it is the branch that had them from the beginning."""
+    """A branch whose points end below its start, resumed with more points, becomes the one that had them at first."""
     follow(tmp_path / "whole", **BOTH)
     parts = tmp_path / "parts"
     first = follow(parts, points=3, **BOTH)
@@ -505,7 +508,7 @@ def test_a_branch_that_has_used_up_its_points_below_its_start_goes_on_there(tmp_
 
 
 def test_a_table_that_cannot_be_written_costs_no_branch(tmp_path, monkeypatch, caplog):
-    """The branch itself is read, and not computed again."""
+    """A complete branch whose table cannot be written is read and not followed again; a warning gives the reason."""
     short = {"energy": [0.0, 0.0295], "locate": False}
     whole = follow(tmp_path, **short)
     (tmp_path / f"{NAME}.csv").unlink()

@@ -1,4 +1,4 @@
-"""Steps along a branch: their arclength, the guards that bound them, where a branch ends, crosses or stands still."""
+"""Steps along a branch: their arclength, the guards that bound them, and where a branch ends, jumps or stands still."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from vipetsc.modes.shooting.start import linear_start
 
 
 def test_steps_have_the_arclength_that_they_say(short_branch):
-    """t . (xi - xi0) = s in the chart of the point before, whose unknowns are of order one."""
+    """Each step s satisfies t . (xi - xi0) = s in the chart of the point before, whose unknowns are of order one."""
     for before, after in itertools.pairwise(short_branch.points):
         chart = Relative(reduced_model(), before.x, before.period)
         xi = chart.encode(before.x, before.period)
@@ -101,7 +101,7 @@ def in_phase_hertz(**control) -> tuple[Shooting, list[Point]]:
 
 
 def findings(problem: Shooting, points: list[Point]) -> list[str]:
-    """Return what the monitor of a growing branch says of its points."""
+    """Return what the monitor of a growing branch reports at its points."""
     monitor = BranchMonitor(problem, Guards())
     return [text for text in map(monitor.check, points) if text]
 
@@ -111,11 +111,12 @@ def turns_too_far(problem: Shooting, points: list[Point]) -> list[int]:
     return [number for number, reason in suspects(problem, points) if "turns by" in reason]
 
 
-# The tip of the in-phase Hertz branch's 3:1 tongue lies on the out-of-phase branch: a turn that the grazing chart hides
-# leads onto that. The true branch comes back from the tip, with c = 1 passed there, and no orbit repeats itself.
+# The tip of the in-phase Hertz branch's 3:1 tongue lies on the out-of-phase branch. A step too long for the turn at the
+# tip leads onto the out-of-phase branch, and the grazing chart hides that turn. The true branch comes back from the
+# tip, where it passes c = 1, and none of its orbits repeats another one.
 @pytest.mark.slow
 def test_guarded_the_in_phase_hertz_branch_comes_back_from_the_tip():
-    """With the guard on turns the branch turns at the tip, and the monitor has nothing to say."""
+    """With the guard on turns the branch turns back at the tip, and neither check reports anything."""
     problem, points = in_phase_hertz()
 
     assert max(problem.turn(a, b) for a, b in itertools.pairwise(points)) > 0.2
@@ -126,7 +127,10 @@ def test_guarded_the_in_phase_hertz_branch_comes_back_from_the_tip():
 
 @pytest.mark.slow
 def test_unguarded_the_in_phase_hertz_branch_goes_over_to_the_out_of_phase_one():
-    """Without the guard on turns the branch goes on along another one passed three times; the checks name the place."""
+    """Without the guard on turns the branch jumps to the out-of-phase one, and the checks say where.
+
+    After the jump each point is an out-of-phase orbit passed three times.
+    """
     problem, points = in_phase_hertz(guards=Guards(turn_relative=0), points=200)
 
     assert max(problem.turn(a, b) for a, b in itertools.pairwise(points)) > 0.2
@@ -136,7 +140,10 @@ def test_unguarded_the_in_phase_hertz_branch_goes_over_to_the_out_of_phase_one()
 
 
 def test_a_branch_comes_back_to_a_mode_of_a_lattice_that_is_free_to_move():
-    """The motion as a rigid body has the frequency 0, which no branch returns to."""
+    """A branch has returned to a linear mode when it has the mode's frequency and no contact.
+
+    The rigid motion of the free lattice has frequency 0, to which no branch returns.
+    """
     omega = 2 * np.pi * np.array([0.0, 3.0, 5.0])
     system = SimpleNamespace(dofs=3, linear_modes=lambda: (omega, np.eye(3)))
     monitor = BranchMonitor(SimpleNamespace(system=system), Guards())
@@ -149,7 +156,10 @@ def test_a_branch_comes_back_to_a_mode_of_a_lattice_that_is_free_to_move():
 
 @pytest.mark.slow
 def test_a_branch_that_stands_still_says_so():
-    """Newmark's rule meets contacts at the ends of steps only: at grazing its branch stands, which the monitor says."""
+    """A branch by Newmark's rule stands still at grazing, and the monitor reports it.
+
+    Newmark's rule evaluates contacts at the ends of steps only.
+    """
     monitor = BranchMonitor(Shooting(Dop853Flow(reduced_model()), MAPS["quarter"]), Guards(standstill=20))
     problem = Shooting(Newmark(reduced_model()), MAPS["quarter"])
     start = linear_start(problem, OUT_OF_PHASE, 0.0293434)

@@ -1,4 +1,4 @@
-"""Condensed branches by harmonic balance against motions that are integrated: shooting, and the whole chain."""
+"""Branches by condensed harmonic balance are compared with integrated motions: by shooting, and of a whole chain."""
 
 from __future__ import annotations
 
@@ -45,7 +45,10 @@ def test_a_branch_from_a_describing_function_is_that_of_shooting():
 
 
 def assert_orbits_of_shooting(system, problem, points) -> None:
-    """The orbit to which shooting corrects a point has the frequency of the branch at its energy, to 1e-6."""
+    """Assert that shooting corrects points of a branch to orbits with the frequency of the branch, to 1e-6.
+
+    The orbit's energy differs from the point's; the slope df/dE of the branch accounts for the difference.
+    """
     shooting = Shooting(Dop853Flow(system), MAPS["quarter"], 1e-12)
     # Every fourth point is enough, but not the first, which is a linear mode.
     for point in points[:0:-4]:
@@ -91,11 +94,11 @@ def test_the_tongues_of_the_in_phase_mode_are_followed():
 
     shooting = Shooting(Dop853Flow(system), MAPS["quarter"], 1e-12)
     resonances = []
-    # The tips, and points beyond each on its other side.
+    # The points are the tips, and one beyond each tip on the way back.
     for i in (*tips, *(tips + 4)):
         point = points[i]
         frame = shooting.relative_frame(displacement(problem, point), point.period)
-        # The orbit at the same length along the branch.
+        # Shooting looks for the orbit at the same length along the branch as the point.
         before = frame.chart.encode(displacement(problem, points[i - 1]), points[i - 1].period)
         row = frame.xi - before
         attempt = frame.solve(frame.xi, row / np.linalg.norm(row), row @ frame.xi / np.linalg.norm(row))

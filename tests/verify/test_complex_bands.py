@@ -18,7 +18,7 @@ KAPPA = 2 * np.pi * 3 / CELLS
 
 
 def damped_wave(cell: UnitCell, band: int) -> tuple[complex, np.ndarray]:
-    """The rate s in 1/s and the shape (2 dof,) of a wave, from (s^2 M + s C(kappa) + K(kappa)) u = 0."""
+    """The complex rate s in 1/s of a wave and its shape (u, s u), from (s^2 M + s C(kappa) + K(kappa)) u = 0."""
     d = cell.dofs
     inverse = np.diag(1 / np.array(cell.masses))
     system = np.zeros((2 * d, 2 * d), complex)
@@ -26,7 +26,7 @@ def damped_wave(cell: UnitCell, band: int) -> tuple[complex, np.ndarray]:
     system[d:, :d] = -inverse @ cell.stiffness_matrix(KAPPA)
     system[d:, d:] = -inverse @ cell.damping_matrix(KAPPA)
     rates, vectors = np.linalg.eig(system)
-    # Of each conjugate pair the one that turns forwards, from the lowest frequency on.
+    # Each conjugate pair counts once, by its rate with a positive imaginary part, in the order of frequencies.
     number = np.argsort(np.where(rates.imag > 0, rates.imag, np.inf))[band]
     return rates[number], vectors[:, number]
 
@@ -43,7 +43,7 @@ def test_a_bloch_wave_decays_as_the_complex_dispersion_says(band):
 
     rate, vector = damped_wave(chain.cell, band)
     shape = vector[:, None] * np.exp(1j * KAPPA * np.arange(CELLS))
-    # Until its amplitude has fallen to 1/e.
+    # The wave decays until its amplitude has fallen to 1/e.
     steps = int(1 / (-rate.real * series.interval))
     assert 25 < steps < 1500
     state = shape.real.copy()
@@ -54,5 +54,5 @@ def test_a_bloch_wave_decays_as_the_complex_dispersion_says(band):
         state, out = out, state
 
     exact = (shape * np.exp(rate * steps * series.interval)).real
-    # Thousands of steps add up their rounding.
+    # The rounding errors of up to 1500 steps add up.
     np.testing.assert_allclose(state, exact, rtol=0, atol=1e-10 * np.abs(exact).max())

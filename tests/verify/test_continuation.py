@@ -53,7 +53,7 @@ def test_without_guards_the_branch_jumps_and_the_detector_finds_it():
 
     guarded = [start, *Continuation(problem, start, NnmTable(points=150))]
     assert not list(suspects(problem, guarded))
-    # What the detector doubts is followed again with the guards on: a point left out is no jump.
+    # A suspected jump is followed again with the guards on: leaving out a point is no jump.
     assert not is_jump(problem, guarded[60], guarded[62], control)
 
 
@@ -100,7 +100,8 @@ def test_branch_switching(kind, periods, kerschen_in_phase):
     *_, far = Continuation(problem, first, NnmTable(points=10))
     assert far.residual <= 1e-11
 
-    # After a quarter period an orbit of the first branch that began at rest passes through zero, and conversely.
+    # An orbit of the first branch that begins at rest passes through zero after a quarter period, and one that begins
+    # at zero is then at rest. Orbits of the crossing branch do neither.
     arc = problem.arc(far.x, far.period)
     quarter = problem.flow.arc(arc.start, far.period / 4, far.period).end
     dofs = problem.system.dofs
@@ -109,7 +110,7 @@ def test_branch_switching(kind, periods, kerschen_in_phase):
 
 
 def test_a_crossing_branch_has_the_newton_steps_that_were_asked_for(kerschen_in_phase):
-    """Its failures name the key nnm.max_newton, which would not help otherwise."""
+    """A crossing branch inherits nnm.max_newton, the key that a failure of Newton's method advises to change."""
     old = kerschen_in_phase.problem
     patient = Shooting(old.flow, old.map, old.tolerance, max_newton=9)
     problem, _ = switch(patient, kerschen_in_phase.of_kind("symmetry-breaking")[0])
@@ -134,9 +135,9 @@ def test_a_failure_states_where_it_stopped_why_and_what_to_change():
 
 @pytest.mark.slow
 def test_contacts_change_at_grazing_points(in_phase, monkeypatch):
-    """On either side of a grazing point the contacts are those of that end; bisection finds the same points."""
+    """On either side of a grazing point an orbit has the contacts of that end of the step; bisection finds the same."""
     problem = in_phase.problem
-    # A dozen of them lie in the grazing cascade, where contacts follow each other most closely.
+    # The first dozen of such steps reaches the grazing cascade, where changes of contacts lie closest together.
     steps = [(a, b) for a, b in itertools.pairwise(in_phase.points) if a.episodes != b.episodes][:12]
 
     def grazing_points(segment_ends: list[tuple[Point, Point]]) -> list[Point]:
@@ -146,7 +147,7 @@ def test_contacts_change_at_grazing_points(in_phase, monkeypatch):
     def fail(*_, **__):
         raise ArithmeticError("this method fails")
 
-    # Points of other kinds, which are bisected, are left out where bisection fails.
+    # Without bisection only grazing points are located; those of other kinds are left out.
     with monkeypatch.context() as patch:
         patch.setattr(segments, "bracketed_root", fail)
         touching = grazing_points(steps)

@@ -22,7 +22,7 @@ KAPPA = np.linspace(0.2, 3.0, 7)
 
 
 def damped(cell, alpha=0.0, beta=0.0, extra=(0.0, 0.0, 0.0, 0.0)):
-    """``cell`` with Rayleigh damping, and more in its springs."""
+    """``cell`` with Rayleigh damping alpha M + beta K, and ``extra`` dashpots (N s/m) parallel to its springs."""
     springs = tuple(replace(s, damping=beta * s.stiffness + c) for s, c in zip(cell.springs, extra, strict=False))
     return replace(cell, springs=springs, grounding=tuple(alpha * m for m in cell.masses))
 
@@ -58,7 +58,7 @@ def test_waves_of_a_real_frequency_solve_the_bloch_equation(cell):
 
 
 def test_overdamped_waves_are_the_slow_ones():
-    """Of s^2 + alpha s + omega^2 = 0 with alpha > 2 omega the root nearer to zero is given."""
+    """The rate of an overdamped wave is the root of s^2 + alpha s + omega^2 = 0, alpha > 2 omega, nearer to zero."""
     alpha = 1e5
     omega = bloch(diatomic(), 1.0).frequency
 
@@ -71,7 +71,10 @@ def test_overdamped_waves_are_the_slow_ones():
 
 @pytest.mark.parametrize("number", [1, 3])
 def test_bloch_waves_of_a_damped_ring_decay_with_their_complex_rates(number):
-    """Each wave u = Re(phi exp(i kappa n + s t)) of a cell whose damping is not proportional, by ``ts``, to 1e-8."""
+    """The engine ``ts`` moves each wave as u = Re(phi exp(i kappa n + s t)), to 1e-8.
+
+    The damping of the cell is not proportional, so that the shapes phi are complex.
+    """
     cells = 8
     half = 4 * cells
     cell = damped(four_band(), 30.0, 1e-5, (0.3, 0.0, 0.1, 0.02))
@@ -100,10 +103,10 @@ def test_bloch_waves_of_a_damped_ring_decay_with_their_complex_rates(number):
 
 @pytest.mark.parametrize("ends", ["fixed", "free"])
 def test_ends_without_dashpots_send_all_back(ends):
-    """However cells differ, a lattice without dashpots reflects all; in a gap there is no wave to reflect."""
+    """A lattice without dashpots reflects all energy, however its cells differ; in a gap the reflection is NaN."""
     omega = max_group_velocity(four_band(), 2)[1]
     masses = np.tile(four_band().masses, (12, 1))
-    # Heavier cells in the middle reflect by themselves: the sum must still be all.
+    # Heavier cells in the middle reflect some waves before the end does: together they must reflect all.
     masses[4:8] *= 1.3
     chain = Chain(four_band(), 12, ends, variation=Variation(masses))
 
@@ -113,21 +116,21 @@ def test_ends_without_dashpots_send_all_back(ends):
 
 
 def test_an_absorbing_end_reflects_alike_on_either_side():
-    """A diatomic cell is its own mirror image: so is the lattice, with the end on the other side."""
+    """A mirrored end reflects as much as the original, since a diatomic cell is its own mirror image."""
     omega = max_group_velocity(diatomic(), 2)[1]
     right = absorber(diatomic(), "fixed", 10, 400.0)
     # The same dashpots in the opposite order.
     left = replace(right, variation=Variation(grounding=right.variation.grounding[::-1]))
     computed = reflection(right, omega, 10)
-    # Neither nothing nor all, either of which a wrong reflection might give.
+    # A wrong reflection could be 0 or 1 on either side: this one is neither.
     assert 1e-6 < computed < 0.9
     assert reflection(left, omega, 10, "left") == pytest.approx(computed, rel=1e-9)
 
 
 def test_a_packet_comes_back_as_computed():
-    """An end that absorbs little leaves the computed part of a packet's energy.
+    """A weak absorbing end leaves the predicted fraction of a packet's energy, within ten per cent.
 
-    A packet has waves of several frequencies, which the end reflects differently: within ten per cent.
+    The prediction is that of the packet's middle frequency; the end reflects its other frequencies differently.
     """
     cell = four_band("calibrated")
     kappa = 1.8
@@ -142,7 +145,7 @@ def test_a_packet_comes_back_as_computed():
     energy = (run["energy/kinetic"] + run["energy/spring"]).values
     omega = float(bloch(cell, kappa).frequency[1])
     computed = reflection(absorber(cell, "fixed", 10, 400.0), omega, 10)
-    # Large enough to be measured in the packet, small enough for a single reflection.
+    # The reflection is large enough to be measured, and small enough for the end to absorb most of the packet.
     assert 1e-3 < computed < 0.1
     assert energy[-1] / energy[0] == pytest.approx(computed, rel=0.1)
 
@@ -187,9 +190,9 @@ def test_profiles_defects_and_scatter_of_a_case():
     assert varied.stiffness[[0, -1], 0] == pytest.approx([2e4, 3e4])
     assert varied.damping[:, 3] == pytest.approx(0.1)
     assert varied.grounding == pytest.approx(5.0 * varied.masses)
-    # As much as the fourth one's, but each quantity is scattered by itself.
+    # Masses 1 and 4 are scattered by the same deviation, but by draws of their own.
     assert np.all(varied.masses[:, 0] != varied.masses[:, 3])
-    # A deviation of 0.02 from 24 draws.
+    # The bounds are wide enough for the deviation of 24 draws from a distribution of deviation 0.02.
     assert 0.005 < np.std(varied.masses[:, 0] / cell.masses[0]) < 0.04
     assert Case.from_toml(case.to_toml()) == case
     assert case.model().chain == small_case(lattice=lattice, disorder=scattered).model().chain
@@ -214,7 +217,7 @@ def test_bad_profiles_are_refused_by_name():
 
 
 def test_what_differs_stands_in_the_file():
-    """A run has the quantities that differ, of the cells that it records."""
+    """A run's file holds the quantities that differ between cells, for the cells that it records."""
     case = small_case(
         lattice={"profiles": {"masses[2]": {"cells": [3], "factor": 2.0}}},
         output={"window": [2, 4]},
@@ -227,14 +230,14 @@ def test_what_differs_stands_in_the_file():
 
 
 def lossy(cell, loss):
-    """``cell`` with dashpots fitted to a ``loss`` by band."""
+    """``cell`` with dashpots fitted to a ``loss``, a table of loss factors by band number."""
     grounding, springs = fitted_dashpots(cell, tuple(loss.items()))
     return replace(damped(cell, extra=springs.tolist()), grounding=tuple(grounding.tolist()))
 
 
 @pytest.mark.parametrize("loss", [{2: 0.02}, {2: 0.002, 4: 0.003}, {1: 0.001, 2: 0.001, 3: 0.001, 4: 0.001}])
 def test_dashpots_fitted_to_a_loss_are_the_best_by_the_complex_dispersion(loss):
-    """No dashpot that is 3 % larger or smaller comes nearer to the loss, and none is negative."""
+    """Fitted dashpots are not negative, and no change of one by 3 % of the largest comes nearer to the loss."""
     cell = four_band("calibrated")
     bands = np.array([*loss]) - 1
 
@@ -249,11 +252,11 @@ def test_dashpots_fitted_to_a_loss_are_the_best_by_the_complex_dispersion(loss):
     dashpots = np.array([fitted.grounding, [spring.damping for spring in fitted.springs]])
     assert dashpots.min() >= 0
     if len(loss) == 1:
-        # Of one band the loss can be met everywhere.
+        # The loss of a single band can be met at all wavenumbers.
         assert ratios(*dashpots) == pytest.approx(1.0, abs=4e-3)
 
     least = misfit(*dashpots)
-    # Every dashpot alone, in both directions: a least value of all of them is one of each.
+    # A minimum over all dashpots is a minimum in each: every one is changed alone, in both directions.
     for place in np.ndindex(dashpots.shape):
         for step in (0.03, -0.03):
             changed = dashpots.copy()

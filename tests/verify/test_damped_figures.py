@@ -1,4 +1,4 @@
-"""Pictures of a laboratory's lattices: what dashpots take, how waves decay, impacts of many sites."""
+"""Figures of a laboratory's lattices: the losses of dashpots, the decay of waves, impacts at many sites."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vipetsc.lattice import four_band, max_group_velocity
 
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_the_ledger_has_the_dashpots(engine, tmp_path):
-    """Both engines compute what dashpots lose, so that the balance has a residual."""
+    """The ledger of either engine shows the loss in dashpots, and its balance has a residual below 1e-8."""
     damping = {"mass": 10.0, "stiffness": 1e-5}
     run = run_of(small_case(lattice={"damping": damping}, time={"engine": engine, "end": 0.02}))
 
@@ -35,7 +35,7 @@ def test_the_ledger_has_the_dashpots(engine, tmp_path):
 
 
 def test_bands_of_a_damped_cell_show_its_decay():
-    """A third panel has the decay of waves over cells, zeta omega/v_g in a band and much more in a gap."""
+    """A third panel shows the decay of waves per cell, zeta omega/v_g in a band and much more in a gap."""
     cell = small_case(lattice={"damping": {"loss": {"2": 0.02}}}).lattice.unit_cell()
     *_, decay = runs.bands(cell, 1000.0).axes
     rates = np.asarray(decay.lines[0].get_xdata())
@@ -48,12 +48,12 @@ def test_bands_of_a_damped_cell_show_its_decay():
     in_gap = rates[np.argmin(np.abs(omega - 0.65))]
     assert in_gap > 20 * in_band
 
-    # Without damping there is none to show.
+    # An undamped cell has no third panel.
     assert len(runs.bands(four_band(), 1000.0).axes) == 2
 
 
 def impacts_of(sites: int, episodes: int, loss: float = 0.0) -> xr.Dataset:
-    """A log of impacts that come to one site after the other, on alternating sides, ever faster."""
+    """A log of ``episodes`` impacts at one of ``sites`` after the other, on alternating sides, with growing speeds."""
     number = np.arange(episodes)
     logged = {"site": number % sites + 1, "side": np.where(number % 2, 1, -1), "onset": (number + 0.5) / episodes}
     logged |= {"approach_velocity": 1.0 + number, "loss": np.full(episodes, loss)}
@@ -75,7 +75,7 @@ def test_impacts_that_markers_do_not_distinguish_are_a_map():
     assert largest.shape == (59, impact_panels.MAP_COLUMNS)
     assert not many[0].collections
 
-    # Episode 4000 is one of site 48, as is number 3941 in the same column: the faster one is shown.
+    # Episodes 3941 and 4000 are both of site 48 and in the same column of the map, which shows the faster one.
     episode = 4000
     column = int((episode + 0.5) / 35_400 * impact_panels.MAP_COLUMNS)
     assert largest[episode % 59, column] == 1.0 + episode
@@ -90,7 +90,7 @@ def test_impacts_that_markers_do_not_distinguish_are_a_map():
 
 
 def test_contacts_that_touch_from_the_beginning_show_their_indentation():
-    """Of three beads the second goes towards the third by 2e-6 m, and comes apart from the first."""
+    """The second of three beads moves by 2e-6 m towards the third, which it indents, and comes apart from the first."""
     table = {
         "lattice": {"cells": 3, "ends": "free", "cell": {"masses": [1e-3]}},
         "drive": {"frequency": 1e3},

@@ -1,4 +1,4 @@
-"""Right-hand side, powers and ledger of lattices with dashpots and cells that differ."""
+"""The right-hand side, powers and energy ledger of lattices with dashpots and cells that differ."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ SITE = 4
 
 
 def damped_case(**sections) -> Case:
-    """A small lattice of about 1 % damping."""
+    """A small lattice whose damping ratio is about 1 %."""
     lattice = {"damping": {"mass": 10.0, "stiffness": 1e-5}} | sections.pop("lattice", {})
     return small_case(lattice=lattice, **sections)
 
 
 def varied_model(ends: str, has_dashpots: bool):
-    """A lattice whose cells all differ, with one site, driven at the second mass of DRIVEN."""
+    """A lattice whose cells all differ, with a contact in cell SITE and a force on the second mass of cell DRIVEN."""
     sections = {"lattice": {"cells": CELLS}, "contacts": {"sites": [SITE]}, "drive": {"cell": DRIVEN, "mass": 2}}
     chain = replace(scattered_chain(ends), sites=(SITE - 1,), clearances=(1e-5,))
     if not has_dashpots:
@@ -44,7 +44,10 @@ def varied_model(ends: str, has_dashpots: bool):
 @ENDS
 @pytest.mark.parametrize("has_dashpots", [True, False])
 def test_rates_and_energies_are_those_of_the_equations(ends, has_dashpots):
-    """At a random state with a closed contact M u'' = -K u - C u' + forces, and energies are their quadratic forms."""
+    """At a random state with a closed contact the engine computes M u'' = -K u - C u' + forces, powers and energies.
+
+    The energies are the quadratic forms u'^T M u'/2 and u^T K u/2; the power lost in dashpots is u'^T C u'.
+    """
     model = varied_model(ends, has_dashpots)
     chain = model.chain
     masses = chain.variation.masses
@@ -54,7 +57,7 @@ def test_rates_and_energies_are_those_of_the_equations(ends, has_dashpots):
     rng = np.random.default_rng(5)
     u = 1e-5 * rng.normal(size=masses.shape)
     v = 1e-2 * rng.normal(size=masses.shape)
-    # An indentation of 2e-5 m.
+    # w = 3e-5 m indents the stop, whose clearance is 1e-5 m, by 2e-5 m.
     u[SITE - 1, host] = -2e-5
     u[SITE - 1, resonator] = 1e-5
     lost = 1e-3 * rng.uniform(size=CELLS * has_dashpots)
@@ -65,7 +68,7 @@ def test_rates_and_energies_are_those_of_the_equations(ends, has_dashpots):
     sites["mode"][0] = CLOSED
     sites["clearance"][0] = 1e-5
     sites["approach"][0] = 0.02
-    # Displacements, velocities, energies lost in dashpots, work, energy lost at the site.
+    # The state holds displacements, velocities, energies lost in dashpots, the work, and the energy lost at the site.
     engine.state.array[:] = np.concatenate([u.T.ravel(), v.T.ravel(), lost, [0.25], [0.5]])
     rates = engine.state.duplicate()
     t = 0.3 * model.drive.duration
@@ -104,10 +107,10 @@ def test_rates_and_energies_are_those_of_the_equations(ends, has_dashpots):
 
 
 def test_cells_that_do_not_differ_give_the_bits_of_those_alike():
-    """Tables by cell give the same rate of all cells but the one that differs, to the last bit."""
+    """Equal cells have the same rates, to the last bit, whether or not coefficients are stored for each cell."""
     model = small_case().model()
     masses = model.chain.coefficients(0, 24).masses.copy()
-    # Not a bit of the others, but tables of its own for each cell.
+    # One mass that differs by rounding makes the engine store coefficients for each cell.
     masses[0, 0] *= 1 + 1e-15
     differing = replace(model.chain, variation=Variation(masses))
 

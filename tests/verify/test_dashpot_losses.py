@@ -1,4 +1,4 @@
-"""What dashpots dissipate by exact steps: against matrix exponentials, SciPy's integrator, and the energy balance."""
+"""The energy that dashpots dissipate in exact steps, against matrix exponentials, SciPy and the energy balance."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from vipetsc.lattice import Chain, Variation
 
 DAMPING = {"mass": 10.0, "stiffness": 1e-5}
 CELLS = 18
-# A dashpot of each kind, in a few cells and in a row of cells.
 EXAMPLES = Path(__file__).parents[2] / "runs" / "examples"
+# Dashpots between masses and to the ground, in single cells and in two neighbouring ones.
 PROFILES = {"springs[2].damping": {"cells": [7, 8, 15], "value": 0.4}, "grounding[1]": {"cells": [3, 6], "value": 0.7}}
 
 
 def long_chain(ends: str) -> Chain:
-    """A damped four-band lattice of CELLS cells, every mass, spring and dashpot of which is another."""
-    # Three short lattices, one after the other: no two cells are equal.
+    """A damped four-band lattice of CELLS cells, all of whose masses, springs and dashpots differ."""
+    # Three short scattered lattices stand in a row, so that no two cells are equal.
     parts = [scattered_chain(ends, seed).variation for seed in (1, 2, 3)]
     arrays = {name: np.concatenate([dict(part.items())[name] for part in parts]) for name, _ in parts[0].items()}
     return replace(scattered_chain(ends), cells=CELLS, variation=Variation(**arrays))
@@ -39,7 +39,10 @@ def long_chain(ends: str) -> Chain:
 
 @ENDS
 def test_the_loss_of_free_motion_is_that_of_matrix_exponentials(ends):
-    """From any state a step loses the integral of v^T C v, v by the exponential of the whole lattice's matrix."""
+    """Over one sample interval from a random state, dashpots take the integral of v^T C v.
+
+    The velocities v(t) are given by the exponential of the whole lattice's matrix.
+    """
     model = small_case(lattice={"cells": CELLS}, contacts={"sites": []}, drive={"amplitude": 1e-9}).model()
     model = replace(model, chain=long_chain(ends))
     layout = Layout(model, MPI.COMM_SELF, dashpots=True)
@@ -50,18 +53,18 @@ def test_the_loss_of_free_motion_is_that_of_matrix_exponentials(ends):
     c = model.chain.damping_rows(0, CELLS).toarray()
 
     rng = np.random.default_rng(4)
-    # Of the sizes of a wave of about 1 krad/s, so that both count in the loss.
+    # Velocities are 1000/s times the displacements, as in a wave of 1 krad/s, so that both matter to the loss.
     u = 1e-5 * rng.normal(size=n)
     v = 1e-2 * rng.normal(size=n)
     cells = np.hstack([u.reshape(CELLS, -1), v.reshape(CELLS, -1)])
     engine.begin(cells, np.zeros((0, 2)), 0.0)
-    # To the sample before the number: one interval.
+    # A goal of 1 lets the engine advance by one sample interval.
     engine.fill(unrecorded_samples(model, layout, goal=1))
     lost = engine.state.array[2 * n : 2 * n + CELLS].sum()
     engine.destroy()
 
     a = np.block([[np.zeros((n, n)), np.eye(n)], [-k / masses[:, None], -c / masses[:, None]]])
-    # Exact for polynomials up to degree 31, far more than the motion needs within an interval.
+    # Gauss's rule with 16 nodes is exact for polynomials up to degree 31, far more than the motion in it needs.
     nodes, weights = leggauss(16)
     expected = 0.0
     for x, weight in zip(nodes, weights, strict=True):
@@ -72,7 +75,7 @@ def test_the_loss_of_free_motion_is_that_of_matrix_exponentials(ends):
 
 @pytest.mark.parametrize("sample_interval", [2e-4, 8e-4])
 def test_the_loss_of_a_driven_lattice_with_stops_is_that_of_scipy(sample_interval):
-    """Two sites side by side, Hertz's law without loss: the integral of v^T C v along SciPy's trajectory."""
+    """The loss is the integral of v^T C v along SciPy's trajectory, with lossless Hertz stops in two adjacent cells."""
     case = small_case(
         lattice={"cells": 10, "damping": DAMPING},
         contacts={"sites": [4, 5], "restitution": 1.0, "clearance": 1e-4},
@@ -104,7 +107,7 @@ def test_the_loss_of_a_driven_lattice_with_stops_is_that_of_scipy(sample_interva
 
     lattice = ScipyLattice(chain.masses(), chain.stiffness_rows(0, 10).toarray(), damping, stops, force)
     end = float(run["time"][-1])
-    # Simpson's rule leaves 1e-9 of the integral at this spacing.
+    # The error of Simpson's rule is 1e-9 of the integral at this spacing.
     times = np.linspace(0.0, end, 20_001)
     motion, impacts = lattice.motion(times, np.zeros(10 * d), np.zeros(10 * d), 0.0)
     expected = simpson(np.einsum("ti,ij,tj->t", motion[1], damping, motion[1]), x=times)
@@ -134,7 +137,10 @@ LATTICES = {
 @pytest.mark.parametrize("sample_interval", [2e-4, 8e-4])
 @pytest.mark.parametrize("name", LATTICES)
 def test_the_energy_balance_closes_by_terms_computed_apart(name, sample_interval):
-    """Short steps and steps in which sites feel one another; contacts that dissipate, too."""
+    """The work is the sum of stored and dissipated energies, each computed by itself, also with lossy contacts.
+
+    The longer interval has steps within which waves travel from one contact site to another.
+    """
     sections = {key: dict(value) for key, value in LATTICES[name].items()}
     sections["contacts"] = {"restitution": 0.8} | sections.get("contacts", {})
     sections["time"] = {"engine": "propagator", "sample_interval": sample_interval}
@@ -147,12 +153,15 @@ def test_the_energy_balance_closes_by_terms_computed_apart(name, sample_interval
     assert statistics["dissipated_by_damping"] > 0.01 * statistics["work"]
     assert statistics["ledger_error"] < 1e-10
     lost = run["energy/dissipated_by_damping"].values
-    # A dashpot never returns energy; what is below zero is rounding.
+    # A dashpot never returns energy: negative differences are rounding errors.
     assert np.diff(lost).min() > -1e-15 * statistics["work"]
 
 
 def test_a_cell_with_an_odd_number_of_masses_counts_each_once():
-    """In so many cells that most are summed as vectors of them, masses two by two."""
+    """The loss of each of a cell's three masses is counted once.
+
+    The losses of most of the 80 cells are summed by vector operations that take masses in pairs.
+    """
     changes = ["lattice.cells=80", "lattice.damping={mass=10.0, stiffness=1e-5}", "contacts.sites=[6, 12]"]
     changes += ["contacts.clearance=1e-4", "time.engine='propagator'", "time.end=0.05"]
     _, result = simulated(Case.load(EXAMPLES / "three-mass.toml", changes))

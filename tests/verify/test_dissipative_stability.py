@@ -21,7 +21,11 @@ pytestmark = pytest.mark.parallel(1)
 
 @pytest.mark.parametrize("last", [61, 119])
 def test_determinants_do_not_depend_on_the_states_before(last):
-    """Without contact the orders beyond 48 are eliminated, with dissipation they are all kept: at 119 sizes divide."""
+    """Hill's determinants of a state are the same bits after any other state.
+
+    Without contact the orders beyond 48 are eliminated, with dissipation all are kept, so that the sizes of the two
+    matrices differ.
+    """
     omega = 1.8
     forces = SiteForces([Stops.both(Contact("hertz", 50.0, restitution=0.7), 1.0)])
     compliance = DenseCompliance(np.ones(1), np.eye(1), np.eye(1))
@@ -41,7 +45,11 @@ def test_determinants_do_not_depend_on_the_states_before(last):
 
 @pytest.mark.parametrize("entries", [1, 2 * 22**2, 1 << 17])
 def test_determinants_of_many_exponents_are_those_of_hills_matrix(monkeypatch, entries):
-    """det(I + G J) of two dissipative contacts, written out mode by mode: one at a time, in pairs, all together."""
+    """Determinants computed one exponent at a time, in pairs or all together are those of I + G J of two contacts.
+
+    The matrix is built here block by block from the compliance G and the contacts' Jacobian J; ``entries`` bounds the
+    number of matrix entries that are held at once.
+    """
     monkeypatch.setattr(hill, "ENTRIES", entries)
     omega = 1.8
     last = 5
@@ -91,23 +99,25 @@ class ForcedCell:
         self.omega = omega
 
     def rate(self, t, y, side, approach):
+        """The time derivative of the state ``y`` (displacements, velocities), in contact on ``side`` (0: open)."""
         u, v = y.reshape(2, -1)
         force = self.load * np.cos(self.omega * t) - self.stiffness @ u
         if side:
-            # Up to rounding the contact is closed while it is in contact.
+            # Rounding may put w just outside the stop while the contact is closed.
             w = side * max(side * self.pair @ u, self.clearance)
             force -= self.pair * self.contact.force(w, self.clearance, self.pair @ v, approach)
         return np.concatenate([v, force / self.masses])
 
     def gap(self, t, y, side, approach):
+        """The indentation in m on ``side``, or on either side of an open contact; zero where contact begins or ends."""
         w = self.pair @ y[: len(self.masses)]
         return side * w - self.clearance if side else abs(w) - self.clearance
 
     def half_a_period(self, state, phase):
-        """Minus displacement and velocity half a period after the ``phase``, at which the contact is open.
+        """The negative of the state half a period after the ``phase`` (rad), at which the contact is open.
 
-        The stops are alike on both sides: half a period later the force is the opposite one, and the lattice has the
-        mirrored motion. Done twice, this is the map of a period.
+        The stops are alike on both sides, and the force changes its sign after half a period. A symmetric steady state
+        is thus mapped to itself, and the map applied twice is the map of a period.
         """
         t = phase / self.omega
         end = t + np.pi / self.omega
@@ -131,7 +141,10 @@ class ForcedCell:
         return -y
 
     def multipliers(self, state, scale, phase):
-        """Eigenvalues of the derivative of a period's map, by central differences of ``scale`` in half of it."""
+        """The Floquet multipliers of a period: squares of the eigenvalues of the half period map's derivative.
+
+        The derivative is taken by central differences with the step ``scale`` of each component.
+        """
         columns = []
         for step, change in zip(scale, np.diag(scale), strict=True):
             after = self.half_a_period(state + change, phase)
@@ -143,14 +156,18 @@ class ForcedCell:
 @pytest.mark.slow
 @pytest.mark.parametrize(("force", "last"), [(19.5, 61), (25.0, 119)])
 def test_stability_of_a_dissipative_state_is_that_of_its_period_map(force, last):
-    """r = 0.7, two cells: an unstable and a stable state, after a state without contact at the same frequency."""
+    """A steady state is unstable where a Floquet multiplier of its period map exceeds 1, and has its growth rate.
+
+    Restitution is 0.7. Of two cells one state is unstable and one stable; each is judged after a state without contact
+    at the same frequency, so that nothing is carried over from one to the next.
+    """
     omega = 1700.0
     of = nfrc_case({"cells": 2}, {"sites": [1], "restitution": 0.7}, source="force", infinite=False, harmonics=last,
               range=[force, 26.0], fixed=[omega], largest_step=0.5)  # fmt: skip
     states = SteadyStates(of, 0.7, omega)
     xi = first_state(states).xi
 
-    # The motion of the linear lattice, at a force that does not touch.
+    # This state is the motion of the linear lattice under a force too small for contact.
     linear = 0.5 * states.parameter.scale * states.linear_motion(omega).harmonics
     free = np.append(states.balance.pack(linear) / states.clearance, 0.5)
     assert states.measured(free).unstable == 0
@@ -166,7 +183,8 @@ def test_stability_of_a_dissipative_state_is_that_of_its_period_map(force, last)
     motion = ForcedCell(states, omega, force)
     start = np.concatenate([part.ravel() for part in motion_at(states, xi, np.arange(2), phase)])
     scale = 1e-5 * states.clearance * np.repeat([1, omega], len(start) // 2)
-    # Harmonics left out, of a force that jumps at the onsets, move the stronger contact's state by 6e-5 clearances.
+    # The force of a lossy contact jumps at its onset. The harmonics that are left out move the state, half a period
+    # later, by up to 6e-5 clearances.
     assert np.abs((motion.half_a_period(start, phase) - start) / scale).max() < 10
     sizes = np.abs(motion.multipliers(start, scale, phase))
     assert measures.unstable == np.count_nonzero(sizes > np.exp(2 * np.pi * LEAST_OF_FINITE))

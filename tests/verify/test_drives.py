@@ -1,4 +1,4 @@
-"""Waveforms, several drives, moved ends: against the transfer function, one another, another integrator."""
+"""Waveforms, several drives and moved ends, compared with the transfer function, superposition and SciPy."""
 
 from __future__ import annotations
 
@@ -35,24 +35,28 @@ def case_of(*drives: dict[str, Any], engine: str = "propagator", **sections: Any
 
 
 def ledger_error(run: xr.Dataset) -> float:
-    """The largest part of the work that is neither dissipated nor held, over the largest work."""
+    """The largest error of work = stored + dissipated energy over the samples, divided by the largest work."""
     work = run["energy/work"].values
     spent = sum(run[f"energy/{name}"].values for name in ("kinetic", "spring", "contact", "dissipated"))
     return float(np.abs(work - spent).max() / np.abs(work).max())
 
 
 def relative_error(values: np.ndarray, expected: np.ndarray) -> float:
-    """The largest deviation over the largest expected value."""
+    """The largest deviation from ``expected``, divided by the largest expected value."""
     return float(np.abs(values - expected).max() / np.abs(expected).max())
 
 
 def by_transfer_function(case: Case) -> np.ndarray:
-    """Displacements (time, cell, dof) by (K - w^2 M)^-1 on a line below the real axis, the discrete transform of F."""
+    """Displacements (time, cell, dof) in m, the inverse transform of (K - w^2 M)^-1 F(w).
+
+    The frequencies w lie on a line below the real axis, which keeps them away from the poles.
+    """
     model = case.model()
     chain = model.chain
     drive = model.drive
     count = 30_000
-    # Three times the run: what the transform wraps round is damped by exp(-25) on the line.
+    # The transform's period is three times the run. What a discrete transform wraps round is damped by exp(-25) on the
+    # line.
     length = 3 * model.end
     decay = 25 / length
     time = np.arange(count) * length / count
@@ -65,7 +69,7 @@ def by_transfer_function(case: Case) -> np.ndarray:
     push = modes[driven] * root[driven]
     amplitudes = np.fft.irfft(force[:, None] * push / (squared - omega[:, None] ** 2), count, axis=0)
 
-    # The transform's instants hold the run's samples.
+    # Every sample of the run is at an instant of the transform.
     samples = np.arange(model.samples) * model.sample_interval
     rows = np.rint(samples * count / length).astype(int)
     np.testing.assert_allclose(time[rows], samples, atol=1e-12)
@@ -109,10 +113,10 @@ def test_a_burst_from_a_file_is_the_burst_to_the_splines_error(engine, tmp_path)
 
 
 def test_samples_travel_with_the_case(tmp_path):
-    """The case holds the samples themselves, to the last bit, and the sum of the file; the file may go."""
+    """A case holds the samples themselves, to the last bit, and their file's checksum; the file may be removed."""
     path = tmp_path / "lab.h5"
     time = np.linspace(0, 0.01, 30)
-    # The first sample is not zero, and has an exponent that few decimals would lose.
+    # The samples are numbers that few decimals would not hold.
     force = np.sin(800 * time) * 1e-60 ** (time == 0)
     with h5py.File(path, "w") as file:
         file["drive"] = np.column_stack([time, force])
@@ -134,7 +138,7 @@ def test_samples_travel_with_the_case(tmp_path):
 
 @pytest.mark.parametrize(("engine", "error"), [("ts", 1e-9), ("propagator", 2e-14)])
 def test_drives_superpose(engine, error):
-    """Without contacts the run of three drives is the sum of their runs, to rounding where steps are exact."""
+    """Without contacts the motion under three drives is the sum of those under each, to rounding in exact steps."""
     drives = [
         BURST,
         {"waveform": "impulse", "amplitude": 1e-3, "duration": 7e-4, "cell": 11},
@@ -170,7 +174,10 @@ def test_every_waveform_has_its_ledger(engine, drive):
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("end", ["left", "right"])
 def test_a_moved_end_against_another_integrator(engine, end):
-    """A wall of given motion acts by its spring's force and gives its power to the lattice, as SciPy's DOP853 says."""
+    """A wall of given motion x(t) acts on a mass by the force k (x - u), and its work is the integral of k (x - u) x'.
+
+    SciPy's DOP853 integrates the same equations.
+    """
     chirp = {
         "waveform": "chirp",
         "amplitude": 2e-5,
@@ -214,13 +221,13 @@ def test_a_moved_end_against_another_integrator(engine, end):
 
     u = run["displacement"].values.reshape(len(time), -1)
     assert relative_error(u, expected[:, :n]) < 1e-8
-    # That difference has an error of its own.
+    # The bound is wider for the work: the wall's speed is a central difference with an error of its own.
     assert relative_error(run["energy/work"].values, expected[:, -1]) < 1e-7
     assert ledger_error(run) < 1e-9
 
 
 def test_a_moved_end_stays_where_its_samples_end():
-    """Unlike a force a displacement does not end with its samples."""
+    """A moved end stays at the last of its samples, whereas a force is zero after its last."""
     samples = {"time": [0.0, 1e-3, 2e-3], "value": [0.0, 0.5, 1.0]}
     wave = waveform_of(case_of({"waveform": "samples", "samples": samples, "end": "left", "amplitude": 1e-5}).drive)
     assert wave.duration == np.inf

@@ -29,21 +29,21 @@ FAST = {"time": {"end": 0.03, "engine": "propagator"}, "lattice": {"cells": 16}}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A short run with contacts, whose fields are those of a window, every second cell and every third sample."""
+    """A short run with contacts that records its fields in a window, at every second cell and every third sample."""
     path = tmp_path_factory.mktemp("run")
-    # Strides in time and space differ from 1, so that a reference that ignores them is seen.
+    # Strides in time and space differ from 1, so that a reference that ignores them fails.
     simulate(small_case(**FAST, output={"window": [3, 15], "every": 2, "stride": 3}), path)
     export.write_xdmf(path)
     return path
 
 
 def sizes(item: ElementTree.Element) -> list[int]:
-    """The dimensions of an element."""
+    """The dimensions that an XDMF element states."""
     return [int(size) for size in item.get("Dimensions").split()]
 
 
 def slab(item: ElementTree.Element, folder) -> np.ndarray:
-    """The values to which a hyperslab of the XDMF format refers, whose description is that of the dataset."""
+    """The values to which a hyperslab of an XDMF file refers; asserts that its description fits the dataset."""
     selection, source = item.findall("DataItem")
     start, stride, count = np.array(selection.text.split(), int).reshape(sizes(selection))
     name, _, path = source.text.strip().partition(":")
@@ -74,14 +74,14 @@ def test_every_reference_of_the_mesh_leads_to_its_field(folder):
         assert fields["displacement (m)"].tobytes() == displacement[row].tobytes()
         assert fields["velocity (m/s)"].tobytes() == velocity[row].tobytes()
 
-        # Cells and masses are a grid whose first coordinate is the number of the cell.
+        # Cells and masses form a grid whose first coordinate is the number of the cell.
         assert sizes(grid.find("Topology")) == list(displacement.shape[1:])
         origin, spacing = ([float(x) for x in item.text.split()] for item in grid.findall("Geometry/DataItem"))
         assert (origin[0] + spacing[0] * np.arange(len(cells))).tolist() == cells.tolist()
 
 
 def test_long_runs_show_every_nth_sample_to_the_end(folder, monkeypatch):
-    """Of a long run every nth sample is listed, from the first on, so that frames are no more than MOST_FRAMES."""
+    """A long run lists every nth sample from the first on, with the least n for at most MOST_FRAMES frames."""
     monkeypatch.setattr(export, "MOST_FRAMES", 7)
     export.write_xdmf(folder)
     grids = ElementTree.parse(folder / "run.xdmf").getroot().findall("Domain/Grid/Grid")
@@ -100,7 +100,7 @@ def test_a_run_without_fields_has_no_mesh(tmp_path):
 
 
 def test_groups_carry_their_time_in_plain_xarray(folder):
-    """Plain xarray opens one group at a time: coordinates of the file are linked into each."""
+    """Plain xarray, which opens one group at a time, finds coordinates of the file, since they are linked into each."""
     with xr.open_dataset(folder / "run.h5", engine="h5netcdf") as run:
         time = run.time.values
     with xr.open_dataset(folder / "run.h5", engine="h5netcdf", group="energy") as energy:
@@ -113,7 +113,7 @@ def test_groups_carry_their_time_in_plain_xarray(folder):
 
 
 def test_links_are_no_variables_and_are_replaced_by_one(tmp_path):
-    """A group's variable that has the name of a coordinate stays: no link takes its place."""
+    """A reader sees no linked coordinates, and no link replaces a group's variable that has a coordinate's name."""
     data = {
         "time": variable("time", [0.0, 1.0], "s", "time"),
         "site": variable("site", [1, 2, 3], "1", "site"),
@@ -188,7 +188,7 @@ def test_a_sweep_is_one_table_of_members(tmp_path):
 
 
 def test_a_full_disk_is_no_error_of_the_results(folder, monkeypatch):
-    """The run can be read: that its curves cannot be written must not be reported as bad input."""
+    """A full disk while curves are written is an OSError, not a FolderError, which would blame the run."""
 
     def fail(path, text):
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -1,4 +1,4 @@
-"""Result files in xarray, with units, windows and strides; runs that end early; another analysis of a run."""
+"""Result files opened by xarray, with units, windows and strides; runs that end early; a second analysis of a run."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_windows_and_strides_are_parts_of_the_whole(run_folder, folder):
 
 
 def test_impact_log_is_complete_and_ordered(run_folder):
-    """Episodes stand by their onsets, their losses sum to those of the sites, their peaks bound what samples show."""
+    """Episodes are in the order of their onsets, their losses sum to those of the sites, their peaks bound samples."""
     run = datasets(run_folder / "run.h5")
     log = {name.removeprefix("impacts/"): values for name, values in run.items() if name.startswith("impacts/")}
     assert np.all(np.diff(log["onset"]) >= 0)
@@ -78,7 +78,7 @@ def test_impact_log_is_complete_and_ordered(run_folder):
     losses = np.bincount(log["site"] - 1, weights=log["loss"], minlength=3)
     np.testing.assert_allclose(losses, run["energy/dissipated_by_site"][-1], rtol=1e-6, atol=1e-12)
 
-    # Between samples the force cannot exceed the logged one.
+    # The logged peak is the largest at any time: no sampled indentation exceeds it.
     w = run["displacement"][..., 2] - run["displacement"][..., 1]
     for site, cell in enumerate((6, 12, 13)):
         inside = np.abs(w[:, cell - 1]) - run["sites/clearance"][site]
@@ -86,7 +86,7 @@ def test_impact_log_is_complete_and_ordered(run_folder):
 
 
 def test_a_stalled_run_states_when_and_where_and_keeps_its_samples(folder, monkeypatch):
-    # A step that needs more trials than this counts as stalled: one with a steep onset does.
+    # A step that needs more than 6 trials now counts as stalled, and the step at a steep onset needs more.
     monkeypatch.setattr(integrator, "MOST_TRIALS", 6)
     result = simulate(small_case(), folder / "run")
     assert not result.complete
@@ -104,7 +104,7 @@ def test_a_stalled_run_states_when_and_where_and_keeps_its_samples(folder, monke
 
 
 def test_a_state_that_is_not_finite_ends_the_run(folder, monkeypatch):
-    """Where a mass turns NaN in the middle of a run the samples before it stay."""
+    """A run ends where a mass's displacement becomes NaN, names the cell, and keeps the samples before."""
     advance = integrator.Integrator.advance
 
     def poisoned(self, target):
@@ -151,7 +151,7 @@ def test_another_analysis_of_the_same_run(run_folder, folder):
 
 @pytest.mark.parametrize("named", [".", "run.h5", "../run"])
 def test_a_run_is_measured_from_its_own_folder(run_folder, folder, monkeypatch, named):
-    """The sweep that it may be a member of is in the folder around it, however the run is named."""
+    """The linear run of a sweep is looked for in the folder that contains the run's, however the run is named."""
     shutil.copytree(run_folder, folder / "run")
     monkeypatch.chdir(folder / "run")
     asked = []
@@ -169,7 +169,10 @@ def test_a_run_is_measured_from_its_own_folder(run_folder, folder, monkeypatch, 
     [({"preset": "four-band", "cells": 100}, 24.33), ({"preset": "diatomic", "cells": 200}, 1.0)],
 )
 def test_the_default_analysis_is_near_the_full_one(lattice, amplitude):
-    """Of runs with hundreds of impacts every measure states what it left out, and about what that changes."""
+    """The default strides of the analysis change its measures little; each measure states strides and sampling error.
+
+    The runs have hundreds of impacts.
+    """
     time = {"engine": "propagator", "rtol": 1e-6}
     run = run_of(Case.from_table({"lattice": lattice, "drive": {"amplitude": amplitude}, "time": time}))
     everything = AnalysisTable(band_stride=1, snapshot_stride=1, cell_stride=1)
@@ -180,7 +183,7 @@ def test_the_default_analysis_is_near_the_full_one(lattice, amplitude):
     if np.isfinite(full["ibtet"]):
         assert default["ibtet"].item() == pytest.approx(full["ibtet"].item(), abs=5e-4)
         assert default["ibtet_whole"].item() == pytest.approx(full["ibtet_whole"].item(), abs=5e-4)
-        # Both carry roundings of about 1e-13 of a part's largest energy.
+        # Both energies carry rounding errors of about 1e-13 of the largest.
         by_default = default["bands/energy"][:-1]
         by_all = full["bands/energy"][:-1]
         np.testing.assert_allclose(by_default, by_all, rtol=1e-12, atol=1e-13 * float(by_all.max()))

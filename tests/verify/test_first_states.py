@@ -1,4 +1,4 @@
-"""States of ``nfrc`` at which a range begins in contact: by growing amplitudes, and where these do not lead there."""
+"""First states of ``nfrc`` in contact, found by growing amplitudes or, where these fail, by growing contact forces."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ from vipetsc.modes.response.steps import first_state
 
 CLEARANCE = 1e-4
 RESTITUTION = 0.7
-PHASE = 1.5  # rad, without contact
+PHASE = 1.5  # rad, at which no contact is closed
 
 
 def states_from(omega: float, touches: float, **nfrc: Any) -> SteadyStates:
-    """Three cells with a stiff lossy stop in the second one, from so many times the amplitude that ``touches`` on."""
+    """Steady states of three cells with a stiff lossy stop in the second, at ``omega`` (rad/s).
+
+    The range begins at ``touches`` times the force at which the linear motion touches the stop.
+    """
 
     def states(low: float) -> SteadyStates:
         case = NfrcCase.from_table(
@@ -39,7 +42,7 @@ def states_from(omega: float, touches: float, **nfrc: Any) -> SteadyStates:
 
 
 def after_a_period(states: SteadyStates, omega: float, amplitude: float, start: np.ndarray) -> np.ndarray:
-    """The state (2, n) a period after that at the phase ``PHASE``, ``start`` (2, n), by SciPy alone."""
+    """Displacements and velocities (2, n) a period after ``start`` (2, n) at the phase ``PHASE``, by SciPy."""
     chain = states.case.model().chain
     n = len(chain.masses())
     stops = tuple(Stop(3, 2, CLEARANCE, 1e7, 1.5, RESTITUTION, side) for side in (1, -1))
@@ -48,17 +51,17 @@ def after_a_period(states: SteadyStates, omega: float, amplitude: float, start: 
     lattice = ScipyLattice(
         chain.masses(), chain.stiffness_matrix().toarray(), np.zeros((n, n)), stops, lambda t: push * np.cos(omega * t)
     )
-    # From a phase without contact, since the integrator begins with open stops.
+    # The integrator begins with open stops, hence at a phase without contact.
     times = (PHASE + np.array([0.0, 2 * np.pi])) / omega
     motion, impacts = lattice.motion(times, *start, start=float(times[0]))
-    # One on either side: the state is the one that was sought.
+    # The state sought has one impact on either side.
     assert impacts == 2
     return motion[:2, -1]
 
 
 @pytest.fixture
 def by_weights(monkeypatch) -> list[Any]:
-    """What states by growing weights have been asked for, one entry for each."""
+    """The calls of the path by growing weights of the contact forces, one entry for each."""
     asked: list[Any] = []
     lead = steps._by_weights
 
@@ -72,14 +75,17 @@ def by_weights(monkeypatch) -> list[Any]:
 
 @pytest.mark.slow
 def test_a_range_begins_where_growing_amplitudes_do_not_lead(by_weights):
-    """They end at 2.4 times the amplitude that touches, where an episode becomes two; the state at 3 times returns."""
+    """At 3 times the touching force a state is found by growing weights, and SciPy returns it after a period.
+
+    Growing amplitudes end at 2.4 times that force, where one episode of contact becomes two.
+    """
     omega = 1000.0
     few = states_from(omega, 3.0)
     first = first_state(few)
     # Growing amplitudes alone would not have led there.
     assert len(by_weights) == 1
 
-    # With so many harmonics the truncation is below the tolerance of the comparison.
+    # With 101 harmonics the error of truncation is below the tolerance of the comparison.
     many = states_from(omega, 3.0, harmonics=101)
     xi = refined(few, many, first.xi)
     _, amplitude = many.drive(xi[-1])
@@ -91,14 +97,17 @@ def test_a_range_begins_where_growing_amplitudes_do_not_lead(by_weights):
 
 @pytest.mark.slow
 def test_growing_weights_lead_to_the_state_of_growing_amplitudes(monkeypatch, by_weights):
-    """Of a motion that is the only one; so does a limit of states on growing amplitudes that is too low."""
+    """Where there is only one state, growing weights find the one that growing amplitudes find.
+
+    Growing weights take over when growing amplitudes reach their limit of steps.
+    """
     omega = 1700.0
     states = states_from(omega, 1.5)
     expected = first_state(states).xi
     assert states.measured(expected).episodes == 2
     assert not by_weights
 
-    # Growing amplitudes are ended early, so that the other path is taken to the same state.
+    # A low limit ends growing amplitudes early, so that growing weights are used.
     monkeypatch.setattr(steps, "MOST_RAMP", 5)
     monkeypatch.setattr(steps, "LONGEST_RAMP", 0.5)
     assert first_state(states).xi == pytest.approx(expected, abs=1e-9)
@@ -108,7 +117,10 @@ def test_growing_weights_lead_to_the_state_of_growing_amplitudes(monkeypatch, by
 @pytest.mark.slow
 @pytest.mark.parametrize("over", ["amplitude", "frequency"])
 def test_growing_amplitudes_have_the_scale_of_the_frequency_that_they_begin_at(monkeypatch, over):
-    """What is fixed of a curve over the frequency is an amplitude, which is no frequency of the ramp."""
+    """Growing amplitudes are followed at the frequency at which the curve begins.
+
+    A curve over the frequency has a fixed amplitude, which must not be taken for that frequency.
+    """
     omega = 1700.0
     states = states_from(omega, 1.5)
     if over == "frequency":

@@ -1,4 +1,4 @@
-"""Contacts that join cells or stand on ground: chains of beads, impacts of two masses, a mass that bounces."""
+"""Contacts between cells or to the ground: chains of beads, an impact of two masses, a mass that bounces on a stop."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ A = 1e9  # N/m^1.5
 
 
 def beads(path, u, v, end, samples, frequency=1e4, lattice=None, rtol=1e-10, engine="ts", **contacts):
-    """The run of beads from displacements ``u`` (cell,) and velocities ``v``, joined by Hertz's contacts."""
+    """The run of beads with Hertz contacts from displacements ``u`` (cell,) in m and velocities ``v`` (cell,) in m/s.
+
+    ``contacts`` updates the table [contacts]; the energy balance of the run is asserted.
+    """
     n = max(np.size(u), np.size(v))
     u = np.broadcast_to(u, n)[:, None]
     v = np.broadcast_to(v, n)[:, None]
@@ -41,7 +44,7 @@ def beads(path, u, v, end, samples, frequency=1e4, lattice=None, rtol=1e-10, eng
     assert result.statistics["engine"] == engine
 
     spent = run["energy/kinetic"] + run["energy/spring"] + run["energy/contact"] + run["energy/dissipated"]
-    # Rounding of what the static state of pressed contacts holds.
+    # The energy of pressed contacts at rest is subtracted, which leaves its rounding error.
     rounding = 1e-14 * n * A * contacts.get("precompression", 0.0) ** 2.5
     assert np.abs(run["energy/work"] - spent).max() < 1e-8 * run["energy/work"].max() + rounding
     return run
@@ -49,10 +52,13 @@ def beads(path, u, v, end, samples, frequency=1e4, lattice=None, rtol=1e-10, eng
 
 @pytest.mark.parametrize(("ends", "turns"), [("periodic", 2), ("free", 1)])
 def test_a_pressed_chain_has_the_dispersion_of_its_linearised_contacts(tmp_path, ends, turns):
-    """omega = 2 sqrt(k/m) sin(kappa/2), k = (3/2) A d^(1/2) (Nesterenko 2001, sec. 1.2); loads hold free ends."""
+    """A small wave has omega = 2 sqrt(k/m) sin(kappa/2) with k = (3/2) A d^(1/2) (Nesterenko 2001, sec. 1.2).
+
+    The contacts are pressed by d at rest; static loads hold the free ends.
+    """
     n = 12
     depth = 1e-5
-    # So small that the contacts are linear to 1e-6.
+    # The amplitude is so small that the contacts are linear to 1e-6.
     amplitude = 1e-11
     kappa = np.pi * 2 * turns / n
     k = 1.5 * A * depth**0.5
@@ -96,7 +102,7 @@ def test_a_struck_chain_is_that_of_an_independent_solver(tmp_path, engine):
 
 
 def peak_time(time: np.ndarray, values: np.ndarray) -> float:
-    """The instant of the largest value, by a parabola through it and its neighbours."""
+    """The time in s of the largest value, the vertex of a parabola through the largest sample and its neighbours."""
     largest = int(values.argmax())
     before, peak, after = values[largest - 1 : largest + 2]
     shift = (before - after) / (2 * (before - 2 * peak + after))
@@ -105,15 +111,16 @@ def peak_time(time: np.ndarray, values: np.ndarray) -> float:
 
 @pytest.mark.slow
 def test_a_struck_chain_sends_a_solitary_wave(tmp_path):
-    """The wave is 1.2 % faster than Nesterenko's long wave, at any force, and five beads move in it.
+    """The solitary wave is 1.2 % faster than Nesterenko's long wave, at any force, and five beads move in it.
 
-    His V = 0.6802 a (2E/(a rho^(3/2) (1 - nu^2)))^(1/3) F^(1/6) is that of ``theory``. SciPy's DOP853 on 40 beads, in
-    units of A = m = 1, gives V = 0.90552 F^(1/6), and speeds of 0.0087, 0.326, 1, 0.326, 0.0087 of the largest.
+    Nesterenko's speed V = 0.6802 a (2E/(a rho^(3/2) (1 - nu^2)))^(1/3) F^(1/6) is the variable ``theory``, in beads per
+    second. SciPy's DOP853 on 40 beads, in units of A = m = 1, gives V = 0.90552 F^(1/6), and speeds of 0.0087, 0.326,
+    1, 0.326, 0.0087 of the largest.
     """
     n = 40
     ratios = []
     for speed in (0.1, 0.4):
-        # The wave's speed goes with the fifth root of the bead's.
+        # The speed of the wave is proportional to the fifth root of the striking speed.
         end = 3.0e-3 * (0.1 / speed) ** 0.2
         run = beads(tmp_path, u=0.0, v=np.append(speed, np.zeros(n - 1)), end=end, samples=4001)
 
@@ -137,7 +144,7 @@ def test_a_struck_chain_sends_a_solitary_wave(tmp_path):
 
 @pytest.mark.parametrize("factor", ["paper", "lankarani-nikravesh", "flores", "exact"])
 def test_two_masses_part_as_the_law_predicts(tmp_path, factor):
-    """Momentum and the law's own restitution give the speeds after an impact, and its loss."""
+    """Momentum and the law's effective restitution e give speeds v (1 -+ e)/2 after an impact and its loss."""
     e = Contact("hertz", A, 0.5, factor=factor).effective_restitution
     v = 0.2
 
@@ -146,7 +153,7 @@ def test_two_masses_part_as_the_law_predicts(tmp_path, factor):
     )
 
     assert run["velocity"].values[-1, :, 0] == pytest.approx(v * np.array([1 - e, 1 + e]) / 2, rel=1e-7)
-    # Half the reduced mass, M/2, times the squares' difference.
+    # The loss is half the reduced mass M/2 times the difference of the squared relative speeds.
     assert run["impacts/loss"].values == pytest.approx(M / 4 * v**2 * (1 - e**2), rel=1e-6)
 
 
@@ -162,12 +169,12 @@ HELD = {
 
 
 def test_a_mass_bounces_on_a_stop_as_in_closed_form(tmp_path):
-    """Two masses in phase, each on a spring K with a stop, have 100 impacts at the piecewise solution's onsets."""
+    """Two masses that move in phase, each on a spring K with a stop, have 100 impacts at the onsets in closed form."""
     start = -5 * D
     free = np.sqrt(K / M)
     stopped = np.sqrt((K + KC) / M)
 
-    # Cosine about 0 until the mass meets the stop, then a sine about the equilibrium in contact.
+    # The motion is a cosine about 0 until the mass meets the stop, then harmonic about the equilibrium in contact.
     angle = np.pi - np.arccos(D / abs(start))
     beyond_equilibrium = D * K / (K + KC)
     speed = free * np.sqrt(start**2 - D**2)
@@ -195,7 +202,10 @@ def test_a_mass_bounces_on_a_stop_as_in_closed_form(tmp_path):
 
 
 def test_with_a_loss_its_speeds_fall_geometrically(tmp_path):
-    """With the stop where the spring rests every impact takes the same time and the same fraction of the speed."""
+    """With a lossy stop at the spring's rest position, every impact takes the same time and scales the speed alike.
+
+    Spring, stop and damping force are all proportional to the speed of approach.
+    """
     contact = Contact("bilinear", KC, 0.95, factor="exact")
 
     def rate(_, y):

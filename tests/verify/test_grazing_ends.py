@@ -20,8 +20,8 @@ def third_mode_of(own: dict[str, Any], **contacts: Any) -> dict[str, Any]:
     return {"name": "stiff", "contacts": {"law": "bilinear"} | contacts, "nnm": nnm}
 
 
-# Four masses whose third mode closes the second of three contacts first, at the start of the orbit; three masses whose
-# third mode does so at its end.
+# AT_START has four masses, whose third mode closes the second of three contacts first, at the start of the orbit.
+# AT_END has three masses, whose third mode closes the second of two contacts first, at the end of the orbit.
 AT_START = third_mode_of(
     {
         "masses": [0.509, 0.8, 1.936, 1.48],
@@ -55,7 +55,7 @@ AT_END = third_mode_of(
 
 
 def ending(table: dict[str, Any], **nnm: Any) -> str:
-    """How the branch of a case with further keys of [nnm] ends."""
+    """The sentence that says how the branch of a case ends; ``nnm`` updates the table [nnm]."""
     (branch,) = follow_all(NnmCase.from_table(table | {"nnm": table["nnm"] | nnm}), None, MPI.COMM_SELF)
     return branch.ending
 
@@ -82,7 +82,7 @@ def motion(amplitude: float, samples: int = 101) -> np.ndarray:
 
 
 def stops(plus: float, minus: float) -> System:
-    """One mass with stops at these clearances in m, a negative one pressed at rest."""
+    """One mass with stops at the clearances ``plus`` and ``minus`` in m; a stop of negative clearance is pressed."""
     pair = ContactPair(None, 0, plus, Contact("bilinear", 1e3), clearance_minus=minus)
     return System(np.ones(1), np.eye(1), (pair,))
 
@@ -99,6 +99,6 @@ def test_a_touch_on_either_side_between_samples():
 
 
 def test_a_pressed_contact_grazes_where_it_would_open():
-    """Pressed by 1 m on the side +, it opens at w = -1 m."""
+    """A contact that is pressed by 1 m on the side + opens, and therefore grazes, at w = -1 m."""
     assert grazing_contacts(stops(-1.0, np.inf), -motion(1.0)) == [1]
     assert grazing_contacts(stops(-1.0, np.inf), motion(1.0)) == []

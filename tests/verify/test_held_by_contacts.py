@@ -1,4 +1,4 @@
-"""Frequency responses of lattices with free ends that only contacts pressed to the ground hold."""
+"""Frequency responses of lattices that no wall holds, but contacts pressed to the ground, dashpots or nothing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ DEPTH = 0.1
 
 
 def held(contacts: dict[str, Any] | None = None, lattice: dict[str, Any] | None = None, **nfrc: Any) -> NfrcCase:
-    """Two masses of 1 kg in a row without walls, of which the first is pressed against a stop of the ground."""
+    """Two masses of 1 kg joined by a spring, without walls; the first is pressed against a stop of the ground.
+
+    ``contacts``, ``lattice`` and ``nfrc`` update the tables of these names.
+    """
     spring = {"start": 1, "end": 1, "stiffness": SPRING, "next_cell": True}
     table: dict[str, Any] = {
         "lattice": {"cells": 2, "ends": "free", "damping": {"mass": DASHPOT}},
@@ -41,7 +44,7 @@ def held(contacts: dict[str, Any] | None = None, lattice: dict[str, Any] | None 
 
 
 def test_a_weak_force_moves_it_as_a_lattice_with_a_spring_to_the_ground():
-    """The spring has the slope of the contact's force at rest; its force is the first harmonic of the contact's."""
+    """Under a weak force the pressed contact acts as a spring k = (3/2) A d^(1/2), the slope of its force at rest."""
     omega = 1.7
     states = SteadyStates(held(range=[omega, 2.0], fixed=[1e-4]), 1.0, 1e-4)
     slope = 1.5 * STOP * DEPTH**0.5
@@ -56,7 +59,10 @@ def test_a_weak_force_moves_it_as_a_lattice_with_a_spring_to_the_ground():
 
 @pytest.mark.parametrize("side", ["plus", "minus"])
 def test_a_motion_that_opens_the_contact_returns_after_a_period(side):
-    """The static load, which the contact no longer balances while it is open, pushes the lattice back."""
+    """A steady state whose contact opens returns after a period of an independent integration.
+
+    The static load, which an open contact does not balance, pushes the lattice back against the stop.
+    """
     states = SteadyStates(held({"side": side}, range=[1.4, 2.0], fixed=[0.5]), 1.0, 0.5)
     point = first_state(states)
     measured = states.measured(point.xi)
@@ -66,7 +72,7 @@ def test_a_motion_that_opens_the_contact_returns_after_a_period(side):
 
 
 def test_growing_weights_lead_to_the_same_state_beside_a_stop_that_touches():
-    """A second stop of the ground touches at rest, so that the forces of contacts grow from zero."""
+    """Growing weights find a steady state that returns after a period, next to a stop that touches at rest."""
     each = {"precompression": [DEPTH, 0.0], "pair": [[0, 1], [0, 1]], "side": ["minus", "plus"]}
     contacts = {"sites": [1, 2], "each": each, "side": None, "pair": None, "precompression": None}
     given = {key: value for key, value in contacts.items() if value is not None}
@@ -78,21 +84,24 @@ def test_growing_weights_lead_to_the_same_state_beside_a_stop_that_touches():
 
 
 def test_the_unit_of_a_curve_is_its_largest_linear_motion():
-    """Not that at the beginning of the range: a resonance would be hundreds of units away, and as many steps."""
+    """The unit of a curve's amplitudes is the largest linear motion in its range, which a resonance determines.
+
+    In units of the motion at the beginning of the range a resonance would be hundreds of units, and of steps, away.
+    """
     states = SteadyStates(held(), 1.0, 0.2)
     motions = [np.abs(states.linear_motion(omega).harmonics).max() for omega in np.linspace(0.8, 3.0, 200)]
     assert states.clearance == pytest.approx(0.2 * max(motions), rel=0.2)
 
 
 def test_a_lattice_that_walls_hold_has_its_own_springs_alone():
-    """Its contacts' forces are all of their forces, as they are where no contact is pressed to the ground."""
+    """Contacts count as springs of the linear lattice where they alone hold it, not where walls do."""
     assert held().are_contacts_springs
     assert not held(lattice={"ends": "fixed"}).are_contacts_springs
     assert not held(IN_A_CELL | PRESSED, {"cell": SPRUNG}).are_contacts_springs
 
 
 def test_what_nothing_holds_is_refused():
-    """A stop at a distance pushes it away, and beyond ends that go on for ever a pressed contact is too far."""
+    """A lattice without walls is refused if its only stop does not touch at rest, or if it is infinite."""
     with pytest.raises(CaseError, match="a lattice that no wall holds"):
         held({"precompression": None, "clearance": 0.1} | {"side": "plus"})
     with pytest.raises(CaseError, match="infinite lattice without bound"):
@@ -128,7 +137,10 @@ BOTH_SIDES = BETWEEN_CELLS | {"side": "both", "clearance": 0.01, "precompression
     ],
 )
 def test_what_only_dashpots_or_nothing_holds_returns_after_a_period(cell, ends, damping, contacts, force):
-    """The contacts' forces add up to nothing on the whole, so that its mean place does not matter."""
+    """Steady states of lattices with contacts between their own masses return after a period.
+
+    The contact forces add up to zero over the lattice, so that its mean position is arbitrary.
+    """
     lattice = {"cells": 3, "ends": ends, "cell": cell, "damping": damping}
     case = held(contacts, lattice, range=[1.3, 2.0], fixed=[force], infinite=False)
     states = SteadyStates(case, 1.0, force)
@@ -139,7 +151,10 @@ def test_what_only_dashpots_or_nothing_holds_returns_after_a_period(cell, ends, 
 
 
 def test_bodies_that_dashpots_oppose_differently_move_each_for_itself():
-    """Two masses of which dashpots brake one: no mode without stiffness is that of one body unless it is chosen so."""
+    """The compliance between two unconnected masses, of which a dashpot brakes one, is the sum of their compliances.
+
+    Both modes have frequency 0; any combination of them is a mode, and only those of one mass each are uncoupled.
+    """
     cell = UnitCell((1.0, 2.0), (), 0, 1, grounding=(0.3, 0.0))
     chain = Chain(cell, 1, "free", sites=(0,), clearances=(0.1,))
     omega = 0.7
@@ -149,7 +164,7 @@ def test_bodies_that_dashpots_oppose_differently_move_each_for_itself():
 
 @pytest.mark.parametrize("clearance", [0.0, 0.1])
 def test_grains_that_do_not_stay_together_are_refused(clearance):
-    """On one side alone their contacts have a mean force, and nothing brings them back."""
+    """Grains with contacts on one side alone are refused: the contacts' mean force pushes them apart for ever."""
     lattice = {"cells": 3, "cell": GRAINS}
     with pytest.raises(CaseError, match="its mean force pushes them apart"):
         held(BETWEEN_CELLS | {"clearance": clearance, "precompression": None}, lattice)

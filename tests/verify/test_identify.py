@@ -1,4 +1,4 @@
-"""Identification: derivatives against both engines, parameters from computed records, and what records lack."""
+"""Identification: derivatives against both engines, parameters from computed records, and what a record cannot show."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UNKNOWNS = [
     {"quantity": "amplitude", "bounds": [1.0, 100.0]},
 ]
 POWER = {"law": "power", "exponent": 1.4, "stiffness": 2e6}
-# Of the case itself, which has the true values: to come from afar is tested with the default unknowns.
+# These unknowns start from the values of the case, which are the true ones. The default unknowns start far from them.
 FROM_THE_TRUTH = [
     {"quantity": "clearance", "of": "each", "bounds": [5e-5, 3e-3]},
     {"quantity": "restitution", "bounds": [0.2, 1.0]},
@@ -37,7 +37,7 @@ FROM_THE_TRUTH = [
 
 
 def fits_of(table) -> Identification:
-    """The fits of an identification, which nothing stops."""
+    """The identification that ``table`` asks for, with its records read."""
     plan = IdentifyCase.from_table(table)
     return Identification(plan, read_records(plan), StopRequest())
 
@@ -50,8 +50,12 @@ def results_of(folder, table):
 
 
 def differences(plan: IdentifyCase, z: np.ndarray, number: int, engine: str) -> np.ndarray:
-    """Derivatives (sample, point) of measured velocities by one coordinate, by differences of order 4 of an engine."""
-    # Of steps of 1e-5 the errors of ts, of rtol = 1e-13 each, are ten times as large; of 3e-4 those of order 4 are.
+    """Derivatives (sample, point) of velocities by coordinate ``number``, from runs of an engine.
+
+    They are central differences of fourth order.
+    """
+    # With steps of 1e-5 the errors of ts, at rtol = 1e-13, would be ten times as large in the difference; with steps of
+    # 3e-4 the error of fourth order would be.
     h = 1e-4
     total = 0.0
     for steps, weight in ((-2, 1), (-1, -8), (1, 8), (2, -1)):
@@ -66,7 +70,7 @@ def differences(plan: IdentifyCase, z: np.ndarray, number: int, engine: str) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["ts", "propagator"])
 def test_derivatives_are_those_of_both_engines_over_1_5_and_20_impacts(tmp_path, engine):
-    """All kinds of parameters, through contacts with loss, against central differences of an engine's runs."""
+    """Derivatives by parameters of every kind, through lossy contacts, are central differences of an engine's runs."""
     table = lattice_table(contacts=POWER, time={"rtol": 1e-13, "end": 0.022})
     plan_table = identify_table(table, measured_table(tmp_path, table), unknowns=UNKNOWNS)
     work = fits_of(plan_table)
@@ -84,13 +88,13 @@ def test_derivatives_are_those_of_both_engines_over_1_5_and_20_impacts(tmp_path,
         assert window.sum() > 10
         error = np.abs(slopes[window] - expected[window]).max(axis=(0, 1))
         scale = np.abs(expected[window]).max(axis=(0, 1))
-        # Before its first contact a site's clearance has no derivative, and differences have their rounding.
+        # The derivative by a clearance is zero before the site's first contact, where differences are rounding errors.
         assert (error <= 1e-6 * scale + 1e-9).all(), (impacts, error / scale)
 
 
 @pytest.mark.slow
 def test_the_motion_is_that_of_the_engine(tmp_path):
-    """Displacement, velocity, acceleration and the force of the drive, with a sensor's derivative by the offset."""
+    """Predicted signals of all kinds are the engine's, and their derivative by the time offset is a difference."""
     table = lattice_table()
     record = measured_table(tmp_path, table) | {"offset": [-1e-3, 1e-3]}
     kinds = ["displacement", "velocity", "acceleration"]
@@ -114,7 +118,7 @@ def test_the_motion_is_that_of_the_engine(tmp_path):
     later[1] += h
     earlier[1] -= h
     expected = (misfit.predicted(later, 0, 1.0)[0] - misfit.predicted(earlier, 0, 1.0)[0]) / (2 * h)
-    # At t = 0 the offset moves the sample out of the motion.
+    # The first samples are left out: at t = 0 the offset moves a sample to before the motion.
     inside = slice(2, None)
     error = np.abs(slopes[inside, :, 0] - expected[inside]).max(axis=0)
     assert (error < 1e-4 * np.abs(expected).max(axis=0)).all(), error / np.abs(expected).max(axis=0)
@@ -122,7 +126,7 @@ def test_the_motion_is_that_of_the_engine(tmp_path):
 
 @pytest.mark.slow
 def test_clearances_and_restitution_come_back_without_noise(tmp_path):
-    """From starts 30 % off, three sensors tell three clearances, the stiffness and the restitution to 1e-6."""
+    """From starts 30 % off, three sensors determine three clearances, the stiffness and the restitution to 1e-6."""
     table = lattice_table(time={"end": 0.014})
     stiffness = IdentifyCase.from_table(identify_table(table, measured_table(tmp_path, table))).base.contacts.stiffness
     options = identify_table(table, measured_table(tmp_path, table))["identify"]
@@ -132,13 +136,13 @@ def test_clearances_and_restitution_come_back_without_noise(tmp_path):
     truth = [*table["contacts"]["clearance"], 0.7, stiffness]
     assert found["value"].values == pytest.approx(truth, rel=1e-6)
     assert (found["determined"].values == 1).all()
-    # Residuals are those of rounding: nothing is said of their whiteness.
+    # The residuals are rounding errors, whose whiteness is not judged.
     assert found.attrs["warnings"] == "[]"
     assert found["windows/impacts"].values[-1] > 5
 
 
 def test_windows_of_two_records_grow_as_those_of_one(tmp_path, monkeypatch):
-    """Contacts are counted record by record: a record that is given twice has the windows of one that is given once."""
+    """Windows grow by the contacts in each record: a record given twice has the windows of the record given once."""
     monkeypatch.setattr(GrowingWindows, "solve", lambda self, z, *_: z)
     table = lattice_table()
     record = measured_table(tmp_path, table)
@@ -155,7 +159,7 @@ def test_windows_of_two_records_grow_as_those_of_one(tmp_path, monkeypatch):
 
 
 def test_a_start_has_the_misfit_of_its_better_pass(tmp_path, monkeypatch):
-    """A second pass that ends in a higher valley is not taken, nor its misfit."""
+    """Of two passes the one with the lower deviance gives the fit its parameters and its misfit."""
     fits = fits_of(identify_table(lattice_table(), measured_table(tmp_path, lattice_table())))
     start = fits.starts()[0]
     passes = iter([(10.0, 1.1), (20.0, 2.2)])
@@ -174,7 +178,7 @@ def test_a_start_has_the_misfit_of_its_better_pass(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_linear_parts_come_from_a_record_without_contact(tmp_path):
-    """A record in which nothing touches tells springs and masses, before the clearances are sought."""
+    """A record without contact determines a spring first; the clearances keep their starts until later windows."""
     quiet = lattice_table(drive={"amplitude": 1.0}, lattice={"cells": 6}) | {"name": "quiet"}
     loud = lattice_table(time={"end": 0.014})
     records = [
@@ -190,14 +194,14 @@ def test_linear_parts_come_from_a_record_without_contact(tmp_path):
     found = results_of(tmp_path / "out", identify_table(loud, records, unknowns=unknowns))
 
     assert found["value"].values == pytest.approx([stiffness, *loud["contacts"]["clearance"]], rel=1e-6)
-    # The first windows have the silent record alone: no contact counts.
+    # The first window has only the record without contact, and leaves the clearance at its start.
     assert found["windows/impacts"].values[0] == 0
     assert found["windows/value"].values[0, 1] == pytest.approx(6e-4, rel=1e-12)
 
 
 @pytest.mark.slow
 def test_a_record_that_never_touches_bounds_the_clearance(tmp_path):
-    """Data without contact give a lower bound, the largest displacement there, and no number."""
+    """Data without contact bound a clearance from below by the largest relative displacement, and give no estimate."""
     table = lattice_table(drive={"amplitude": 2.0}, contacts={"clearance": 5e-3}, time={"end": 0.014})
     record = measured_table(tmp_path, table, noise=0.02)
     unknowns = [{"quantity": "clearance", "bounds": [1e-5, 1e-2], "start": 6e-3}]
@@ -217,7 +221,10 @@ def test_a_record_that_never_touches_bounds_the_clearance(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("truth", "start"), [(5e-3, 2e-4), (3e-4, 2.9e-3)])
 def test_a_clearance_on_the_wrong_side_of_the_motion_is_moved(tmp_path, truth, start):
-    """No derivative leads out of a contact that was not there, nor to one that was: other clearances are tried."""
+    """A clearance that has contacts where the record has none, or none where it has some, is moved to the other side.
+
+    The misfit has no derivative that leads there, so that other clearances are tried.
+    """
     free = lattice_table(contacts={"clearance": [5e-4, 4e-4, 5e-3]}, time={"end": 0.014})
     table = lattice_table(contacts={"clearance": [5e-4, 4e-4, truth]}, time={"end": 0.014})
     record = measured_table(tmp_path, table)
@@ -236,7 +243,7 @@ def test_a_clearance_on_the_wrong_side_of_the_motion_is_moved(tmp_path, truth, s
 
 @pytest.mark.slow
 def test_a_clearance_out_of_reach_does_not_slow_the_others_down(tmp_path):
-    """Its column of the Jacobian is zero, and the steps of the others still converge."""
+    """A clearance that is never reached has a zero column in the Jacobian; the other parameters converge."""
     table = lattice_table(contacts={"clearance": [5e-4, 4e-4, 5e-3]}, time={"end": 0.014})
     unknowns = [
         {"quantity": "clearance", "of": "each", "bounds": [5e-5, 6e-3], "start": [5.02e-4, 3.98e-4, 5e-3]},
@@ -251,7 +258,7 @@ def test_a_clearance_out_of_reach_does_not_slow_the_others_down(tmp_path):
 
 @pytest.mark.slow
 def test_a_law_of_the_wrong_kind_is_seen(tmp_path):
-    """Data of Hertz's law, and a bilinear model of any stiffness: the residuals are not white."""
+    """A bilinear model fitted to data of Hertz's law leaves residuals that are not white; Hertz's law does not."""
     table = lattice_table(time={"end": 0.014})
     record = measured_table(tmp_path, table, noise=0.005)
     wrong = table | {"contacts": table["contacts"] | {"law": "bilinear", "stiffness": 3e4}}
@@ -265,14 +272,14 @@ def test_a_law_of_the_wrong_kind_is_seen(tmp_path):
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth(tmp_path):
-    """Over four records with 2 % noise, 90 % intervals hold most of the true values; errors are those stated."""
+    """Intervals of 90 % contain most true values in four records with 2 % noise; deviations are as large as stated."""
     table = lattice_table(time={"end": 0.014})
     truth = np.array([*table["contacts"]["clearance"], 0.7])
     inside = []
     deviations = []
     for seed in (1, 2, 4, 8):
         record = measured_table(tmp_path, table, noise=0.02, seed=seed)
-        # Where a fit begins says nothing about its errors: one that comes from afar, through windows, is enough.
+        # The errors of a fit do not depend on its start: one fit from a distant start, through windows, is enough.
         options = {} if seed == 1 else {"unknowns": FROM_THE_TRUTH, "impacts": 1000}
         work = fits_of(identify_table(table, record, **options))
         windows, z = work.placed(work.fit(0))
@@ -291,14 +298,14 @@ def test_white_noise_is_white_and_a_slow_drift_is_not():
     probabilities = [ljung_box(row).probability for row in noise]
     assert np.mean(np.array(probabilities) < 0.1) == pytest.approx(0.1, abs=0.06)
     assert ljung_box(noise[0, 1:] + 0.6 * noise[0, :-1]).probability < 1e-6
-    # By the definition, with one autocorrelation.
+    # Five values have one autocorrelation r, and the statistic is n (n + 2) r^2/(n - 1) by definition.
     short = np.array([1.0, -1.0, 2.0, 0.0, -2.0])
     r = np.sum(short[1:] * short[:-1]) / np.sum(short**2)
     assert ljung_box(short).statistic == pytest.approx(5 * 7 * r**2 / 4)
 
 
 def test_a_direction_without_data_is_not_determined():
-    """Singular values tell what is lost, and which sensor would tell it."""
+    """Parameters with parallel derivatives are not determined; a sensor that separates them reduces their errors."""
     jacobian = np.array([[100.0, 100.0], [50.0, 50.0], [0.0, 0.1]])
     known = uncertainty_of(jacobian)
     assert known.determined.tolist() == [False, False]
