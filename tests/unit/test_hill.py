@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from vipetsc.lattice import Contact, DenseCompliance
 from vipetsc.modes.balance import hill
@@ -38,3 +39,47 @@ def test_growth_is_found_where_the_determinant_is_cut_off(monkeypatch):
     assert alone is not None
     assert alone.real > 0.5
     assert fastest(touching, closed) == pytest.approx(alone, rel=1e-9)
+
+
+def monodromy(stiffness: np.ndarray, row: np.ndarray, contact: float, amplitude: float) -> np.ndarray:
+    """Of masses of 1 kg over 2 pi s, with ``contact`` N/m on ``row`` while |cos t| exceeds 1/``amplitude``."""
+    n = len(row)
+
+    def flow(spring: float, duration: float) -> np.ndarray:
+        rate = np.zeros((2 * n, 2 * n))
+        rate[:n, n:] = np.eye(n)
+        rate[n:, :n] = -stiffness - spring * np.outer(row, row)
+        return expm(rate * duration)
+
+    touching = float(np.arccos(1 / amplitude))
+    half = flow(contact, touching) @ flow(0.0, np.pi - 2 * touching) @ flow(contact, touching)
+    return half @ half
+
+
+@pytest.mark.parametrize(
+    ("frequencies", "contact", "amplitude"),
+    [
+        # An order that 48 would leave out is next to a mode.
+        ((0.7, 59.5), 1e3, 1.3),
+        ((0.7, 60.3), 1e3, 1.3),
+        ((0.7, 63.2), 1e3, 1.3),
+        # Both modes are slow, but with a closed contact there is one above 48 rad/s.
+        ((0.7, 12.5), 2.6e3, 1.3),
+    ],
+)
+def test_growth_of_a_slow_motion_is_that_of_the_monodromy_matrix(frequencies, contact, amplitude):
+    """Orders up to the highest frequency are kept, also that of the system with a closed contact."""
+    turned = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
+    stiffness = turned @ np.diag(np.square(frequencies)) @ turned.T
+    row = np.array([1.0, 0.0])
+    multipliers = np.linalg.eigvals(monodromy(stiffness, row, contact, amplitude))
+    growth = np.log(np.abs(multipliers)) / (2 * np.pi)
+
+    order = 171
+    z = np.zeros((1, order + 1), complex)
+    z[0, 1] = amplitude
+    series = SiteForces([Stops.both(Contact("bilinear", contact), 1.0)]).series(z, 1.0)
+    found = Hill(DenseCompliance(np.ones(2), stiffness, row[None]), 1.0, order, odd=True, finite=True)
+    assert growth.max() > 0.01
+    assert found.fastest(series).real == pytest.approx(growth.max(), abs=2e-3)
+    assert found.unstable(series) == np.count_nonzero(growth > found.least)

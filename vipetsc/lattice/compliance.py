@@ -10,12 +10,13 @@ in place of waves.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vipetsc.lattice.bands import waves_at
+from vipetsc.lattice.bands import pass_bands, waves_at
 from vipetsc.lattice.chain import Chain, Pair
 from vipetsc.lattice.unit_loads import unit_loads
 from vipetsc.lattice.waves import NEUTRAL, BlochWaves, bloch_waves, cell_between, coupling_blocks, energy_flux
@@ -84,6 +85,11 @@ class WaveCompliance:
     chain: Chain
     infinite: bool = False
     points: tuple[tuple[int, int], ...] = ()
+
+    @cached_property
+    def highest(self) -> float:
+        """The highest frequency of a wave in rad/s."""
+        return pass_bands(self.chain.cell)[-1].high
 
     @property
     def cells(self) -> list[int]:

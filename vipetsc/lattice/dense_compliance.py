@@ -34,6 +34,11 @@ class DenseCompliance:
         relative = np.abs(self.parts).max(axis=0, initial=0.0)
         self.parts[:, rigid & (relative < UNMOVED * np.abs(self.parts).max(initial=0.0))] = 0
 
+    @property
+    def highest(self) -> float:
+        """The highest frequency of a mode in rad/s."""
+        return float(np.sqrt(self.squared.max(initial=0.0)))
+
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Relative displacements (omega, pair, pair) in m/N at frequencies ``omegas`` in rad/s, real or complex."""
         gain = self._gain(np.atleast_1d(omegas))

@@ -88,6 +88,11 @@ class ModalCompliance:
         return float(np.abs(self._poles.poles.real).min(initial=np.inf))
 
     @cached_property
+    def highest(self) -> float:
+        """The highest frequency of a mode in rad/s."""
+        return float(np.abs(self._poles.poles.imag).max(initial=0.0))
+
+    @cached_property
     def loads(self) -> np.ndarray:
         """Unit loads (dofs, pairs and points): columns that pick a relative displacement, or one of a mass."""
         loads = unit_loads(self.chain, self.chain.resonator_cells, self.points, range(self.chain.cells))

@@ -31,6 +31,11 @@ class SeriesCompliance:
         self.chain = compliance.chain
         self.top = pass_bands(self.chain.cell)[-1].high
 
+    @property
+    def highest(self) -> float:
+        """The highest frequency of a wave in rad/s."""
+        return self.top
+
     def at(self, omegas: ArrayLike) -> np.ndarray:
         """Compliance (omega, pair, pair) in m/N at frequencies in rad/s, real or complex."""
         omega = np.atleast_1d(omegas)

@@ -83,12 +83,12 @@ class OpenCompliance(ModalCompliance):
         """The frequencies (omega,) with an imaginary part below zero."""
         omega = np.atleast_1d(np.asarray(omegas, complex))
         # At omega = 0 its own size would give no decay: a thousandth of the highest frequency stands for it there.
-        scale = np.maximum(np.abs(omega), 1e-3 * self._highest)
+        scale = np.maximum(np.abs(omega), 1e-3 * self._fastest)
         return omega.real + 1j * np.minimum(omega.imag, -DECAY * scale)
 
     @cached_property
-    def _highest(self) -> float:
-        """The highest frequency of the finite part in rad/s."""
+    def _fastest(self) -> float:
+        """The size in rad/s of the largest pole of the finite part."""
         return float(np.abs(self._poles.poles).max())
 
     @cached_property

@@ -23,13 +23,9 @@ gives are guesses, which a secant method corrects on D itself. If a motion has o
 orders of perturbations do not meet even ones: D is the product of two determinants. J is a Toeplitz matrix unless
 forces dissipate.
 
-**Many harmonics.** Without dissipation the orders beyond ``KEPT``, d_h = -(I + G_hh J_hh)^-1 G_hh J_hl d_l, are
-eliminated with G at lambda = 0: their part of J falls as KEPT^-4 with Hertz's law, and changes by lambda/(KEPT Om) of
-itself. D is then what it was over det(I + G_hh J_hh), a constant, which moves no zero. At lambda = 0 the elimination is
-exact. Above the linear modes and pass bands G is even in the frequency, so that the changes of the orders k and -k have
-opposite signs, and cancel to first order in lambda for a motion that is even in time: D keeps its double zero at
-lambda = 0, of a shift in time and of the neighbouring motion. Where an order beyond ``KEPT`` meets a linear mode, as in
-a slow motion of a system with fast modes, growth rates are less accurate.
+**Many harmonics.** Without dissipation orders far above all linear modes, and above those of the lattice with closed
+contacts, are eliminated with G at lambda = 0, once for each motion: J is then that of the lower ones, with what the
+others do (``high_orders``). It is exact at lambda = 0, where D keeps its double zero.
 
 **Words.** A *pair* is one of masses between which a force acts, as in ``harmonics``; exponents lambda that are not real
 come in *complex pairs*.
@@ -45,7 +41,8 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from vipetsc.modes.balance.harmonics import ForceSeries
-from vipetsc.modes.balance.order_matrices import FEW_PAIRS, flat, of_pairs, plus_one, product_of
+from vipetsc.modes.balance.high_orders import KeptOrders, kept_orders
+from vipetsc.modes.balance.order_matrices import FEW_PAIRS, flat, of_pairs, plus_one
 from vipetsc.modes.balance.shifted_compliance import Compliance
 
 # Growth rate over Om up to which a motion counts as stable: 0.06 % a period.
@@ -64,8 +61,6 @@ FINEST = 14
 TURN = 0.7
 # Exponent at which ``stability_changes`` takes D(0): at 0 itself a lattice that is free to move has no compliance.
 AT_ZERO = 1e-9
-# Orders of perturbations, to both sides of 0, that are kept where nothing dissipates.
-KEPT = 48
 # Steps, first step and accuracy, over Om, of the secant method.
 MOST_STEPS = 30
 STEP = 1e-4
@@ -163,7 +158,7 @@ class Hill:
             self._blocks = [orders[1 - order % 2 :: 2], orders[order % 2 :: 2]]
         # Compliances by block, number of its orders and exponent, and the latest forces with their reduced Jacobians.
         self._compliances: dict[tuple[int, int, complex], np.ndarray] = {}
-        self._reduced: tuple[ForceSeries, list[np.ndarray | None]] | None = None
+        self._reduced: tuple[ForceSeries, list[KeptOrders]] | None = None
 
     def determinants(self, series: ForceSeries, exponents: np.ndarray) -> np.ndarray:
         """D (exponents,) at lambda/Om = ``exponents``; large ones keep their phases."""
@@ -178,11 +173,9 @@ class Hill:
         if not acting.size:
             return _Determinants(out, sizes)
         if self._reduced is None or self._reduced[0] is not series:
-            self._reduced = series, [self._eliminated(series, orders) for orders in self._blocks]
-        for block, (orders, jacobian) in enumerate(zip(self._blocks, self._reduced[1], strict=True)):
-            low = orders
-            if jacobian is not None:
-                low = orders[np.abs(orders) <= KEPT]
+            reduced = [kept_orders(self.compliance, self.omega, series, orders, acting) for orders in self._blocks]
+            self._reduced = series, reduced
+        for block, (low, jacobian) in enumerate(self._reduced[1]):
             compliances = self._at(block, low, exponents.tolist())
 
             # Many small determinants at once, but no more matrices than the processor's memory holds.
@@ -225,23 +218,6 @@ class Hill:
             parts = g.reshape(len(new), len(orders), *g.shape[1:])
             self._compliances |= dict(zip(new, parts, strict=True))
         return [self._compliances[key] for key in keys]
-
-    def _eliminated(self, series: ForceSeries, orders: np.ndarray) -> np.ndarray | None:
-        """J (order pair, order pair) of the orders kept, with what the others do; None if it depends on lambda."""
-        if series.dissipates:
-            return None
-        acting = self._acting(series)
-        pairs = len(acting)
-        jacobian = flat(series.jacobian(orders=orders)[acting])
-        high = np.abs(orders) > KEPT
-        if not high.any():
-            return jacobian
-
-        g = of_pairs(self.compliance.at(orders[high] * self.omega), acting)
-        rows = np.repeat(high, pairs)
-        inner = plus_one(g, jacobian[np.ix_(rows, rows)])
-        moved = np.linalg.solve(inner, product_of(g, jacobian[np.ix_(rows, ~rows)]))
-        return jacobian[np.ix_(~rows, ~rows)] - jacobian[np.ix_(~rows, rows)] @ moved
 
     def _line(self, series: ForceSeries, growth: float) -> ContourLine:
         """D on Re lambda = ``growth`` Om, so finely that it turns by ``TURN`` at most from one position to the next.

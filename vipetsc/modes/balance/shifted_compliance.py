@@ -38,6 +38,10 @@ KEPT = 3
 class Compliance(Protocol):
     """Interface of ``lattice.compliance``: G (frequencies, pairs, pairs) in m/N, real or complex."""
 
+    @property
+    def highest(self) -> float:
+        """The highest frequency of a linear mode or wave in rad/s."""
+
     def at(self, omegas: np.ndarray) -> np.ndarray:
         """G (frequency, pair, pair) in m/N at ``omegas`` (frequency,) in rad/s, which may be complex."""
 
