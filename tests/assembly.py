@@ -1,4 +1,4 @@
-"""Matrices of a lattice that are added up spring by spring, for comparison with those of the package."""
+"""Stiffness and damping matrices assembled spring by spring, for comparison with those of the package."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from vipetsc.lattice import Chain
 
 
 def assembled(chain: Chain, per_cell: np.ndarray, of_reference: Sequence[float]) -> np.ndarray:
-    """The matrix of springs or dashpots that are added one by one.
+    """The matrix (dof, dof), cell by cell, of a lattice's springs or dashpots, assembled one by one.
 
-    ``per_cell`` (cell, spring) are their coefficients; those from the wall on the left have the reference cell's.
+    ``per_cell`` (cell, spring) are their coefficients in N/m or N s/m. Springs from the wall on the left belong to no
+    cell: they have the coefficients ``of_reference`` (spring,) of the reference cell.
     """
     n = chain.cells
     d = chain.cell.dofs
@@ -40,6 +41,6 @@ def assembled(chain: Chain, per_cell: np.ndarray, of_reference: Sequence[float])
 
 
 def assembled_stiffness(chain: Chain) -> np.ndarray:
-    """The stiffness matrix in N/m of a lattice of equal cells; a wall holds the springs that leave fixed ends."""
+    """The stiffness matrix (dof, dof) in N/m of a lattice of equal cells; walls hold the end springs of fixed ends."""
     stiffness = [spring.stiffness for spring in chain.cell.springs]
     return assembled(chain, np.tile(stiffness, (chain.cells, 1)), stiffness)

@@ -8,7 +8,7 @@ from tests.models import CLEARANCE
 from vipetsc.case import NnmCase
 from vipetsc.lattice import Chain, four_band
 
-# The gap between bands 2 and 3 holds 1600 rad/s, where the breather of SPEC section 15 is: it decays within few cells.
+# The breather of SPEC section 15 has 1600 rad/s, in the gap between bands 2 and 3, and decays within few cells.
 BREATHER_CELLS = 14
 BREATHER_SITE = 5
 BREATHER_FREQUENCY = 1600.0
@@ -20,7 +20,10 @@ def breather_chain(ends: str = "fixed", sites: tuple[int, ...] = (BREATHER_SITE,
 
 
 def breather_case(**nnm: Any) -> NnmCase:
-    """The branch of two points from that breather, shot with the whole lattice; ``nnm`` updates its section."""
+    """The case of a branch of two points from the breather at ``BREATHER_FREQUENCY``, by shooting the whole lattice.
+
+    ``nnm`` updates the section of that name.
+    """
     section: dict[str, Any] = {
         "system": "chain",
         "start_frequency": [BREATHER_FREQUENCY],

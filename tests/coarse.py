@@ -1,4 +1,4 @@
-"""The program with coarse pictures: ``python -m tests.coarse ARGUMENTS`` of the command line, for tests of files."""
+"""The program with coarse pictures, for tests that look at files only: ``python -m tests.coarse ARGUMENTS``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 def coarse_pictures(replace: Callable[[object, str, object], None]) -> None:
-    """Make pictures coarse and leave out their layout, which takes longest; ``replace`` acts as ``setattr`` does."""
+    """Make pictures coarse and leave out their layout, the slowest step; ``replace`` acts as ``setattr`` does."""
     from vipetsc.figures import style
     from vipetsc.figures.layout import remove_engine
 

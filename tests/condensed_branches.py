@@ -20,17 +20,18 @@ from vipetsc.modes.system import System
 
 
 def condensed_problem(system: System, **options: Any) -> ConservativeMotions:
-    """The motions of a system with few masses; ``options`` are keys of [nnm]."""
+    """The equations of a system's periodic motions by harmonic balance; ``options`` are keys of [nnm]."""
     return condensed_system(system, NnmTable(**{"tolerance": 1e-12, "first_step": 1e-2} | options))
 
 
 def condensed_branch(
     system: System, mode: int, energy: float, **options: Any
 ) -> tuple[ConservativeMotions, list[Point]]:
-    """The problem and the points of a branch that begins at a linear mode (from 0) with an ``energy`` in J."""
+    """The problem and the points of a branch that begins in linear mode ``mode`` (from 0) with ``energy`` in J."""
     problem = condensed_problem(system, **options)
     omega, shapes = system.linear_modes()
     rows = np.vstack([system.contact_rows, system.spring_rows])
+    # A mode of unit modal mass has the energy omega^2 a^2 / 2 at the amplitude a.
     z = rows @ shapes[:, mode] * np.sqrt(2 * energy) / omega[mode]
     start = problem.from_mode(z, float(omega[mode]))
     return problem, [start, *Continuation(problem, start, problem.control)]
@@ -39,7 +40,7 @@ def condensed_branch(
 def condensed_breather(
     cells: int, site: int, omega: float, truncation: float = 1e-8, **options: Any
 ) -> tuple[ConservativeMotions, Point]:
-    """The problem and the breather of ``omega`` in rad/s about a contact in cell ``site`` (from 1)."""
+    """The problem and the breather of ``omega`` in rad/s at the only contact, in cell ``site`` (counted from 1)."""
     chain = Chain(four_band("calibrated"), cells, "fixed", (site - 1,), (CLEARANCE,))
     control = NnmTable(truncation=truncation, tolerance=1e-12, **options)
     forces = SiteForces([Stops.both(four_band_contact("hertz"), CLEARANCE)])
@@ -48,6 +49,6 @@ def condensed_breather(
 
 
 def displacement(problem: ConservativeMotions, point: Point) -> np.ndarray:
-    """Displacements of a system's masses at rest, at phase 0."""
+    """Displacements (mass,) in m at phase 0, where all velocities are zero."""
     (u,) = state_of(problem, point, len(problem.compliance.vectors)).values()
     return u

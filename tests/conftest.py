@@ -1,4 +1,4 @@
-"""Small cases and shared folders; signals and threads as the front door sets them."""
+"""Fixtures, small cases and helpers that tests share; this process has the signals and threads of the program's own."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-# Small matrices gain nothing from threads, which take the cores of other ranks and workers.
+# Small matrices gain nothing from threads, and threads take the cores of other ranks and workers.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import petsc4py
 
-# Signals are the front door's: PETSc's own handler would print its trace and abort.
+# The command line handles signals itself: PETSc's own handler would print its trace and abort.
 petsc4py.init(["pytest", "-no_signal_handler"])
 
 from mpi4py import MPI
@@ -40,7 +40,7 @@ from vipetsc.io.store import RunMemory
 from vipetsc.parallel import StopRequest, wait_for_all
 from vipetsc.process import collect_seldom
 
-# As in the program's own processes.
+# The program's own processes do the same: garbage is collected less often.
 collect_seldom()
 
 ROOT = Path(__file__).parents[1]
@@ -53,9 +53,9 @@ hypothesis.settings.load_profile("vipetsc")
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip tests for another number of ranks than there are, and name the command that runs them.
+    """Skip tests that need another number of ranks than there are, and name the command that runs them.
 
-    For those mpi-pytest calls mpiexec, which Open MPI refuses in a process that has MPI already.
+    Without this, mpi-pytest would call mpiexec for such tests, and Open MPI refuses that in a process with MPI.
     """
     if MPI.get_vendor()[0] != "Open MPI":
         return
@@ -99,7 +99,7 @@ def folder():
         shutil.rmtree(path, ignore_errors=True)
 
 
-# Three sites that differ in their laws, damping and stops, of which one has stops on both sides.
+# Three sites that differ in their laws, damping and stops; the second one has stops on both sides.
 DIFFERING = {
     "law": ["hertz", "bilinear", "power"],
     "stiffness": [5e6, 2e4, 1e6],
@@ -128,7 +128,7 @@ def small_case(**sections) -> Case:
 
 
 def simulated(case: Case, observers: Sequence[type[Observer]] = ()) -> tuple[xr.Dataset, Result]:
-    """The dataset and the result of a run in memory on one rank, which comes to its end."""
+    """The dataset and the result of a run in memory on one rank; a run that does not complete fails the test."""
     memory = RunMemory(MPI.COMM_SELF)
     result = simulate(case, memory, observers=observers)
 
@@ -138,7 +138,7 @@ def simulated(case: Case, observers: Sequence[type[Observer]] = ()) -> tuple[xr.
 
 
 def run_of(case: Case) -> xr.Dataset:
-    """The dataset of a run in memory on one rank, which comes to its end."""
+    """The dataset of a run in memory on one rank; a run that does not complete fails the test."""
     return simulated(case)[0]
 
 
@@ -155,12 +155,12 @@ def search_table(cells: int, sites: list[int], **sections: dict[str, Any]) -> di
     return with_sections(table, sections)
 
 
-# A second objective that the first one contradicts.
+# Two objectives that contradict each other: the transmitted energy at two amplitudes, of which one is minimised.
 TWO = "optimise.objective=[{measure='transmitted', amplitudes=[5.0]}, {measure='transmitted', goal='minimise'}]"
 
 
 def datasets(path: Path) -> dict[str, np.ndarray]:
-    """Every dataset of an HDF5 file by its path."""
+    """Every dataset of an HDF5 file, by its path within the file."""
     found = {}
 
     def collect(name: str, item: h5py.Dataset | h5py.Group) -> None:
@@ -173,7 +173,7 @@ def datasets(path: Path) -> dict[str, np.ndarray]:
 
 
 def assert_same_bits(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> None:
-    """Two files' datasets agree in every bit; NaN equals NaN."""
+    """Assert that the datasets of two files have the same bits; NaN equals NaN."""
     assert first.keys() == second.keys()
     for name, values in first.items():
         assert values.shape == second[name].shape, name
@@ -186,9 +186,9 @@ def assert_same_bits(first: dict[str, np.ndarray], second: dict[str, np.ndarray]
 def put_members(folder: Path, plan: Sweep, outcome: Callable[[int, Case], dict[str, Any] | str], file: int = 0) -> None:
     """Write a finished sweep whose members were not simulated.
 
-    ``outcome`` of a member's number and case is what is recorded of it, or a sentence that says why it failed.
+    ``outcome`` returns, for a member's number and case, what is recorded of it, or a sentence that says why it failed.
     """
-    # Only few tests need these modules, whose import takes a noticeable part of a second.
+    # Few tests need these modules, and their import takes a noticeable part of a second.
     from vipetsc.studies.ensemble import Results
     from vipetsc.studies.sweep import conclude
 
@@ -208,25 +208,25 @@ def put_members(folder: Path, plan: Sweep, outcome: Callable[[int, Case], dict[s
 
 
 def modified(folder: Path) -> dict[Path, int]:
-    """The time in ns at which each file in a folder was written."""
+    """The time in ns at which each file below ``folder`` was last written."""
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
-# What ranks write together; h5py's wheel cannot.
+# Ranks write one file together; the h5py of a wheel cannot.
 needs_parallel_hdf5 = pytest.mark.skipif(
     MPI.COMM_WORLD.size > 1 and not h5py.get_config().mpi,
     reason="this h5py is not built for MPI (Debian: python3-h5py-mpi)",
 )
 in_parallel = pytest.param("parallel", marks=needs_parallel_hdf5)
 
-# One rank is a serial test, which gives the cores to mpirun.
+# With 0 ranks the program is called without mpirun, in a serial test.
 alone_and_on_two_ranks = pytest.mark.parametrize("ranks", [0, pytest.param(2, marks=pytest.mark.mpirun)])
 
 
 def on_two(*values: object) -> list:
-    """Parameters of tests that ``scripts/test`` runs on one rank and on two alone; a value may be a tuple of arguments.
+    """Parameters for which ``scripts/test`` runs a test on one rank and on two, but not on more.
 
-    On more ranks they would show nothing new.
+    More ranks would show nothing new. A value may be a tuple of arguments.
     """
     parameters = []
     for value in values:
@@ -236,7 +236,7 @@ def on_two(*values: object) -> list:
 
 
 class StopAt(StopRequest):
-    """A request to stop that comes after a number of ``looks`` at it."""
+    """A request to stop that is granted after it has been looked at ``looks`` times."""
 
     def __init__(self, looks: int) -> None:
         self.left = looks
@@ -247,8 +247,8 @@ class StopAt(StopRequest):
         return self.left < 0
 
 
-# By these names Open MPI's mpirun, whose layers have been PMIx and PRRTE since 5, says which rank a process is. A
-# process without mpirun sets some of them itself when it loads MPI, and its children inherit them.
+# Environment variables by which Open MPI's mpirun says which rank a process is; since Open MPI 5 its layers PMIx and
+# PRRTE set them. A process without mpirun sets some of them itself when it loads MPI, and its children inherit them.
 NAMES_OF_RANKS = re.compile(r"(OMPI|PMIX|PRTE)_(?!MCA_|ALLOW_RUN_AS_ROOT)|OMPI_MCA_(ess|orte|pmix)")
 
 
@@ -261,10 +261,10 @@ def set_words(*changes: str) -> list[str]:
 
 
 def clean_environment() -> dict[str, str]:
-    """The environment without what this process's own MPI has put into it: a child may then be an mpirun.
+    """The environment without the variables of this process's own MPI: a child may then be an mpirun.
 
-    Ranks of tests are on one machine, and networks are switched off. Open MPI 5 would write lines about interfaces
-    among those that the program prints; Open MPI 4 would try some networks, and take four times as long to start.
+    All ranks are on one machine, and networks are switched off: with them Open MPI 5 would print lines about interfaces
+    among those of the program, and Open MPI 4 would try some networks and take four times as long to start.
     """
     kept = {name: value for name, value in os.environ.items() if not NAMES_OF_RANKS.match(name)}
     as_root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
@@ -291,9 +291,9 @@ def vipetsc():
 
 @pytest.fixture
 def in_process(capsys, monkeypatch):
-    """Call the program on one rank in this process, where how a process begins and ends is not what is tested.
+    """Call the program in this process, on one rank, for tests that do not concern how a process begins and ends.
 
-    ``in_process("run", ..., cwd=None)`` returns what the fixture ``vipetsc`` returns.
+    ``in_process("run", ..., cwd=None)`` returns what a call of the fixture ``vipetsc`` returns.
     """
 
     def call(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess:
@@ -314,9 +314,9 @@ def in_process(capsys, monkeypatch):
 
 @pytest.fixture
 def on_ranks(request, vipetsc, in_process):
-    """Call the program on a number of ranks of mpirun, or with 0 in this process: ``on_ranks(ranks, "run", ...)``.
+    """Call the program on ranks of mpirun, or in this process if ``ranks`` is 0: ``on_ranks(ranks, "run", ...)``.
 
-    If the test has the fixture ``plain_pictures``, pictures of the ranks are coarse as well.
+    If the test has the fixture ``plain_pictures``, the ranks draw coarse pictures as well.
     """
     options: dict[str, Any] = {}
     if "plain_pictures" in request.fixturenames:
@@ -332,7 +332,7 @@ def on_ranks(request, vipetsc, in_process):
 
 @pytest.fixture
 def plain_pictures(monkeypatch):
-    """Pictures are coarse and not laid out, which takes longest: for tests of files, not of what is seen."""
+    """Draw coarse pictures without their layout, the slowest step: for tests of files, not of what is seen."""
     coarse_pictures(monkeypatch.setattr)
 
 
@@ -351,6 +351,6 @@ def petsc_options():
 
     yield put
 
-    # The database of options belongs to the process: the next test would run with what this one leaves in it.
+    # The database of options belongs to the process: options that stay in it would act on the next test.
     for name in given:
         options.delValue(name)

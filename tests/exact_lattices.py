@@ -1,4 +1,4 @@
-"""Lattices of which cells differ and are damped, and their exact motion by the matrix exponential."""
+"""Lattices with cells that differ and are damped, and their exact motion by the matrix exponential."""
 
 from __future__ import annotations
 
@@ -44,10 +44,13 @@ def unlike_lattice(ends: str, cells: int, differing: Differing, dashpots: float)
 
 
 def exponential(chain: Chain, t: float) -> np.ndarray:
-    """The exact map P(t) of free motion; states are ordered as (2 dof, cell)."""
+    """The exact map exp(A t) of free motion over ``t`` in s, with A = [[0, I], [-M^-1 K, -M^-1 C]].
+
+    Its rows and columns are states: displacements, then velocities, each mass by mass and within a mass cell by cell.
+    """
     n = chain.cells
     size = n * chain.cell.dofs
-    # Matrices of a chain are ordered cell by cell, states mass by mass.
+    # Matrices of a chain are ordered cell by cell, states of the propagator mass by mass.
     order = np.arange(size).reshape(n, -1).T.ravel()
     inverse = -1 / chain.masses()[order][:, None]
     system = np.zeros((2 * size, 2 * size))

@@ -9,14 +9,14 @@ import numpy as np
 
 from vipetsc.studies.backbone import BRANCH
 
-# Energy in J at which the motion of the branch just touches.
+# Energy in J at which the motion of the branch just touches its stop.
 GRAZING = 0.03
 
 
 def write_branch(folder: Path, largest: float, last_region: float = np.inf) -> None:
-    """Write a branch into ``folder``, whose slope falls as 1/E in region III.
+    """Write into ``folder`` a branch whose slope falls with the energy E as 1/E from the grazing energy on.
 
-    It ends at ``largest`` times the grazing energy; region IV begins at the energy ``last_region`` in J.
+    The branch ends at ``largest`` times the grazing energy; region IV begins at the energy ``last_region`` in J.
     """
     energy = GRAZING * np.concatenate([[0.1, 1.0], np.geomspace(1.001, largest, 60)])
     region = np.select([energy <= GRAZING, energy < 1.2 * GRAZING, energy < last_region], [1, 2, 3], 4)

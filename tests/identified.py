@@ -1,4 +1,4 @@
-"""Cases and records of the verb ``identify``, computed by the engines, for several test modules."""
+"""Cases of the verb ``identify`` and records of simulated motions for them, for several test modules."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ POINTS = [{"name": "a", "cell": 2, "mass": 1}, {"name": "b", "cell": 3, "mass": 
 
 
 def lattice_table(**sections: dict[str, Any]) -> dict[str, Any]:
-    """The table of a short four-band lattice with three sites that strike within a burst; ``sections`` update it."""
+    """The table of a short four-band lattice with impacts at three sites under a burst; ``sections`` update it."""
     table: dict[str, Any] = {
         "name": "truth",
         "lattice": {"preset": "four-band", "cells": 6},
@@ -32,7 +32,7 @@ def measured_table(
 ) -> dict[str, Any]:
     """Write the motion of the ``POINTS`` in a run of ``table`` into a file, and return the table of that record.
 
-    ``noise`` is the standard deviation of random errors over the root mean square of each point's motion.
+    ``noise`` is the standard deviation of normal errors, as a fraction of the root mean square of each point's motion.
     """
     run = run_of(Case.from_table(table))
     values = run[f"points/{quantity}"].values

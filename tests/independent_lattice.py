@@ -1,4 +1,4 @@
-"""Records of lattices with stops by SciPy alone: equations, integrator and contacts share nothing with the package."""
+"""Motions of lattices with stops by SciPy: equations, integrator and contacts share no code with the package."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from scipy.integrate import solve_ivp
 class Stop:
     """A stop that mass ``resonator`` meets at w = u_resonator - u_host = ``side`` times ``gap``; host -1 is the ground.
 
-    Its force is k x^n (1 + c w'/w'_minus) with c = 3 (1 - r)/2.
+    At the penetration x = ``side`` w - ``gap`` > 0 its force is k x^n (1 + c w'/w'_minus): w'_minus is the velocity w'
+    at the onset of the contact, and c = 3 (1 - r)/2 with the restitution r.
     """
 
     resonator: int
@@ -26,7 +27,7 @@ class Stop:
     side: int = 1
 
     def row(self, count: int) -> np.ndarray:
-        """The row (``count``,) with which w = row @ u."""
+        """The row (``count``,) that gives w = row @ u from the displacements of ``count`` masses."""
         row = np.zeros(count)
         row[self.resonator] = 1.0
         if self.host >= 0:
@@ -35,7 +36,10 @@ class Stop:
 
 
 class CurvedSpring(NamedTuple):
-    """The part q z^2 + c z^3 of a spring's force at its elongation z = ``row`` @ u: ``quadratic`` q, ``cubic`` c."""
+    """The nonlinear part q z^2 + c z^3 of a spring's force at the elongation z = ``row`` @ u.
+
+    ``quadratic`` is q in N/m^2, ``cubic`` is c in N/m^3.
+    """
 
     row: np.ndarray
     quadratic: float
@@ -49,7 +53,10 @@ class CurvedSpring(NamedTuple):
 
 @dataclass(frozen=True)
 class ScipyLattice:
-    """M u'' + C u' + K u = force(t) + contacts + curved springs; ``masses`` (n,), ``damping``, ``stiffness`` (n, n)."""
+    """The lattice M u'' + C u' + K u = force(t) + forces of stops + nonlinear parts of springs.
+
+    ``masses`` (n,) are the diagonal of M, ``stiffness`` (n, n) is K and ``damping`` (n, n) is C.
+    """
 
     masses: np.ndarray
     stiffness: np.ndarray
@@ -59,13 +66,13 @@ class ScipyLattice:
     curved: tuple[CurvedSpring, ...] = ()
 
     def motion(self, times: np.ndarray, u: np.ndarray, v: np.ndarray, start: float) -> tuple[np.ndarray, int]:
-        """u, u', u'' (quantity, time, mass) at ``times`` in s, and the number of impacts up to the last one.
+        """u, u' and u'' (quantity, time, mass) at ``times`` in s, and the number of impacts until the last time.
 
         The motion begins at the time ``start`` with the displacements ``u`` (mass,) and the velocities ``v`` (mass,).
         """
         n = len(self.masses)
         rows = [stop.row(n) for stop in self.stops]
-        # Springs and dashpots in one product: rates are asked for some ten thousand times.
+        # Springs and dashpots are one product, because rates are evaluated some ten thousand times.
         linear = -np.hstack([self.stiffness, self.damping])
         closed: dict[int, float] = {}
         impacts = 0
@@ -77,7 +84,7 @@ class ScipyLattice:
             for k, speed in closed.items():
                 stop = self.stops[k]
                 depth = max(stop.side * (rows[k] @ y[:n]) - stop.gap, 0.0)
-                # The velocity over that at the onset, w'_minus, towards the stop.
+                # w'/w'_minus: the velocity towards the stop, over its value at the onset.
                 ratio = stop.side * (rows[k] @ y[n:]) / speed
                 pressure = stop.stiffness * depth**stop.exponent * (1 + 1.5 * (1 - stop.restitution) * ratio)
                 total = total - stop.side * pressure * rows[k]
@@ -103,13 +110,13 @@ class ScipyLattice:
                 (t, times[-1]),
                 y,
                 "DOP853",
-                # Far below what the tests compare, so that their tolerances are the package's alone.
+                # These errors are far below the tolerances of the tests, which then hold for the package alone.
                 rtol=1e-11,
                 atol=1e-15,
                 events=events,
-                # Values at samples alone: a dense output of all steps would cost a fifth more.
+                # Values are returned at the samples only: a dense output of all steps would cost a fifth more.
                 t_eval=times[times >= t],
-                # Events are looked for once a step: a longer one could miss a short contact.
+                # SciPy looks for events once a step: a longer step could miss a short contact.
                 max_step=2e-4,
             )
             first = np.searchsorted(times, t)
@@ -130,7 +137,7 @@ class ScipyLattice:
 
     @staticmethod
     def _end_of(solution: Any, last: float) -> tuple[float, np.ndarray]:
-        """Time and state at which SciPy's ``solution`` ended: a change of contact, or else the ``last`` time."""
+        """The time and state at the end of SciPy's ``solution``: at a change of contact, or at the time ``last``."""
         for times, states in zip(solution.t_events, solution.y_events, strict=True):
             if len(times):
                 return float(times[-1]), states[-1]
@@ -138,9 +145,9 @@ class ScipyLattice:
 
 
 def chain_matrices(count: int, stiffness: float, damping: float, ground: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """K and C (count, count) of equal springs and dashpots between two walls, with a dashpot ``ground`` to the ground.
+    """K and C (count, count) of ``count`` masses in a row, with equal springs and dashpots, between two walls.
 
-    ``stiffness`` is in N/m, ``damping`` and ``ground`` are in N s/m.
+    ``stiffness`` is in N/m, ``damping`` in N s/m; a dashpot ``ground`` in N s/m joins each mass to the ground.
     """
     shape = 2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
     return stiffness * shape, damping * shape + ground * np.eye(count)

@@ -1,4 +1,4 @@
-"""The modules with parts of users that the manual's chapter *extend* shows, written as files."""
+"""The users' modules that the manual's chapter *extend* shows, written as files."""
 
 from __future__ import annotations
 

@@ -34,12 +34,13 @@ def kerschen_system() -> System:
     return System.assemble([1.0, 1.0], springs, smooth=[SmoothSpring.between(None, 0, cubic=0.5)])
 
 
-# Two masses, of which the first one is joined to the next cell's; a lattice of them is its own mirror image.
+# Two masses, of which the first one is joined to the first one of the next cell; a lattice of them is symmetric under
+# reflection.
 TWO_MASS_CELL = {
     "masses": [4e-3, 2e-3],
     "springs": [{"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True}, {"start": 1, "end": 2, "stiffness": 5e3}],
 }
-# A cell that no preset has: three masses in a row, of which the first is joined to the next cell's.
+# A cell that no preset has: three masses in a row, of which the first one is joined to the first one of the next cell.
 THREE_MASS_CELL = {
     "masses": [0.010, 0.004, 0.002],
     "springs": [

@@ -1,4 +1,4 @@
-"""Cases of the scattering law of one site and of predictions that tests share."""
+"""Cases of the scattering law of one site, and of predictions, that tests share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LATTICES = {
     "diatomic": {"preset": "diatomic"},
     "three-mass": {"cell": THREE_MASS_CELL},
 }
-# A table of few points, each of one run.
+# A scattering law of few points, each from one run.
 COARSE = {"largest": 2.0, "samples": 1, "tolerance": 0.3, "finest": 0.2}
 
 PREDICTION: dict[str, Any] = {
@@ -27,10 +27,10 @@ PREDICTION: dict[str, Any] = {
 
 
 def law_case(lattice: str = "four-band", law: dict[str, Any] = COARSE, **sections: dict[str, Any]) -> LawCase:
-    """The law of a site without loss under a short burst; ``sections`` update the table of the case."""
+    """The case of the scattering law of a lossless site under a short burst; ``sections`` update its table."""
     contacts: dict[str, Any] = {"sites": [2], "clearance": 1e-3, "restitution": 1.0}
     if lattice == "three-mass":
-        # Only presets have a stiffness of their own.
+        # Presets have a contact stiffness of their own, other cells have none.
         contacts["stiffness"] = 5e6
     table = {
         "lattice": LATTICES[lattice],
@@ -43,5 +43,5 @@ def law_case(lattice: str = "four-band", law: dict[str, Any] = COARSE, **section
 
 
 def prediction_case(**sections: dict[str, Any]) -> PredictCase:
-    """Two sites of a four-band lattice at four amplitudes; ``sections`` update the table of the case."""
+    """The case of a prediction for two sites of a four-band lattice; ``sections`` update its table."""
     return PredictCase.from_table(with_sections(PREDICTION, sections))

@@ -1,4 +1,4 @@
-"""What cannot be read in a figure: text outside the page or over other text, axes without labels, unnamed panels."""
+"""Faults of a figure's text: outside the page, over other text, too few labels on an axis, panels without a letter."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 OVERLAP = 2  # pixels that boxes of text may have in common: a box is higher than the letters in it
-FEWEST = 3  # labels of a logarithmic axis: with fewer the values between them cannot be told
+FEWEST = 3  # labels of a logarithmic axis: with fewer the values between them cannot be estimated
 
 
 def complaints(figure: Figure) -> list[str]:
-    """Return a sentence for everything that cannot be read in a laid-out figure."""
+    """Return a sentence for each fault of the text in a laid-out figure."""
     return [*_texts(figure), *_logarithmic_axes(figure), *_letters(figure)]
 
 
 def _texts(figure: Figure) -> Iterator[str]:
+    """Yield a sentence for each text outside the page, and for each two texts that overlap."""
     FigureCanvasAgg(figure)
     figure.draw_without_rendering()
     renderer = figure.canvas.get_renderer()
@@ -40,7 +41,7 @@ def _texts(figure: Figure) -> Iterator[str]:
 
 
 def _hidden(figure: Figure) -> Iterator[Text]:
-    """Yield labels that are not drawn: those of ticks beyond their axis or switched off, and of axes switched off."""
+    """Yield labels that are not drawn: of ticks beyond their axis, of ticks and of axes that are switched off."""
     for axes in figure.findobj(Axes):
         for axis in (axes.xaxis, axes.yaxis):
             if not axes.axison:
@@ -52,6 +53,7 @@ def _hidden(figure: Figure) -> Iterator[Text]:
 
 
 def _logarithmic_axes(figure: Figure) -> Iterator[str]:
+    """Yield a sentence for each logarithmic axis with fewer than ``FEWEST`` labels within its limits."""
     for axes in figure.get_axes():
         for axis in (axes.xaxis, axes.yaxis):
             low, high = sorted(axis.get_view_interval())
@@ -61,9 +63,9 @@ def _logarithmic_axes(figure: Figure) -> Iterator[str]:
 
 
 def _letters(figure: Figure) -> Iterator[str]:
-    """Yield a sentence for each panel without a letter on a page of several.
+    """Yield a sentence for each panel without a letter in a figure of several panels.
 
-    Panels of a subfigure may have one letter together, in the title of the subfigure.
+    The panels of a subfigure may share one letter, in the title of the subfigure.
     """
     together = {part for part in figure.findobj(lambda one: getattr(one, "_suptitle", None)) if _begins(part._suptitle)}
     shown = [axes for axes in figure.get_axes() if axes.axison and axes.get_label() != "<colorbar>"]
@@ -73,4 +75,5 @@ def _letters(figure: Figure) -> Iterator[str]:
 
 
 def _begins(text: Text) -> bool:
+    """Whether a title begins with a panel's letter."""
     return text.get_text().startswith("(")

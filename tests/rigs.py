@@ -1,4 +1,4 @@
-"""Cases of frequency responses of what stands on a table, and their time integration by SciPy."""
+"""Frequency responses of rigs on a shaking table: cases, and the time integration of their motions by SciPy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.response.state import Response
 from vipetsc.modes.response.steady import SteadyStates
 
-# Two masses of 1 kg between walls, of which the first one meets a stop of the table; the left wall shakes.
+# Two masses of 1 kg between two walls; the first mass meets a stop on the ground, and the left wall moves.
 TWO_MASSES: dict[str, Any] = {
     "name": "rig",
     "lattice": {
@@ -42,13 +42,13 @@ OUTPUT: dict[str, Any] = {
 
 
 def rate_of(states: SteadyStates, omega: float, amplitude: float):
-    """The equations of motion of a lattice with elastic contacts, from its matrices: y' = f(t, y), y = (u, u').
+    """The equations of motion of a lattice with elastic contacts: a function f with y' = f(t, y) and y = (u, u').
 
-    States (..., component) may be several. Springs that are not linear are looked for cell by cell, between walls or on
-    a line of cells with free ends.
+    The states y (..., component) may be several. Linear parts come from the lattice's matrices. Springs that are not
+    linear are added one by one, for fixed or free ends: the spring that closes a ring is left out.
     """
     chain = states.case.model().chain
-    # Lattices are so small that products with whole matrices are the quicker ones.
+    # For such small lattices products with dense matrices are faster than with sparse ones.
     stiffness = chain.stiffness_matrix().toarray()
     damping = chain.damping_rows(0, chain.cells).toarray()
     masses = chain.masses()
@@ -100,7 +100,7 @@ def rate_of(states: SteadyStates, omega: float, amplitude: float):
 
 
 def after_a_period(states: SteadyStates, point: Response, state: np.ndarray) -> np.ndarray:
-    """The ``state`` (..., displacements and velocities), or several together, a period later, by SciPy."""
+    """The state (..., displacements and velocities) one period after ``state``, by SciPy; states may be several."""
     omega, amplitude = states.drive(point.xi[-1])
     rate = rate_of(states, omega, amplitude)
     period = 2 * np.pi / omega
@@ -114,22 +114,25 @@ def after_a_period(states: SteadyStates, point: Response, state: np.ndarray) -> 
 
 
 class PeriodMap(NamedTuple):
-    """The ``end`` of a period that begins in a state, and the Floquet ``multipliers`` of the motion from there."""
+    """The state ``end`` (component,) after a period, and the eigenvalues ``multipliers`` of the period map's Jacobian.
+
+    On a periodic motion the eigenvalues are its Floquet multipliers.
+    """
 
     end: np.ndarray
     multipliers: np.ndarray
 
 
 def period_map(states: SteadyStates, point: Response, state: np.ndarray) -> PeriodMap:
-    """The map of a period at a ``state``, its derivative by differences."""
+    """The map of a period at ``state`` (component,); its Jacobian comes from forward differences."""
     step = 1e-6
-    # Integrated together, all have the same steps, whose errors the differences do not contain.
+    # Motions that are integrated together have the same time steps, whose errors cancel in the differences.
     ends = after_a_period(states, point, state + step * np.vstack([np.zeros(len(state)), np.eye(len(state))]))
     return PeriodMap(end=ends[0], multipliers=np.linalg.eigvals((ends[1:] - ends[0]).T / step))
 
 
 def followed(case: NfrcCase, folder):
-    """The only curve of a case, and its equations."""
+    """The equations of a case's only curve, and the points of that curve."""
     folder.mkdir(exist_ok=True)
     (curve,) = follow_all(case, folder, MPI.COMM_SELF)
     _, restitution, fixed = case.curves()[0]

@@ -1,4 +1,4 @@
-"""Cases of frequency response curves that tests share, and the motion that a point of a curve stands for."""
+"""Cases of frequency response curves that tests share, and the motion in the lattice at a point of a curve."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NFRC = {"harmonics": 11, "range": [0.98, 1.01]}
 
 
 def nfrc_case(lattice: dict[str, Any] | None = None, contacts: dict[str, Any] | None = None, **nfrc: Any) -> NfrcCase:
-    """One site of a four-band lattice under a wave; arguments update the tables of the case."""
+    """The case of one site of a four-band lattice under a wave; arguments update the tables of the case."""
     table = {"name": "x", "lattice": LATTICE | (lattice or {}), "contacts": CONTACTS | (contacts or {})}
     return NfrcCase.from_table(table | {"nfrc": NFRC | nfrc})
 
@@ -34,7 +34,7 @@ def curve_of(case: NfrcCase, folder: Path):
 
 
 def refined(few: SteadyStates, many: SteadyStates, xi: np.ndarray) -> np.ndarray:
-    """The solution near ``xi``, which has the harmonics of ``few``, with those of ``many``."""
+    """The solution with the harmonics of ``many`` near the solution ``xi`` with the harmonics of ``few``."""
     missing = many.options.harmonics - few.options.harmonics
     harmonics = np.pad(few.balance.unpack(xi[:-1]), ((0, 0), (0, missing)))
     guess = np.append(many.balance.pack(harmonics), xi[-1])
@@ -42,14 +42,14 @@ def refined(few: SteadyStates, many: SteadyStates, xi: np.ndarray) -> np.ndarray
 
 
 def motion_at(states: SteadyStates, xi: np.ndarray, cells: np.ndarray, phase: float | np.ndarray = 0.0):
-    """Displacement and velocity (cell, dof, ...) of a steady state at a ``phase`` (...) of its drive."""
+    """Displacement in m and velocity in m/s of a steady state at the ``phase`` (...) of its drive: (cell, dof, ...)."""
     omega, amplitude = states.drive(xi[-1])
     unknowns = xi[:-1] * states.clearance
-    # Motions that are the same on both sides have no mean.
+    # Motions that are symmetric about zero have no mean.
     first = 1 if states.options.symmetric else 0
     orders = np.arange(first, states.balance.unpack(unknowns).shape[1])
 
-    # Forces on the lattice, harmonic by harmonic: of its contacts, and of the drive at the first one.
+    # Contacts act on the lattice with every harmonic, the drive with the first one only.
     forces = states.balance.series(unknowns, omega).forces
     displacement = 0.0
     velocity = 0.0
@@ -68,6 +68,6 @@ def motion_at(states: SteadyStates, xi: np.ndarray, cells: np.ndarray, phase: fl
 
 
 def first_harmonic(motion: np.ndarray, samples: int) -> float:
-    """The amplitude of the first harmonic of a ``motion`` (time,) over whole periods of so many ``samples``."""
+    """The amplitude of the first harmonic of a ``motion`` (time,) over whole periods of ``samples`` samples each."""
     turns = np.exp(-2j * np.pi * np.arange(len(motion)) / samples)
     return float(2 * np.abs(np.mean(turns * motion)))

@@ -1,4 +1,4 @@
-"""A lattice whose cells and sites all differ, as a case of normal modes and by SciPy alone."""
+"""A lattice whose cells and sites all differ, as a case of nonlinear normal modes and as equations for SciPy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ HOSTS = np.linspace(4e-3, 5e-3, CELLS)
 RESONATORS = np.full(CELLS, 2e-3)
 BETWEEN = 1e4
 WITHIN = np.array([5e3, 5.5e3, 4.5e3])
-# Sites: within the first cell with stops on both sides, between the first two cells on one side, to the ground.
+# Three sites: within the first cell, with stops on both sides; between the first two cells, with a stop on one side;
+# and to the ground in the third cell.
 LINEAR = 4e4
 HERTZ = 2e6
 TABLE: dict[str, Any] = {
@@ -52,7 +53,7 @@ def unlike_case(**nnm: Any) -> NnmCase:
 
 
 def independent_lattice() -> ScipyLattice:
-    """The same lattice, put together mass by mass: host and resonator of each cell in turn."""
+    """The lattice of ``TABLE``, assembled spring by spring; its masses are host and resonator of each cell in turn."""
     n = 2 * CELLS
     stiffness = np.zeros((n, n))
     for left in range(-1, CELLS):

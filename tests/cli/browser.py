@@ -1,4 +1,4 @@
-"""Headless Chromium behind its driver, and what is measured of a page in it."""
+"""Headless Chromium, controlled through its driver, and measurements of the pages that it shows."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ return {
 
 
 class Browser:
-    """Headless Chromium behind its driver, spoken to as the W3C protocol has it."""
+    """Headless Chromium, controlled through its driver by the W3C WebDriver protocol."""
 
     def __init__(self, folder: Path) -> None:
         with socket.socket() as free:
@@ -49,16 +49,16 @@ class Browser:
         self.base = f"http://127.0.0.1:{port}"
         log = (folder / "driver.log").open("w")
         self.driver = subprocess.Popen(
-            # A session of its own, by which all its processes are found.
             ["chromedriver", f"--port={port}"],
             stdout=log,
             stderr=log,
+            # The driver leads a process session of its own, by which all its processes are found.
             start_new_session=True,
         )
         self.sessions: list[str] = []
 
     def call(self, path: str, body: dict | None = None, method: str | None = None, patience: float = 30) -> Any:
-        """The ``value`` of the driver's answer; waits until the driver listens."""
+        """Send a request; returns the ``value`` of the answer. Waits up to ``patience`` s for the driver to listen."""
         data = None if body is None else json.dumps(body).encode()
         request = urllib.request.Request(self.base + path, data, {"Content-Type": "application/json"}, method=method)
         deadline = time.monotonic() + patience
@@ -66,7 +66,7 @@ class Browser:
             try:
                 with urllib.request.urlopen(request, timeout=60) as answer:
                     return json.load(answer)["value"]
-            # An answer of the driver, which listens: a refusal is not repeated.
+            # The driver has answered with a refusal: it listens, and the request is not repeated.
             except urllib.error.HTTPError:
                 raise
             except OSError:
@@ -76,11 +76,11 @@ class Browser:
                 time.sleep(0.1)
 
     def open(self, page: Path, width: int, height: int) -> str:
-        """A new session that shows ``page`` in a window of that size; returns its path."""
+        """Open a session that shows ``page`` in a window of ``width`` x ``height`` pixels; returns its path."""
         switches = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
                     "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
                     f"--user-data-dir={self.home}/{len(self.sessions)}"]  # fmt: skip
-        # The mouse of a phone is a finger.
+        # A narrow window stands for a phone, which is operated by touch.
         phone = width < 600
         metrics = {
             "deviceMetrics": {"width": width, "height": height, "pixelRatio": 1.0, "mobile": phone, "touch": phone}
@@ -97,20 +97,23 @@ class Browser:
         return session
 
     def show(self, session: str, page: Path) -> None:
-        """Another page in the same window."""
+        """Show another page in the window of ``session``."""
         self.call(f"{session}/url", {"url": page.as_uri()})
 
     def ask(self, session: str, script: str) -> Any:
-        """What ``script`` returns in the page."""
+        """Run ``script`` in the page; returns its value."""
         return self.call(f"{session}/execute/sync", {"script": script, "args": []})
 
     def measure(self, session: str) -> dict[str, Any]:
-        """What ``MEASURE`` finds in the page, and the errors of its console."""
+        """Run ``MEASURE`` in the page; returns its findings and the ``errors`` of the console."""
         log = self.call(f"{session}/se/log", {"type": "browser"})
         return self.ask(session, MEASURE) | {"errors": [line for line in log if line["level"] == "SEVERE"]}
 
     def drag(self, session: str, *places: tuple[float, float]) -> None:
-        """The pressed mouse from the first of ``places`` (x, y in the window) to the others; one place: no button."""
+        """Drag the mouse from the first of ``places`` (x, y in the window, in pixels) to the others.
+
+        With one place the mouse only moves there, without a pressed button.
+        """
         moves = [{"type": "pointerMove", "duration": 0, "x": round(x), "y": round(y)} for x, y in places]
         steps = moves
         if len(moves) > 1:
@@ -121,11 +124,11 @@ class Browser:
         self.call(f"{session}/actions", {"actions": [{"type": "pointer", "id": "mouse", "actions": steps}]})
 
     def processes(self) -> list[int]:
-        """Every process of the driver's session, and every browser with a profile in the folder."""
+        """The numbers of the driver's processes, and of all browsers with a profile in the folder."""
         numbers = []
         for path in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
-                # After the last bracket: the name of a program may have blanks and brackets itself.
+                # State and session follow the last bracket: the program's name may have blanks and brackets itself.
                 zombie, session = (path / "stat").read_text().rpartition(")")[2].split()[0:4:3]
                 # A browser may leave the session; its command has the folder of the profile.
                 started_here = os.fsencode(self.home) in (path / "cmdline").read_bytes()
@@ -134,7 +137,7 @@ class Browser:
         return numbers
 
     def close(self) -> None:
-        """Quit the browsers and their driver; what does not go by itself within seconds is killed."""
+        """Quit the browsers and their driver; processes that have not ended within seconds are killed."""
         for session in self.sessions:
             with suppress(OSError):
                 self.call(session, method="DELETE", patience=0)
@@ -143,7 +146,7 @@ class Browser:
         while self.processes() and time.monotonic() < deadline:
             time.sleep(0.05)
         for number in self.processes():
-            # It may have ended since it was listed.
+            # The process may have ended since it was listed.
             with suppress(ProcessLookupError):
                 os.kill(number, signal.SIGKILL)
         self.driver.wait()
@@ -151,7 +154,7 @@ class Browser:
 
 @contextmanager
 def browsing(folder: Path) -> Iterator[Browser]:
-    """A browser with its profile in ``folder``, of which no process is left behind."""
+    """Yield a browser with its profile in ``folder``; afterwards assert that no process of it is left."""
     opened = Browser(folder)
     try:
         yield opened

@@ -42,7 +42,7 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path, monkeypatch, c
         assert row["seconds"] > 0, row
         errors.setdefault(row["solver"], []).append(row["error"])
 
-    # Peers that a machine may lack are held to the same where they are installed.
+    # A machine may lack some solvers: those that it can run must be among the results.
     wanted = {"vipetsc ts", "DOP853 numba", "DOP853 numpy"}
     has_compiler = bool(shutil.which("c++"))
     monkeypatch.syspath_prepend(str(SCRIPTS))
@@ -59,14 +59,14 @@ def test_every_solver_gains_accuracy_with_its_tolerance(tmp_path, monkeypatch, c
     assert wanted <= errors.keys()
 
     for solver, falling in errors.items():
-        # Kinks that Fehlberg's estimate overlooks leave its error uneven.
+        # Fehlberg's error estimate overlooks some kinks of the force, and the error falls unevenly with the tolerance.
         fraction = 0.3 if solver == "odeint fehlberg78" else 1e-3
-        # Exact steps leave little that could fall: the propagator begins where the reference's own error lies.
+        # The propagator's linear steps are exact: its largest error is already about the reference's own.
         assert falling[-1] < max(fraction * falling[0], 1e-11), (solver, falling)
     assert max(found["reference"]["separation"].values()) < 1e-9
     assert min(found["ratios"].values()) > 0
 
-    # A picture without curves takes less.
+    # An empty picture takes fewer bytes.
     assert (tmp_path / "work-precision.png").stat().st_size > 5000
     from bench import main
 
@@ -86,12 +86,12 @@ def test_what_two_ranks_do_is_timed_beside_memory_messages_and_files(monkeypatch
     assert row["wall_ms"] > 0
     assert 0 < row["fraction_of_bandwidth_limit"] < 1
     assert 0.01 < row["peak_gib_a_rank"] < 4
-    # Each stage of a step sends the ghosts of a cell, 4 displacements and 4 velocities or half of them.
+    # A message holds the ghosts of one cell: 4 displacements and 4 velocities of 8 bytes, or half of them.
     assert row["messages"] >= 13
     assert row["message_bytes"] / row["messages"] in (32, 64)
-    # One of PETSc's own a step, and ours.
+    # A step of 13 stages has at least one reduction, of PETSc or of the package.
     assert row["reductions"] > row["messages"] / 14
-    # Events of PETSc's log.
+    # These times come from events of PETSc's log.
     assert row["TSStep_ms"] > row["ContactSearch_ms"] > 0
 
     alone, together = builds([(200, 3)])
@@ -130,14 +130,15 @@ def test_a_model_of_many_ranks_and_the_targets_read_the_same_rows(monkeypatch):
     rows.append({"engine": "ts", "cells": 300, "ranks": 0, "failure": "no memory"})
 
     model = ScalingModel(rows, "propagator")
-    # 1e-8 s a cell and a message to each neighbour and ten in turn for the reduction.
+    # 2000 cells a rank take 1e-8 s each; a message to each of two neighbours, and log2(1024) = 10 messages one after
+    # the other for the reduction, take the latency each.
     assert model.total(1024 * 2000, 1024) == pytest.approx(2e-5 + 12 * LATENCY)
     assert model.total(10**6, 1) == pytest.approx(1e-2)
     assert model_tables(rows).count("| propagator |") == 3
     # The engine whose rows all failed has no model.
     assert "| ts |" not in model_tables(rows)
 
-    # No target concerns the bandwidth of so few cells.
+    # No target concerns the bandwidth of so few cells: this row must change nothing.
     short_alone.update(fraction_of_bandwidth_limit=0.1)
     found = {
         "scaling": rows,
@@ -145,8 +146,8 @@ def test_a_model_of_many_ranks_and_the_targets_read_the_same_rows(monkeypatch):
         "members": {"diatomic": 1.0},
     }
     met = {target.name: target.met for target in targets(found)}
-    # 21 times where 20 are wanted, 0.4 of the limit where 0.3 are, a gain of 1.4 / 2 where 0.9 is, 2 where 1 is, and
-    # 1 s where a member may take 0.25 s.
+    # Measured and wanted: 21 and 20 times as fast as odeint; 0.4 and 0.3 of the bandwidth limit; 1.4/2 and 0.9 of the
+    # speedup of memory on two ranks; 2 and 1 times as fast on two ranks; 1 s and at most 0.25 s a member.
     assert list(met.values()) == [True, True, False, True, False]
     assert table(found).count("| yes |") == 3
 
@@ -156,7 +157,7 @@ def test_programs_run_beside_an_earlier_version(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(SCRIPTS))
     import bench_programs
 
-    # A repository of its own: these sources may come from an archive, which has no history.
+    # The test makes a repository of its own, because these sources may come from an archive without history.
     sources = tmp_path / "sources"
     shutil.copytree(SCRIPTS.parent / "vipetsc", sources / "vipetsc", ignore=shutil.ignore_patterns("__pycache__"))
     git = ["git", "-C", str(sources), "-c", "user.name=bench", "-c", "user.email=bench@example.org"]
@@ -172,7 +173,7 @@ def test_programs_run_beside_an_earlier_version(tmp_path, monkeypatch):
     assert min(helped["wall_now"], helped["cpu_now"], helped["cpu_before"]) > 0.02
     assert helped["wall_ratio"] == pytest.approx(helped["wall_now"] / helped["wall_before"])
     assert "none.toml" in failed["failure"]
-    # The package of that commit was unpacked, not the present one.
+    # The package of the commit was unpacked, not the present one.
     unpacked = tmp_path / "baseline" / "HEAD" / "vipetsc"
     assert (unpacked / "__init__.py").exists()
     assert not (unpacked / "added_since.py").exists()
@@ -185,7 +186,7 @@ def test_programs_run_beside_an_earlier_version(tmp_path, monkeypatch):
 
 
 def test_the_goal_of_a_program_is_compared_with_its_ratio(monkeypatch):
-    """A goal of wall time is compared with that ratio, one of CPU time with the other, and none of a failed call."""
+    """A goal of wall time is compared with the ratio of wall times, one of CPU time with that of CPU times."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     from bench_targets import targets
 
@@ -198,7 +199,7 @@ def test_the_goal_of_a_program_is_compared_with_its_ratio(monkeypatch):
 
 
 def test_the_chapter_takes_the_tables_that_were_measured(monkeypatch):
-    """A table with the titles of a measured one is replaced, all else remains; a table without a place is named."""
+    """A table with the titles of a measured one is replaced, all else remains; one without a place is returned."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     from bench_chapter import CHAPTER, with_tables
 
@@ -210,32 +211,32 @@ def test_the_chapter_takes_the_tables_that_were_measured(monkeypatch):
     assert written == chapter.replace("| ms |", "| s |").replace("| 1 |", "| 7 |")
     assert left == ["goal|met"]
 
-    # Of the goals only those that were measured change.
+    # In the table of goals, rows that were measured are replaced or added, and the others stay.
     goals = "| goal | measured |\n|---|---|\n| ts | 1 |\n| plot | 2 |\n"
     written, _ = with_tables(goals, "| goal | measured |\n|---|---|\n| plot | 3 |\n| run | 4 |\n")
     assert written == goals.replace("| 2 |", "| 3 |") + "| run | 4 |\n"
 
-    # A table that is measured twice changes nothing else in the real chapter either.
+    # The real chapter stays as it is if every measured table equals the one that it has.
     text = CHAPTER.read_text(encoding="utf-8")
     assert with_tables(text, text) == (text, [])
 
 
 def test_equal_error_is_interpolated_in_logarithms_and_never_beyond_the_points(monkeypatch):
-    """The cost at an error follows a power law between the points; beyond them it is a bound, if that is asked for."""
+    """The time at an error is a power law between measured points; beyond them there is none, or a bound on request."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     from bench_precision import at_equal_error
 
-    # Twice the time for a tenth of the error.
+    # Pairs of error and time: a tenth of the error takes twice the time.
     power_law = [(10.0**-k, 2.0**k) for k in range(4, 9)]
 
     assert at_equal_error(power_law, 10**-5.5) == pytest.approx(2**5.5)
     assert at_equal_error(power_law, 1e-3) is None
     assert at_equal_error(power_law, 1e-9) is None
 
-    # A larger error costs no more than the largest one; what a smaller one costs cannot be bounded.
+    # The time at the largest measured error bounds that at any larger error; nothing bounds that at a smaller error.
     assert at_equal_error(power_law, 1e-3, bound=True) == pytest.approx(2**4)
     assert at_equal_error(power_law, 1e-9, bound=True) is None
     assert at_equal_error([], 1e-5, bound=True) is None
 
-    # A point that is slower and less accurate than another one says nothing about what an error costs.
+    # A point that is slower and less accurate than another one does not change the result.
     assert at_equal_error([*power_law, (3e-6, 1e4)], 3e-6) == pytest.approx(at_equal_error(power_law, 3e-6))

@@ -1,4 +1,4 @@
-"""The verb design as a user types it: files, table, refusal, pictures again from the file alone."""
+"""The verb design as a user types it: files, table, refusal, pictures from the file alone."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def case(tmp_path):
 
 
 def numbers(path):
-    """Return the datasets that hold numbers; those of texts have Python objects."""
+    """Return the datasets of ``path`` that hold numbers, and not those that hold texts."""
     return {name: values for name, values in datasets(path).items() if values.dtype != object}
 
 
 @pytest.mark.mpirun
 def test_search_leaves_its_file_its_pictures_and_a_table(on_ranks, in_process, case, tmp_path):
-    """The search leaves its files; the cell that it names has the bands that the cell's model has.
+    """The search leaves its files, and the recorded bands of the best cell are those of Bloch's theorem for that cell.
 
-    A second call makes nothing, and two ranks make the same bits.
+    A second call computes nothing, and two ranks compute the same bits as one.
     """
     out = tmp_path / "out"
     done = in_process("design", case, "--out", out)
@@ -56,7 +56,7 @@ def test_search_leaves_its_file_its_pictures_and_a_table(on_ranks, in_process, c
     with xarray.open_dataset(out / "design.h5", engine="h5netcdf") as file:
         assert list(file.reading.values) == ["printed", "calibrated"]
         assert file["weighted"].dims == ("reading", "lambda", "eta")
-        # eta = 1 would leave the host without mass.
+        # The value eta = 1 is left out: it would leave the host without mass.
         assert file.eta.values[-1] == 0.9
         assert "eta = 1" in file.attrs["left_out"]
         assert file.attrs["vipetsc_version"]
@@ -69,7 +69,7 @@ def test_search_leaves_its_file_its_pictures_and_a_table(on_ranks, in_process, c
 
         cell = four_band("calibrated", place["lambda"], place["eta"])
         expected = bloch(cell, file.wavenumber.values).frequency
-        # The first band begins at zero, where a relative tolerance alone may not be met.
+        # The first band begins at zero frequency, where a relative tolerance alone may not be met.
         np.testing.assert_allclose(best.frequency.sel(place).values, expected, atol=1e-9)
 
         second = best.optimum_deflection.sel(band=2)
@@ -81,7 +81,7 @@ def test_search_leaves_its_file_its_pictures_and_a_table(on_ranks, in_process, c
     second_call = in_process("design", case, "--out", out)
     assert second_call.returncode == 0
     assert second_call.stdout.splitlines()[:8] == done.stdout.splitlines()[:8]
-    # Complete: nothing is computed again.
+    # The search is complete: nothing is computed again.
     assert modified(out) == written
 
     before = numbers(out / "design.h5")
@@ -94,7 +94,7 @@ def test_pictures_again_from_the_file_alone(in_process, monkeypatch, case, tmp_p
     out = tmp_path / "out"
     bare = tmp_path / "bare"
     with monkeypatch.context() as context:
-        # The one that is compared below.
+        # The search draws only the picture that is compared below.
         for name in FIGURES - {"cost_maps"}:
             context.delitem(registry.FIGURES, name)
         assert in_process("design", case, "--out", out, "--set", "design.readings=['printed']").returncode == 0
@@ -105,7 +105,7 @@ def test_pictures_again_from_the_file_alone(in_process, monkeypatch, case, tmp_p
     assert done.returncode == 0, done.stderr
     drawn = {p.name: p.stat().st_size for p in (bare / "figures").iterdir()}
     assert drawn.keys() == {f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf")}
-    # A picture without curves takes less.
+    # An empty picture takes fewer bytes.
     assert min(drawn.values()) > 5000
     assert (bare / "figures" / "cost_maps.png").read_bytes() == (out / "figures" / "cost_maps.png").read_bytes()
 
@@ -123,13 +123,13 @@ def test_pictures_again_from_the_file_alone(in_process, monkeypatch, case, tmp_p
 
 
 def test_a_grid_without_a_good_cell_says_so(in_process, case, tmp_path):
-    """A search of which no cell is out of phase ends well, says so and has no optimum."""
-    # Springs of the resonators that are fifty times as stiff as the paper's, and more.
+    """A search without a cell whose masses move out of phase ends with 0, says so and has no optimum."""
+    # The resonators' springs are at least fifty times as stiff as the paper's.
     stiff = set_words("design.lambda.first=5.0", "design.lambda.last=6.0")
 
     done = in_process("design", case, "--out", tmp_path / "out", *stiff)
     assert done.returncode == 0, done.stderr
-    # Three costs in each of two readings.
+    # There are three costs in each of two readings.
     assert done.stdout.count("none is out of phase") == 6
     assert np.isnan(datasets(tmp_path / "out" / "design.h5")["optimum_lambda"]).all()
 
@@ -159,7 +159,7 @@ def test_what_is_wrong_with_a_search_is_named(change, message):
 
 
 def test_bad_cases_write_nothing(in_process, case, tmp_path):
-    """Everything wrong is said at once, once; tests/mpi/test_refusals.py says it of two ranks."""
+    """All problems of a case are reported together, each once; tests/mpi/test_refusals.py tests two ranks."""
     wrong = set_words("design.eta.last=1.5", "design.lambda.coutn=3", "design.wavenumbers=2")
 
     done = in_process("design", case, "--out", tmp_path / "out", *wrong)
@@ -175,7 +175,7 @@ def test_bad_cases_write_nothing(in_process, case, tmp_path):
 
 
 def test_results_of_other_kinds_are_never_replaced(in_process, case, tmp_path):
-    """Even --force replaces no results of another verb, be it by a search or of one."""
+    """Even with --force a search replaces no results of another verb, and no other verb those of a search."""
     for evidence in ("run.h5", "branch-mode-1.h5", "index.json"):
         folder = tmp_path / evidence.split(".")[0]
         folder.mkdir()

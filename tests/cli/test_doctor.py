@@ -1,4 +1,4 @@
-"""What ``doctor`` says of a machine on which the program cannot work, and of one that nobody has tried."""
+"""The report of ``doctor`` on machines on which the program cannot work, and on ones with untested versions."""
 
 from __future__ import annotations
 
@@ -61,6 +61,7 @@ def version_of(monkeypatch):
     ],
 )
 def test_a_package_that_is_too_old(version_of, name, version, remedy):
+    """A package below its oldest version is a fault that names that version and the command that brings it."""
     version_of(name, version)
     check = check_package(NAMED[name])
     assert check.value == version
@@ -69,7 +70,7 @@ def test_a_package_that_is_too_old(version_of, name, version, remedy):
 
 
 def test_doctor_ends_with_2_where_the_program_cannot_work(in_process, version_of):
-    # One package too old and one missing: both are named in the last line.
+    """One package is too old and one is missing: both are named in the last line, and the exit code is 2."""
     version_of("xarray", "2024.9.0")
     version_of("cma", None)
     ended = in_process("doctor")
@@ -80,24 +81,26 @@ def test_doctor_ends_with_2_where_the_program_cannot_work(in_process, version_of
 
 
 def test_a_package_that_is_newer_than_any_tried(version_of):
+    """A version after the latest tested one is no fault but a note."""
     version_of("petsc4py", "3.27.0")
     check = check_package(NAMED["petsc4py"])
     assert not check.fault
     assert "newer than 3.26, the latest tested version" in check.note
-    # A patch of the latest, the oldest and a candidate are no newer.
+    # A patch or a candidate of the latest tested version, and the oldest version, bring no note.
     for version in ("3.26.9", "3.18.5", "3.26.0rc1"):
         version_of("petsc4py", version)
         assert check_package(NAMED["petsc4py"]).text == version
 
 
 def test_this_machine_has_no_fault():
-    # The suite runs here, so that every package must be found good.
+    """Every package of this machine is found good, because the tests run on it."""
     faults = [check for check in map(check_package, PACKAGES) if check.fault]
     assert faults == []
 
 
 @pytest.mark.parametrize("scalar", [np.complex128, np.float32])
 def test_scalars_other_than_real_doubles(scalar):
+    """A PETSc with complex or single-precision scalars is a fault whose message names the options of a new build."""
     check = check_scalars(scalar)
     assert check.value == np.dtype(scalar).name
     for remedy in ("petsc-dev", "--with-scalar-type=real", "--with-precision=double"):
@@ -105,7 +108,7 @@ def test_scalars_other_than_real_doubles(scalar):
 
 
 def test_one_mpi_for_all():
-    # Two of them in one process: petsc4py and mpi4py of different builds crash at the first call that both make.
+    """Two MPI libraries in one process are a fault: petsc4py and mpi4py of different builds crash at a common call."""
     ours, other = loaded_libraries(MPI_LIBRARY), "/opt/mpich/lib/libmpi.so.12"
     assert len(ours) == 1
     assert not check_mpi(ours, 2, {"OMPI_COMM_WORLD_SIZE": "2"}).fault
@@ -116,7 +119,7 @@ def test_one_mpi_for_all():
 
 @pytest.mark.parametrize("launcher", ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE"])
 def test_a_launcher_of_another_mpi(launcher):
-    # The launcher's variable says four, and this MPI sees one: each process would write the same files.
+    """A launcher of 4 processes of which MPI sees 1 is a fault: each process would write the same files."""
     check = check_mpi([], 1, {launcher: "4"})
     assert "started 4 processes, but mpi4py sees 1" in check.fault
 
@@ -131,31 +134,31 @@ def test_a_blas_that_is_slow_is_named():
     ):
         assert BLAS_LIBRARY.fullmatch(library)
         assert check_blas([library]) == ("BLAS", library, "", "")
-    # Of this machine either form is right.
+    # This machine has a BLAS library of its own, or the one within numpy.
     assert loaded_libraries(BLAS_LIBRARY) or check_blas([]).value == "within numpy"
 
 
 def test_what_the_program_can_do_without_is_no_fault(monkeypatch):
-    # Without parallel HDF5 rank 0 writes, without mpirun one rank runs.
+    """Parallel HDF5 and mpirun are optional: without the one rank 0 writes, without the other there is one rank."""
     monkeypatch.setattr(h5py, "get_config", lambda: SimpleNamespace(mpi=False))
     monkeypatch.setattr(installation.shutil, "which", lambda name: None)
     for check in (installation.check_parallel_hdf5(2), installation.check_mpirun()):
         assert check.note and not check.fault
-    # Its second value is whether the program can run.
+    # The second value of the table is whether the program can run.
     assert doctor_table(MPI.COMM_SELF)[1]
 
 
 def test_the_oldest_versions_are_those_of_the_package():
+    """The oldest versions that the doctor takes are the bounds of pyproject.toml, which lists them for pip."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    # Two lists of one thing, in different languages: here they are held equal.
     wanted = {line.split(",")[0] for line in project["dependencies"]}
     assert {f"{package.name}>={package.oldest}" for package in PACKAGES} == wanted
 
 
 def test_a_library_that_does_not_load_is_named():
-    """pydantic stands for one that the program wants before it can call ``doctor``."""
+    """A library that is needed before ``doctor`` can be called, here pydantic, is named without a traceback."""
     code = (
-        # In a process of its own, because this one has imported everything.
+        # The code runs in a process of its own, because this one has imported every library.
         "import sys; sys.argv = ['vipetsc']; sys.modules['pydantic'] = None;"
         " from vipetsc.__main__ import main; sys.exit(main(['doctor']))"
     )
@@ -166,8 +169,11 @@ def test_a_library_that_does_not_load_is_named():
 
 
 def test_doctor_compiles_kernels_where_it_is_asked_to(in_process, monkeypatch):
-    """With --compile the last line says how long that took, or that all are there; without it nothing is compiled."""
-    # Compiling takes minutes, and is replaced by the time that it reports.
+    """With --compile the last line has the time of compilation, or says that there was nothing to compile.
+
+    Without --compile nothing is compiled.
+    """
+    # The compilation takes minutes: a function that only returns its duration in s replaces it.
     took = [83.0]
     monkeypatch.setattr(first_calls, "compile_kernels", lambda comm: took[0])
     ended = in_process("doctor", "--compile")
@@ -198,11 +204,11 @@ for engine in ("ts", "propagator"):
 
 @pytest.mark.slow
 def test_after_that_a_run_compiles_nothing(vipetsc, tmp_path):
-    """Runs by both engines and their measures find all their kernels."""
+    """After ``doctor --compile`` runs by both engines, and their measures, find all kernels compiled."""
     compiled = vipetsc(0, "doctor", "--compile", timeout=600)
     assert compiled.returncode == 0, compiled.stderr
 
-    # Both runs in one process: what it compiles it announces once, in whichever of them.
+    # Both runs are in one process, which announces a compilation once.
     ended = subprocess.run(
         [sys.executable, "-c", BOTH_ENGINES, tmp_path],
         capture_output=True,
@@ -212,6 +218,6 @@ def test_after_that_a_run_compiles_nothing(vipetsc, tmp_path):
     )
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.count("complete: ") == 2
-    # A run announces that it compiles; with all kernels there it must not.
+    # A run that has to compile kernels announces it.
     assert "compiling" not in ended.stderr
     assert "compiled" not in ended.stdout

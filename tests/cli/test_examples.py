@@ -1,4 +1,4 @@
-"""The case files of the package: listed, copied with the data that they read, and the same wherever they are."""
+"""The case files of the package: they are listed, copied with their data, and read alike from any folder."""
 
 from __future__ import annotations
 
@@ -39,6 +39,7 @@ def test_every_case_file_is_listed_with_its_verb_and_a_sentence(in_process, monk
 
 
 def test_a_case_with_scatter_is_validated(in_process):
+    """``validate`` shows the distribution of a scattered clearance and the factors of the first sample."""
     ended = in_process("validate", EXAMPLES / "disorder.toml")
     assert ended.returncode == 0, ended.stderr
     assert re.search(r"disorder of clearance +normal, deviation 1 %; seed 0: times 0\.99", ended.stdout)
@@ -69,17 +70,17 @@ def test_a_copied_case_has_its_modules(in_process, tmp_path, monkeypatch):
     shipped = Case.load(EXAMPLES / "own-law.toml")
     assert copied.plugins.parts["law"]["rubber-stop"].module == str(tmp_path / "mine/own_law.py")
     assert copied.contacts == shipped.contacts
-    # As the comment in the case says.
+    # The comment in the case says that at this depth the force is twice that of the linear law, k x.
     depth = 0.32e-3
     law = copied.model().contact
     assert law.elastic_force(depth) == pytest.approx(2 * 2e5 * depth, rel=0.02)
-    # Of a number the force is a number: numpy makes none of an array of one.
+    # The force at a number is a number, and the force at an array has the array's shape.
     assert np.shape(law.elastic_force(depth)) == ()
     assert law.elastic_force(np.full((2, 1), depth)).shape == (2, 1)
 
 
 def test_a_file_that_differs_is_replaced_on_request_alone(in_process, tmp_path):
-    """Another file of the name is refused before anything is written; what is there already is no obstacle."""
+    """A different file of the same name is refused before anything is written; an equal file is no obstacle."""
     (tmp_path / "waveform.csv").write_text("0,0\n")
     refused = in_process("examples", "beads", "waveform", cwd=tmp_path)
     assert refused.returncode == 2
@@ -101,7 +102,7 @@ def test_a_file_that_differs_is_replaced_on_request_alone(in_process, tmp_path):
     ],
 )
 def test_what_cannot_be_copied_is_refused(in_process, tmp_path, words, problem):
-    """A name that is none, no name, and a folder that is a file end with a sentence, and nothing is written."""
+    """An unknown name, a missing name, and a file in the place of the folder are refused, and nothing is written."""
     refused = in_process("examples", *words, cwd=tmp_path)
     assert refused.returncode == 2
     assert problem in refused.stderr
@@ -109,7 +110,7 @@ def test_what_cannot_be_copied_is_refused(in_process, tmp_path, words, problem):
 
 
 def test_a_relative_name_is_that_of_a_file_next_to_the_case_before_one_of_the_current_folder(tmp_path, monkeypatch):
-    """The folder of the case file comes first, then the current one; what --set names is in the current one."""
+    """A relative name in a case file is sought next to it, then in the current folder; --set uses the latter only."""
     (tmp_path / "cases").mkdir()
     case = tmp_path / "cases/mine.toml"
     case.write_text(SAMPLES + 'samples = { file = "force.csv" }\n')
@@ -127,7 +128,7 @@ def test_a_relative_name_is_that_of_a_file_next_to_the_case_before_one_of_the_cu
 
 
 def test_a_sweep_over_files_goes_on_from_its_own_folder(tmp_path, monkeypatch):
-    """The case file that a sweep leaves names the files as they are found from anywhere."""
+    """The case file in a sweep's results names data files by absolute paths, and is the same from another folder."""
     (tmp_path / "cases").mkdir()
     for name in "ab":
         (tmp_path / f"cases/{name}.csv").write_text("".join(f"{i * 1e-3},{(-1) ** i}\n" for i in range(9)))

@@ -1,4 +1,4 @@
-"""What the report's page tells under the pointer: values of maps by their colours, points on logarithmic axes."""
+"""Values that the report's page shows under the pointer: of maps by their colours, of points on logarithmic axes."""
 
 from __future__ import annotations
 
@@ -16,15 +16,18 @@ from vipetsc.paper.paper_figures import PaperFigure
 from vipetsc.paper.report import ReportContents, write_report
 
 CELLS = 100
-# Six decades, of which a map shows five.
+# The energies span six decades; a map shows the upper five.
 ENERGY = np.geomspace(1e-7, 1e-1, CELLS)
-# Amplitudes and entropies of two points.
+# Amplitudes in N and entropies of two points.
 POINTS = ([1.0, 1e4], [10.0, 1e3])
 
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory):
-    """Open a page with one picture, a map with a white line and two points; yield its axes and a way to read it."""
+    """Open a page with a map that has a white line, and with a panel of two points.
+
+    Yields the axes of the picture, and a function that reads the page at a place.
+    """
     folder = tmp_path_factory.mktemp("page")
     with rc_style():
         figure = new_figure(7, 3)
@@ -53,7 +56,10 @@ def shown(tmp_path_factory):
         found = "m.hidden ? [] : [parseFloat(m.style.left) / i.offsetWidth, parseFloat(m.style.top) / i.offsetHeight]"
 
         def read_off(panel: dict, x: float, y: float) -> tuple[str, list[float]]:
-            """Return what stands below the picture with the pointer at (x, y), 0 to 1, of a panel, and the mark."""
+            """Return the text below the picture, and the place of the mark in the picture or an empty list.
+
+            The pointer is at ``x`` from the left and ``y`` from below, from 0 to 1, of ``panel``.
+            """
             west, north, east, south = panel["box"]
             left, top, width, height = browser.ask(session, box + "return [b.left, b.top, b.width, b.height];")
             across = west + x * (east - west)
@@ -71,14 +77,14 @@ def shown(tmp_path_factory):
 def test_a_map_shows_the_value_of_its_colour(shown):
     """The page shows the value that the colour under the pointer stands for, or the bound that it lies beyond."""
     (area, _), read_off = shown
-    # Middles of cells, which are five pixels of the picture wide and two or three of the screen.
+    # The places are middles of cells: a cell is five pixels wide in the picture, and two or three on the screen.
     for x in (0.305, 0.425, 0.605, 0.775, 0.935):
         text, mark = read_off(area, x, 0.2)
         value = float(re.search(r"; Energy \(J\) ≈ (\S+)$", text)[1])
         assert value == pytest.approx(np.interp(x * CELLS - 0.5, np.arange(CELLS), ENERGY), rel=0.2), text
         assert mark == []
 
-    # Below and above the five decades, and on the white line.
+    # These places lie below and above the five decades, and on the white line, whose colour stands for no value.
     assert read_off(area, 0.05, 0.2)[0].endswith("Energy (J) ≤ 0.000001")
     assert "Energy (J) ≥" in read_off(area, 0.995, 0.2)[0]
     assert "Energy" not in read_off(area, 0.6, 0.51)[0]
@@ -87,11 +93,11 @@ def test_a_map_shows_the_value_of_its_colour(shown):
 @pytest.mark.browser
 @NEEDED
 def test_logarithmic_axes_are_read_by_decades(shown):
-    """The values are those of the point that is nearest on the picture, not of the pointer's place; a mark is on it."""
+    """The page shows the values of the point that is nearest to the pointer in the picture, and marks that point."""
     (_, panel), read_off = shown
 
     west, north, east, south = panel["box"]
-    # Near each point, and away from it where it is still the nearer one.
+    # The pointer is near each point, and then farther from it but still nearer to it than to the other one.
     first, second = zip(*POINTS, strict=True)
     beyond = 0.2
     for (x, y), shift in ((first, 0.01), (first, beyond), (second, 0.01), (second, -beyond)):
@@ -106,7 +112,7 @@ def test_logarithmic_axes_are_read_by_decades(shown):
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """Write a page with a figure whose panels have equal titles, and open it; yield the folder and a browser."""
+    """Write a page with a figure whose panels have equal titles; yield its path and a browser."""
     folder = tmp_path_factory.mktemp("panels")
     with rc_style():
         figure = new_figure(7, 3)
@@ -132,6 +138,7 @@ def page(tmp_path_factory):
 @pytest.mark.browser
 @NEEDED
 def test_panels_have_full_names_of_their_own(page):
+    """Panels with equal titles are numbered in the list of panels; the index stands beside the text on a wide page."""
     path, browser = page
     session = browser.open(path, 1280, 900)
     names = browser.ask(session, "return [...document.querySelectorAll('option')].map(o => o.textContent).slice(1);")
@@ -140,7 +147,6 @@ def test_panels_have_full_names_of_their_own(page):
         "5 sites: Entropy over Amplitude (N) (2)",
         "5 sites: Transfer over Amplitude (N)",
     ]
-    # The index stands at the side of a wide page, with every figure.
     index = "const n = document.querySelector('nav').getBoundingClientRect(), m = document.querySelector('main');"
     assert browser.ask(session, index + "return n.right <= m.getBoundingClientRect().left;")
     assert "Three panels" in browser.ask(session, "return document.querySelector('nav').textContent;")
@@ -149,16 +155,17 @@ def test_panels_have_full_names_of_their_own(page):
 @pytest.mark.browser
 @NEEDED
 def test_a_tap_on_a_phone_shows_the_picture_on_the_whole_screen(page):
+    """A tap opens the picture in a dialog of the screen's width, at twice that width or more; another tap closes it."""
     path, browser = page
     session = browser.open(path, 390, 844)
-    # Until then the page has no image without a picture.
+    # Before the tap no image of the page lacks its picture.
     assert browser.measure(session)["broken"] == []
     tap = "document.querySelector('figure img').dispatchEvent(new PointerEvent('click', {pointerType: 'touch'}));"
     look = "const d = document.querySelector('dialog'), l = d.querySelector('img');"
     shown = browser.ask(session, tap + look + "return [d.open, l.offsetWidth, d.clientWidth, innerWidth];")
     assert shown[0]
     assert shown[1] >= 2 * shown[2] == 2 * shown[3]
-    # What comes later covers what comes first, where it has a filter: pictures on a dark page have one.
+    # The button comes after the picture in the dialog: on a dark page the picture has a filter, and would cover it.
     assert browser.ask(session, look + "return d.firstElementChild === l && d.lastElementChild.textContent;") == "close"
     assert not browser.ask(session, look + "l.click(); return d.open;")
     assert browser.measure(session)["errors"] == []
@@ -167,9 +174,13 @@ def test_a_tap_on_a_phone_shows_the_picture_on_the_whole_screen(page):
 @pytest.mark.browser
 @NEEDED
 def test_a_full_report_is_printed_on_less_than_forty_pages(page, tmp_path, monkeypatch):
-    """Seventy-four pictures of half a page's height."""
+    """A report of 74 pictures takes at most 32 pages, which leaves eight pages for the claims of a full report.
+
+    A printed picture takes at most a quarter of a page.
+    """
     _, browser = page
-    # 770 pixels, wider than a printed page: the style alone makes them smaller. More would take long to encode.
+    # Pictures have 770 pixels, wider than a printed page: only the style sheet makes them smaller. More pixels would
+    # take long to encode.
     monkeypatch.setattr(style, "SCREEN", 110)
     with rc_style():
         figure = new_figure(7, 5)
@@ -190,5 +201,4 @@ def test_a_full_report_is_printed_on_less_than_forty_pages(page, tmp_path, monke
     session = browser.open(tmp_path / "report.html", 1280, 900)
     printed = base64.b64decode(browser.call(f"{session}/print", {}))
     pages = len(re.findall(rb"/Type\s*/Page\b", printed))
-    # A quarter of a page is the most that a picture takes, and claims take eight pages.
     assert 1 < pages <= 32

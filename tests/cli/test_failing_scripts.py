@@ -1,4 +1,4 @@
-"""Scripts whose ranks raise, one alone or all together: all end, and the message is printed once."""
+"""Scripts in which one rank or all ranks raise an error: all ranks end, and the message is printed once."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if MPI.COMM_WORLD.rank == 1:
 simulate(Case.from_table({"time": {"end": 0.01}}), "out")
 """
 
-# Rank 1 waits for rank 0 in a collective of the job, as rank 0 waits for it at the end of the job.
+# Rank 1 waits for rank 0 in a collective call of the job, and rank 0, whose job has failed, waits in another one.
 FAILS_IN_THE_MIDST_OF_A_JOB = """
 from mpi4py import MPI
 from vipetsc.parallel import StopRequest, install_abort_hook, on_every_rank
@@ -68,7 +68,7 @@ def test_what_rank_0_raises_for_all_is_said_once(tmp_path):
 
 @pytest.mark.mpirun
 def test_a_rank_of_a_script_that_raises_ends_all(tmp_path):
-    """An error of one rank ends the others, which wait for it, and is printed with its rank."""
+    """An error of one rank ends the other ranks, which wait for it, and is printed with the number of its rank."""
     ended = run_script(FAILS_ON_ONE_RANK, tmp_path, ranks=2)
 
     assert ended.returncode == 1
@@ -78,7 +78,7 @@ def test_a_rank_of_a_script_that_raises_ends_all(tmp_path):
 
 @pytest.mark.mpirun
 def test_a_rank_that_fails_in_the_midst_of_a_job_of_several_ends_all(tmp_path):
-    """The end of a job on one rank is not taken for a collective of the job on another: the error itself is printed."""
+    """The error of the job is printed: the call at the job's end on one rank is not matched with a call of the job."""
     ended = run_script(FAILS_IN_THE_MIDST_OF_A_JOB, tmp_path, ranks=2)
 
     assert ended.returncode == 1

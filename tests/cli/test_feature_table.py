@@ -1,7 +1,7 @@
-"""The manual's table of verbs and features: each yes is computed as a user would, each no is what the program says.
+"""The manual's table of verbs and features: each yes is computed by the verb, each no is the verb's own message.
 
-Of the verbs that take seconds, every fifth feature is computed, another fifth by each verb; all of them (minutes of
-CPU) are with a variable: ``EVERY_FEATURE=1 python -m pytest tests/cli/test_feature_table.py``.
+Verbs that take seconds compute every fifth feature, each verb another fifth. A variable asks for all of them, which
+takes minutes of CPU: ``EVERY_FEATURE=1 python -m pytest tests/cli/test_feature_table.py``.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ RUNS = {"run", "propagator"}
 STUDIES = [column for column in COLUMNS if column.heading not in RUNS]
 LATTICE = {"profiles of cells", "disorder of cells", "free ends", "ring"}
 ENDS = {"free ends", "ring"}
-# What a verb accepts and what does not change its results: linear modes have no drive, no dashpot, and of contacts
-# only those that are pressed at rest; the law's site is alone on a ring of cells; an infinite lattice has no ends, and
-# the reduced model is one pair of masses; for steady states a burst gives the frequency, as a harmonic drive does; the
-# few points of branches touch a site or none.
+# Features that a verb accepts although they do not change its results. Linear modes have no drive and no dashpot, and
+# contacts act on them only if they are pressed at rest. The scattering law has one site on a ring of cells. An infinite
+# lattice has no ends, and the reduced model is one pair of masses. Steady states take the frequency of a burst as they
+# take that of a harmonic drive. The few points of branches touch one site or none.
 WITHOUT_INFLUENCE = {
     "bands": {feature.name for feature in FEATURES} - LATTICE - {"preload"},
     "law": ENDS | {"several in a cell"},
@@ -48,13 +48,13 @@ pytestmark = pytest.mark.slow
 
 
 def is_in_turn(column: Column, feature: Feature) -> bool:
-    """Whether a yes is computed here: of a column whose verb takes seconds, features in turn."""
+    """Whether a yes is computed: always by a fast verb, every ``TURNS``-th feature by a verb that takes seconds."""
     place = COLUMNS.index(column) + FEATURES.index(feature)
     return place % TURNS == 0 or column.heading not in DEAR
 
 
 def words_of(column: Column, case: Path) -> list[str]:
-    """The command for the case file of a column."""
+    """The words of the command line that compute the case file of a column."""
     if column.heading == "bands":
         return ["bands", str(case), "--modes", "2"]
     return [column.kind.verb, str(case)]
@@ -69,7 +69,7 @@ def put_case(column: Column, feature: Feature, folder: Path) -> Path:
 
 
 def numbers_of(folder: Path) -> dict[str, np.ndarray]:
-    """All numbers of the results in a folder, by file and name."""
+    """All datasets of floating-point numbers in the results of a folder, by file and name."""
     numbers: dict[str, np.ndarray] = {}
 
     def keep(name: str, item: Any) -> None:
@@ -84,7 +84,7 @@ def numbers_of(folder: Path) -> dict[str, np.ndarray]:
 
 @pytest.fixture
 def picture_of_each_cell(monkeypatch):
-    """Bands are drawn once for each cell and frequency, on which alone their picture depends."""
+    """Draw bands once for each cell and frequency: their picture depends on nothing else."""
     draw = registry.draw_bands
     drawn: dict[Any, Path] = {}
 
@@ -100,7 +100,7 @@ def picture_of_each_cell(monkeypatch):
 @pytest.mark.usefixtures("plain_pictures", "picture_of_each_cell")
 @pytest.mark.parametrize("column", STUDIES, ids=lambda column: column.heading)
 def test_every_yes_is_computed(column, tmp_path, in_process):
-    """The verb ends well, and its results differ from those without the feature: no yes is one that is ignored."""
+    """The verb ends with 0, and its results differ from those without the feature, but for ``WITHOUT_INFLUENCE``."""
 
     def computed(case: Path) -> dict[str, np.ndarray]:
         out = case.parent / "out"
@@ -137,7 +137,7 @@ def test_every_no_is_what_the_program_says(column, tmp_path, in_process):
         ended = in_process(*words_of(column, case), "--out", folder)
 
         if column.heading == "propagator":
-            # The run goes on with the other engine, and says why.
+            # The run uses the other engine, and says why.
             assert ended.returncode == 0, feature.name
             assert answer in ended.stdout + ended.stderr
         else:
@@ -148,14 +148,14 @@ def test_every_no_is_what_the_program_says(column, tmp_path, in_process):
 
 @pytest.fixture(scope="module")
 def plain_motion() -> np.ndarray:
-    """The motion of the case without a feature."""
+    """The displacement (time, cell, dof) in m of the case without a feature."""
     return run_of(Case.from_table(BY_HEADING["run"].table(PLAIN)))["displacement"].values
 
 
 @pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize("feature", FEATURES, ids=lambda feature: feature.name)
 def test_a_feature_changes_a_run_and_both_engines_agree(feature, tmp_path, in_process, plain_motion):
-    """A yes is no feature that is ignored: the motion differs from that of the plain case, equally by both engines.
+    """The motion differs from that of the plain case, and both engines compute the same motion.
 
     Every fifth run is exported and drawn as well.
     """
@@ -178,7 +178,7 @@ def test_a_feature_changes_a_run_and_both_engines_agree(feature, tmp_path, in_pr
 
 
 def test_the_chapter_has_every_answer():
-    """Each row has an answer of every column, and each number is that of a sentence below the table."""
+    """Each row has the answer of every column, in words or as the number of a sentence below the table."""
     text = chapter()
     table = answers()
     rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| ")]
@@ -191,6 +191,6 @@ def test_the_chapter_has_every_answer():
 
 
 def test_no_feature_is_refused_for_a_fault_of_the_small_case():
-    """A message about a key that is missing or misplaced would say nothing about the feature."""
+    """No answer is a message about a missing or misplaced key, which would say nothing about the feature."""
     said = {answer for row in answers().values() for answer in row}
     assert not [answer for answer in said if "missing" in answer or "outside" in answer or "unknown" in answer]

@@ -1,4 +1,4 @@
-"""Files of results in whose place another program's lie: a sentence and exit code 2."""
+"""Files of other programs in the place of results are refused with a sentence and exit code 2."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ def put_foreign(path: Path, contents: str) -> None:
 @pytest.mark.parametrize("contents", CONTENTS)
 @pytest.mark.parametrize("name", ["run", "optimum", "branch-r1", "law", "prediction", "design", "ensemble", "analysis"])
 def test_pictures_of_a_foreign_file_are_refused(in_process, tmp_path, name, contents):
+    """``plot`` refuses an HDF5 file of another program under a name of results; ``export`` refuses or leaves it."""
     put_foreign(tmp_path / "out" / f"{name}.h5", contents)
     ended = in_process("plot", tmp_path / "out")
     assert ended.returncode == 2
@@ -44,6 +45,7 @@ def test_pictures_of_a_foreign_file_are_refused(in_process, tmp_path, name, cont
 
 @pytest.mark.slow
 def test_a_search_in_whose_place_a_foreign_file_lies_is_computed_again(in_process, tmp_path):
+    """A search replaces a foreign design.h5 in its own folder, and says so."""
     scenario = SCENARIOS["design"]
     out = tmp_path / "out"
     words = words_of(f"{scenario.words} {PLAIN}", prepare(scenario, tmp_path), out)
@@ -59,6 +61,8 @@ def test_a_search_in_whose_place_a_foreign_file_lies_is_computed_again(in_proces
 
 @pytest.mark.parametrize("kind", [ResultFileError, UnreadableFileError])
 def test_a_study_that_cannot_read_earlier_results_says_what_to_do(in_process, monkeypatch, tmp_path, kind):
+    """An error of reading earlier results ends with exit code 2 and names --force as the remedy."""
+
     def study(case: object, work: object) -> None:
         raise kind("law.h5 is of another program")
 

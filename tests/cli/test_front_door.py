@@ -50,7 +50,7 @@ def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, monke
 
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["complete"]
-    # In so short a lattice one rank simulates, and others draw.
+    # A lattice this short is simulated by one rank, and other ranks draw.
     assert summary["ranks"] == 1
     assert ("one of 2 ranks computes" in ended.stdout) == (ranks == 2)
     assert summary["case"]["contacts"]["sites"] == [6, 12, 13]
@@ -63,10 +63,10 @@ def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, monke
     pictures = {p.name: p.stat().st_size for p in (tmp_path / "out" / "figures").glob("*.png")}
     wanted = {"modal_energies", "spacetime", "dispersion", "ledger", "impacts", "phase", "unit_cell"}
     assert {f"{name}.png" for name in wanted} <= pictures.keys()
-    # A picture without curves takes less.
+    # An empty picture takes fewer bytes.
     assert min(pictures.values()) > 5000
 
-    # What one rank does from here on concerns files alone; two pictures are enough for it.
+    # The rest concerns files only, and two pictures are enough for it.
     if not ranks:
         for name in FIGURES.keys() - {"ledger", "modal_energies"}:
             monkeypatch.delitem(FIGURES, name)
@@ -74,14 +74,14 @@ def test_run_leaves_a_traceable_run_and_its_pictures(on_ranks, in_process, monke
 
 
 def assert_the_same_command_finishes_what_is_missing(in_process, case, out):
-    """Remove or spoil files: the same command makes those again and no others, and refuses a run that is cut off."""
+    """Remove or damage files: the same command writes those again and no others, and refuses a run that is cut off."""
     before = modified(out)
-    # Nothing first: the same command then writes nothing at all.
+    # In the first round no file is missing, and the command writes nothing.
     for missing in ((), ("analysis.h5",), ("figures/ledger.png", "summary.json", "run.xdmf")):
         for name in missing:
             (out / name).unlink()
             if name == "analysis.h5":
-                # As a kill may leave it.
+                # A kill may leave an incomplete file.
                 (out / name).write_text("cut")
 
         ended = in_process("run", case, "--out", out)
@@ -124,7 +124,7 @@ def test_no_verb_is_the_builtin_case(vipetsc, in_process, tmp_path):
 
 @alone_and_on_two_ranks
 def test_everything_wrong_with_a_case_is_said_at_once(on_ranks, tmp_path, ranks):
-    """Every wrong key and value is named once, whatever the number of ranks, and nothing is written."""
+    """Every wrong key and value is named once, on one rank and on two, and nothing is written."""
     path = tmp_path / "bad.toml"
     path.write_text(
         """
@@ -178,7 +178,7 @@ def test_bad_input_is_exit_code_2_and_writes_nothing(in_process, tmp_path, argum
 def test_a_case_that_is_not_toml(in_process, tmp_path):
     """A case file that is not TOML is refused by name."""
     path = tmp_path / "case.toml"
-    # How an HDF5 file begins, with bytes that are no UTF-8.
+    # The bytes are the beginning of an HDF5 file, and some of them are not valid in UTF-8.
     path.write_bytes(b"\x89HDF\r\n\x1a\n\xff\xfe")
     ended = in_process("validate", path)
     assert ended.returncode == 2
@@ -223,7 +223,7 @@ def test_validate_prints_what_follows_from_the_case(in_process):
 
 
 def test_validate_reads_every_section_as_its_verb_does(in_process, tmp_path):
-    """A file with sections of several verbs has a table of each, and the problems of all are named, once."""
+    """``validate`` prints a table for each verb that has a section in the file, and each of their problems once."""
     path = tmp_path / "case.toml"
     path.write_text("[nnm]\nmodes = [2]\n[design]\nwavenumbers = 11\n[sweep.drive]\namplitude = [1.0, 2.0]\n")
     ended = in_process("validate", path)
@@ -251,19 +251,19 @@ def test_bands_as_json_and_picture(in_process, tmp_path):
     edges = [(round(b["low"], 2), round(b["high"], 2)) for b in table["bands"]]
     assert edges == [(0.0, 836.47), (947.07, 1414.21), (2331.09, 3162.28), (3271.55, 3669.65)]
     assert len(table["gaps"]) == 3
-    # A picture without curves takes less.
+    # An empty picture takes fewer bytes.
     assert (tmp_path / "bands" / "bands.png").stat().st_size > 5000
 
 
 def test_bands_with_modes_of_the_finite_lattice(in_process, tmp_path):
-    """So many modes as are asked for next to a frequency are printed and written; impossible requests are refused."""
+    """The requested number of modes next to a frequency is printed and written; impossible requests are refused."""
     bands = ("bands", "--set", "lattice.cells=40")
     out = tmp_path / "bands"
 
     printed = in_process(*bands, "--out", out, "--modes", "2", "--near", "2034")
     assert printed.returncode == 0, printed.stderr
     rows = [line.split() for line in printed.stdout.splitlines() if line.endswith("edge")]
-    # Two modes of one frequency in a gap, which live at the edges of the lattice.
+    # Two modes in a gap have the same frequency: each is localised at one end of the lattice.
     assert [row[:3] for row in rows] == [["1", "2034.825055", "gap"], ["2", "2034.825055", "gap"]]
     with h5py.File(out / "modes.h5") as file:
         assert file["shape"].shape == (2, 40, 4)
@@ -284,14 +284,14 @@ def test_bands_with_modes_of_the_finite_lattice(in_process, tmp_path):
 
 @pytest.mark.mpirun
 def test_doctor(vipetsc):
-    """On two ranks the doctor finds an installation that is well."""
+    """``doctor`` on two ranks finds no problem with this installation."""
     ended = vipetsc(2, "doctor")
     assert ended.returncode == 0, ended.stdout
     assert "no problems" in ended.stdout
 
 
 def test_doctor_without_slepc_names_the_package(monkeypatch):
-    """Without SLEPc the installation is healthy and the package that brings it is named; with it, its version is."""
+    """Without SLEPc the installation is healthy and the package to install is named; with it, its version is shown."""
     monkeypatch.setitem(sys.modules, "slepc4py", None)
     text, healthy = doctor_table(MPI.COMM_SELF)
     assert healthy
@@ -311,9 +311,9 @@ def test_petsc_options_reach_the_integrator(vipetsc, case, tmp_path):
 
 @alone_and_on_two_ranks
 def test_an_unstable_run_ends_with_time_place_and_last_good_sample(vipetsc, tmp_path, ranks):
-    """A run that grows without bound ends with 1; its status says when, where and up to which sample it is good."""
+    """A run that grows without bound ends with 1; its status names the time, the place and the last good sample."""
     out = tmp_path / "out"
-    # Explicit Euler without step control feeds energy in.
+    # Explicit Euler steps of constant length add energy to an oscillation.
     euler = ("--", "-ts_rk_type", "1fe", "-ts_adapt_type", "none", "-ts_dt", "1e-5")
     changes = set_words("lattice.cells=40", "contacts.sites=[10]", "time.end=0.5")
 
@@ -324,7 +324,7 @@ def test_an_unstable_run_ends_with_time_place_and_last_good_sample(vipetsc, tmp_
     for text in ("diverges", "at t = ", "nearest site 1 in cell 10", "last good sample: t = "):
         assert text in status
 
-    # Samples up to the last good one are kept, and none of those that ran away.
+    # Samples up to the last good one are kept, and none of those that grew without bound.
     run = datasets(out / "run.h5")
     assert 1 < len(run["time"]) < 2500
     assert all(abs(run["velocity"][k]).max() < 1e3 for k in range(len(run["time"])))
@@ -345,7 +345,8 @@ sys.exit(main(sys.argv[2:]))
 def test_a_disk_that_fills_ends_all_and_loses_nothing(in_process, case, tmp_path, ranks, limit):
     """A run that cannot be written ends all ranks with a sentence, keeps the earlier run, and can be resumed.
 
-    No file may grow beyond the limit: the first part does not fit, or the parts do and run.h5 does not.
+    ``limit`` in bytes bounds every file. On one rank the first part of the run exceeds it; on two ranks the parts fit,
+    and run.h5 exceeds it.
     """
     out = tmp_path / "out"
     first = in_process("run", case, "--out", out, *QUICK)
@@ -364,7 +365,7 @@ def test_a_disk_that_fills_ends_all_and_loses_nothing(in_process, case, tmp_path
     assert "File too large" in full.stderr
     assert (out / "run.h5").read_bytes() == before
 
-    # On one rank, whatever it was begun on.
+    # One rank resumes the run, on whatever number of ranks it began.
     resumed = in_process("run", case, "--out", out, "--resume", *QUICK)
     assert resumed.returncode == 0, resumed.stderr
     assert_same_bits(whole, datasets(out / "run.h5"))

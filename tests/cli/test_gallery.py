@@ -1,4 +1,4 @@
-"""The gallery: a page a study, whose commands are those of cases that are there; each runs in small."""
+"""The gallery: each study has a page, whose commands name existing cases; some of them are run at a small size."""
 
 import re
 import shutil
@@ -16,7 +16,7 @@ from vipetsc.cli.main import main
 sys.path.insert(0, str(ROOT / "scripts"))
 import gallery
 
-# All pictures come with every clone: so many bytes together.
+# Bytes of all pictures together: every clone of the repository contains them.
 MOST_PNG = 1_000_000
 PAGES = gallery.pages()
 SMALL = {
@@ -27,7 +27,7 @@ SETS = {verb: set_words(*changes) for verb, changes in SMALL.items()}
 
 
 def test_every_study_has_a_page_a_command_and_small_pictures():
-    """Each page has commands and pictures within their sizes, and no case or picture lacks a page."""
+    """Each page has commands and pictures of limited size, and every case and picture is on a page."""
     assert 6 <= len(PAGES) <= 12
     assert set(PAGES.values()) == set(gallery.INDEX.with_suffix("").glob("*.md"))
 
@@ -46,10 +46,10 @@ def test_every_study_has_a_page_a_command_and_small_pictures():
 
 
 def test_every_case_is_valid_and_some_run_in_small(tmp_path, monkeypatch):
-    """Every case that a page's commands name is valid; runs and branches are computed in small, as the pages go on."""
+    """Every case in a page's commands is valid; some runs and branches are computed, shortened, in the pages' order."""
     shutil.copytree(ROOT / "runs", tmp_path / "runs", ignore=shutil.ignore_patterns("*.h5", "*.png"))
     monkeypatch.chdir(tmp_path)
-    # In the order of the pages: the run of a breather begins with an orbit of the branch before it.
+    # The order of the pages matters: the run of a breather begins with an orbit of the branch before it.
     commands = [words for page in PAGES.values() for words in gallery.commands(page)]
     for command in commands:
         begin = command.index("python")
@@ -58,7 +58,7 @@ def test_every_case_is_valid_and_some_run_in_small(tmp_path, monkeypatch):
 
         verb, case, *options = command[begin + 3 :]
         if verb in SMALL and any(name in case for name in ("runs/examples/breather.toml", "breather-run", "gate.toml")):
-            # The short branch lacks the orbit that the case names: its first one is taken.
+            # The short branch lacks the orbit that the case names: the run begins with its first one.
             first = set_words("initial.orbit=1") if "breather-run" in case else []
             assert main([verb, case, *options, *SETS[verb], *first, "--quiet"]) == 0, command
         elif verb != "plot":
@@ -68,7 +68,7 @@ def test_every_case_is_valid_and_some_run_in_small(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("width", "size"), [(300, (300, 200)), (1800, (900, 100))])
 def test_a_picture_is_scaled_down(width, size, tmp_path):
-    """A picture is scaled to 900 pixels at most, and one that is still too large is refused."""
+    """A picture is scaled to a width of 900 pixels at most, and refused if its file is still too large."""
     Image.effect_noise((width, 200), 5).convert("RGB").save(tmp_path / "a.png")
     gallery.make_small(tmp_path / "a.png", tmp_path / "b.png")
     assert Image.open(tmp_path / "b.png").size == size

@@ -1,4 +1,4 @@
-"""The guide does what it says: the blocks of the README and of the chapters that go on with it, typed as they stand."""
+"""The guide does what it says: the blocks of the README and of the chapters that continue it are run as they stand."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from vipetsc.parallel import StopRequest, on_root
 ROOT = Path(package.__file__).parents[1]
 MANUAL = ROOT / "vipetsc/manual"
 CHAPTERS = ("own-lattice", "files", "measures", "modal", "engines", "python")
-# One session in this order: later pages go on with files of earlier ones.
+# The pages are one session in this order: later pages use files of earlier ones.
 GUIDE = [ROOT / "README.md", *(MANUAL / f"{name}.md" for name in CHAPTERS)]
 CASE_NAME = re.compile(r"# (\S+\.toml)(, added)?\n")
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", flags=re.M | re.S)
@@ -53,8 +53,8 @@ NOT_TYPED = {
 def session() -> str:
     """Return all blocks in order as one script for bash, which ends at the first command that fails.
 
-    Blocks of Python that follow one another are run by one interpreter, each in a namespace of its own: to load the
-    package for each of them takes longer than what they do.
+    One interpreter runs consecutive blocks of Python, each in a namespace of its own, because to load the package takes
+    longer than to run them.
     """
     script = ["set -ex"]
     waiting: list[str] = []
@@ -77,7 +77,7 @@ def session() -> str:
             script.append(f"cat {'>>' if added else '>'} {name} <<'END'\n{text}END")
         else:
             assert language == "sh", language
-            # The tests would come back here.
+            # A call of scripts/test would run this test again.
             script.append(re.sub(r"^scripts/test .*\n", "", text, flags=re.M))
     return "\n".join(script + run_together(waiting))
 
@@ -97,7 +97,7 @@ def run_together(files: list[str]) -> list[str]:
 
 @pytest.mark.mpirun
 def test_the_guide_does_what_it_says(tmp_path):
-    """The session ends well in a fresh clone, and leaves the results, numbers and the picture that the guide shows."""
+    """The session ends with 0 in a fresh clone, and leaves the results, numbers and picture that the guide shows."""
     type_session(tmp_path)
     assert_results_are_there(tmp_path)
     assert_numbers_are_those_of_the_guide(tmp_path)
@@ -105,7 +105,7 @@ def test_the_guide_does_what_it_says(tmp_path):
 
 
 def type_session(folder: Path) -> None:
-    """Type the whole session in a fresh clone, without a variable of MPI set, where it ends well."""
+    """Run the whole session in a fresh clone, without variables of MPI, and assert that it ends with 0."""
     shutil.copytree(ROOT / "scripts", folder / "scripts")
     shutil.copytree(ROOT / "runs" / "examples", folder / "runs" / "examples")
 
@@ -120,7 +120,7 @@ def type_session(folder: Path) -> None:
 
 
 def assert_results_are_there(desk: Path) -> None:
-    """The session leaves the results that the guide speaks of, none of them empty."""
+    """Assert that the session has left the results that the guide names, and that none is empty."""
     for name in (
         "four-band/figures/dispersion.png",
         "loud/figures/dispersion.pdf",
@@ -134,7 +134,7 @@ def assert_results_are_there(desk: Path) -> None:
 
 
 def assert_numbers_are_those_of_the_guide(desk: Path) -> None:
-    """The numbers that the guide gives of its lattice, its run and its sweep are those of the files."""
+    """Assert that the guide's numbers of its lattice, its run and its sweep are those of the files."""
     case = Case.load(desk / "my-lattice.toml")
     assert case.warnings() == []
     assert case.drive.frequency == pytest.approx(936, abs=0.5)
@@ -150,23 +150,23 @@ def assert_numbers_are_those_of_the_guide(desk: Path) -> None:
         ibtet = file["ibtet"][...]
         quiet = file["contact_episodes"][...] == 0
         assert 1 < quiet.sum() < 7
-        # Members without contact are scaled from one linear run, whose transfer is the same at any amplitude.
+        # Members without contact are scaled from one linear run: its transfer does not depend on the amplitude.
         assert ibtet[quiet] == pytest.approx(ibtet[0], rel=1e-12)
         assert ibtet.max() > 10 * ibtet[0]
     assert (desk / "runs/my-sweep/figures/ibtet-over-drive.amplitude.png").exists()
 
 
 def assert_the_picture_is_that_of_the_readme(desk: Path) -> None:
-    """The dispersion of the built-in run that the session drew is that of the README, but for versions of fonts."""
+    """Assert that the session's picture of the built-in run is that of the README, apart from versions of fonts."""
 
     def seen(path: Path) -> np.ndarray:
-        """Return the picture as a reader at a distance sees it: brightness on a coarse grid."""
+        """Return the brightness of a picture, 0 to 255, on a coarse grid, on which fonts make no difference."""
         return np.asarray(Image.open(path).convert("L").resize((140, 64)), float)
 
     drawn = desk / "runs/four-band/figures/dispersion.png"
     shown = MANUAL / "pictures/four-band.png"
     assert Image.open(drawn).size == Image.open(shown).size
-    # Of 255: a picture of the same run in an earlier layout differed by 8.
+    # A picture of the same run with another layout differed by 8 of 255.
     assert np.abs(seen(drawn) - seen(shown)).mean() < 1
 
 
@@ -174,10 +174,10 @@ def commands() -> dict[str, list[str]]:
     """Return the words of every call of the program in README and manual, by page and number."""
     found = {}
     for page in [ROOT / "README.md", *sorted(MANUAL.rglob("*.md"))]:
-        # A command may go on in the next line.
+        # A command may continue on the next line.
         text = page.read_text(encoding="utf-8").replace("\\\n", " ")
         for number, line in enumerate(re.findall(r"python -m vipetsc *([^`\n]*)", text)):
-            # Options of PETSc and redirections are not the parser's.
+            # The parser does not see options of PETSc and redirections.
             words = line.partition(" -- ")[0].partition(">")[0]
             found[f"{page.relative_to(ROOT)}-{number}"] = shlex.split(words, comments=True)
     return found
@@ -185,7 +185,7 @@ def commands() -> dict[str, list[str]]:
 
 @pytest.mark.parametrize("words", commands().values(), ids=commands())
 def test_every_command_of_the_manual_is_understood(words, monkeypatch):
-    """The program's own parser takes every command, and the case file that it names exists."""
+    """The program's own parser takes every command of the manual, and the case file that the command names exists."""
     calls = []
 
     def note(options, petsc) -> int:
@@ -196,14 +196,14 @@ def test_every_command_of_the_manual_is_understood(words, monkeypatch):
     monkeypatch.setattr("vipetsc.cli.main._call", note)
     assert main(words) == 0
 
-    # The others are placeholders, or files that the session writes.
+    # The names that are left out are placeholders, or files that the session writes.
     case = getattr(calls[0], "case", None)
     if case and case.endswith(".toml") and case not in ("CASE", "my-lattice.toml", "case.toml"):
         assert (ROOT / case).exists()
 
 
 def test_every_block_of_commands_is_typed_or_listed_with_a_reason():
-    """The pages with commands or code are those of the session and those with a reason, and no page is both."""
+    """Each page with commands or code is either part of the session or listed with a reason why it is not."""
     found = set()
     for page in [ROOT / "README.md", *MANUAL.glob("*.md")]:
         for language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
@@ -215,12 +215,12 @@ def test_every_block_of_commands_is_typed_or_listed_with_a_reason():
 
 
 def test_what_extend_shows_of_verbs_works(monkeypatch):
-    """The verb that the chapter shows prints what it says."""
+    """The verb whose code the chapter *extend* shows prints the mass of the lattice."""
     text = (MANUAL / "extend.md").read_text(encoding="utf-8")
     blocks = [block for language, block in BLOCK.findall(text) if language == "python"]
     (verb,) = (block for block in blocks if block.startswith("def weigh("))
 
-    # Names that the chapter imports, or that stand in the file to which its code is added.
+    # The code uses names that the chapter imports, and names of the file to which a reader adds it.
     printed: list[str] = []
     names = {"Case": Case, "MPI": MPI, "StopRequest": StopRequest, "argparse": argparse,
              "echo": lambda comm, text: printed.append(text), "on_root": on_root,
@@ -233,7 +233,7 @@ def test_what_extend_shows_of_verbs_works(monkeypatch):
 
 
 def test_the_chapter_on_verbs_lists_those_that_are_there():
-    """The chapter has a command of every verb, and lists those that take PETSc's options and those with results."""
+    """The chapter *verbs* has a command of every verb, and lists the verbs with PETSc's options and with results."""
     text = (MANUAL / "verbs.md").read_text(encoding="utf-8")
 
     def listed(pattern: str) -> set[str]:
@@ -248,7 +248,7 @@ def test_the_chapter_on_verbs_lists_those_that_are_there():
 
 
 def test_the_names_that_extend_gives_are_where_it_says():
-    """Every name in the chapter's table stands in one of the files of its row."""
+    """Every name in a table of the chapter *extend* occurs in one of the files of its row."""
     text = (MANUAL / "extend.md").read_text(encoding="utf-8")
     for files, what in re.findall(r"^\| (`\w+/.*?) \| (.*?) \|$", text, flags=re.M):
         sources = "".join((ROOT / "vipetsc" / name).read_text() for name in re.findall(r"`([\w/.]+)`", files))
@@ -257,9 +257,9 @@ def test_the_names_that_extend_gives_are_where_it_says():
 
 
 def sections() -> dict[str, str]:
-    """Return every excerpt of a case file in the manual, but those that the session writes, by page and number.
+    """Return every excerpt of a case file in the manual that the session does not write, by page and number.
 
-    Those of extend need modules: tests/cli/test_plugins.py has them together.
+    Excerpts in *extend* are left out, because they need modules: tests/cli/test_plugins.py uses them.
     """
     excerpts = {}
     for page in sorted(MANUAL.glob("*.md")):
@@ -273,9 +273,9 @@ def sections() -> dict[str, str]:
 
 @pytest.mark.parametrize("text", sections().values(), ids=sections())
 def test_every_excerpt_of_a_case_file_is_valid(text, tmp_path):
-    """The verbs of its sections read every excerpt without a problem."""
+    """Every excerpt is a valid case file for each verb that reads one of its sections."""
     (tmp_path / "case.toml").write_text(text, encoding="utf-8")
-    # The record of the chapter identify.
+    # An excerpt of the chapter *identify* names this record.
     time = np.arange(0.0, 0.05, 1e-4)
     columns = np.column_stack([time, np.sin(500 * time)])
     np.savetxt(tmp_path / "hammer.csv", columns, delimiter=",", header="t,a3", comments="")
@@ -283,7 +283,7 @@ def test_every_excerpt_of_a_case_file_is_valid(text, tmp_path):
 
 
 def test_every_file_that_the_manual_names_is_there():
-    """Every path of the source tree that README or manual name exists."""
+    """Every path of the source tree that the README or the manual names exists."""
     for page in [ROOT / "README.md", *MANUAL.rglob("*.md")]:
         text = page.read_text(encoding="utf-8")
         for path in re.findall(r"`((?:vipetsc|scripts|tests|runs/gallery)/[\w/.-]*[\w/])`", text):

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("plain_pictures")
 
 @pytest.fixture
 def case(tmp_path):
-    """A case that seeks one clearance in a record of a few contacts."""
+    """The path of a case that identifies the clearance of site 1 and that of sites 2 and 3 from one record."""
     table = lattice_table(time={"end": 0.009})
     unknowns = [
         {"quantity": "clearance", "of": [[1]], "bounds": [2e-4, 8e-4], "start": 6e-4},
@@ -31,7 +31,7 @@ def case(tmp_path):
 
 @pytest.mark.slow
 def test_a_record_becomes_a_case(in_process, case, tmp_path):
-    """The files of an identification, its table, and the case that was found, which ``run`` takes."""
+    """An identification leaves its files and a table, and the identified case has the true clearance within 2 %."""
     checked = in_process("validate", case)
     assert checked.returncode == 0, checked.stderr
     assert "clearance 1, clearance 2+3; starts: 1" in checked.stdout
@@ -55,7 +55,7 @@ def test_a_record_becomes_a_case(in_process, case, tmp_path):
 
 
 def test_bad_data_write_nothing(in_process, case, tmp_path):
-    """A record with a gap is one sentence with key and remedy, exit code 2 and no folder."""
+    """A record with a missing value is refused with the key of its column, exit code 2 and no folder."""
     data = next(tmp_path.glob("*.csv"))
     lines = data.read_text().splitlines()
     lines[5] = lines[5].rpartition(",")[0] + ",nan"
@@ -67,7 +67,7 @@ def test_bad_data_write_nothing(in_process, case, tmp_path):
 
 
 def test_another_record_is_not_gone_on_with(in_process, case, tmp_path):
-    """The hash of the data is part of the case: results of other data are refused."""
+    """Results of a record with other values are refused: the hash of the data is part of the case."""
     stopped = tmp_path / "out"
     stopped.mkdir()
     (stopped / "case.toml").write_text(IdentifyCase.load(case).to_toml())

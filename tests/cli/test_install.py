@@ -1,4 +1,4 @@
-"""The package as a user installs it: an sdist, a wheel from it, and its programs away from the source tree."""
+"""The package as a user installs it: an sdist, a wheel from the sdist, and its programs outside the source tree."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.manual_modules import write_modules
 from vipetsc.__main__ import BUILT_FOR_MPI
 
 ROOT = Path(package.__file__).parents[1]
-# As pip calls them, without the copies and the processes around.
+# pip calls the same functions, but in copies of the source and in processes of their own.
 BUILD = "import sys; from setuptools.build_meta import build_sdist; print(build_sdist(sys.argv[1]))"
 BUILD_WHEEL = "import sys; from setuptools.build_meta import build_wheel; print(build_wheel(sys.argv[1]))"
 PIP = (sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "--no-cache-dir")
@@ -28,7 +28,7 @@ TOP = {
     "pyproject.toml", "vipetsc", "tests", "runs", "scripts", "README.md",
     "LICENSE", "CITATION.cff", "CHANGELOG.md", "MANIFEST.in", ".gitignore", ".ci",
 }  # fmt: skip
-# As scripts/setup runs it, so that its kernels are compiled.
+# scripts/setup runs the same case, and therefore its kernels are compiled.
 TINY = set_words(
     "lattice.cells=40",
     "contacts.sites=[6,12]",
@@ -40,14 +40,14 @@ TINY = set_words(
 
 
 def tracked() -> list[str]:
-    """Return the files that git tracks and that are there."""
+    """Return the names of the files that git tracks and that exist."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
-    # A file that was removed is tracked until that is committed.
+    # A file that was removed is tracked until its removal is committed.
     return [name for name in listed.stdout.splitlines() if (ROOT / name).exists()]
 
 
 def call(*command: object, cwd: Path, site: Path | None = None) -> subprocess.CompletedProcess:
-    """Call a command, which ends well, with the installed package if that is in ``site``, never with the source."""
+    """Call a command and assert that it ends with 0; it finds the package in ``site``, if given, never the source."""
     environment = clean_environment()
     if site:
         environment["PYTHONPATH"] = str(site)
@@ -67,7 +67,7 @@ def built(tmp_path_factory) -> tuple[Path, Path]:
         # The link to the folder of the examples stays a link.
         shutil.copy2(ROOT / name, folder / "source" / name, follow_symlinks=not (ROOT / name).is_dir())
 
-    # The wheel comes from the sdist, so that what the sdist lacks is missed.
+    # The wheel is built from the sdist, and therefore lacks what the sdist lacks.
     call(sys.executable, "-c", BUILD, folder, cwd=folder / "source")
     (sdist,) = folder.glob("*.tar.gz")
     call("tar", "-xzf", sdist, cwd=folder)
@@ -86,10 +86,10 @@ def site(built, tmp_path_factory) -> Path:
 
 
 def test_the_sdist_is_the_source_and_the_wheel_is_the_package(built):
-    """The sdist has all tracked files that are not hidden, and the wheel all of the package, with its version."""
+    """The sdist has all tracked files that are not hidden; the wheel has all of the package's, and its version."""
     sdist, wheel = built
     with tarfile.open(sdist) as file:
-        # Without the folder that all of them are in.
+        # All names begin with the folder of the archive.
         packed = {name.partition("/")[2] for name in file.getnames()}
     assert {name for name in tracked() if not name.startswith(".")} <= packed
 
@@ -99,7 +99,7 @@ def test_the_sdist_is_the_source_and_the_wheel_is_the_package(built):
 
 
 def test_the_top_level_holds_what_it_may():
-    """Every tracked file lies in one of the folders of the source tree, or is one of the files at its top."""
+    """The top of the source tree holds only the files and folders of ``TOP``."""
     assert {name.partition("/")[0] for name in tracked()} <= TOP
 
 
@@ -115,11 +115,11 @@ def test_the_wheel_runs_away_from_the_source(site, tmp_path):
     ended = call(*mpirun, program, "run", *TINY, cwd=tmp_path, site=site)
     assert ended.stdout.count("complete: ") == 1
 
-    # A picture without curves takes less.
+    # An empty picture takes fewer bytes.
     call(program, "plot", "runs/four-band", "--fig", "ledger", cwd=tmp_path, site=site)
     assert (tmp_path / "runs/four-band/figures/ledger.png").stat().st_size > 5000
     assert "scattering" in call(program, "paper", "--list", cwd=tmp_path, site=site).stdout
-    # As the manual says: its commands name case files in this folder.
+    # The manual asks for this folder: its commands name case files in it.
     call(program, "examples", "--all", "--out", "runs/examples", cwd=tmp_path, site=site)
     read = call(program, "validate", "runs/examples/waveform.toml", cwd=tmp_path, site=site).stdout
     assert "308 samples, interpolated by a cubic spline" in read
@@ -130,7 +130,7 @@ def test_the_wheel_runs_away_from_the_source(site, tmp_path):
 
 
 def test_an_installed_package_registers_a_law(site, tmp_path):
-    """With the wheel, a package names the manual's law by an entry point: its version and hash are in the results."""
+    """A package with an entry point registers the manual's law; its version and hash are in the results."""
     write_modules(tmp_path, site / "vipetsc/manual/extend.md")
     about = site / "stops_of_a_user-1.2.dist-info"
     about.mkdir()
@@ -151,7 +151,7 @@ def test_an_installed_package_registers_a_law(site, tmp_path):
 
 
 def test_what_pip_cannot_bring_is_named(site, tmp_path):
-    """Without the libraries that are built for MPI the doctor ends with a sentence about them, without a traceback."""
+    """Without the libraries that are built for MPI, ``doctor`` names them and their remedy, without a traceback."""
     # An import of a module that is None in sys.modules fails.
     code = (
         f"import sys; sys.path.insert(0, {str(site)!r}); sys.modules.update(dict.fromkeys({BUILT_FOR_MPI}));"
@@ -178,12 +178,12 @@ def test_recipes_and_citation_say_what_the_package_says():
     assert [author["name"] for author in project["authors"]] == re.findall(r"- name: (.*)", authors)
     needed = {re.match(r"[\w-]+", line)[0] for line in [*project["dependencies"], "h5py"]}
 
-    # Conda calls some packages by the name of their smaller variant; what it brings besides is not pip's.
+    # Conda names some packages after their smaller variant, and needs Python, PETSc and SLEPc besides pip's packages.
     run = recipe.split("\n  run:\n")[1].split("\n\n")[0]
     names = {name.removesuffix("-base") for name in re.findall(r"^ +- ([\w-]+)", run, flags=re.M)}
     assert names - {"python", "petsc", "slepc4py"} == needed
 
-    # The recipe asks for no older version than the package, nor for a newer one.
+    # The recipe and the package have the same oldest versions.
     oldest = {name.removesuffix("-base"): bound for name, bound in re.findall(r"- ([\w-]+) >=(\S+)", run)}
     lines = [*project["dependencies"], *project["optional-dependencies"]["h5py"]]
     assert {name: oldest[name] for name in needed} == dict(line.split(">=") for line in lines)

@@ -56,7 +56,7 @@ def browser(tmp_path_factory):
         yield opened
 
 
-# Elements beyond the window's right edge, but for those in a box that scrolls by itself.
+# Elements beyond the window's right edge, except those in a box that scrolls by itself.
 WIDE = """
 const scrolls = e => e && (getComputedStyle(e).overflowX === 'auto' || scrolls(e.parentElement.closest('article *')));
 return (window.MathJax ? MathJax.startup.promise : Promise.resolve()).then(() =>
@@ -68,7 +68,7 @@ return (window.MathJax ? MathJax.startup.promise : Promise.resolve()).then(() =>
 @NEEDED
 @SCREENS
 def test_pages_fit_a_phone_and_a_desk(pages, browser, width, height):
-    """Pages are no wider than the window, and no picture, link or script of them fails or leads outside."""
+    """Pages are no wider than the window; their pictures, links and scripts work, and all files are local."""
     session = browser.open(pages / "index.html", width, height)
     for name in ("index", "start", "theory", "measures", "files", *WRITTEN, "glossary", "paper", "vipetsc.contact"):
         browser.show(session, pages / f"{name}.html")
@@ -81,7 +81,8 @@ def test_pages_fit_a_phone_and_a_desk(pages, browser, width, height):
         assert [url for url in found["linked"] if not url.startswith("file:")] == []
 
 
-# Formulas that were not set, and the beginnings of formulas and blocks of code that are cut at their right edge.
+# Formulas that MathJax has not set (``raw``) or set with an error (``wrong``), the beginnings of formulas and of blocks
+# of code that are cut at the right edge (``cut``), and the number of formulas that are set (``set``).
 CUT = """
 return (window.MathJax ? MathJax.startup.promise : Promise.resolve()).then(() => ({
     raw: [...document.querySelectorAll('.math')].filter(e => !e.querySelector('mjx-container svg')).map(
@@ -97,7 +98,7 @@ return (window.MathJax ? MathJax.startup.promise : Promise.resolve()).then(() =>
 
 @NEEDED
 def test_formulas_are_set_and_nothing_is_cut_on_a_desk(pages, browser):
-    """On every page its own MathJax sets every formula, and no formula or block of code is cut at 1200 px."""
+    """MathJax sets every formula of every page, and a window of 1200 pixels cuts no formula and no block of code."""
     session = browser.open(pages / "index.html", 1200, 900)
     formulas = {}
     for page in sorted(pages.glob("*.html")):
@@ -113,7 +114,7 @@ def test_formulas_are_set_and_nothing_is_cut_on_a_desk(pages, browser):
 
 
 def test_the_manual_has_four_parts_and_every_chapter_is_in_one(pages):
-    """The margin of every page lists tutorials, how-to, theory and reference; every chapter is in one of them."""
+    """The margin lists tutorials, how-to, theory and reference; every chapter is in exactly one of these parts."""
     page = (pages / "index.html").read_text(encoding="utf-8")
     captions = re.findall(r'class="caption-text">([^<]+)<', page)
     assert captions == ["Tutorials", "How to", "Theory", "Reference"]
@@ -123,7 +124,7 @@ def test_the_manual_has_four_parts_and_every_chapter_is_in_one(pages):
 
 
 def test_terms_lead_to_the_glossary(pages):
-    """A term in a chapter is a link to its entry, with the text that the chapter gives it."""
+    """A term in a chapter is a link to its entry in the glossary, with the chapter's own wording."""
     page = (pages / "theory.html").read_text(encoding="utf-8")
     assert 'href="glossary.html#term-ibtet"' in page
     assert "contact sites" in page

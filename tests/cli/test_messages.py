@@ -1,4 +1,4 @@
-"""What is printed where: --quiet, --verbose, --log and the help of every verb; a bar on a terminal, lines elsewhere."""
+"""Messages on stdout, on stderr and in the log: --quiet, --verbose, --log, the help of every verb, and progress."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STAMP = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3}"
 def test_every_verb_has_an_example_that_it_takes(in_process):
     """The example in each verb's help is understood by the parser, and its case file exists."""
     for verb in VERBS.values():
-        # Without what the shell does with the output.
+        # The shell, not the program, reads a redirection of the output.
         words = shlex.split(verb.example.partition(" > ")[0])
         options = _parser().parse_args(words)
         assert options.verb == verb.name
@@ -45,7 +45,7 @@ def test_every_verb_has_an_example_that_it_takes(in_process):
 
 
 def test_quiet_prints_warnings_alone(in_process, tmp_path):
-    """--quiet leaves warnings and refusals on stderr, and what a verb is called for on stdout."""
+    """With --quiet stderr has warnings and refusals only; stdout has the answer of a verb that is called for one."""
     ended = in_process("run", *TINY, "--out", tmp_path / "run", "--quiet")
     assert ended.returncode == 0
     assert (tmp_path / "run/run.h5").exists()
@@ -60,7 +60,7 @@ def test_quiet_prints_warnings_alone(in_process, tmp_path):
 
 
 def test_the_log_holds_all_messages_with_their_times(in_process, tmp_path):
-    """The log has results and warnings with their times, whatever is printed, and later calls add to it."""
+    """The log has results and warnings with their times, also with --quiet, and later calls add to it."""
     log = tmp_path / "run.log"
     first = in_process("run", *TINY, "--out", tmp_path / "run", "--log", log, "--quiet")
     assert first.returncode == 0, first.stderr
@@ -69,10 +69,10 @@ def test_the_log_holds_all_messages_with_their_times(in_process, tmp_path):
 
     second = in_process("run", *TINY, "--out", tmp_path / "run", "--set", "drive.amplitude=3", "--log", log)
     assert second.returncode == 2
-    # A log is added to: it holds the history of a folder.
+    # The second call has added to the log, which holds the history of a folder.
     assert log.read_text().startswith(text)
     assert re.search(rf"^{STAMP} WARNING vipetsc: .*contains another run", log.read_text(), flags=re.M)
-    # A handler that is left would write later calls of this process to the log.
+    # A handler that stays would write messages of later calls in this process to the log.
     assert not logging.getLogger("vipetsc").handlers
 
 
@@ -85,7 +85,7 @@ def test_a_log_that_cannot_be_written_is_bad_input(in_process, tmp_path):
 
 
 def test_what_ends_a_verb_stands_in_its_log(in_process, tmp_path, monkeypatch):
-    """An exception that ends a verb is in the log as critical."""
+    """An exception that ends a verb is in the log with the level CRITICAL."""
 
     def fail(*arguments: object) -> int:
         raise RuntimeError("the disk is on fire")
@@ -99,7 +99,7 @@ def test_what_ends_a_verb_stands_in_its_log(in_process, tmp_path, monkeypatch):
 
 
 def test_verbose_prints_phases_and_statistics(in_process, tmp_path):
-    """--verbose prints the phases of its own call and the integrator's statistics; the next call is as before."""
+    """--verbose prints the phases of one call and the integrator's statistics, and has no effect on the next call."""
     ended = in_process("run", *TINY, "--out", tmp_path / "run", "--verbose")
     for text in ("set-up four-band", "claim ", "analyse", 'statistics {"samples": 101'):
         assert re.search(rf"^{re.escape(text)}", ended.stderr, flags=re.M), text
@@ -110,9 +110,9 @@ def test_verbose_prints_phases_and_statistics(in_process, tmp_path):
 
 @pytest.mark.parametrize(("quiet", "bar"), [(False, True), (True, False)])
 def test_a_bar_on_a_terminal_unless_quiet(monkeypatch, quiet, bar):
-    """On a terminal progress is a bar, which --quiet leaves out."""
+    """On a terminal, progress is shown as a bar, but not with --quiet."""
     outer, inner = pty.openpty()
-    # A new terminal has no width, and a bar on it no length.
+    # A new terminal has no width, and a bar on it would have no length.
     termios.tcsetwinsize(inner, (24, 80))
 
     with os.fdopen(inner, "w") as terminal:
@@ -122,7 +122,7 @@ def test_a_bar_on_a_terminal_unless_quiet(monkeypatch, quiet, bar):
         progress.update(0.5)
         progress.close()
 
-        # A terminal has no end of its own: this one is read up to a mark.
+        # A terminal has no end of file: it is read up to a mark.
         terminal.write("end")
         terminal.flush()
         shown = b""
@@ -134,9 +134,9 @@ def test_a_bar_on_a_terminal_unless_quiet(monkeypatch, quiet, bar):
 
 
 def test_lines_elsewhere_come_every_five_seconds(monkeypatch, caplog):
-    """Where stderr is no terminal, progress of 20 s is a line every five seconds of the clock."""
+    """Where stderr is no terminal, progress is one line every five seconds of the clock."""
     now = [0.0]
-    # A clock of the test's own, which goes as it says.
+    # The test sets the time of this clock.
     monkeypatch.setattr(reports.time, "monotonic", lambda: now[0])
     with caplog.at_level(logging.INFO, logger="vipetsc"):
         progress = Progress(MPI.COMM_SELF, 20.0, "s")

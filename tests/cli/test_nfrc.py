@@ -1,4 +1,4 @@
-"""The verb nfrc as a user types it: files, exit codes, refusal, a curve that cannot go on."""
+"""The verb nfrc as a user types it: files, exit codes, refusal, a curve whose continuation fails."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ harmonics = 5
 pytestmark = [pytest.mark.parallel(1), pytest.mark.usefixtures("plain_pictures")]
 
 
-# A curve is named by its restitution and by what it keeps, here the frequency in rad/s.
+# A curve is named by its restitution and by the quantity that is fixed along it, here the frequency in rad/s.
 STEM = "branch-r1-1023.27"
 
 
@@ -58,7 +58,7 @@ def test_a_curve_leaves_its_files_and_its_picture_and_is_not_computed_twice(in_p
 
 
 def test_a_range_that_descends_is_refused(in_process, case, tmp_path):
-    """A wrong value ends with exit code 2, its key and no folder."""
+    """A wrong value is refused with its key and exit code 2, and no folder is created."""
     ended = in_process("nfrc", case, "--out", tmp_path / "none", "--set", "nfrc.range=[2.0, 1.0]")
 
     assert ended.returncode == 2
@@ -68,7 +68,7 @@ def test_a_range_that_descends_is_refused(in_process, case, tmp_path):
 
 @pytest.mark.slow
 def test_a_curve_that_cannot_go_on_keeps_its_points(in_process, case, tmp_path):
-    """Steps that must not be as short as a fold needs end the curve: its points and their picture are there."""
+    """A smallest step that is too long for a fold ends the curve with exit code 1; its points and picture remain."""
     out = tmp_path / "stuck"
 
     ended = in_process("nfrc", case, "--out", out, "--set", "nfrc.smallest_step=0.005")

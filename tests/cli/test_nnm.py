@@ -33,12 +33,12 @@ def case(tmp_path):
 @pytest.mark.slow
 @pytest.mark.usefixtures("plain_pictures")
 def test_a_branch_leaves_its_files_and_its_picture_and_is_not_computed_twice(in_process, case, tmp_path):
-    """The same command writes nothing, mends what was cut off, and replaces another case's branch by force alone."""
+    """The same command writes nothing or repairs a damaged file; another case replaces the branch only with --force."""
     out = tmp_path / "out"
     done = in_process("nnm", case, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "fold-energy: 2" in done.stdout
-    # The live table.
+    # A table that grows with the branch goes to stderr.
     assert "Newton" in done.stderr
     names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
     assert names == {
@@ -51,11 +51,11 @@ def test_a_branch_leaves_its_files_and_its_picture_and_is_not_computed_twice(in_
     written = modified(out)
     second = in_process("nnm", case, "--out", out)
     assert second.returncode == 0
-    # But for the last line, which names the pictures that were drawn.
+    # The first call has one line more, which names the pictures that it has drawn.
     assert second.stdout == done.stdout.rpartition("  /")[0].rpartition("\n")[0] + "\n"
     assert modified(out) == written
 
-    # No HDF5 at all, as after a full disk.
+    # The damaged file is not HDF5.
     (out / "branch-out-of-phase.h5").write_text("cut")
     assert in_process("nnm", case, "--out", out).returncode == 0
     assert modified(out).keys() == written.keys()
@@ -69,7 +69,7 @@ def test_a_branch_leaves_its_files_and_its_picture_and_is_not_computed_twice(in_
 
 
 def test_resumed_branch_is_the_uninterrupted_one(in_process, case, tmp_path):
-    """A branch of 20 points that is resumed to 48 has the bits of one that was followed to 48 at once."""
+    """A branch of 20 points that is resumed to 48 has the same bits as one that was followed to 48 at once."""
     whole = tmp_path / "whole"
     parts = tmp_path / "parts"
     assert in_process("nnm", case, "--out", whole, "--set", "nnm.points=48").returncode == 0
@@ -85,7 +85,7 @@ def test_resumed_branch_is_the_uninterrupted_one(in_process, case, tmp_path):
     [("nnm.modes=[7]", "2 modes"), ("nnm.flow=rk4", "nnm.flow"), ("nmn.flow=1", "did you mean nnm")],
 )
 def test_bad_cases_write_nothing(in_process, case, tmp_path, change, message):
-    """A wrong key or value ends with exit code 2, what is right, and no folder."""
+    """A wrong key or value is refused with a hint and exit code 2, and no folder is created."""
     done = in_process("nnm", case, "--out", tmp_path / "out", "--set", change)
     assert done.returncode == 2
     assert message in done.stderr
@@ -94,10 +94,10 @@ def test_bad_cases_write_nothing(in_process, case, tmp_path, change, message):
 
 @pytest.mark.mpirun
 def test_failure_is_reported_with_its_knob(vipetsc, case, tmp_path):
-    """A branch whose steps become too short ends with exit code 1, the key to change, and its points in the file."""
+    """A branch whose steps become too short ends with exit code 1 and the key to change; its points are in the file."""
     out = tmp_path / "out"
 
-    # So large a smallest step that the fold cannot be passed.
+    # With this smallest step the branch cannot pass its fold.
     done = vipetsc(2, "nnm", case, "--out", out, "--set", "nnm.smallest_step=1e-3")
 
     assert done.returncode == 1
@@ -134,11 +134,11 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.mark.mpirun
 def test_an_error_of_one_rank_ends_all_that_follow_a_branch_together(vipetsc, tmp_path):
-    """Where one of two ranks raises, both end, with its message: neither waits for the other."""
+    """An error on one of two ranks ends both with its message: neither waits for the other."""
     (tmp_path / "fails.py").write_text(FAILS_ON_RANK_1)
     (tmp_path / "chain.toml").write_text(CHAIN)
     paths = f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '.')}"
-    # Ranks that wait for each other would do so for ever.
+    # Ranks that wait for each other would never end: the time is limited.
     options = {"module": "fails", "env": clean_environment() | {"PYTHONPATH": paths}, "timeout": 100}
 
     done = vipetsc(2, "nnm", tmp_path / "chain.toml", "--out", tmp_path / "out", **options)
@@ -147,7 +147,7 @@ def test_an_error_of_one_rank_ends_all_that_follow_a_branch_together(vipetsc, tm
 
 
 def test_a_file_that_is_no_branch_is_refused(in_process, tmp_path):
-    """An HDF5 file of another kind under a branch's name ends with exit code 2 and no traceback."""
+    """An HDF5 file of another kind under a branch's name is refused with exit code 2 and without a traceback."""
     with h5py.File(tmp_path / "branch-x.h5", "w") as file:
         file["energy"] = [1.0]
 
@@ -158,7 +158,7 @@ def test_a_file_that_is_no_branch_is_refused(in_process, tmp_path):
 
 
 def test_branches_and_runs_never_share_a_folder(in_process, tmp_path):
-    """--force replaces results of its own kind only."""
+    """A verb with --force replaces results of its own kind only."""
     run = tmp_path / "run"
     branches = tmp_path / "branches"
     for folder, evidence in ((run, "run.h5"), (branches, "branch-mode-1.h5")):

@@ -1,4 +1,4 @@
-"""The notebooks of the manual: each is sound, and its cells run one after another."""
+"""The notebooks of the manual: each has a valid format, and its cells run one after another."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def cells(path: Path, kind: str) -> list[str]:
 
 
 def test_the_four_are_there():
-    """The manual has a notebook of each kind, and its chapter names all of them."""
+    """The manual has four notebooks, and its chapter *notebooks* has a link to each."""
     assert {path.stem for path in NOTEBOOKS} == {"own-lattice", "sweep-heat-map", "breather", "measured-data"}
     chapter = (FOLDER.parent / "notebooks.md").read_text(encoding="utf-8")
     for path in NOTEBOOKS:
@@ -33,12 +33,12 @@ def test_the_four_are_there():
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_is_kept_without_what_it_printed(path):
-    """A notebook is of format 4, begins with its title, and holds no outputs, which differ from machine to machine."""
+    """A notebook has format 4.5, begins with its title, and holds no outputs, which would differ between machines."""
     notebook = json.loads(path.read_text(encoding="utf-8"))
     assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
     assert cells(path, "markdown")[0].startswith("# ")
     identities = [cell["id"] for cell in notebook["cells"]]
-    # Cells that were copied have the same identity, of which Jupyter warns.
+    # A copied cell has the identity of its original, and Jupyter warns of that.
     assert len({*identities}) == len(identities)
     for cell in notebook["cells"]:
         assert cell.get("outputs", []) == []
@@ -46,7 +46,7 @@ def test_a_notebook_is_kept_without_what_it_printed(path):
 
 
 def test_the_manual_shows_what_each_cell_draws():
-    """Every cell that makes a figure has its picture in the manual, whose page of the notebook shows it."""
+    """The manual has a picture of every cell that makes a figure."""
     drawing = set()
     for path in NOTEBOOKS:
         for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
@@ -54,12 +54,12 @@ def test_the_manual_shows_what_each_cell_draws():
                 drawing.add(f"notebook-{path.stem}-{number}")
 
     assert drawing == {path.stem for path in (FOLDER.parent / "pictures").glob("notebook-*.png")}
-    # One each: a notebook whose code draws in another manner would not be found above.
+    # Each notebook draws one figure: a cell that draws without ``plt.subplots`` would not be found above.
     assert len(drawing) == len(NOTEBOOKS)
 
 
 def execute(path: Path) -> dict[str, Any]:
-    """Execute the cells in one namespace, which is returned; a value at the end of a cell is shown as in a notebook."""
+    """Execute the cells in one namespace, which is returned; a name at the end of a cell must have an HTML form."""
     names: dict[str, Any] = {"__name__": "__main__"}
     for number, text in enumerate(cells(path, "code")):
         lines = text.rstrip().splitlines()
@@ -72,19 +72,19 @@ def execute(path: Path) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_its_cells_run(path, monkeypatch, tmp_path, capsys):
-    """All cells run without a kernel, and what the text says of the numbers is so."""
+    """All cells run without a kernel, and their numbers are those that the notebook's text describes."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(mpl.rcParams, "backend", "agg")
     try:
         names = execute(path)
     finally:
-        # Figures of a notebook stay open, and would be those of the next test.
+        # Figures of a notebook stay open, and would belong to the next test.
         plt.close("all")
 
     printed = capsys.readouterr().out
     if path.stem == "own-lattice":
         assert "returns to the site" in printed
-        # What the text says of the number, not its digits, which belong to other tests.
+        # The text describes the size of the fraction; other tests assert its digits.
         assert 0.2 < names["dissipated"] < 0.5
     elif path.stem == "sweep-heat-map":
         assert names["fraction"].shape == (5, 6)

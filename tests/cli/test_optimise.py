@@ -1,4 +1,4 @@
-"""The verb optimise as a user types it: files, a kill, a request to stop, refusals, pictures again from the file."""
+"""The verb optimise as a user types it: files, a kill, a request to stop, refusals, pictures from the file alone."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ def case(tmp_path):
 
 
 def names(folder):
-    """Return the paths of all files in a folder but hidden ones."""
+    """Return the paths of all files in a folder that are not hidden."""
     return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file() and p.name[0] != "."}
 
 
 def recorded_values(folder):
-    """Return the values of each run that the records of a search hold, by the run's key."""
+    """Return the recorded values of each run of a search, by the run's key."""
     records = read_records(folder / "optimum-runs.jsonl", pytest.fail)
     return {record["key"]: record["values"] for record, _ in records}
 
 
 @pytest.mark.slow
 def test_a_search_leaves_its_files_and_goes_on_after_a_kill(in_process, case, tmp_path):
-    """A search that was killed in the middle and resumed leaves the files of one that was not."""
+    """A search that is killed and resumed leaves the same files as an uninterrupted one."""
     out = tmp_path / "out"
     done = in_process("optimise", case, "--out", out)
     assert done.returncode == 0, done.stderr
@@ -47,7 +47,7 @@ def test_a_search_leaves_its_files_and_goes_on_after_a_kill(in_process, case, tm
     files = {"case.toml", "best.toml", "optimum.h5", "optimum-runs.jsonl"}
     assert names(out) == files | {f"figures/{name}.png" for name in FIGURES}
 
-    # A kill leaves the records of the runs, the last one cut off.
+    # A kill leaves the records of some runs, of which the last one is incomplete.
     killed = tmp_path / "killed"
     killed.mkdir()
     records = (out / "optimum-runs.jsonl").read_bytes()
@@ -60,7 +60,7 @@ def test_a_search_leaves_its_files_and_goes_on_after_a_kill(in_process, case, tm
     assert recorded_values(killed) == recorded_values(out)
     assert (killed / "best.toml").read_text() == (out / "best.toml").read_text()
 
-    # The same command makes nothing; another search and other verbs are refused, the latter even with --force.
+    # The same command computes nothing. Another search is refused, and other verbs are refused even with --force.
     written = modified(out)
     assert in_process("optimise", case, "--out", out).stdout.splitlines()[:5] == done.stdout.splitlines()[:5]
     assert modified(out) == written
@@ -79,14 +79,14 @@ def test_a_search_leaves_its_files_and_goes_on_after_a_kill(in_process, case, tm
 
 @pytest.mark.slow
 def test_two_objectives_leave_a_front_with_its_ends_and_its_knee(in_process, case, tmp_path):
-    """Along the front one objective gains what the other loses; its ends are the best designs of either."""
+    """Along the Pareto front one objective improves while the other worsens; its ends are the best designs of each."""
     out = tmp_path / "out"
     done = in_process("optimise", case, "--out", out, "--set", TWO, "--set", "optimise.population=6")
     assert done.returncode == 0, done.stderr
     assert {"best.toml", "best-1.toml", "best-2.toml", *(f"figures/{n}.png" for n in FIGURES)} < names(out)
 
     data = datasets(out / "optimum.h5")
-    # What passes is to be much at 5 N and little at the case's amplitude: both fall along the front.
+    # The transmitted energy is maximised at 5 N and minimised at the case's amplitude: both fall along the front.
     passed, stopped = data["value"][data["front"]].T
     assert len(passed) > 1
     assert np.all(np.diff(passed) < 0)
@@ -139,7 +139,7 @@ def test_a_request_to_stop_ends_with_75_and_the_same_command_goes_on(in_process,
 
 
 def test_bad_cases_write_nothing(in_process, case, tmp_path):
-    """Everything wrong is said at once, once; tests/mpi/test_refusals.py says it of two ranks."""
+    """All problems of a case are reported together, each once; tests/mpi/test_refusals.py tests two ranks."""
     wrong = set_words("optimise.variables.clearance=[-1.0, 1.0]", "optimise.objective=[{measure='band_share'}]")
 
     done = in_process("optimise", case, "--out", tmp_path / "out", *wrong)
@@ -151,7 +151,7 @@ def test_bad_cases_write_nothing(in_process, case, tmp_path):
 
 @pytest.mark.parametrize("name", ["clearances", "amplitudes", "band", "gate", "absorber"])
 def test_the_cases_in_runs_are_valid(in_process, name):
-    """Each search in ``runs`` is valid, with the number of its designs."""
+    """``validate`` accepts each search in ``runs`` and prints the number of its designs."""
     done = in_process("validate", f"runs/examples/optimise-{name}.toml")
 
     assert done.returncode == 0, done.stderr

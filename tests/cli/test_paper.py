@@ -1,4 +1,4 @@
-"""The paper in one command: on one rank and two, through a kill, a second time, in part, in a browser."""
+"""The paper by one command: on one rank and on two, a second time, in part, and its report in a browser."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ ROOT = Path(__file__).parents[2]
 
 
 def command(folder: Path) -> list[str]:
-    """Return the words that make the tiny paper in a folder on two ranks."""
+    """Return the words of the command that makes the tiny paper in a folder on two ranks."""
     return ["mpirun", "--oversubscribe", "-n", "2", sys.executable, "-m", "tests.cli.tiny_paper", str(folder)]
 
 
 def make(folder: Path) -> dict:
-    """Make the tiny paper on two ranks; return what it says it did."""
+    """Make the tiny paper on two ranks; return the record that it prints."""
     ended = subprocess.run(
         command(folder), cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=300, check=False
     )
@@ -41,7 +41,7 @@ def make(folder: Path) -> dict:
 
 
 def environment() -> dict[str, str]:
-    """Return the environment in which the tests' own modules are found."""
+    """Return an environment in which Python finds the tests' own modules."""
     return clean_environment() | {"PYTHONPATH": str(ROOT)}
 
 
@@ -57,7 +57,7 @@ def made(tmp_path_factory) -> Path:
 
 @pytest.mark.mpirun
 def test_one_rank_makes_the_same_claims_as_two(made, tmp_path):
-    """One rank computes the steps that two claims need, and their table is the same to the byte."""
+    """One rank computes the steps that two claims need, and its table of claims has the same bytes as on two ranks."""
     done = make_paper(drawing(tiny_plan()), tmp_path / "out", only=["C8", "C11"])
     assert set(done.new_steps) == {"scattering", "interband", "interband-scatter"}
 
@@ -68,7 +68,7 @@ def test_one_rank_makes_the_same_claims_as_two(made, tmp_path):
 
 @pytest.mark.mpirun
 def test_a_second_call_does_nothing_and_a_lost_picture_is_drawn_again(made):
-    """A second call computes, draws and writes nothing; without one of its files a picture is drawn again."""
+    """A second call computes, draws and writes nothing; a picture that lacks one of its files is drawn again."""
     before = modified(made)
     second_call = make_paper(drawing(tiny_plan()), made)
     assert second_call.new_steps == ()
@@ -76,14 +76,14 @@ def test_a_second_call_does_nothing_and_a_lost_picture_is_drawn_again(made):
     assert second_call.complete is True
     assert modified(made) == before
 
-    # A picture is three files, which are drawn together.
+    # A picture consists of three files, which are drawn together.
     (made / "figures" / "fig10-reduced-model-printed.pdf").unlink()
     assert len(make_paper(drawing(tiny_plan()), made).drawn) == 3
 
 
 @pytest.mark.mpirun
 def test_every_figure_of_the_paper_is_offered(made):
-    """The results of the tiny paper allow pictures of all figures; those that it draws are there in every format."""
+    """The tiny paper's results suffice for pictures of all figures; those that it draws exist in every format."""
     plan = tiny_plan()
     folders = plan.folders(made)
     assert set(folders) == {step.name for step in plan.steps}
@@ -100,7 +100,7 @@ def test_every_figure_of_the_paper_is_offered(made):
 
 @pytest.mark.mpirun
 def test_a_changed_case_is_stale(made):
-    """A finished step is stale once its case has a change more."""
+    """A finished step is stale as soon as its case has one change more."""
     (step,) = (step for step in tiny_plan().steps if step.name == "design")
     assert step.state(made) == DONE
     assert replace(step, changes=(*step.changes, "design.lambda.count=4")).state(made) == "stale"
@@ -117,7 +117,7 @@ SAME = (
 
 
 def test_every_claim_and_figure_leads_to_steps():
-    """On both grids every claim and figure leads to its steps; but for some the grids have other cases."""
+    """On both grids every claim and figure names its steps; the cases of the grids differ, except those of ``SAME``."""
     for grid in ("full", "quick"):
         plan = paper_plan(grid)
         assert {claim for step in plan.steps for claim in plan.claims_of(step)} == set(CLAIMS)
@@ -138,7 +138,7 @@ def test_every_claim_and_figure_leads_to_steps():
 
 
 def test_list_says_what_is_left(in_process, tmp_path):
-    """--list names missing steps with their minutes and claims, and missing figures, and writes nothing."""
+    """``paper --list`` names missing steps with their minutes and claims, and missing figures, and writes nothing."""
     listed = in_process("paper", "--list", "--out", tmp_path / "none")
     assert listed.returncode == 0, listed.stderr
     assert re.search(r"^scattering +missing +\d+ min +.*C7 C8", listed.stdout, re.M)
@@ -147,7 +147,7 @@ def test_list_says_what_is_left(in_process, tmp_path):
 
 
 def test_bad_ids_and_foreign_folders_are_refused(in_process, tmp_path):
-    """An unknown id is refused with those that there are, once, and a folder with other files is refused."""
+    """An unknown id is refused with a list of the known ones, and a folder with other files is refused."""
     wrong = in_process("paper", "--only", "fig99", "C7", "--out", tmp_path / "out")
     assert wrong.returncode == 2
     assert wrong.stderr.count("--only fig99: figures are fig01, fig02") == 1
@@ -162,7 +162,7 @@ def test_bad_ids_and_foreign_folders_are_refused(in_process, tmp_path):
 
 
 def test_quick_and_full_do_not_mix(in_process, tmp_path):
-    """A folder of the full grid is refused for the quick one, with the remedy."""
+    """The quick grid is refused in a folder of the full grid, and the message names a remedy."""
     (tmp_path / "plan.json").write_text('{"grid": "full"}')
     mixed = in_process("paper", "--quick", "--only", "fig10", "--out", tmp_path)
     assert mixed.returncode == 2
@@ -180,7 +180,7 @@ def browser(tmp_path_factory):
 @NEEDED
 @SCREENS
 def test_the_report_fits_a_phone_and_a_desk(made, browser, width, height):
-    """The report is no wider than the window, holds every picture itself, and has no dead link and no error."""
+    """The report is no wider than the window, contains its pictures, and has no dead link and no error."""
     found = browser.measure(browser.open(made / "report.html", width, height))
     assert found["window"] == width
     assert found["page"] <= width
@@ -192,7 +192,8 @@ def test_the_report_fits_a_phone_and_a_desk(made, browser, width, height):
     assert found["errors"] == []
 
 
-# Before each script below: the figure whose picture has a text, its choice of panels and its picture.
+# Each script below begins with these lines: they find the figure whose picture has a given text, its choice of panels
+# and its picture.
 LOOK = """
 const figure = [...document.querySelectorAll('figure')].find(f => f.querySelector('img').alt.includes('%s'));
 const box = e => { const b = e.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; };
@@ -203,7 +204,7 @@ const choice = figure.querySelector('select'), image = figure.querySelector('img
 @pytest.mark.mpirun
 @NEEDED
 def test_values_of_the_report_are_read_off_zoomed_and_switched_off(made, browser):
-    """Of a picture in the report the values are those of the results; its plot zooms, comes back and hides curves."""
+    """The values of a picture in the report are those of the results; its plot zooms, resets and hides curves."""
     session = browser.open(made / "report.html", 1280, 900)
     look = LOOK % "Transferred energy against amplitude"
     left, top, width, height = browser.ask(
@@ -218,7 +219,7 @@ def test_values_of_the_report_are_read_off_zoomed_and_switched_off(made, browser
     with h5py.File(made / "interband/ensemble.h5") as file:
         assert curve["x"] == pytest.approx(list(file["amplitude"][...][: len(curve["x"])]), rel=5e-4)
 
-    # The pointer in the middle of the panel.
+    # The pointer is in the middle of the panel.
     west, north, east, south = first["box"]
     browser.drag(session, (left + (west + east) / 2 * width, top + (north + south) / 2 * height))
     text = browser.ask(session, look + "return figure.querySelector('output').textContent;")
@@ -238,13 +239,13 @@ def test_values_of_the_report_are_read_off_zoomed_and_switched_off(made, browser
     paths, ticks = browser.ask(session, count)
     assert paths == sum(curve["joined"] for curve in first["curves"])
 
-    # A part that is pulled open has other ticks, and the button brings back the whole.
+    # A selected part of the plot has other ticks, and the button resets the plot.
     browser.drag(session, (left + 0.3 * width, top + 0.3 * height), (left + 0.5 * width, top + 0.6 * height))
     assert browser.ask(session, count)[1] != ticks
     browser.ask(session, look + "figure.querySelector('.legend .reset').click();")
     assert browser.ask(session, count) == [paths, ticks]
 
-    # A curve's button takes it away.
+    # The button of a curve hides it.
     browser.ask(session, look + "figure.querySelector('.legend button').click();")
     assert browser.ask(session, count)[0] < paths
     assert browser.measure(session)["errors"] == []

@@ -1,4 +1,4 @@
-"""Parts of users' modules: the modules of the manual's chapter *extend* in a run, and the cases that are refused."""
+"""Laws, waveforms, measures and figures of users' modules: those of the manual's chapter *extend*, and refusals."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from vipetsc.lattice import Contact
 from vipetsc.lattice.drive import Pieces
 
 EXAMPLE = CHAPTER.parents[1] / "examples/own-law.toml"
-# In 1/m^2: at an indentation of 1 mm the stop is 40 % stiffer than the linear one.
+# The coefficient b in 1/m^2 of the force F = k x (1 + b x^2): at x = 1 mm it is 40 % above that of a linear stop.
 RATE = 4e5
-# The chapter's own text, so that what it says of a sweep is run.
+# The sweep is read from the chapter's own text.
 SWEEP = re.compile(r"^```toml\n(\[sweep\].*?)^```$", flags=re.M | re.S)
 CASE = f"""
 [plugins]
@@ -57,7 +57,7 @@ engine = "propagator"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """The modules of the chapter, and a case that uses all of them."""
+    """A folder with the modules of the chapter, and with a case that uses all of them."""
     folder = tmp_path_factory.mktemp("plugins")
     write_modules(folder)
     (folder / "case.toml").write_text(CASE)
@@ -66,21 +66,21 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def out(folder, tmp_path_factory) -> Path:
-    """The folder of a run of the case, which is started elsewhere."""
+    """The results of a run of the case in ``folder``; the run is started in another folder."""
     from vipetsc.cli.main import main
 
     out = tmp_path_factory.mktemp("results") / "out"
-    # From another current folder: paths of modules count from the case file.
+    # The current folder is another one: paths of modules are relative to the case file.
     assert main(["run", str(folder / "case.toml"), "--out", str(out), "--quiet"], {}) == 0
     return out
 
 
 def test_a_run_uses_and_records_the_parts(folder, out):
-    """The case in the results has every part with module and hash, and the registered figure is drawn."""
+    """The results use every registered part, record its module and hash, and have the registered figure."""
     with open(out / "run.h5") as run:
         case = Case.of(run)
         law = case.model().contact
-        # Otherwise the law and the measure would not have been used.
+        # Without contacts the law and the measure would not be used.
         assert len(run["impacts/onset"]) > 4
         longest = float((run["impacts/separation"] - run["impacts/onset"]).max())
     with open(out / "analysis.h5") as analysis:
@@ -98,7 +98,7 @@ def test_a_run_uses_and_records_the_parts(folder, out):
         record = parts[kind][name]
         assert record.module == str(folder / file)
         assert record.sha256 == hashlib.sha256((folder / file).read_bytes()).hexdigest()
-    # An empty page has less.
+    # An empty picture takes fewer bytes.
     assert (out / "figures/kinetic.png").stat().st_size > 5000
 
     summary = json.loads((out / "summary.json").read_text())
@@ -107,7 +107,7 @@ def test_a_run_uses_and_records_the_parts(folder, out):
 
 
 def test_a_registered_measure_is_exported(out):
-    """The CSV of a run's numbers has a row of it, with its unit and text."""
+    """The CSV of a run's measures has a row for a registered measure, with its unit and its description."""
     write_curves(out)
     with open(out / "analysis.h5") as analysis:
         longest = float(analysis["longest_contact"])
@@ -119,8 +119,8 @@ def test_a_registered_measure_is_exported(out):
 
 
 def test_validate_lists_the_parts_that_a_case_uses(folder, in_process):
-    """Each part has a row with its kind, its module and the version; a law that the case does not use has none."""
-    # With the factor of the package, so that the module of factors registers one that this case does not use.
+    """Each part that the case uses has a row with its kind, module and version; an unused part has no row."""
+    # The case uses a damping factor of the package: the one of the module is registered but not used.
     shown = in_process("validate", folder / "case.toml", "--set", "contacts.damping=exact").stdout
     rows = re.findall(r"^  (\w+) +(\S+), registered by (\S+?)(?:, version (\S+))?$", shown, flags=re.M)
     assert {(kind, name): (module, version) for kind, name, module, version in rows} == {
@@ -138,13 +138,13 @@ def test_the_waveform_is_the_formula(folder):
     waveform = Case.load(folder / "case.toml").model().drive
     assert isinstance(waveform, Pieces)
     t = np.linspace(0.002, 0.018, 33)
-    # Ricker's wavelet (1 - 2 p) exp(-p) with the frequency of its largest component.
+    # Ricker's wavelet is (1 - 2 p) exp(-p) with p = (omega (t - delay)/2)^2; its spectrum is largest at omega.
     phase = (1000.0 * (t - 0.01) / 2) ** 2
     assert waveform.force(t) == pytest.approx(500.0 * (1 - 2 * phase) * np.exp(-phase), abs=1e-2)
 
 
 def edited_copy(out: Path, target: Path, before: str, after: str) -> Path:
-    """A copy of the results' case in ``target`` with a changed text."""
+    """Copy a run to ``target``, with ``before`` replaced by ``after`` in the text of its case; returns ``target``."""
     text = (out / "case.toml").read_text()
     assert before in text
     target.mkdir()
@@ -154,22 +154,22 @@ def edited_copy(out: Path, target: Path, before: str, after: str) -> Path:
 
 
 def test_results_of_another_source_are_not_continued(folder, out, tmp_path, in_process):
-    """A folder whose law has another hash is refused by a sentence with the hash, and stays as it is."""
+    """--resume refuses results whose law has another hash, with both hashes, and leaves the folder as it is."""
     digest = hashlib.sha256((folder / "stops.py").read_bytes()).hexdigest()
-    # A hash that no file has stands for that of an earlier source.
+    # A hash of zeros stands for that of an earlier source.
     old = edited_copy(out, tmp_path / "old", digest, "0" * 64)
     ended = in_process("run", folder / "case.toml", "--out", old, "--resume")
     assert ended.returncode == 2
     assert f"plugins.parts.law.hardening.sha256 = {'0' * 16}... there, {digest[:16]}... here" in ended.stderr
-    # Refused before anything was written; the lock, whose name begins with a dot, may stay.
+    # The case is refused before anything is written; the lock, whose name begins with a dot, may stay.
     assert {path.name for path in old.iterdir() if path.name[0] != "."} == {"case.toml", "run.h5"}
 
 
 def test_a_changed_source_is_warned_of_where_results_are_read(folder, out, caplog):
-    """Reading a case with another hash warns once and names the part."""
+    """Reading results that record another hash of a module warns once, and names the part."""
     digest = hashlib.sha256((folder / "factors.py").read_bytes()).hexdigest()
     text = (out / "case.toml").read_text().replace(digest, "0" * 64)
-    # Twice, and one warning: a sweep reads the case of every member.
+    # Reading twice gives one warning: a sweep reads the case of every member.
     for _ in range(2):
         assert Case.from_toml(text).plugins.parts["dissipation"]["herbert-mcwhannell"].sha256 == digest
     warned = [line for line in caplog.messages if "has changed" in line]
@@ -180,8 +180,8 @@ def test_a_changed_source_is_warned_of_where_results_are_read(folder, out, caplo
 
 
 def test_a_source_that_changes_within_a_process_is_refused(folder, tmp_path):
-    """Python has imported the earlier source: its results would be recorded with the hash of the later one."""
-    # Under a name of its own, since names are registered for the whole process.
+    """A module that changes after its import is refused: results would be recorded with the hash of the new source."""
+    # The law gets another name, because names are registered for the whole process.
     (tmp_path / "stop.py").write_text((folder / "stops.py").read_text().replace('"hardening"', '"changing"'))
     table = {"plugins": {"modules": [str(tmp_path / "stop.py")]}}
     Case.from_table(table)
@@ -195,8 +195,8 @@ def test_a_source_that_changes_within_a_process_is_refused(folder, tmp_path):
     ("file", "needed"), [("stops.py", True), ("pulses.py", True), ("durations.py", False), ("pictures.py", False)]
 )
 def test_results_need_the_modules_of_their_physics(out, file, needed, caplog):
-    """Results whose law or waveform is not there are not read; a module of measures or figures alone may be missing."""
-    # Changed in the text, because the file is needed by the other tests.
+    """Results are not read without the module of their law or waveform; one of a measure or figure may be missing."""
+    # The path is changed in the text of the case, because other tests need the file.
     text = (out / "case.toml").read_text().replace(f"/{file}", f"/gone-{file}")
     if needed:
         with pytest.raises(CaseError, match=rf"gone-{file}, which registers parts of this case"):
@@ -207,7 +207,7 @@ def test_results_need_the_modules_of_their_physics(out, file, needed, caplog):
 
 
 def test_moved_results_take_the_module_of_the_current_folder(folder, out, monkeypatch):
-    """Where the recorded path does not exist, a file of that name in the current folder is taken."""
+    """If the recorded path of a module does not exist, a file of that name in the current folder is used."""
     text = (out / "case.toml").read_text().replace(str(folder), "/elsewhere")
     with pytest.raises(CaseError, match="there is no file /elsewhere/stops"):
         Case.from_toml(text)
@@ -216,8 +216,8 @@ def test_moved_results_take_the_module_of_the_current_folder(folder, out, monkey
 
 
 def test_names_are_those_of_the_modules_that_a_case_names(folder):
-    """A part that another case has imported is unknown in a case that does not name its module."""
-    # Imports all modules: their names are then in the process, but not in the next case.
+    """A case does not know a part whose module it does not name, although another case has imported that module."""
+    # This case imports all modules: their names are then registered in the process.
     Case.load(folder / "case.toml")
     others = [str(folder / name) for name in ("factors.py", "pulses.py")]
     with pytest.raises(CaseError, match="'hardening': must be 'hertz', 'bilinear' or 'power'; plugins"):
@@ -230,7 +230,7 @@ def test_the_schema_of_a_case_has_the_names_of_its_modules(folder, in_process):
     """``schema CASE`` allows the registered names, the schema of all cases does not."""
     table = tomllib.loads(CASE)
     jsonschema.validate(table, json.loads(in_process("schema", folder / "case.toml").stdout))
-    # The schema of all cases has the package's laws alone.
+    # The schema of all cases has only the laws of the package.
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(table, json_schema())
 
@@ -255,11 +255,11 @@ def test_the_schema_of_a_case_has_the_names_of_its_modules(folder, in_process):
     ],
 )
 def test_a_module_that_cannot_be_used_is_refused(source, sentence, tmp_path, in_process):
-    """A missing or failing module is one problem with its file and line; exit code 2, and nothing is written."""
+    """A missing or failing module is one problem, with exit code 2, and nothing is written."""
     if source is not None:
         (tmp_path / "part.py").write_text(source)
     (tmp_path / "case.toml").write_text('[plugins]\nmodules = ["part.py"]\n')
-    # By the program for the exit code, and below in Python for the sentence.
+    # The program gives the exit code; the call in Python below gives the sentence.
     ended = in_process("run", tmp_path / "case.toml", "--out", tmp_path / "out")
     assert ended.returncode == 2
     assert "1 problem\n  plugins.modules[1] = " in ended.stderr
@@ -269,7 +269,7 @@ def test_a_module_that_cannot_be_used_is_refused(source, sentence, tmp_path, in_
 
 
 def test_a_module_that_fails_halfway_leaves_no_parts(tmp_path):
-    """What it had registered before it failed is no part."""
+    """A part that a module registered before it failed is not available."""
     text = "from vipetsc import register\n\n@register.dissipation_factor('halfway')\ndef c(r):\n    return 0\n\n1 / 0\n"
     (tmp_path / "part.py").write_text(text)
     with pytest.raises(CaseError, match="line 7"):
@@ -294,7 +294,7 @@ def test_a_module_that_fails_halfway_leaves_no_parts(tmp_path):
     ],
 )
 def test_keys_of_parts_are_checked(folder, change, sentence):
-    """Parameters are those of the part, within its bounds; other verbs refuse a waveform that they are not about."""
+    """Parameters are checked by the names and bounds of the part; verbs of steady states refuse its waveform."""
     from vipetsc.case.verb_cases import load_every
 
     with pytest.raises(CaseError, match=sentence):
@@ -302,12 +302,12 @@ def test_keys_of_parts_are_checked(folder, change, sentence):
 
 
 def test_a_sweep_varies_laws_and_their_parameters(folder):
-    """Laws vary together with their parameters, as in the chapter; a stop that does not harden is the linear one."""
+    """A sweep varies laws together with their parameters, as in the chapter; for b = 0 the law is the linear one."""
     table = tomllib.loads(CASE)
     table["plugins"]["modules"] = [str(folder / name) for name in table["plugins"]["modules"]]
     varied = tomllib.loads(SWEEP.search(CHAPTER.read_text(encoding="utf-8"))[1])["sweep"]
     assert varied["contacts"]["parameters"] == [{}, {"b": 1e5}, {"b": RATE}]
-    # One more than the chapter has, which is the linear stop.
+    # The chapter's sweep gets one member more: the law with b = 0.
     varied["contacts"]["law"].append("hardening")
     varied["contacts"]["parameters"].append({"b": 0.0})
     varied["measures"] = ["transfer", "motion"]
@@ -315,14 +315,14 @@ def test_a_sweep_varies_laws_and_their_parameters(folder):
     assert (ensemble["longest_contact"] > 0).all()
     linear, little, hardened, unhardened = ensemble["ibtet"].values
     assert unhardened == pytest.approx(linear, rel=1e-6)
-    # Far above rounding, and in order: the parameter reaches the kernel.
+    # The compiled kernel uses the parameter: changes grow with it, and are far above rounding.
     assert abs(hardened / linear - 1) > abs(little / linear - 1) > 1e-4
     assert "[plugins.parts.law.hardening]" in ensemble.attrs["case"]
 
 
 @pytest.mark.mpirun
 def test_two_ranks_have_the_bits_of_one(folder, out, tmp_path, on_ranks):
-    """The registered law, compiled on each rank, gives the bits of one rank."""
+    """The registered law, compiled on each of two ranks, gives the same bits as on one rank."""
     on_ranks(2, "run", folder / "case.toml", "--out", tmp_path / "two", *set_words("output.figures=false"))
     with open(out / "run.h5") as one, open(tmp_path / "two/run.h5") as two:
         assert np.array_equal(one["velocity"], two["velocity"])

@@ -1,4 +1,4 @@
-"""The chapter on Python: its blocks run, its names are there; the front door as help and editors see it."""
+"""The chapter on Python: its blocks run, its names exist; the package's public names in help and in editors."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_every_block_runs(block, tmp_path, monkeypatch, plain_pictures):
 
 
 def test_every_name_is_there():
-    """The names of the front door and those of the table are where the chapter says."""
+    """The chapter's public names are in the package, and those of its table in the modules of their rows."""
     for name in re.findall(r"`(\w+)`", CHAPTER.partition("\n## ")[0]):
         assert name == "vipetsc" or hasattr(package, name), name
 
@@ -49,11 +49,11 @@ def test_every_name_is_there():
 
 
 def test_completion_and_help_show_the_front_door():
-    """Names that are loaded late are completed, and help shows each of them with its own text."""
+    """Completion and help show the public names of the package, although they are imported only when they are used."""
     assert {*dir(package)} >= FRONT
     assert {*package.__all__} >= FRONT
 
-    # From Python 3.13 on the arguments of a long signature stand in lines of their own.
+    # Since Python 3.13 a long signature has one argument a line.
     shown = re.sub(r"\(\n +", "(", pydoc.render_doc(package, renderer=pydoc.plaintext))
     for text in (
         "class Case(",
@@ -64,13 +64,13 @@ def test_completion_and_help_show_the_front_door():
         "analyse(",
     ):
         assert text in shown, text
-    # The example of the docstring runs.
+    # Another test runs this example.
     assert "result = simulate(case, progress=True)" in package.__doc__
 
 
 @pytest.mark.slow
 def test_the_example_of_help_runs():
-    """The example in the package's docstring runs as it stands, and speaks on stderr of its progress."""
+    """The example in the package's docstring runs as it stands, with its progress on stderr."""
     lines = package.__doc__.partition("    from vipetsc import")[2]
     example = "from vipetsc import" + re.sub(r"\n    ", "\n", lines).partition("\nAll keys")[0]
     command = [sys.executable, "-c", example]
@@ -81,7 +81,7 @@ def test_the_example_of_help_runs():
 
 
 def test_the_front_door_opens_without_petsc_and_mpi():
-    """Importing the package and asking for its names starts nothing, and builds no case."""
+    """To import the package and to list its names loads neither PETSc nor MPI nor another large library."""
     code = (
         "import sys, vipetsc; dir(vipetsc);"
         " print(*sorted({'petsc4py', 'mpi4py', 'numba', 'tqdm', 'pydantic', 'numpy'} & sys.modules.keys()))"
@@ -91,7 +91,7 @@ def test_the_front_door_opens_without_petsc_and_mpi():
 
 
 def test_stubs_say_what_the_module_does():
-    """What type checkers read has the same names, from the same modules; the package says that it is typed."""
+    """The stub file for type checkers has the names of the package, from the same modules; py.typed exists."""
     stub = (ROOT / "vipetsc/__init__.pyi").read_text(encoding="utf-8")
     found = {alias: (module, name) for module, name, alias in re.findall(r"from (\S+) import (\w+) as (\w+)", stub)}
     assert found == package.MODULES

@@ -1,4 +1,4 @@
-"""What the program says of itself: chapters, the schema of case files against their validator, completion."""
+"""The program's own reference: chapters at the prompt, the schema of case files and their validator, completion."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CASES = sorted([*(ROOT / "vipetsc/examples").glob("*.toml"), *(ROOT / "vipetsc/p
 
 
 def classes() -> dict[str, set[str]]:
-    """Return the keys that the validator takes in every class of a section, tables within tables as well."""
+    """Return the keys that the validator accepts in the class of every section and of every table within it."""
     keys_of = {}
     waiting = list(SECTIONS.values())
     while waiting:
@@ -42,7 +42,7 @@ def classes() -> dict[str, set[str]]:
 
 
 def test_schema_and_texts_have_the_keys_of_the_validator():
-    """Every class of the schema has the keys that the validator takes, and each of them a text."""
+    """Every class of the schema has the keys that the validator accepts, and every key has a text."""
     schema = keys.json_schema()
     assert set(schema["properties"]) == {"name", *SECTIONS}
 
@@ -50,7 +50,7 @@ def test_schema_and_texts_have_the_keys_of_the_validator():
     # The schema of a sweep also has the sections whose keys may vary.
     varied = set(schema["$defs"]["SweepTable"]["properties"]) & set(SECTIONS)
     expected = validator | {"SweepTable": validator["SweepTable"] | varied}
-    # In both directions: no key without a schema, and no schema of a key that was removed.
+    # The sets are equal: no key lacks a schema, and no schema describes a key that was removed.
     assert {name: set(item.get("properties", {})) for name, item in schema["$defs"].items()} == expected
 
     with_keys = {name: names for name, names in (validator | {"CaseFile": {"name"}}).items() if names}
@@ -58,7 +58,7 @@ def test_schema_and_texts_have_the_keys_of_the_validator():
 
 
 def test_the_chapter_on_keys_has_those_of_the_validator():
-    """The manual's table of each section has the keys that the validator takes there, once."""
+    """The manual's table of each section has the keys that the validator accepts there, each once."""
     validator = classes()
     chapter = keys.chapter()
     shown = {}
@@ -66,9 +66,9 @@ def test_the_chapter_on_keys_has_those_of_the_validator():
         shown.setdefault(path, set()).update(re.findall(r"^\| `(\w+)` \|", text, flags=re.M))
     for section, table in SECTIONS.items():
         assert shown[section] == validator[table.__name__], section
-    # Counted as well: a key that stands twice would be lost in the sets.
+    # The numbers must agree too: a key that is listed twice would not show in the sets.
     assert sum(map(len, shown.values())) == sum(map(len, validator.values()))
-    # An empty list is no default: ``nfrc.fixed`` without values has the drive's frequency, as its text says.
+    # An empty list is not shown as a default: ``nfrc.fixed`` without values takes the drive's frequency.
     assert "| `[]` |" not in chapter
     assert re.search(r"^\| `fixed` \| list of number > 0 \|  \|  \| .*default: that of the drive", chapter, flags=re.M)
 
@@ -82,13 +82,13 @@ def test_a_refused_key_names_those_of_the_schema():
 
 @pytest.mark.parametrize("path", CASES, ids=lambda path: path.stem)
 def test_the_schema_takes_every_case_file(path):
-    """Every case file in ``runs`` and of the paper is valid by its schema, as an editor would check it."""
+    """Every case file of the examples and of the paper is valid by its schema, as an editor would check it."""
     validator_of(json.dumps(schema_of(str(path)))).validate(tomllib.loads(path.read_text(encoding="utf-8")))
 
 
 @cache
 def validator_of(schema: str) -> jsonschema.protocols.Validator:
-    """Return the validator of a schema, which is valid itself; most case files have the same one."""
+    """Return the validator of a schema, and assert that the schema is valid; most case files have the same one."""
     table = json.loads(schema)
     kind = jsonschema.validators.validator_for(table)
     # A schema with a mistake of its own might accept everything.
@@ -103,7 +103,7 @@ def validator_of(schema: str) -> jsonschema.protocols.Validator:
         "lattice.cells = 0",
         "lattice.ends = 'loose'",
         "drive.wavenumber = '5p/9'",
-        # Beyond pi.
+        # A wavenumber is at most pi.
         "drive.wavenumber = 4.0",
         "contacts.sites = [1.5]",
         "contacts.restitution = 1.5",
@@ -136,13 +136,13 @@ def test_the_verb_schema_prints_it(in_process):
 
 
 def test_bash_completes_verbs_options_and_files(in_process, tmp_path):
-    """In bash the completion proposes verbs, files for a case, and the shells that it is for."""
+    """In bash the completion proposes verbs, files for a case, and the shells that have a completion."""
     script = in_process("completion", "bash").stdout
     (tmp_path / "case.toml").touch()
 
     def completed(*words: str) -> set[str]:
         line = f"COMP_WORDS=({' '.join(words)} '') COMP_CWORD={len(words)}; COMP_WORDS[-1]="
-        # The variables that bash sets when the tabulator is pressed.
+        # Bash sets these variables when the tabulator is pressed.
         asked = f"{script}\n{line}\n_shtab_vipetsc; printf '%s\\n' \"${{COMPREPLY[@]}}\""
         ended = subprocess.run(["bash", "-c", asked], cwd=tmp_path, capture_output=True, text=True, check=False)
         return set(ended.stdout.split())
@@ -162,7 +162,7 @@ def test_zsh_reads_its_completion(in_process):
 
 
 def test_the_manual_at_the_prompt(in_process):
-    """Chapters are listed and shown at the prompt, their links as commands; one that is not there is refused."""
+    """Chapters are listed and shown at the prompt, with links as commands; an unknown chapter is refused."""
     listed = in_process("manual").stdout
     index = (ROOT / "vipetsc/manual/index.md").read_text(encoding="utf-8")
     names = {*WRITTEN, *re.findall(r"\]\(([\w-]+)\.md\)", index)}
@@ -193,10 +193,10 @@ def test_messages_in_the_chapter_on_trouble_are_the_programs():
     quoted = [
         quote for table in tables for row in table.splitlines() for quote in re.findall("`([^`]+)`", row.split("|")[1])
     ]
-    # A pattern that finds nothing would let everything pass.
+    # If the pattern found nothing, the test would pass without a check.
     assert len(quoted) > 20
 
-    # A message may go on in a further string.
+    # Adjacent strings of a message are joined.
     sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "vipetsc").rglob("*.py"))
     joined = re.sub(r"\"\s*\n\s*f?\"", "", sources)
     for piece in {part.strip() for quote in quoted for part in quote.split("...")}:

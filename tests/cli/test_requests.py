@@ -1,4 +1,4 @@
-"""Requests to stop before the program is there, and those that a launcher sends because a rank was killed."""
+"""Requests to stop while the program is loading, and those that a launcher sends because a rank was killed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from tests.conftest import clean_environment
 from vipetsc.parallel import STOP_SIGNALS
 
-# A module that takes for ever to load.
+# A module that takes 100 s to load.
 ENDLESS = "import sys, time\nprint('loading', flush=True)\ntime.sleep(100)\n"
 RANK_1_IS_KILLED = """
 import os, signal, sys
@@ -34,6 +34,7 @@ sys.exit(front_door.main(["doctor"]))
 @pytest.mark.slow
 @pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_request_while_modules_load_is_one(tmp_path, number):
+    """A signal during the import of petsc4py ends the program with exit code 75 and a sentence, without a traceback."""
     package = tmp_path / "petsc4py"
     package.mkdir()
     (package / "__init__.py").write_text(ENDLESS)
@@ -42,7 +43,7 @@ def test_a_request_while_modules_load_is_one(tmp_path, number):
     command = [sys.executable, "-m", "vipetsc", "doctor"]
 
     def listen() -> None:
-        # A shell may have started the tests with signals ignored, as it does in the background.
+        # A shell that starts the tests in the background may have made them ignore signals.
         signal.signal(number, signal.SIG_DFL)
 
     with subprocess.Popen(
@@ -61,6 +62,7 @@ def test_a_request_while_modules_load_is_one(tmp_path, number):
 
 @pytest.mark.slow
 def test_what_nohup_ignores_stays_ignored(tmp_path):
+    """A signal that the caller ignores, as nohup does SIGHUP, is ignored by the program too."""
     script = (
         "import signal, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); from vipetsc.process import end_on_request;"
     )
@@ -72,6 +74,7 @@ def test_what_nohup_ignores_stays_ignored(tmp_path):
 @pytest.mark.mpirun
 @pytest.mark.parametrize("ending", ["kill", "request"])
 def test_nobody_stops_on_request_where_a_rank_was_killed(tmp_path, ending):
+    """After a rank was killed the job has the exit code of the kill, and no rank reports a stop on request."""
     script = tmp_path / "killed.py"
     script.write_text(RANK_1_IS_KILLED)
     command = ["mpirun", "--oversubscribe", "-n", "2", sys.executable, str(script), "--", ending]

@@ -1,4 +1,4 @@
-"""Pictures that a second process draws: the same files, also where it fails; it ends with the process that asks."""
+"""Pictures by a second process: the files are the same, also if it fails, and it ends with the process that asks."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from vipetsc.figures.common_turns import CommonTurns
 from vipetsc.figures.second_process import SecondProcess
 
 pytestmark = pytest.mark.parallel(1)
-# Drawn from run.h5 alone, and therefore possible before the measures are there.
+# These pictures are drawn from run.h5 alone: they need not wait for the measures.
 WITHOUT_MEASURES = {"phase.png", "unit_cell.png", "impacts.png", "ledger.png"}
 
 
 def run_in(folder: Path, stride: int) -> Path:
-    """Write a run with few pictures, whose fields are those of every ``stride``-th sample."""
+    """Write a run without contacts, with the fields of every ``stride``-th sample, into ``folder``, and return it."""
     output = {"fields": ["velocity"], "stride": stride}
     case = small_case(contacts={"sites": []}, time={"engine": "propagator", "end": 0.03}, output=output)
     simulate(case, folder, MPI.COMM_SELF)
@@ -49,11 +49,12 @@ def thinned(tmp_path_factory) -> Path:
 
 
 def pictures_in(folder: Path) -> dict[str, bytes]:
+    """The bytes of each picture of a run, by its name."""
     return {path.name: path.read_bytes() for path in (folder / "figures").iterdir()}
 
 
 class Recorded:
-    """A second process that has failed; keeps what it was asked for."""
+    """A second process that has failed: it draws nothing, and keeps the options of each request."""
 
     is_asked = False
 
@@ -71,16 +72,17 @@ class Recorded:
 
 @pytest.mark.slow
 def test_two_processes_draw_what_one_draws(run, tmp_path):
+    """Two processes together draw the same pictures, byte by byte, as one process alone."""
     alone = shutil.copytree(run, tmp_path / "alone")
     expected = draw_pictures(PICTURES, [alone], MPI.COMM_SELF)
 
     with SecondProcess() as second:
         draw_unmeasured(PICTURES, run, second)
         drawn = draw_pictures(PICTURES, [run], MPI.COMM_SELF, afresh=False, helper=second)
-        # Both were asked for the two that show measures, and each took one turn too many.
+        # The two processes took a turn for each of two pictures, and each took one more to find that none was left.
         assert next(second.turns) == 2 + 2
 
-        # A request that fails ends nothing.
+        # A request that fails does not end the second process.
         second.ask("run", [run], names=["no figure"])
         assert second.drawn() is None
         second.ask("run", [run], names=["unit_cell"])
@@ -91,6 +93,7 @@ def test_two_processes_draw_what_one_draws(run, tmp_path):
 
 
 def test_pictures_that_the_second_process_did_not_draw_are_drawn_here(thinned):
+    """If the second process has failed, this process draws all pictures."""
     second = Recorded()
     drawn = draw_pictures(PICTURES, [thinned], MPI.COMM_SELF, helper=second)
     assert {path.name for path in drawn} == {"spacetime.png", "unit_cell.png", "ledger.png"}
@@ -99,7 +102,7 @@ def test_pictures_that_the_second_process_did_not_draw_are_drawn_here(thinned):
 
 @pytest.mark.parametrize("name", ["run", "thinned"])
 def test_pictures_without_the_warnings_of_the_measures_are_drawn_again(name, request, monkeypatch, tmp_path):
-    """A picture that was drawn before the run was measured stays if the measures have nothing to warn of."""
+    """A picture that was drawn before the run was measured stays only if the measures bring no warning."""
     folder = shutil.copytree(request.getfixturevalue(name), tmp_path / "run")
     (folder / "analysis.h5").unlink(missing_ok=True)
     monkeypatch.setattr("vipetsc.figures.registry.draw", lambda *arguments, **options: [])
@@ -112,6 +115,7 @@ def test_pictures_without_the_warnings_of_the_measures_are_drawn_again(name, req
 
 
 def test_earlier_measures_keep_pictures_from_being_drawn_ahead(tmp_path):
+    """Nothing is drawn before the measures if a run has earlier measures."""
     (tmp_path / "analysis.h5").touch()
     second = Recorded()
     draw_unmeasured(PICTURES, tmp_path, second)
@@ -119,8 +123,9 @@ def test_earlier_measures_keep_pictures_from_being_drawn_ahead(tmp_path):
 
 
 def test_a_second_process_that_was_killed_has_drawn_nothing(tmp_path):
+    """A request to a second process that was killed returns no pictures, without an error."""
     with SecondProcess() as second:
-        # As the system does where memory is short.
+        # The system kills a process where memory is short.
         second._process.kill()
         second._process.wait()
         second.ask("run", [tmp_path])
@@ -128,7 +133,10 @@ def test_a_second_process_that_was_killed_has_drawn_nothing(tmp_path):
 
 
 def test_the_second_process_ends_with_the_one_that_asks():
-    """The first one is killed; what both hold open is closed when neither is left."""
+    """The second process ends when the first one is killed.
+
+    Both processes hold the pipe of stderr open: the call returns only after the second one has ended too.
+    """
     program = (
         "import os, signal\n"
         "from vipetsc.figures.second_process import SecondProcess\n"
@@ -142,6 +150,7 @@ def test_the_second_process_ends_with_the_one_that_asks():
 
 @pytest.mark.parametrize(("cores", "load", "useful"), [(2, 1.4, True), (1, 0.0, False), (2, 8.0, False)])
 def test_a_second_process_needs_an_idle_core(cores, load, useful, monkeypatch):
+    """A second process is useful on Linux with more than one core and a load that leaves one of them idle."""
     monkeypatch.delitem(sys.modules, "matplotlib", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {*range(cores)})
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
@@ -153,14 +162,14 @@ def test_a_second_process_needs_an_idle_core(cores, load, useful, monkeypatch):
 
 @pytest.fixture
 def turns() -> Iterator[int]:
-    """The descriptor of a file of turns."""
+    """The descriptor of a file from which processes take turns: numbers 0, 1, 2, ..., each once."""
     file = os.memfd_create("turns")
     yield file
     os.close(file)
 
 
 def taker(file: int, count: int) -> subprocess.Popen:
-    """A process that says that it has begun, and writes the numbers that it takes."""
+    """Start a process that prints "begun", takes ``count`` turns, and prints their numbers."""
     program = (
         "import sys; from itertools import islice\n"
         "from vipetsc.figures.common_turns import CommonTurns\n"
@@ -171,6 +180,7 @@ def taker(file: int, count: int) -> subprocess.Popen:
 
 
 def test_two_processes_take_each_turn_once(turns):
+    """Two processes that take 2000 turns each have together taken every number below 4000 once."""
     with taker(turns, 2000) as first, taker(turns, 2000) as second:
         taken = [process.communicate()[0].split()[1:] for process in (first, second)]
     assert sorted(map(int, taken[0] + taken[1])) == list(range(4000))
@@ -178,6 +188,7 @@ def test_two_processes_take_each_turn_once(turns):
 
 
 def test_a_turn_is_not_taken_while_another_process_takes_one(turns):
+    """A process waits for the lock of the file, and takes the number that the owner of the lock has left in it."""
     with taker(turns, 1) as other:
         fcntl.lockf(turns, fcntl.LOCK_EX)
         assert other.stdout.readline() == "begun\n"

@@ -1,4 +1,4 @@
-"""Pictures that are not wanted, tables whose columns fit, files that another program has open."""
+"""Details of verbs: pictures that are switched off, columns of tables, files that another program has open."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from vipetsc.lattice.cell import Spring
 
 @pytest.mark.parametrize("kind", [NnmCase, DesignCase])
 def test_pictures_are_no_part_of_a_case_that_simulates_nothing(kind):
+    """output.figures switches pictures of branches and design searches off, and is not recorded in their cases."""
     table = {"nnm": {"modes": [1]}, "design": {"wavenumbers": 11}}
     drawn = kind.from_table(table)
     undrawn = kind.from_table(table, ["output.figures=false"])
@@ -36,6 +37,7 @@ def test_pictures_are_no_part_of_a_case_that_simulates_nothing(kind):
 @pytest.mark.usefixtures("plain_pictures")
 @pytest.mark.parametrize(("verb", "text"), [("nnm", BRANCHES), ("design", DESIGN)])
 def test_branches_and_searches_need_not_be_drawn(in_process, monkeypatch, tmp_path, verb, text):
+    """With output.figures=false there are no pictures; the same command without it draws them."""
     # One picture of a search is enough.
     for name in {"cost_maps", "dispersion_against_lambda", "dispersion_against_eta"}:
         monkeypatch.delitem(FIGURES, name)
@@ -47,7 +49,6 @@ def test_branches_and_searches_need_not_be_drawn(in_process, monkeypatch, tmp_pa
     assert ended.returncode == 0, ended.stderr
     assert not (out / "figures").exists()
 
-    # The same case without it only draws.
     assert in_process(*words).returncode == 0
     assert any((out / "figures").glob("*.png"))
 
@@ -57,11 +58,16 @@ def test_branches_and_searches_need_not_be_drawn(in_process, monkeypatch, tmp_pa
     [(0.0042, "0.0042 s"), (99.4, "99 s"), (112.0, "110 s"), (119.0, "120 s"), (74_040.0, "1230 min")],
 )
 def test_durations_are_written_without_powers_of_ten(seconds, text):
+    """Durations have two significant digits in seconds, and three in minutes from two minutes on."""
     assert duration(seconds) == text
 
 
 def test_waves_that_do_not_decay_are_null_in_json():
-    """At frequency 0 a lattice that is held nowhere moves as a whole, without loss; JSON has no infinite numbers."""
+    """The decay length is null at frequency 0, and finite at 1000 rad/s.
+
+    At frequency 0 a lattice without springs to the ground moves as a whole, its dashpots do no work, and the decay
+    length is infinite, which JSON cannot express.
+    """
     springs = (Spring(0, 0, 1e4, next_cell=True, damping=0.1), Spring(0, 1, 5e3, damping=0.1))
     cell = UnitCell(masses=(1e-3, 1e-3), springs=springs, host=0, resonator=1)
     moving = damping_table(cell, 1000.0)
@@ -75,6 +81,7 @@ def test_waves_that_do_not_decay_are_null_in_json():
 
 @pytest.mark.parametrize("path", [".", "design.h5"])
 def test_the_folder_in_which_one_is_has_its_name_on_pages(tmp_path, monkeypatch, path):
+    """The current folder, given as "." or by a file in it, is resolved: pictures are titled with the folder's name."""
     (tmp_path / "design.h5").touch()
     monkeypatch.chdir(tmp_path)
     pictures, folders = pictures_of([Path(path)])
@@ -83,6 +90,7 @@ def test_the_folder_in_which_one_is_has_its_name_on_pages(tmp_path, monkeypatch,
 
 
 def test_columns_of_the_list_of_the_paper_are_apart(in_process, tmp_path):
+    """In the list of figures of ``paper --list`` a blank precedes every column."""
     listed = in_process("paper", "--list", "--out", tmp_path / "paper").stdout.splitlines()
     (title,) = (line for line in listed if line.startswith("figure"))
     figures = listed[listed.index(title) + 1 :]
@@ -93,6 +101,7 @@ def test_columns_of_the_list_of_the_paper_are_apart(in_process, tmp_path):
 
 @pytest.mark.slow
 def test_a_run_that_another_program_writes_is_one(in_process, tmp_path):
+    """A run.h5 that another program has open for writing is refused as such, not as a file that is no run."""
     case = tmp_path / "case.toml"
     case.write_text(RUN)
     out = tmp_path / "out"
@@ -106,7 +115,7 @@ def test_a_run_that_another_program_writes_is_one(in_process, tmp_path):
     ) as other:
         assert other.stdout.readline() == "open\n"
         refused = {verb: in_process(verb, out) for verb in ("plot", "analyse", "export")}
-        # What is refused leaves nothing to the next verb.
+        # The refused verbs have written no file.
         assert modified(out).keys() == before.keys()
         other.communicate("\n", timeout=300)
 
@@ -118,7 +127,7 @@ def test_a_run_that_another_program_writes_is_one(in_process, tmp_path):
 
 
 def test_bands_of_beads_are_none(in_process, tmp_path):
-    """A cell without springs has no band: a sentence and an empty list say so, and there is no picture."""
+    """A cell without springs has no pass band: ``bands`` says so, writes an empty list, and draws no picture."""
     answer = in_process("bands", "runs/examples/beads.toml", "--out", tmp_path)
     assert answer.returncode == 0
     assert answer.stdout == "no pass bands: only contacts join the masses, so that there are no linear waves\n"
@@ -128,7 +137,7 @@ def test_bands_of_beads_are_none(in_process, tmp_path):
 
 
 def test_what_is_not_driven_has_no_drive(in_process):
-    """Of a lattice that only begins in motion validate names the motion, and no burst of 0 N."""
+    """For a lattice with an initial motion and no drive, ``validate`` names the motion, and not a burst of 0 N."""
     shown = in_process("validate", "runs/examples/packet.toml").stdout
     assert re.search(r"^  begins with  a packet .*, Om = 927.0256 rad/s$", shown, flags=re.M)
     assert re.search(r"^  drive +none$", shown, flags=re.M)

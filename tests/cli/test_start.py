@@ -1,4 +1,4 @@
-"""What a command loads before it answers: libraries that take long are loaded by the verbs that need them alone."""
+"""Libraries that commands load: those whose import takes long are loaded only by the verbs that need them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pytest
 
 pytestmark = pytest.mark.parallel(1)
 
-# Each takes a tenth of a second or more.
+# The import of each of these takes a tenth of a second or more.
 HEAVY = {"matplotlib", "numba", "pandas", "scipy.interpolate", "scipy.optimize", "xarray"}
 CASE = Path("runs/examples/three-mass.toml")
 
-# Several commands in turn: none of the first ones may load what it could leave to a later one.
+# One process calls several commands, and reports the loaded modules after each of them.
 REPORT = """
 import json, sys
 from tests.coarse import coarse_pictures
@@ -26,7 +26,7 @@ commands = json.loads(sys.argv[1])
 sys.argv[0] = "vipetsc"
 for command in commands:
     if command[0] == "plot":
-        # What a picture looks like is of no matter here.
+        # The look of a picture does not matter here.
         coarse_pictures(setattr)
     try:
         code = main(command)
@@ -37,7 +37,7 @@ for command in commands:
 
 
 def loaded_by(*commands: tuple[object, ...]) -> list[set[str]]:
-    """The heavy libraries that one process has loaded at the end of each of its commands, which end well."""
+    """The libraries of ``HEAVY`` that one process has loaded after each of its commands, which must end with 0."""
     words = json.dumps([list(map(str, command)) for command in commands])
     ended = subprocess.run([sys.executable, "-c", REPORT, words], capture_output=True, text=True, check=True)
     lines = [line.split() for line in ended.stdout.splitlines() if line.startswith("ended: ")]
@@ -46,16 +46,20 @@ def loaded_by(*commands: tuple[object, ...]) -> list[set[str]]:
 
 
 def test_verbs_that_compute_nothing_load_none_of_them_and_checks_and_bands_no_kernels(tmp_path):
-    """Bands are refined by a search; the cost of a run follows from its steps, which are chosen without its engine."""
+    """Help, schema and manual load none of the libraries, ``validate`` at most scipy.optimize, ``bands`` no numba.
+
+    A search refines the bands. ``validate`` estimates the cost of a run from its steps, without the engines' kernels.
+    """
     nothing = [("--help",), ("sweep", "--help"), ("schema",), ("manual", "contacts")]
     loaded = loaded_by(*nothing, ("validate", CASE), ("bands", CASE, "--out", tmp_path))
     assert loaded[:4] == [set()] * 4
     assert loaded[4] <= {"scipy.optimize"}
-    # Bands are drawn as well, by a module that draws runs.
+    # The module that draws bands also draws runs, and must not load kernels.
     assert "numba" not in loaded[5]
 
 
 def test_a_run_without_pictures_loads_no_pictures_and_its_pictures_load_no_kernels(tmp_path):
+    """A run without pictures does not load matplotlib, and ``plot`` does not load numba."""
     small = ("--set", "time.end=0.01", "--set", "output.figures=false")
     (loaded,) = loaded_by(("run", CASE, "--out", tmp_path / "run", *small))
     assert "matplotlib" not in loaded
@@ -64,7 +68,7 @@ def test_a_run_without_pictures_loads_no_pictures_and_its_pictures_load_no_kerne
 
 
 def test_the_second_process_loads_neither_kernels_nor_mpi():
-    """A copy of the program next to a run, that draws its pictures."""
+    """The process that draws pictures beside a run loads matplotlib, but neither numba nor MPI nor PETSc."""
     program = "import sys, vipetsc.figures.draw_requests, vipetsc.figures.registry; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert "matplotlib" in loaded

@@ -1,4 +1,4 @@
-"""Answers and logs that cannot be written: the exit code says so, and results are whole all the same."""
+"""Output and logs that cannot be written: the exit code tells the failure, and results are complete nevertheless."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ANSWERS = {
     "schema": ("schema",),
     "manual": ("manual", "case-file"),
     "validate": ("validate",),
-    # Beads, which have no band and therefore no picture.
+    # Beads have no band and therefore no picture, which would take long.
     "bands": ("bands", str(BEADS), "--json", "--out", "bands"),
     "help": ("law", "--help"),
     "run": TINY,
@@ -35,7 +35,7 @@ ANSWERS = {
 
 @pytest.fixture
 def by_shell(tmp_path):
-    """Call the program in a folder of its own, with its streams led as a shell's ``redirection`` says."""
+    """Call the program in a temporary folder, with its streams redirected by ``redirection``, as typed in a shell."""
 
     def call(words: tuple[str, ...], redirection: str) -> subprocess.CompletedProcess:
         command = [
@@ -57,6 +57,7 @@ def by_shell(tmp_path):
 
 @pytest.mark.parametrize("answer", ANSWERS)
 def test_an_answer_that_a_full_device_does_not_take_is_a_failure(by_shell, tmp_path, answer):
+    """A verb whose stdout is a full device ends with 1 and a sentence; a run keeps its results."""
     ended = by_shell(ANSWERS[answer], ">/dev/full")
     assert ended.returncode == 1, ended.stderr
     assert "vipetsc: stdout: No space left on device" in ended.stderr
@@ -67,6 +68,7 @@ def test_an_answer_that_a_full_device_does_not_take_is_a_failure(by_shell, tmp_p
 
 @pytest.mark.parametrize("answer", ["schema", "run"])
 def test_an_answer_to_a_closed_stdout_is_a_failure(by_shell, tmp_path, answer):
+    """A verb whose stdout is closed ends with 1 and a sentence; the answer does not go to stderr instead."""
     ended = by_shell(ANSWERS[answer], ">&-")
     assert ended.returncode == 1, ended.stderr
     assert "vipetsc: stdout: Bad file descriptor" in ended.stderr
@@ -76,7 +78,7 @@ def test_an_answer_to_a_closed_stdout_is_a_failure(by_shell, tmp_path, answer):
 
 
 def test_no_file_takes_the_number_of_a_closed_stream(tmp_path):
-    """Else libraries would print into it."""
+    """If stdout is closed, a new file does not get its descriptor: libraries would print into that file."""
     script = "import os; from vipetsc.cli.streams import check_standard_streams as check; check(); "
     script += "os.write(os.open('file', os.O_WRONLY | os.O_CREAT), b'content'); os.write(1, b'message')"
     command = ["bash", "-c", '"$@" >&-', "bash", sys.executable, "-c", script]
@@ -88,6 +90,7 @@ def test_no_file_takes_the_number_of_a_closed_stream(tmp_path):
 
 
 def test_closed_streams_are_no_failure_where_nothing_is_printed(by_shell, tmp_path):
+    """A run with --quiet and closed streams ends with 0 and leaves its results."""
     ended = by_shell((*TINY, "--quiet"), "<&- >&- 2>&-")
     assert ended.returncode == 0
     assert (tmp_path / "out/run.h5").exists()
@@ -95,6 +98,7 @@ def test_closed_streams_are_no_failure_where_nothing_is_printed(by_shell, tmp_pa
 
 @pytest.mark.parametrize("answer", ["schema", "run"])
 def test_a_reader_that_has_seen_enough_hears_nothing_more(by_shell, tmp_path, answer):
+    """A pipe whose reader has ended gives exit code 141 (128 + SIGPIPE) without a message; a run keeps its results."""
     ended = by_shell(ANSWERS[answer], "| true")
     assert ended.returncode == 141
     for complaint in ("stdout", "Traceback", "Broken"):
@@ -105,6 +109,7 @@ def test_a_reader_that_has_seen_enough_hears_nothing_more(by_shell, tmp_path, an
 
 @pytest.mark.parametrize("words", [("schema",), TINY])
 def test_a_log_on_a_full_device_is_a_failure(by_shell, tmp_path, words):
+    """A verb whose log is a full device prints its answer, says once that the log failed, and ends with 1."""
     ended = by_shell((*words, "--log", "/dev/full"), ">printed")
     assert ended.returncode == 1, ended.stderr
     assert ended.stderr.count("vipetsc: --log /dev/full: No space left on device") == 1
@@ -113,7 +118,7 @@ def test_a_log_on_a_full_device_is_a_failure(by_shell, tmp_path, words):
 
 
 def test_a_reader_that_is_slow_gets_all(tmp_path):
-    """A pipe may be one that does not wait: another of its users may have set it so."""
+    """A slow reader gets the whole answer, also from a non-blocking pipe: another user of a pipe may have set that."""
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     command = [sys.executable, "-m", "vipetsc", "schema"]
@@ -123,7 +128,7 @@ def test_a_reader_that_is_slow_gets_all(tmp_path):
         while process.poll() is None and held[0] < CAPACITY_OF_A_PIPE:
             time.sleep(0.05)
             fcntl.ioctl(reading, termios.FIONREAD, held)
-        # Time enough for a second attempt at a full pipe.
+        # The program has time for a second attempt to write into the full pipe.
         time.sleep(0.5)
         with os.fdopen(reading, "rb") as pipe:
             whole = pipe.read()
@@ -134,7 +139,8 @@ def test_a_reader_that_is_slow_gets_all(tmp_path):
 
 @pytest.mark.mpirun
 def test_all_ranks_end_with_the_code_of_the_first(tmp_path):
-    # A rank whose code is another than 0 has the others ended: both say how they ended before they end.
+    """All ranks end with 1 if the answer, which rank 0 writes, cannot be written; the message is printed once."""
+    # mpirun ends all ranks as soon as one has another code than 0: each rank records its code in a file first.
     of_rank = f"{sys.executable} -m vipetsc manual >/dev/full; echo $? >{tmp_path}/code-$OMPI_COMM_WORLD_RANK"
     command = ["mpirun", "--oversubscribe", "-n", "2", "bash", "-c", of_rank]
     ended = subprocess.run(command, capture_output=True, text=True, env=clean_environment(), timeout=300, check=False)

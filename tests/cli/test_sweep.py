@@ -1,4 +1,4 @@
-"""Sweeps as a user types them: members, resuming after a kill, failures, refusals, pictures again from files."""
+"""Sweeps as a user types them: members, resumption after a kill, failures, refusals, measures again from files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def case(tmp_path) -> Path:
 
 @pytest.mark.mpirun
 def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, case, tmp_path):
-    """Twelve members leave an index and an ensemble over both axes; those without contact are one linear run."""
+    """Twelve members leave an index and an ensemble over both axes; members without contact scale one linear run."""
     out = tmp_path / "out"
     ended = vipetsc(2, "sweep", case, "--out", out)
     assert ended.returncode == 0, ended.stderr
@@ -61,13 +61,13 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
         work = file["work"][...]
         entropy = file["entropy/energy_weighted"][...]
         assert [d.label or d[0].name for d in file["work"].dims] == ["/sites", "/amplitude"]
-    # 1 is a member that was scaled from another one.
+    # The status 1 is that of a member that was scaled from another one.
     assert status.shape == (2, 6)
     assert np.array_equal(status == 1, episodes == 0)
     assert (status[:, 0] == 1).all()
     assert (status[:, -1] == 0).all()
 
-    # Contact-free runs are one linear run: work goes with the square of the amplitude, entropy does not change.
+    # Without contact the motion is linear: work grows as the square of the amplitude, entropy does not depend on it.
     quiet = status[0] == 1
     assert work[0, quiet] / amplitude[quiet] ** 2 == pytest.approx(work[0, 0] / amplitude[0] ** 2, rel=1e-14)
     assert np.ptp(entropy[0, quiet]) == 0
@@ -83,7 +83,7 @@ def test_a_sweep_leaves_members_an_index_and_an_ensemble(vipetsc, in_process, ca
 
 
 def test_a_whole_member_is_run_again_by_its_name_or_number(in_process, case, tmp_path):
-    """Its run has what its record says, be it simulated or scaled, and measures are the same bits."""
+    """The run of a member, simulated or scaled, has the work and entropy that the sweep has recorded for it."""
     out = tmp_path / "out"
     changes = set_words("sweep.drive.amplitude=[0.3, 20.0]", "sweep.contacts.sites=[1]")
     assert in_process("sweep", case, "--out", out, *changes).returncode == 0
@@ -92,10 +92,10 @@ def test_a_whole_member_is_run_again_by_its_name_or_number(in_process, case, tmp
         status = ensemble["status"].values.ravel()
         work = ensemble["work"].values.ravel()
         entropy = ensemble["entropy/masked"].values.ravel()
-    # One scaled, one simulated.
+    # One member is scaled, and one is simulated.
     assert status.tolist() == [1, 0]
 
-    # The sweep is named by its folder, and by a file beside which its linear run is not recorded.
+    # The sweep is named by its folder, and by a case file in a folder without the record of the linear run.
     file = tmp_path / "sweep.toml"
     file.write_bytes((out / "case.toml").read_bytes())
     for number, (sweep, name) in enumerate(((out, names[0]), (file, "1"))):
@@ -104,8 +104,8 @@ def test_a_whole_member_is_run_again_by_its_name_or_number(in_process, case, tmp
         assert ended.returncode == 0, ended.stderr
         found = datasets(run / "run.h5")
         measured = datasets(run / "analysis.h5")
-        # A simulated member has the same bits. A scaled one is simulated here with its own steps, whose errors of
-        # rtol = 1e-8 each add up.
+        # A simulated member has the same bits. A scaled one is now simulated with time steps of its own, whose errors
+        # of rtol = 1e-8 each add up.
         rel = 1e-6 if status[number] else 0
         assert found["energy/work"][-1] == pytest.approx(work[number], rel=rel)
         assert measured["entropy/masked"] == pytest.approx(entropy[number], rel=rel)
@@ -130,11 +130,11 @@ def test_a_member_that_is_not_there_is_refused(in_process, case, tmp_path):
 
 
 def test_a_sweep_of_an_earlier_version_is_named(in_process, case, tmp_path):
-    """Results of an earlier version are neither gone on with nor analysed; --force replaces them."""
+    """A sweep of an earlier version is neither continued nor analysed; --force replaces it."""
     out = tmp_path / "out"
     changes = set_words("sweep.drive.amplitude=[0.3]", "sweep.contacts.sites=[1]")
     assert in_process("sweep", case, "--out", out, *changes).returncode == 0
-    # Contact-free runs once had this folder.
+    # Earlier versions kept runs without contact in this folder.
     (out / "linear").mkdir()
     for words in (("sweep", case, "--out", out, *changes), ("analyse", out)):
         ended = in_process(*words)
@@ -147,13 +147,13 @@ def test_a_sweep_of_an_earlier_version_is_named(in_process, case, tmp_path):
 
 @pytest.mark.mpirun
 def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
-    """A value outside the lattice costs its own members: they are named, are NaN in the ensemble, and the code is 1."""
+    """Members with a site outside the lattice are named and NaN in the ensemble; others are computed; the code is 1."""
     out = tmp_path / "out"
     ended = vipetsc(2, "sweep", case, "--out", out, "--set", "sweep.contacts.sites=[[20], [41], [30]]")
     assert ended.returncode == 1
     assert "contacts.sites = [41]: outside the lattice; cells are numbered from 1 to 40" in ended.stdout
 
-    # One for each of the six amplitudes.
+    # There is one failed member for each of the six amplitudes.
     rows = json.loads((out / "index.json").read_text())["failed"]
     assert [row["place"][0] for row in rows] == [1] * 6
     with h5py.File(out / "ensemble.h5") as file:
@@ -164,11 +164,11 @@ def test_a_failed_member_is_named_and_the_others_go_on(vipetsc, case, tmp_path):
 
 
 def test_a_member_that_does_not_come_out_is_recorded(in_process, monkeypatch, case, tmp_path):
-    """A member that stalls has its place and reason in the index; the other one is there."""
+    """A member that stalls has its place and the reason in the index, and the other member is not affected."""
     out = tmp_path / "out"
-    # The quiet run takes a few steps from sample to sample; the other one does not come to the next by any number.
+    # The run without contact takes a few steps from sample to sample; the other run never reaches the next sample.
     monkeypatch.setattr(integrator, "MOST_TRIALS", 300)
-    # A contact this stiff needs steps below the rounding of the time: the run stalls, the quiet one does not.
+    # A contact this stiff needs time steps below the rounding error of the time.
     stiff = set_words("contacts.stiffness=1e30", "time.engine=ts")
     two = set_words("sweep.drive.amplitude=[0.1, 20.0]", "sweep.contacts.sites=[1]")
 
@@ -184,7 +184,7 @@ def test_a_member_that_does_not_come_out_is_recorded(in_process, monkeypatch, ca
 
 @pytest.mark.parametrize("value", ["sweep.drive.amplitud=[1.0]", "sweep.feilds=true", "sweep.drive.amplitude=[0.0]"])
 def test_bad_sweeps_write_nothing(in_process, case, tmp_path, value):
-    """An unknown key and an amplitude that is impossible end with exit code 2, and no folder is created."""
+    """An unknown key and an amplitude of zero are refused with exit code 2, and no folder is created."""
     ended = in_process("sweep", case, "--out", tmp_path / "out", "--set", value)
     assert ended.returncode == 2, ended.stdout
     assert not (tmp_path / "out").exists()
@@ -192,7 +192,7 @@ def test_bad_sweeps_write_nothing(in_process, case, tmp_path, value):
 
 @pytest.mark.mpirun
 def test_full_fields_on_request(vipetsc, in_process, case, tmp_path):
-    """With sweep.fields a member keeps its run and analysis; one that a kill cut off is run again."""
+    """With sweep.fields a member keeps its run and its analysis; a member that a kill interrupted is run again."""
     out = tmp_path / "out"
     one = set_words("sweep.fields=true", "sweep.drive.amplitude=[1.0]", "sweep.contacts.sites=[2]")
     ended = vipetsc(2, "sweep", case, "--out", out, *one)
@@ -200,7 +200,7 @@ def test_full_fields_on_request(vipetsc, in_process, case, tmp_path):
     (member,) = (path.parent for path in out.glob("*/run.h5"))
     assert {path.name for path in member.iterdir()} == {"run.h5", "analysis.h5"}
 
-    # As a kill leaves it that comes before the run has begun.
+    # A kill before the first sample leaves such a folder.
     shutil.rmtree(member)
     (member / "parts").mkdir(parents=True)
     repaired = in_process("sweep", out / "case.toml", "--out", out)
@@ -216,7 +216,7 @@ def test_full_fields_on_request(vipetsc, in_process, case, tmp_path):
 
 @pytest.mark.mpirun
 def test_measures_again_from_files(vipetsc, in_process, case, tmp_path):
-    """Analyses and ensemble that were removed are computed from the kept runs to the same bits."""
+    """``analyse`` computes removed analyses and a removed ensemble from the kept runs, with the same bits."""
     out = tmp_path / "out"
     two = set_words("sweep.fields=true", "sweep.drive.amplitude=[0.1, 5.0]", "sweep.contacts.sites=[2]")
     assert in_process("sweep", case, "--out", out, *two).returncode == 0
@@ -237,7 +237,7 @@ def test_measures_again_from_files(vipetsc, in_process, case, tmp_path):
 
 
 def test_validate_counts_the_members(in_process, case):
-    """The table of a sweep has the number of its members, by axes, and of those that cannot be."""
+    """``validate`` prints the number of members, in all and along each axis, and of members with invalid cases."""
     ended = in_process("validate", case, "--set", "sweep.contacts.sites=[[20], [41]]")
     assert ended.returncode == 0, ended.stderr
     assert "12 members (2 x 6), 6 of them impossible" in ended.stdout

@@ -1,4 +1,4 @@
-"""Pictures of sweeps as a user asks for them: pages of measures, sentences about what is not drawn, exit codes."""
+"""Pictures of sweeps as a user asks for them: pages of measures, reasons why some are not drawn, exit codes."""
 
 from pathlib import Path
 
@@ -58,12 +58,12 @@ fields = true
 [sweep.drive]
 frequency = [800.0, 1000.0]
 """
-# What a sweep with the measure transfer shows without being asked.
+# The pages that a sweep with the measure transfer has by default.
 PAGES = ("bands_share", "contact_episodes", "dissipated_fraction", "ibtet", "largest_force", "upper_share_at_end")
 
 
 def sweep(folder: Path, case: str, *changes: str) -> Path:
-    """The folder of a sweep that was simulated, without pictures."""
+    """Simulate a sweep of ``case`` with ``changes``, without pictures; returns the folder of its results."""
     path = folder / "case.toml"
     path.write_text(LATTICE + case)
     out = folder / "out"
@@ -73,31 +73,33 @@ def sweep(folder: Path, case: str, *changes: str) -> Path:
 
 @pytest.fixture(scope="module")
 def burst(tmp_path_factory) -> Path:
-    """Three clearances and three restitutions."""
+    """The results of a sweep over three clearances and three restitutions."""
     return sweep(tmp_path_factory.mktemp("burst"), BURST)
 
 
 def drawn(folder: Path) -> set[str]:
-    """The names of the pictures in a folder, which are then removed."""
+    """Return the names of the pictures in a folder, and remove the pictures."""
     paths = list((folder / "figures").glob("*"))
     names = {path.name for path in paths}
     for path in paths:
-        # So that the next test of the same sweep sees its own pictures alone.
+        # The next test of the same sweep must see only its own pictures.
         path.unlink()
     return names
 
 
 @pytest.mark.slow
 def test_every_measure_has_a_page_over_the_keys_that_vary(burst):
+    """``plot`` draws the default pages, each named by its measure and by the keys that vary."""
     assert main(["plot", str(burst)]) == 0
     keys = "contacts.clearance-contacts.restitution"
-    # Parts of the energy have a page each band.
+    # The bands' parts of the energy have a panel for each band.
     assert drawn(burst) == {f"{name}-over-{keys}{'-band' * (name == 'bands_share')}.png" for name in PAGES}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ibtet", "work", "bands_modal_energy"])
 def test_a_measure_asked_for_by_name_is_drawn_alone(burst, name):
+    """``plot --fig`` draws only the page of the named measure, also of one that has no page by default."""
     assert main(["plot", str(burst), "--fig", name]) == 0
     (picture,) = drawn(burst)
     assert picture.startswith(f"{name}-over-contacts.clearance")
@@ -113,15 +115,15 @@ def test_a_measure_asked_for_by_name_is_drawn_alone(burst, name):
     ],
 )
 def test_a_figure_that_cannot_be_drawn_is_refused(burst, name, message, capsys):
+    """A figure whose data the sweep lacks, or an unknown one, is refused with the reason, and nothing is drawn."""
     assert main(["plot", str(burst), "--fig", name]) == 2
     assert message in capsys.readouterr().err
-    # Refused before anything was drawn.
     assert drawn(burst) == set()
 
 
 @pytest.mark.slow
 def test_an_own_cell_under_a_harmonic_drive_has_pages_over_its_frequency(tmp_path):
-    """No picture has the name of another, or of a law, a reading or cycles that the case has not."""
+    """Pages are named by the frequencies of the drive, and by no reading or cycles, which the case does not have."""
     out = sweep(tmp_path, HARMONIC)
     assert main(["plot", str(out)]) == 0
     names = drawn(out)
@@ -134,7 +136,8 @@ def test_an_own_cell_under_a_harmonic_drive_has_pages_over_its_frequency(tmp_pat
 
 @pytest.mark.slow
 def test_what_is_zero_for_every_member_is_said_and_drawn_on_request(tmp_path, capsys):
-    # Clearances of metres: nothing touches.
+    """A measure that is zero for every member is named instead of drawn; ``--fig`` draws it nevertheless."""
+    # With clearances of metres there are no contacts.
     out = sweep(tmp_path, BURST, "sweep.contacts.clearance=[1.0, 2.0, 3.0]")
     assert main(["plot", str(out)]) == 0
     assert (
@@ -147,6 +150,7 @@ def test_what_is_zero_for_every_member_is_said_and_drawn_on_request(tmp_path, ca
 
 @pytest.mark.slow
 def test_branches_that_a_figure_does_not_show_are_named(burst, tmp_path):
+    """A sentence names branches that a figure does not show, or the reason why a figure with branches is left out."""
     # An empty folder stands for one with branches.
     (sentence,) = left_out(PICTURES, [burst, tmp_path], Files(), ["ibtet"])
     assert sentence == f"ibtet: without the branches of {tmp_path}; --fig ibtet_backbone draws both"

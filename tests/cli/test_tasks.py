@@ -1,4 +1,4 @@
-"""Thirteen questions of a user's own, each answered by the commands of the manual, without a script."""
+"""Thirteen questions that a user may have, each answered by the commands of the manual, without a script."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.cli.test_python import my_lattice
 from tests.faults.scenarios import NFRC
 from vipetsc.case import Case
 
-# The lattice of the README with the fast engine; pictures are asked for where they are looked at.
+# These sections follow the README's lattice: the fastest engine that can compute it, and no pictures.
 PLAIN = '\n[time]\nengine = "auto"\n\n[output]\nfigures = false\n'
 RESTITUTIONS = """
 [sweep.contacts]
@@ -101,7 +101,10 @@ measure = "ibtet"
 
 @pytest.fixture
 def typed(in_process, tmp_path, plain_pictures) -> Callable[[str], str]:
-    """Type commands, a line each, in a folder of one's own: ``typed("validate x.toml")`` returns what was printed."""
+    """Call the program in a temporary folder, once for each line: ``typed("validate x.toml")`` returns what it prints.
+
+    Every command must end with 0.
+    """
 
     def call(lines: str) -> str:
         printed = ""
@@ -116,7 +119,7 @@ def typed(in_process, tmp_path, plain_pictures) -> Callable[[str], str]:
 
 @pytest.fixture
 def put(tmp_path) -> Callable[..., None]:
-    """Save case files in that folder, each of sections that are put together."""
+    """Save a case file in the temporary folder: ``put(name, *sections)`` writes the sections one after another."""
 
     def save(name: str, *sections: str) -> None:
         (tmp_path / name).write_text("".join(sections), encoding="utf-8")
@@ -143,12 +146,13 @@ def table(path: Path) -> list[dict[str, str]]:
 
 @pytest.mark.slow
 def test_an_own_lattice_with_pictures(typed, put, tmp_path):
-    """Bands, check and run of the README's lattice: nothing is warned of, energy is accounted for, seven pictures."""
+    """Bands, check and run of the README's lattice: no warning, an energy balance within 1e-8, seven pictures."""
     put("my-lattice.toml", my_lattice())
     printed = typed("bands my-lattice.toml\nvalidate my-lattice.toml\nrun my-lattice.toml --set time.engine=auto")
     assert "warning" not in printed
 
-    # The highest wave of band 3 alternates from cell to cell: the hosts' springs count four times.
+    # At the upper edge of band 3, qa = pi, neighbouring cells move in antiphase: the springs between hosts, of 2e4 N/m,
+    # add 2 k (1 - cos qa) = 4 k to the hosts' stiffness.
     masses, stiffness = np.diag([0.010, 0.004, 0.002]), np.array([[8.6e4, -6e3, 0], [-6e3, 7e3, -1e3], [0, -1e3, 1e3]])
     top = np.sqrt(np.linalg.eigvals(np.linalg.solve(masses, stiffness)).max())
     assert f"{top:.2f}" in printed
@@ -164,7 +168,7 @@ def test_an_own_lattice_with_pictures(typed, put, tmp_path):
 
 @pytest.mark.slow
 def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put, in_process, tmp_path):
-    """A curve for each restitution over the amplitude; the slope of a branch on a page of its own, or a sentence."""
+    """A sweep has a curve over the amplitude for each restitution, and a page for each with the slope of a branch."""
     put("rest.toml", my_lattice(), PLAIN, RESTITUTIONS, BRANCH)
     typed("sweep rest.toml\nplot runs/rest --fig ibtet")
     data = ensemble(tmp_path / "runs/rest")
@@ -175,10 +179,10 @@ def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put
     hit = impacts.min(axis=0) > 0
     assert not impacts[:, 0].any()
     assert hit.sum() == 4
-    # Stops that return less dissipate more, at every amplitude with contact.
+    # Stops of lower restitution dissipate more, at every amplitude with contact.
     assert np.all(lost[0, hit] > 1.2 * lost[1, hit])
 
-    # The eleventh question: the sweep and the branch of the cell on one page, a page for each restitution.
+    # Another question: the sweep and the branch of the cell in one picture, for each restitution.
     printed = typed(
         "nnm rest.toml --out runs/branch --set output.figures=false\n"
         "plot runs/rest runs/branch --fig ibtet_backbone\nplot runs/rest runs/branch --fig ibtet"
@@ -197,7 +201,7 @@ def test_restitutions_over_amplitudes_and_one_of_them_beside_a_branch(typed, put
 
 @pytest.mark.slow
 def test_clearances_and_restitutions_as_a_map(typed, put, in_process, tmp_path):
-    """Two keys of three values and more are a map; a page that a sweep cannot have is refused with the reason."""
+    """A sweep over two keys of three or more values is drawn as a map; a page without its data is refused."""
     put("map.toml", my_lattice(), PLAIN, CLEARANCES)
     typed("sweep map.toml\nplot runs/map --fig contact_episodes\nexport runs/map")
     assert pages(tmp_path / "runs/map") == {"contact_episodes-over-contacts.clearance-contacts.restitution"}
@@ -205,7 +209,7 @@ def test_clearances_and_restitutions_as_a_map(typed, put, in_process, tmp_path):
     rows = table(tmp_path / "runs/map/curves/ensemble-members.csv")
     impacts = {(row["clearance (m)"], row["restitution"]): float(row["contact_episodes"]) for row in rows}
     assert len(impacts) == 12
-    # Numbers as the case has them. The wider the clearance, the fewer impacts.
+    # The table has numbers as the case writes them. The wider the clearance, the fewer impacts.
     for restitution in ("0.3", "0.6", "0.9"):
         counts = [impacts[clearance, restitution] for clearance in ("0.0005", "0.001", "0.0015", "0.002")]
         assert counts == sorted(counts, reverse=True)
@@ -217,7 +221,7 @@ def test_clearances_and_restitutions_as_a_map(typed, put, in_process, tmp_path):
 
 @pytest.mark.slow
 def test_an_own_cell_under_a_harmonic_drive_over_the_frequency(typed, put, tmp_path):
-    """What passes from cell 2 to cell 60, over the frequency: waves in a band, nothing in a gap."""
+    """The transmission from cell 2 to cell 60 is far smaller at a drive's frequency in a gap than at ones in bands."""
     driven = my_lattice().replace("cycles = 10\n", 'waveform = "harmonic"\n')
     driven = "".join(line for line in driven.splitlines(keepends=True) if not line.startswith(("band =", "at =")))
     put("harmonic.toml", driven, PLAIN, 'transmission = [["base", "tip"]]\n', HARMONIC)
@@ -228,14 +232,14 @@ def test_an_own_cell_under_a_harmonic_drive_over_the_frequency(typed, put, tmp_p
 
     data = ensemble(tmp_path / "runs/harmonic")
     passed = dict(zip(data.frequency.values, data["transmission/base-tip"].values, strict=True))
-    # Bands: 0-632, 717-1312, 1529-2955 rad/s. In the gap only transients pass, of the beginning of the drive.
+    # The bands are 0-632, 717-1312 and 1529-2955 rad/s. In a gap only transients of the drive's beginning pass.
     assert passed[1420.0] < 0.3 * min(passed[500.0], passed[900.0], passed[1100.0])
     assert pages(tmp_path / "runs/harmonic") == {"transmission_base-tip-over-drive.frequency"}
 
 
 @pytest.mark.slow
 def test_clearances_that_scatter_as_a_band(typed, put, tmp_path):
-    """Mean and band of samples over the amplitude: no scatter without contact, some with it."""
+    """Samples of scattered clearances deviate from their mean with contacts, and not at all without contact."""
     put("scatter.toml", my_lattice(), PLAIN, SCATTER)
     typed("sweep scatter.toml\nplot runs/scatter --fig ibtet\nexport runs/scatter")
     assert pages(tmp_path / "runs/scatter") == {"ibtet-over-drive.amplitude"}
@@ -249,7 +253,10 @@ def test_clearances_that_scatter_as_a_band(typed, put, tmp_path):
 
 
 def crossing(folder: Path, first: int, last: int) -> float:
-    """Return the time in s that the largest velocity takes from one cell to another, between samples too."""
+    """Return the time in s that the largest velocity takes from cell ``first`` to cell ``last``.
+
+    Each arrival is the vertex of the parabola through the largest sample and its neighbours.
+    """
     with vipetsc.open(folder) as run:
         time = run.time.values
         arrivals = []
@@ -266,17 +273,18 @@ def crossing(folder: Path, first: int, last: int) -> float:
     [("", 1.5), (" --set contacts.law=power --set contacts.exponent=2 --set contacts.stiffness=3e13", 2)],
 )
 def test_struck_beads(typed, put, tmp_path, changes, exponent):
-    """A struck bead sends a solitary wave, whose speed grows as the velocity to the power (n - 1)/(n + 1)."""
+    """A struck bead excites a solitary wave, whose speed grows as the bead's velocity to the power (n - 1)/(n + 1)."""
     put("beads.toml", BEADS)
     typed(f"run beads.toml --out slow{changes}\nrun beads.toml --out fast{changes} --set initial.velocity=0.8")
 
-    # Nesterenko: by dimensions alone, for F = k x^n of beads that just touch.
+    # Nesterenko's law follows from dimensions: beads of mass m that just touch, with F = k x^n, have no other
+    # parameters than m, k, their distance and the velocity v. The velocities differ by a factor of 8.
     ratio = crossing(tmp_path / "slow", 15, 40) / crossing(tmp_path / "fast", 15, 40)
     assert ratio == pytest.approx(8 ** ((exponent - 1) / (exponent + 1)), rel=1e-3)
 
 
 def test_a_measured_force_and_its_units(typed, put, tmp_path):
-    """A record with time in ms is asked about; with time in s it drives the lattice, and nothing is asked."""
+    """A record with times in ms brings a question about their unit; one in s drives the lattice without a warning."""
     typed("examples waveform")
     rows = [line.split(",") for line in (tmp_path / "waveform.csv").read_text().splitlines()]
     put("ms.csv", "time (ms), force\n", *(f"{float(time) * 1e3!r},{value}\n" for time, value in rows[1:]))
@@ -288,13 +296,13 @@ def test_a_measured_force_and_its_units(typed, put, tmp_path):
     assert "warning" not in printed
     with vipetsc.open(tmp_path / "runs/waveform") as run:
         assert float(run["energy/work"][-1]) > 0
-        # The run is repeated from its own folder, where no file of samples is.
+        # The run's own case holds the samples: it can be repeated without their file.
         assert Case.of(run).drive.samples.time[1] == float(rows[2][0])
 
 
 @pytest.mark.slow
 def test_a_breather(typed, put, tmp_path):
-    """A motion of the branch that begins in a run stays at its site, with its energy."""
+    """A run that begins with a breather of a branch keeps its energy, and the motion stays at its site."""
     small = "--set nnm.points=3 --set nnm.start_frequency=[1420.0] --set nnm.orbits_at=[] --set output.figures=false"
     begun = "--set initial.orbit=1 --set time.end=0.05 --set output.figures=false"
     typed(f"examples breather gallery/breather-run\nnnm breather.toml {small}\nrun gallery/breather-run.toml {begun}")
@@ -305,15 +313,16 @@ def test_a_breather(typed, put, tmp_path):
         speed = np.abs(run.velocity).max(("time", "dof")).values
         cells = run.cell.values
     assert cells[speed.argmax()] == 100
-    # The branch decays from its site as exp(-0.2 n), in the gap between bands 2 and 3.
+    # In the gap between bands 2 and 3 the breather decays as exp(-0.2 n) with the distance of n cells from its site:
+    # to exp(-4) = 0.018 at 20 cells.
     assert speed[np.abs(cells - 100) > 20].max() < 0.03 * speed.max()
 
 
 @pytest.mark.slow
 def test_a_frequency_response(typed, put, tmp_path):
-    """Steady states over the frequency, of conservative and of lossy stops, as a table."""
+    """Curves of steady states over the amplitude, with conservative and with lossy stops, fold and turn back."""
     put("response.toml", NFRC)
-    # The few points of the case end before its curves turn back.
+    # The case allows so few points that its curves would end before they turn back.
     command = "nfrc response.toml --set nfrc.harmonics=5 --set nfrc.points=200 --set output.figures=false"
     typed(f"{command}\nexport runs/response")
     curves = {
@@ -323,7 +332,7 @@ def test_a_frequency_response(typed, put, tmp_path):
     for rows in curves.values():
         amplitude = np.array([float(row["amplitude"]) for row in rows])
         touching = np.array([float(row["episodes"]) for row in rows]) > 0
-        # Waves below the clearance need not touch; the curve folds where contact begins, and turns back.
+        # Waves of a smaller amplitude than the clearance need not touch; the curve folds where contact begins.
         assert not touching[0]
         assert amplitude[~touching].max() == pytest.approx(1.0, abs=0.01)
         assert amplitude[touching].min() < 0.98
@@ -332,7 +341,7 @@ def test_a_frequency_response(typed, put, tmp_path):
 
 @pytest.mark.slow
 def test_the_best_clearances(typed, put, tmp_path):
-    """A search leaves a case file of its best design, whose run has the objective that the search says."""
+    """A search leaves a case file of its best design, and a run of that case has the objective of the search."""
     put("search.toml", my_lattice(), PLAIN, SEARCH)
     typed("optimise search.toml\nrun runs/search/best.toml --out runs/best --set output.figures=false")
     with vipetsc.open(tmp_path / "runs/search") as found:
@@ -347,7 +356,7 @@ def test_the_best_clearances(typed, put, tmp_path):
 
 @pytest.mark.slow
 def test_a_movie_and_tables(typed, put, tmp_path):
-    """A run in motion, and its curves for another program, whose numbers are those of the run."""
+    """A run is drawn as a movie, and exported as tables whose numbers are those of the run."""
     put("mine.toml", my_lattice(), PLAIN)
     typed("run mine.toml\nplot runs/mine --movie --format gif --width 320 --from 0.05 --to 0.06\nexport runs/mine")
     assert (tmp_path / "runs/mine/figures/movie-energy.gif").read_bytes()[:4] == b"GIF8"

@@ -1,4 +1,4 @@
-"""Verbs that compute results behave alike: warnings, options, lock, pictures, exit codes; tables and recognition."""
+"""Verbs that compute results behave alike: warnings, options, lock, pictures, exit codes, recognition of results."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def example_case(name: str) -> Path:
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """Keep the sources of pictures that are asked for, and draw nothing."""
+    """The list of the kinds of results whose pictures are requested; nothing is drawn."""
     sources = []
 
     def draw(pictures, folders, comm, afresh, helper):
@@ -42,7 +42,7 @@ def drawn(monkeypatch):
 
 @pytest.fixture
 def call(monkeypatch, in_process, tmp_path, drawn):
-    """Call a verb on its example's case with another study: ``call(name, study, ...)``."""
+    """Call a verb on its example's case with another study in its place: ``call(name, study, *arguments)``."""
 
     def call_with(name, study, *arguments):
         monkeypatch.setitem(VERBS, name, replace(VERBS[name], study=study))
@@ -57,7 +57,7 @@ def finish(case, work) -> Outcome:
 
 
 def test_the_case_of_every_verb_is_in_the_list_of_cases():
-    """The cases of the verbs are those that files are read as, and their results are a kind of folder."""
+    """Every verb with results has a class in the list of cases and a kind of folder for its results."""
     assert {verb.case for verb in study_verbs()} == set(VERB_CASES)
     for verb in study_verbs():
         assert verb.name == verb.case.verb
@@ -83,21 +83,21 @@ def test_warnings_are_printed_once_and_the_folder_is_locked(call, monkeypatch, n
 
 @pytest.mark.parametrize("name", NAMES)
 def test_petsc_options_of_what_is_simulated_are_checked(call, tmp_path, name):
-    """A wrong PETSc option is refused before anything is written, by every verb that simulates."""
+    """Every verb that simulates refuses a wrong PETSc option before anything is written."""
     ended = call(name, finish, "--set", "petsc.ts_rk_type=magic")
     if VERBS[name].case.load(example_case(name)).runs():
         assert ended.returncode == 2
         assert "petsc.ts_rk_type = 'magic'" in ended.stderr
         assert not (tmp_path / "out").exists()
     else:
-        # These step nothing by PETSc's options.
+        # These verbs integrate nothing with PETSc.
         assert name in ("nnm", "design")
         assert ended.returncode == DONE
 
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_pictures_are_drawn_where_they_are_wanted_and_can_be(call, drawn, name):
-    """Pictures are drawn of results that can be, unless the case says not to."""
+    """Results are drawn unless they cannot be, or the case switches pictures off."""
     ended = call(name, finish)
     assert drawn == [VERBS[name].pictures.source]
     assert "figures/picture.png" in ended.stdout
@@ -132,25 +132,25 @@ def test_exit_codes_say_how_a_study_ended(call, drawn, name):
 
 
 def test_validate_prints_the_table_of_the_verb_that_reads_the_case(in_process):
-    """The table has the rows that concern the verb, each once, and none of a run that the verb does not make."""
+    """The table has the rows that concern the verb, each once, and no rows of a run if the verb makes none."""
     response = in_process("validate", example_case("nfrc")).stdout
     assert re.search(r"^  nfrc +3 curves over the amplitude, 0.4 to 1.6 of the clearance$", response, flags=re.M)
     assert re.search(r"^  lattice +infinite, ", response, flags=re.M)
-    # Rows of a run.
+    # These rows would describe a run.
     assert not re.search(r"^  (samples|burst, end|drive, end|engine|disk)", response, flags=re.M)
 
     prediction = in_process("validate", example_case("predict")).stdout
     assert re.search(r"^  predict +19 amplitudes, 17 to 1500 N$", prediction, flags=re.M)
     assert re.search(r"^  composed of +24 runs of one site ", prediction, flags=re.M)
     assert not re.search(r"^  law ", prediction, flags=re.M)
-    # Both run and predict read the case, and have the rows of the lattice in common.
+    # Both run and predict read the case, and both have the rows of the lattice.
     rows = re.findall(r"^  (\w[\w ]*?)  ", prediction, flags=re.M)
     assert len(rows) == len(set(rows))
 
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_results_are_recognised_by_their_file(tmp_path, name):
-    """A folder, and a file that has a fixed name, are recognised as the verb's results."""
+    """Results are recognised by their folder and, if their file has a fixed name, by that file."""
     pictures = VERBS[name].pictures
     file = tmp_path / pictures.file.replace("*", "x")
     file.touch()
@@ -167,7 +167,7 @@ def test_a_verb_may_have_nothing_to_draw(call, monkeypatch, drawn):
 
 
 def test_only_sweeps_and_branches_share_a_page(tmp_path):
-    """Folders of branches, or with a sweep among them, are drawn together; others are refused."""
+    """Several folders are drawn together only if they hold branches, or branches and a sweep."""
     folders = [tmp_path / "a", tmp_path / "b"]
     for folder in folders:
         folder.mkdir()
@@ -184,11 +184,11 @@ def test_only_sweeps_and_branches_share_a_page(tmp_path):
 
 
 def test_a_folder_without_results_is_taken_for_a_run(tmp_path):
-    """An empty folder is looked at as a run, whose missing file is then named."""
+    """An empty folder is treated as that of a run, so that the message names the missing run.h5."""
     assert pictures_of([tmp_path])[0].source == "run"
 
 
 def test_the_verb_of_a_case_is_found_by_its_class():
-    """A case leads to the verb that it was read for."""
+    """``verb_of`` returns the verb by whose class a case was read."""
     assert verb_of(Case.load(example_case("run"))) is VERBS["run"]
     assert verb_of(VERBS["predict"].case.load(example_case("predict"))) is VERBS["predict"]

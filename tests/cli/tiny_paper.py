@@ -1,4 +1,4 @@
-"""The paper shrunk to seconds: ``python -m tests.cli.tiny_paper DIR [ID ...]``, alone or under mpirun."""
+"""A paper that takes seconds: ``python -m tests.cli.tiny_paper DIR [ID ...]``, with or without mpirun."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FOUR_BAND = (*SHORT, "lattice.cells=30")
 AMPLITUDES = "sweep.drive.amplitude={ log = [0.2, 50.0], count = 6 }"
 BRANCH = ("nnm.energy=[0.0, 30.0]",)
 PREDICTED = (*FOUR_BAND[:3], "lattice.cells=30", "contacts.sites=2", "predict.amplitudes=[2.0]")
-# By the name of a step, which a step that checks it by the other engine takes too.
+# Changes of each step, by its name; a step that checks another one by the second engine has the changes of that one.
 CHANGES = {
     "scattering-amplitudes": (*DIATOMIC, "contacts.sites=2"),
     "interband-amplitudes": (*FOUR_BAND, "output.window=[5, 15]", "output.every=10"),
@@ -41,28 +41,28 @@ CHANGES = {
     ),
     "scattering": (*DIATOMIC, "time.samples=201", "sweep.contacts.sites=[1, 2]", AMPLITUDES),
 }  # fmt: skip
-# The cheap ones; all others are offered as well.
+# Figures that take little time to draw; the results suffice for all others too.
 DRAWN = ("fig01", "fig09", "fig10", "fig11", "figS3")
 
 
 def tiny_plan() -> Plan:
-    """Return the steps of the quick plan in small, with claims that are sums over the results."""
+    """Return the quick plan with shortened steps, and with claims that are sums over the results."""
     plan = paper_plan(QUICK)
     steps = []
     for step in plan.steps:
-        # One sample by the other engine will do.
+        # One check by the second engine is enough.
         if step.checks in ("", "interband"):
             steps.append(replace(step, changes=(*step.changes, *CHANGES[step.checks or step.name])))
     return replace(plan, steps=tuple(steps), measure=measure_claims)
 
 
 def drawing(plan: Plan) -> Plan:
-    """Return the plan with the figures ``DRAWN`` alone."""
+    """Return the plan with the figures ``DRAWN`` only."""
     return replace(plan, figures=tuple(figure for figure in plan.figures if figure.id in DRAWN))
 
 
 def measure_claims(root: Path) -> list[dict]:
-    """Return sums over the results of two steps as rows like the project's own; any bit that differs shows in them."""
+    """Return rows of claims whose values are sums over the results of two steps: they show any bit that differs."""
     found = []
     for name, key, step, data in (
         ("C7", "entropy", "scattering", "entropy/energy_weighted"),
@@ -70,7 +70,7 @@ def measure_claims(root: Path) -> list[dict]:
     ):
         path = root / step / "ensemble.h5"
         value = {}
-        # With a part of the paper one of the steps may be missing; where all members failed, nothing was measured.
+        # A part of the paper may lack one of the steps; a step whose members all failed has no measures.
         if path.exists():
             with h5py.File(path) as file:
                 if data in file:
@@ -96,7 +96,7 @@ def measure_claims(root: Path) -> list[dict]:
 
 def main() -> int:
     """Make the tiny paper and print what was done."""
-    # Here and not above, since tests import this module into processes that have PETSc.
+    # These imports are not at the top, because tests import this module into processes that have PETSc already.
     import petsc4py
 
     petsc4py.init(["tiny", "-no_signal_handler"])
