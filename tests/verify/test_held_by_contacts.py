@@ -94,7 +94,7 @@ def test_the_unit_of_a_curve_is_its_largest_linear_motion():
 
 
 def test_a_lattice_that_walls_hold_has_its_own_springs_alone():
-    """Contacts count as springs of the linear lattice where they alone hold it, not where walls do."""
+    """Contacts count as springs of the linear lattice where they press on the ground and no wall holds the lattice."""
     assert held().are_contacts_springs
     assert not held(lattice={"ends": "fixed"}).are_contacts_springs
     assert not held(IN_A_CELL | PRESSED, {"cell": SPRUNG}).are_contacts_springs

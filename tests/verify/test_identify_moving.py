@@ -1,4 +1,4 @@
-"""Identification from records of another program, of lattices that move already when the record begins."""
+"""Identification from records that SciPy computed, of lattices that already move when the record begins."""
 
 from __future__ import annotations
 
@@ -33,15 +33,18 @@ def results_of(folder, table):
 
 
 def chain_record(path, start: np.ndarray, speed: np.ndarray, times: np.ndarray, clock: float = 0.0) -> np.ndarray:
-    """Write the motion of a chain of four masses with a stop and dashpots; returns the state (2, mass) at its begin."""
+    """Write a record of a chain of four masses with a stop and dashpots to ``path``.
+
+    Returns displacements and velocities (2, mass) at the first of the ``times``.
+    """
     stiffness, damping = chain_matrices(4, 4e4, 3.0)
     stop = Stop(resonator=2, host=-1, gap=4e-4, stiffness=2e6, exponent=1.0, restitution=0.8)
-    # By SciPy: a record of this package's own integrator would hide an error that both have.
+    # SciPy integrates the motion: a record by this package's own engine would hide an error of that engine.
     lattice = ScipyLattice(np.full(4, 0.25), stiffness, damping, (stop,), force=lambda t: np.zeros(4))
     motion, impacts = lattice.motion(times, start, speed, start=0.0)
-    # Fewer would not determine stiffness and restitution apart.
+    # Fewer impacts would not separate stiffness and restitution.
     assert impacts > 4
-    # Milliseconds, g and a clock of its own, as laboratories store them.
+    # The file has milliseconds, accelerations in g and a clock of its own, as laboratories store them.
     columns = np.column_stack([1e3 * (times + clock), motion[0, :, 0], motion[1, :, 3], motion[2, :, 1] / 9.81])
     np.savetxt(path, columns, delimiter=";", header="ms;u1;v4;a2", comments="", fmt="%.17g")
     return motion[:2, 0]
@@ -73,9 +76,9 @@ def chain_table(path, **record: Any) -> dict[str, Any]:
 
 
 def test_a_displaced_lattice_determines_its_stop_and_its_initial_state(tmp_path):
-    """Free decay after an unknown release, from another integrator: parameters and the whole state to 1e-6."""
+    """The free decay after an unknown release determines the parameters, to 1e-6, and the whole initial state."""
     times = np.arange(0.0, 0.15, 1 / 2000)
-    # The offset in the case is half a second off: with no drive the clock must not matter.
+    # The offset in the case is half a second off the clock of the record, which does not matter without a drive.
     begin = chain_record(tmp_path / "decay.csv", np.array([3e-3, 0.0, 0.0, 0.0]), np.zeros(4), times, clock=7.5)
     found = results_of(tmp_path / "out", chain_table(tmp_path / "decay.csv", offset=7.0, initial="estimate"))
 
@@ -83,32 +86,39 @@ def test_a_displaced_lattice_determines_its_stop_and_its_initial_state(tmp_path)
     assert found["initial/displacement"].values == pytest.approx(begin[0], abs=1e-8)
     assert found["initial/velocity"].values == pytest.approx(begin[1], abs=1e-5)
     assert found["initial/cell"].values.tolist() == [1, 2, 3, 4]
-    # Every direction of the initial state is measured, and none left to its prior.
+    # The record measures every direction of the initial state: none depends on the prior alone.
     assert (found["initial/singular"].values > 2).all()
     assert found.attrs["warnings"] == "[]"
 
 
 def test_a_struck_lattice_begins_as_the_case_says(tmp_path):
-    """A mass is struck with a given velocity at the offset; the record overrides the case's [initial].
+    """A record may state that a mass is struck at the offset, in place of the case's [initial].
 
-    Its first samples are left out: the first window has contacts behind its beginning only.
+    The record is used from a time after the strike on, and the first window has one impact after that time.
     """
     times = np.arange(0.0, 0.15, 1 / 2000)
     chain_record(tmp_path / "strike.csv", np.zeros(4), np.array([0.0, 1.1, 0.0, 0.0]), times, clock=-2.0)
     strike = {"cell": 2, "velocity": 1.1}
     table = chain_table(tmp_path / "strike.csv", offset=-2.0, begin=-1.92, initial=strike)
-    # A first window with one impact, which begins after the record's own beginning.
+    # The first window has one impact.
     table["identify"]["impacts"] = 1
     found = results_of(tmp_path / "out", table)
     assert found["value"].values == pytest.approx([4e-4, 2e6, 0.8, 3.0], rel=1e-6)
-    # No state was estimated: the case states it.
+    # No initial state was estimated, since the record states it.
     assert found.sizes["moving"] == 0
 
 
 def shaken_record(path, window: tuple[float, float]) -> dict[str, Any]:
-    """Write accelerations of a row of masses, shaken by its left frame, with unlike stops on both sides; its table."""
-    count, stiffness, mass, amplitude, frequency = 4, 4e4, 0.25, 4e-4, 250.0
-    # Ten periods, the default of a harmonic drive.
+    """The identification of a row of masses, shaken by its left frame, with unlike stops on both sides.
+
+    The accelerations from ``window[0]`` to ``window[1]`` (s) are written to the HDF5 file ``path``.
+    """
+    count = 4
+    stiffness = 4e4
+    mass = 0.25
+    amplitude = 4e-4
+    frequency = 250.0
+    # The ramp takes ten periods, the default of a harmonic drive.
     ramp = 10 * 2 * np.pi / frequency
 
     def force(t: float) -> np.ndarray:
@@ -128,7 +138,7 @@ def shaken_record(path, window: tuple[float, float]) -> dict[str, Any]:
     motion, _ = lattice.motion(times, np.zeros(count), np.zeros(count), start=0.0)
     with h5py.File(path, "w") as file:
         used = times >= window[0]
-        # A clock that began 100 s earlier, as data loggers have.
+        # The clock of a data logger began 100 s earlier.
         file["daq/clock"] = times[used] + 100.0
         file["daq/g"] = motion[2][used][:, [0, 2, 3]] / 9.81
     sensors = [
@@ -160,8 +170,8 @@ def shaken_record(path, window: tuple[float, float]) -> dict[str, Any]:
 
 
 def test_a_record_that_begins_while_the_lattice_is_shaken(tmp_path):
-    """Base motion, accelerations in HDF5, other stops on the two sides: all come back with the unknown state."""
-    # After the ramp has ended, in the midst of impacts.
+    """Accelerations under base motion determine unlike stops on two sides, together with an unknown initial state."""
+    # The record begins after the ramp, in the midst of impacts.
     table = shaken_record(tmp_path / "daq.h5", window=(0.27, 0.36))
     table["identify"]["records"][0]["initial"] = "estimate"
     found = results_of(tmp_path / "out", table)
@@ -178,19 +188,22 @@ def test_a_record_that_begins_while_the_lattice_is_shaken(tmp_path):
 
 
 def test_a_stop_that_the_lattice_does_not_meet(tmp_path):
-    """The record from rest on is too short for one stop, which the model meets at first: the others are still exact."""
+    """A stop that the record never meets gets a lower bound, and the other parameters are exact.
+
+    The model meets that stop at first, with the clearance of its start.
+    """
     found = results_of(tmp_path / "out", shaken_record(tmp_path / "daq.h5", window=(0.0, 0.17)))
     named = dict(zip(found["parameter"].values.tolist(), found["value"].values.tolist(), strict=True))
     truth = {"clearance 1": 2e-4, "clearance_minus 1": 1.5e-4, "clearance_minus 2": 3e-4, "grounding": 3.0}
     assert {name: named[name] for name in truth} == pytest.approx(truth, rel=1e-6)
     at_least = found["at_least"].values[found["parameter"].values.tolist().index("clearance 2")]
-    # The largest approach of the record is just below the clearance, which is all that the record says of it.
+    # The record shows only that the clearance exceeds the largest displacement towards the stop, just below 6e-4 m.
     assert 5.5e-4 < at_least < 6e-4
 
 
 @pytest.mark.parametrize(("size", "touching"), [(0.1, 0), (0.3, 2), (1.0, 2)])
 def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size, touching):
-    """Of parameters and coordinates of the state, from states of all sites free and from ones with sites in contact."""
+    """Derivatives by parameters and by the initial state are differences, with free sites and with sites in contact."""
     table = lattice_table(time={"end": 0.0065})
     record = measured_table(tmp_path, table) | {"begin": 4e-3, "initial": "estimate", "offset": [-1e-4, 1e-4]}
     unknowns = [
@@ -203,7 +216,8 @@ def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size
     state = misfit.states[0]
     generator = np.random.default_rng(5)
     z = np.array([p.to_coordinate(p.start) for p in plan.parameters])
-    # The signs of modes are those of the LAPACK that is installed; the state is the same everywhere.
+    # Signs of modes depend on the LAPACK that is installed. Coordinates solved from a state give the same state
+    # everywhere.
     moving = size * np.linalg.norm(state.matrix, axis=1) * generator.standard_normal(len(state.matrix))
     z = np.concatenate([z, np.linalg.solve(state.matrix, moving)])
     ends = [0.0052]
@@ -211,7 +225,8 @@ def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size
     jacobian = misfit.jacobian(z, ends, every)
     # An onset before the record is logged at 0.
     assert np.sum(misfit.respond(z, 0, 1.0).episodes["onset"] == 0) == touching
-    # Of a five-point formula: its error h^4 and that of the runs over h are both below the tolerance.
+    # The five-point formula has an error of order h^4, and divides the errors of the runs by h. With this h both are
+    # below the tolerance.
     h = 1e-4
     for column, p in enumerate(every):
         expected = np.zeros(len(jacobian))
@@ -220,5 +235,5 @@ def test_derivatives_by_the_initial_state_are_central_differences(tmp_path, size
             moved[p] += steps * h
             expected += weight * misfit.residuals(moved, ends) / (12 * h)
         error = np.abs(jacobian[:, column] - expected).max()
-        # A force of the power 1.5 has no second derivative at an onset: differences across one have errors up to 1e-4.
+        # The force of power 1.5 has no second derivative at an onset: differences across an onset err by up to 1e-4.
         assert error < 3e-4 * np.abs(expected).max() + 1e-7, (p, error)

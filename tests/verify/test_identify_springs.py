@@ -1,4 +1,4 @@
-"""Identification in lattices of quadratic and cubic springs: derivatives and parameters against SciPy alone."""
+"""Identification in lattices with quadratic and cubic springs, from records and differences by SciPy."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ KINDS = ["displacement", "velocity", "acceleration"]
 
 
 def motion_of(truth: dict[str, float], times: np.ndarray = TIMES, state: np.ndarray = STRUCK) -> np.ndarray:
-    """u, u', u'' as (quantity, time, mass) of a chain between walls, whose last mass has a stop.
+    """The motion u, u', u'' (quantity, time, mass) of a chain between walls, whose last mass has a stop.
 
-    It begins in the ``state`` (2n,) of displacements in m and velocities in m/s at ``times[0]``.
+    The motion begins in the ``state`` (2n,) of displacements in m and velocities in m/s at ``times[0]``.
     """
     shape, _ = chain_matrices(COUNT, 1.0, 0.0)
-    # The springs in the walls are curved, too.
+    # The springs to the walls are curved like the others.
     rows = np.eye(COUNT + 1, COUNT) - np.eye(COUNT + 1, COUNT, k=-1)
     lattice = ScipyLattice(
         masses=np.full(COUNT, truth["mass"]),
@@ -47,7 +47,10 @@ def motion_of(truth: dict[str, float], times: np.ndarray = TIMES, state: np.ndar
 
 
 def table_of(path, unknowns: list[dict[str, Any]], **changes: Any) -> dict[str, Any]:
-    """The identification of ``unknowns`` from the record in ``path``: u, v and a of the masses 1, 2 and 3."""
+    """The table that identifies ``unknowns`` from the record in ``path``, which has u, v and a of masses 1, 2 and 3.
+
+    ``changes`` are values of the case that differ from the true ones.
+    """
     sensors = [{"quantity": kind, "column": kind, "cell": cell} for cell, kind in enumerate(KINDS, 1)]
     truth = TRUTH | changes
     spring = {"start": 1, "end": 1, "stiffness": truth["spring"], "damping": 3.0, "next_cell": True}
@@ -75,12 +78,12 @@ def table_of(path, unknowns: list[dict[str, Any]], **changes: Any) -> dict[str, 
 
 
 def measured(motion: np.ndarray) -> np.ndarray:
-    """What the sensors of ``table_of`` measure, (time, sensor)."""
+    """The signals (time, sensor) of the sensors of ``table_of``: u of mass 1, u' of mass 2, u'' of mass 3."""
     return np.stack([motion[k, :, k] for k in range(COUNT)], axis=1)
 
 
 def written(path, values: np.ndarray, times: np.ndarray = TIMES):
-    """Write a record of the sensors' ``values`` (time, sensor) to ``path``."""
+    """Write a record of the sensors' ``values`` (time, sensor) to ``path``, which is returned."""
     rows = np.column_stack([times, values])
     np.savetxt(path, rows, delimiter=",", header=",".join(["t", *KINDS]), comments="", fmt="%.17g")
     return path
@@ -94,7 +97,7 @@ def record(tmp_path_factory):
 
 @pytest.mark.slow
 def test_derivatives_are_differences_of_scipy(record):
-    """Through three impacts: by both parts of curved springs, their stiffness, the mass, the stop and the offset."""
+    """Derivatives through three impacts, by parameters of springs, mass, stop and offset, are differences of SciPy."""
     quantities = ["quadratic", "cubic", "spring", "mass", "clearance"]
     unknowns = [{"quantity": q, "bounds": [0.5 * TRUTH[q], 2 * TRUTH[q]]} for q in quantities]
     table = table_of(record, unknowns)
@@ -116,7 +119,7 @@ def test_derivatives_are_differences_of_scipy(record):
         error = np.abs(slopes[:, :, column] - expected).max(axis=0)
         assert (error < 2e-5 * np.abs(expected).max(axis=0)).all(), (quantity, error)
 
-    # A later offset takes every sample at an earlier time; the motion begins with the first one.
+    # A larger offset moves every sample to an earlier time of the motion, whose beginning stays at the first sample.
     short = 1e-6
     ends = [measured(motion_of(TRUTH, np.append(0.0, TIMES[1:] + step)))[1:] for step in (short, -short)]
     expected = (ends[1] - ends[0]) / (2 * short) * plan.parameters[-1].slope(z[-1])
@@ -126,7 +129,7 @@ def test_derivatives_are_differences_of_scipy(record):
 
 @pytest.mark.slow
 def test_derivatives_by_an_unknown_state_are_differences_of_scipy(record):
-    """The stiffness of curved springs at the motion moves a displacement and a velocity of the state that begins it."""
+    """Derivatives by an initial displacement and velocity, through curved springs, are differences of SciPy."""
     unknowns = [{"quantity": "cubic", "bounds": [1e9, 4e9]}]
     table = table_of(record, unknowns)
     table["identify"]["records"][0] |= {"initial": "estimate", "begin": 1e-3}
@@ -154,12 +157,12 @@ UNKNOWNS = [
     {"quantity": "clearance", "bounds": [1e-4, 2e-3]},
 ]
 SOUGHT = [TRUTH[unknown["quantity"]] for unknown in UNKNOWNS]
-# The case has linear springs: the fit begins with curves of zero.
+# The case has linear springs, so that the fit begins with quadratic and cubic parts of zero.
 CASE = {"quadratic": 0.0, "cubic": 0.0, "spring": 4.2e4, "clearance": 4.6e-4}
 
 
 def found_in(table, folder):
-    """The results of an identification."""
+    """The results of the identification that ``table`` describes, run in ``folder``."""
     run_identification(IdentifyCase.from_table(table), folder)
     with open_netcdf(folder / "identified.h5", "identification") as file:
         return file.load()
@@ -167,7 +170,7 @@ def found_in(table, folder):
 
 @pytest.mark.slow
 def test_curved_springs_come_back_from_linear_ones(record, tmp_path):
-    """Without noise all parameters come back, and the case that comes out has them."""
+    """From linear springs and without noise the fit finds all true parameters, and the identified case has them."""
     found = found_in(table_of(record, UNKNOWNS, **CASE), tmp_path)
     assert found["value"].values == pytest.approx(SOUGHT, rel=1e-7)
     case = IdentifyCase.of(found).case_of(found["value"].values)
@@ -191,7 +194,7 @@ def test_intervals_of_curved_springs_hold_the_truth(record, tmp_path):
 
 
 def test_the_rate_of_an_acceleration_is_that_of_every_spring():
-    """In a cell with a linear and two unlike curved springs, u''' at each mass is the central difference of u''."""
+    """The rate u''' is the central difference of u'' at every mass of a cell with a linear and two curved springs."""
     springs = [
         {"start": 1, "end": 2, "stiffness": 2e4, "cubic": 8e9},
         {"start": 1, "end": 2, "stiffness": 4e4},

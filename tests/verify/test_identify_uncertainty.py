@@ -1,4 +1,4 @@
-"""Standard errors, correlation, profiles and the sensor that would tell most, each by another computation."""
+"""Standard errors, correlation, profiles and the best additional sensor, each compared with another computation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def engine_derivatives(plan: IdentifyCase, z: np.ndarray, cell: int, mass: int) 
 
 @pytest.fixture(scope="module")
 def identified(tmp_path_factory):
-    """The plan, the coordinates found, and the results of a fit of three parameters to a record of a few contacts."""
+    """The plan, the coordinates (3,) found, and the results of a fit of three parameters to a record with contacts."""
     folder = tmp_path_factory.mktemp("uncertainty")
     table = lattice_table(time={"end": 0.011})
     record = measured_table(folder, table, noise=0.02)
@@ -55,7 +55,10 @@ def identified(tmp_path_factory):
 
 @pytest.mark.slow
 def test_errors_and_correlation_are_those_of_an_engines_derivatives(identified):
-    """(J^T J)^-1 with J from differences of runs; one more sensor adds its rows, the best place lowers errors most."""
+    """The covariance is (J^T J)^-1 with J from differences of runs, and the sensor that is named lowers an error most.
+
+    Another sensor adds its rows to J.
+    """
     plan, z, results = identified
     rows = [engine_derivatives(plan, z, point["cell"], point["mass"]) for point in POINTS]
     jacobian = np.vstack(rows) / 0.02
@@ -65,7 +68,7 @@ def test_errors_and_correlation_are_those_of_an_engines_derivatives(identified):
     assert results["correlation"].values == pytest.approx(covariance / np.outer(errors, errors), abs=1e-4)
     assert results["singular"].values == pytest.approx(np.linalg.svd(jacobian, compute_uv=False), rel=1e-4)
 
-    # Every fifth mass, and the one that is named for the first parameter.
+    # The places tried are every fifth mass, and the mass that is named for the first parameter.
     named = int(results["sensor/cell"][0]), int(results["sensor/mass"][0])
     lowest = float(results["sensor/relative_error"][0])
     for cell, mass in [named, *((1 + k // 4, 1 + k % 4) for k in range(0, 24, 5))]:
@@ -78,7 +81,10 @@ def test_errors_and_correlation_are_those_of_an_engines_derivatives(identified):
 
 @pytest.mark.slow
 def test_profiles_are_the_least_misfit_with_one_parameter_held(identified):
-    """The outermost place of a profile, fitted again by another method with differences for derivatives."""
+    """At the last value of a profile the misfit is the least one with that parameter held.
+
+    SciPy's ``least_squares`` fits the other parameters, with differences for derivatives.
+    """
     plan, z, results = identified
     misfit = Identification(plan, read_records(plan), StopRequest()).windows().misfit
     ends = [float(misfit.records[0].times[-1])]
@@ -93,14 +99,14 @@ def test_profiles_are_the_least_misfit_with_one_parameter_held(identified):
 
         fitted = least_squares(residuals, np.delete(z, number), method="lm", x_scale=1e-3)
         assert results["profile/cost"].values[number, 2] == pytest.approx(2 * fitted.cost - least, rel=2e-2)
-        # Three standard errors away the misfit is nine more, as far as the problem is linear.
+        # In a linear problem the sum of squares grows by 3^2 at three standard errors.
         assert 5 < results["profile/cost"].values[number, 2] < 15
     assert results["profile/cost"].values[:, 1] == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.slow
 def test_a_sensor_is_found_from_every_third_sample(identified, monkeypatch):
-    """Of long records every n-th sample stands for n of them: about the same errors, from a third of the memory."""
+    """Errors with a further sensor, computed from every third sample to save memory, are about those from all."""
     plan, z, results = identified
     windows = Identification(plan, read_records(plan), StopRequest()).windows()
     known = uncertainty_of(windows.misfit.jacobian(z, windows.last, range(3)))
@@ -112,7 +118,7 @@ def test_a_sensor_is_found_from_every_third_sample(identified, monkeypatch):
 
 
 def test_the_marginal_jacobian_has_the_inverse_of_the_covariance():
-    """Its information is that of the parameters with the other coordinates free, the Schur complement."""
+    """The marginal Jacobian A has (A^T A)^-1 equal to the parameters' block of the covariance of all coordinates."""
     jacobian = np.random.default_rng(2).standard_normal((30, 7))
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     marginal = marginal_jacobian(jacobian, 3)
@@ -121,7 +127,7 @@ def test_the_marginal_jacobian_has_the_inverse_of_the_covariance():
 
 
 def test_fewer_data_than_parameters_leave_some_of_them_undetermined():
-    """One datum that depends on one of two parameters determines it alone; random ones none of five by three data."""
+    """A datum that depends on one of two parameters determines that one; three random data determine none of five."""
     one = uncertainty_of(np.array([[10.0, 0.0]]))
     assert one.errors == pytest.approx([0.1, 1e11], rel=1e-12)
     assert one.determined.tolist() == [True, False]

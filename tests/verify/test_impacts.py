@@ -1,4 +1,4 @@
-"""Single impacts: their restitution and loss, forces that are clipped, approach velocities below a floor."""
+"""Impacts: restitution and loss, clipped forces, a floor on approach velocities, checkpoints and the energy balance."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from vipetsc.dynamics.ts.integrator import Integrator
 
 
 def effective_restitution(r: float) -> float:
-    """Restitution of x'' = -k x^n (1 + c x'/v0), c = 3 (1 - r)/2, by separation of x and x'.
+    """The restitution e of x'' = -k x^n (1 + c x'/v0) with c = 3 (1 - r)/2, by separation of x and v = x'.
 
-    The integral of v dv/(1 + c v/v0) has the same value over approach and rebound.
+    From v dv/(1 + c v/v0) = -k x^n dx, the integral of the left side from v0 to -e v0 is zero.
     """
     c = 1.5 * (1 - r)
 
@@ -32,7 +32,7 @@ def effective_restitution(r: float) -> float:
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 @pytest.mark.parametrize("restitution", [0.95, 0.7, 0.3])
 def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
-    # Springs so soft that they do nothing during one impact.
+    # The springs are so soft that they do not matter during one impact.
     soft = 1e-9
     springs = [{"start": 1, "end": 1, "stiffness": soft, "next_cell": True}, {"start": 1, "end": 2, "stiffness": soft}]
     masses = [0.01, 0.004]
@@ -46,14 +46,14 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     layout = Layout(model, MPI.COMM_SELF)
     integrator = Integrator(model, layout)
 
-    # Velocities lie behind the displacements, mass by mass: the resonator of cell 1 moves at 1 m/s.
+    # The state holds displacements, then velocities, mass by mass. The resonator of cell 1 begins with 1 m/s.
     first_velocity = layout.dofs * layout.owned
     integrator.state.array[first_velocity + layout.owned] = 1.0
     integrator.step = 1e-5
     integrator.free_step = 1e-5
     integrator._first_step = 1e-5
     integrator.observe(integrator.tracker.start)
-    # The impact is over after 1.1 ms or so; after 3 ms the rebound meets the other side.
+    # The impact is over after about 1.1 ms; after 3 ms the rebounding mass meets the stop on the other side.
     integrator.advance(0.0025)
 
     (episode,) = integrator.take_episodes()
@@ -62,7 +62,7 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
     assert episode["approach_velocity"] == pytest.approx(1.0, abs=1e-9)
     assert episode["onset"] == pytest.approx(1e-3, abs=1e-9)
     assert rebound == pytest.approx(effective_restitution(restitution), abs=1e-8)
-    # The law is derived for r near 1: its own error is of second order in 1 - r.
+    # The law is derived for r near 1: its effective restitution differs from r by the order (1 - r)^2.
     assert abs(rebound - restitution) < (1 - restitution) ** 2
 
     reduced_mass = masses[0] * masses[1] / sum(masses)
@@ -70,7 +70,7 @@ def test_an_isolated_impact_has_the_laws_own_restitution(law, restitution):
 
 
 def test_clipped_contacts_never_pull():
-    """With restitution 0 the law pulls late in an impact; clipping holds the force at zero there instead."""
+    """The law with restitution 0 pulls late in an impact, where clipping keeps the force at zero."""
     _, allowed = simulated(small_case(contacts={"restitution": 0.0, "adhesion": "allow"}))
     _, clipped = simulated(small_case(contacts={"restitution": 0.0, "adhesion": "clip"}))
 
@@ -109,17 +109,17 @@ def clipped_run(request) -> tuple[xr.Dataset, Result]:
 def test_a_clipped_contact_loses_its_elastic_energy(clipped_run):
     run, result = clipped_run
     force = run["sites/force"].values
-    # Pressed together without a force: that is a clipped phase.
+    # In a clipped phase the masses are pressed together without a force.
     w = np.diff(run["displacement"].values, axis=2)[..., 0]
     clipped = (w > 1.0001e-5) & (force == 0)
     assert clipped[-1].any()
 
-    # The loss is the elastic energy's, whatever steps the motion has: the balance closes as it does without clipping.
+    # The elastic energy at the beginning of a clipped phase is lost. The balance closes as it does without clipping.
     assert result.statistics["clipped"] > 0
     rounding = {"ts": 1e-11, "propagator": 1e-13}
     assert result.statistics["ledger_error"] < rounding[result.statistics["engine"]]
 
-    # Energy leaves a site and never returns, at the beginning and at the end of a clipped phase, too.
+    # No energy returns to a site, not even at the beginning or the end of a clipped phase.
     lost = run["energy/dissipated_by_site"].values
     assert np.diff(lost, axis=0).min() > -1e-15 * lost.max()
     by_episodes = np.bincount(run["impacts/site"].values - 1, run["impacts/loss"].values, minlength=6)
@@ -127,7 +127,7 @@ def test_a_clipped_contact_loses_its_elastic_energy(clipped_run):
 
 
 def test_many_conservative_hertzian_contacts_keep_the_energy():
-    """A tiny lattice with soft stops: the error of each of some 400 onsets and separations adds to the balance."""
+    """The energy error after some 400 onsets and separations of soft lossless stops, which adds up, is below 1e-8."""
     springs = [{"start": 1, "end": 2, "stiffness": 1e4}, {"start": 2, "end": 1, "stiffness": 1e4, "next_cell": True}]
     contacts = {"law": "hertz", "stiffness": 3.5e6, "restitution": 1.0, "side": "plus", "clearance": 5.2e-5}
     case = Case.from_table({
@@ -140,16 +140,19 @@ def test_many_conservative_hertzian_contacts_keep_the_energy():
     _, result = simulated(case)
 
     assert result.statistics["switches"] > 400
-    # 3.2e-8 if the first step of each contact went in time and not in its root.
+    # The error would be 3.2e-8 if the first step of each contact had equal parts of time and not of its square root.
     assert result.statistics["ledger_error"] < 1e-8
 
 
 def test_a_checkpoint_at_an_onset_goes_on_to_the_same_bits():
-    """Where an onset falls on a sample, the step after it still goes in the root of time."""
+    """A run restored from a checkpoint at an onset takes the contact's first step as the uninterrupted run does.
+
+    That step is taken in the square root of time.
+    """
     model = small_case(contacts={"law": "hertz", "sites": [5], "clearance": 1e-3}, time={"engine": "ts"}).model()
     layout = Layout(model, MPI.COMM_SELF)
     whole = Integrator(model, layout)
-    # The resonator of the site stands on its stop and moves on: a contact begins.
+    # The resonator of the site is at its stop and moves towards it, so that a contact begins.
     cells = np.zeros((layout.cells, 2 * layout.dofs))
     resonator = model.chain.cell.resonator
     cells[4, resonator] = 1e-3
@@ -167,7 +170,11 @@ def test_a_checkpoint_at_an_onset_goes_on_to_the_same_bits():
 
 
 def test_checkpoints_under_a_drive_of_pieces_go_on_to_the_same_bits():
-    """The drive acts on a mass of the site, and so on w'', by which the first step is searched for an onset."""
+    """Runs restored at every sample under a drive of several pieces have the bits of the uninterrupted run.
+
+    The drive acts on a mass of the contact site and therefore on w'', which the search for an onset in the first step
+    uses.
+    """
     case = Case.from_table({
         "lattice": {"preset": "four-band", "cells": 24},
         "contacts": {"sites": [5], "clearance": 2e-4},
@@ -180,7 +187,7 @@ def test_checkpoints_under_a_drive_of_pieces_go_on_to_the_same_bits():
     whole = Integrator(model, layout)
 
     for number in range(1, model.samples):
-        # A new engine each time, as a resumed run has: no piece of its drive is on.
+        # Like a resumed run, each new engine begins with no piece of its drive selected.
         parts = Integrator(model, layout)
         parts.restore([whole.checkpoint()])
         for engine in (whole, parts):

@@ -1,4 +1,4 @@
-"""Runs and sweeps without a folder: the same numbers as with one, and nothing left behind."""
+"""Runs and sweeps without a folder have the numbers of those with one, and leave no files."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def small_sweep(**options) -> Sweep:
 
 
 def test_a_run_without_a_folder_is_the_run_with_one(tmp_path):
-    """The dataset in memory has the values of the file, and both results give theirs."""
+    """A run in memory has the bits of the run in a folder, and each result says where it is."""
     case = small_case(time={"end": 0.02, "engine": "propagator"})
     held = simulate(case)
     stored = simulate(case, tmp_path / "run")
 
     assert held.folder is None
     assert held.complete
-    # To the bit: where results are kept must not change the integration.
+    # The bits are equal: where results are kept must not change the integration.
     assert held.dataset["velocity"].values.tobytes() == stored.dataset["velocity"].values.tobytes()
     assert held.dataset["velocity"].dims == stored.dataset["velocity"].dims
     assert "complete: " in held._repr_html_()
@@ -49,18 +49,18 @@ def test_a_run_without_a_folder_is_the_run_with_one(tmp_path):
 
 
 def test_a_run_without_a_folder_is_not_resumed():
-    """There is nothing to resume in memory."""
+    """A run without a folder refuses to resume, as nothing is stored from which it could."""
     with pytest.raises(ValueError, match="a run in memory cannot be resumed"):
         simulate(small_case(), resume=True)
 
 
 @pytest.mark.slow
 def test_a_sweep_without_a_folder_is_the_sweep_with_one(tmp_path, monkeypatch):
-    """The ensemble in memory is that of the file, and the temporary folder is gone."""
+    """A sweep in memory has the ensemble of a sweep in a folder, and removes its temporary folder."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     plan = small_sweep()
     held = run_sweep(plan)
-    # A temporary folder that is left would fill the disk of a long session.
+    # Temporary folders that stay would fill the disk in a long session.
     assert list(tmp_path.iterdir()) == []
     assert held.folder is None
     assert held.complete
@@ -78,7 +78,7 @@ def test_a_sweep_without_a_folder_is_the_sweep_with_one(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_sweep_that_is_stopped_stays_where_it_is(tmp_path, monkeypatch):
-    """Members that were complete are kept in the temporary folder, and the sweep goes on from it."""
+    """A stopped sweep in memory keeps its temporary folder, with the complete members, and can go on from it."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     stop = StopRequest()
     stop.requested = True
@@ -98,8 +98,8 @@ def test_fields_of_members_need_a_folder():
 
 
 def test_ranks_of_several_machines_need_a_folder(monkeypatch):
-    """A temporary folder of one machine is not seen by the others."""
-    # One machine is all that a test has.
+    """A sweep in memory on several machines is refused: each sees only its own temporary folders."""
+    # The test runs on one machine, and pretends that there are several.
     monkeypatch.setattr(sweeps, "on_one_machine", lambda comm: False)
     with pytest.raises(ValueError, match="ranks on several machines need a folder that all of them see"):
         run_sweep(small_sweep())

@@ -1,4 +1,4 @@
-"""Runs that begin in motion: modes, packets and states from files do what theory says, on both engines."""
+"""Runs that begin in motion: modes, packets, breathers and states from files move as theory says, in both engines."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ENGINES = ("ts", "propagator")
 
 
 def moving(initial: dict, **sections) -> Case:
-    """A four-band lattice that nothing drives."""
+    """A four-band lattice without a drive; ``initial`` is its table [initial]."""
     table = {
         "name": "moving",
         "lattice": {"preset": "four-band", "cells": 40},
@@ -38,7 +38,7 @@ def moving(initial: dict, **sections) -> Case:
 
 
 def run(case: Case) -> xr.Dataset:
-    """A run in memory whose energy balance closes."""
+    """The result of a run in memory; asserts that its energy balance closes."""
     data, result = simulated(case)
     assert result.statistics["ledger_error"] < 1e-8
     return data
@@ -47,7 +47,7 @@ def run(case: Case) -> xr.Dataset:
 @pytest.mark.parametrize("ends", ["fixed", "free", "periodic"])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_mode_stays_a_mode(engine, ends):
-    """A mode keeps its energy and swings as a cosine, which no other mode joins."""
+    """A lattice that begins in one mode moves as u(t) = u(0) cos(omega t), and all energy stays in that mode."""
     end = 0.02
     case = moving(
         {"kind": "mode", "number": 50, "energy": 2e-3},
@@ -56,7 +56,7 @@ def test_a_mode_stays_a_mode(engine, ends):
     )
     chain = case.model().chain
     omega = mode_frequency(chain, 50)
-    # Nothing is driven: the frequency, which sets tolerances, is that of the motion.
+    # Without a drive the mode's frequency is the one that sets tolerances.
     assert case.initial.frequency == omega
 
     data = run(case)
@@ -67,14 +67,14 @@ def test_a_mode_stays_a_mode(engine, ends):
 
     modes = linear_modes(chain)
     energy = 0.5 * np.abs(modes.amplitudes(data["displacement"].values, data["velocity"].values)) ** 2
-    # On a ring the waves of both directions have one frequency.
+    # On a ring waves in both directions have the same frequency.
     own = np.abs(modes.frequency - omega) < 1e-6 * omega
     assert own.sum() == (2 if ends == "periodic" else 1)
     assert energy[:, own].sum(axis=1) == pytest.approx(2e-3, rel=1e-12)
 
     u = data["displacement"].values
     wave = u[:1] * np.cos(omega * data["time"].values)[:, None, None]
-    # The tolerance of the phase, times all radians of the run.
+    # The phase may err by 1e-12 in each radian of the run.
     assert np.abs(u - wave).max() < 1e-12 * np.abs(u).max() * omega * end
     assert np.abs(u).max() == pytest.approx(case.initial.amplitude, rel=1e-12)
 
@@ -83,7 +83,7 @@ def test_a_mode_stays_a_mode(engine, ends):
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_packet_travels_with_the_group_velocity_on_its_band(engine, direction):
-    """All of the energy is on band 2, and its middle moves with the packet's mean group velocity."""
+    """All energy of a packet is in its band, and the centre of energy moves with the packet's mean group velocity."""
     kappa = 2 * np.pi / 5
     width = 8
     initial = {
@@ -105,7 +105,7 @@ def test_a_packet_travels_with_the_group_velocity_on_its_band(engine, direction)
     by_part = parts.energies(data["displacement"].values, v, [0, len(v) - 1]).sum(axis=1)
     assert by_part[parts.parts.names.index("band 2")] == pytest.approx(data["energy/work"][0].item(), rel=1e-9)
 
-    # Each wave weighs by its energy: the square of its frequency times its part in the Gaussian.
+    # Each wave is weighted by its energy, the square of its frequency times its amplitude in the Gaussian.
     k = kappa + np.linspace(-0.7, 0.7, 2001)
     point = bloch(model.chain.cell, k)
     weight = (point.frequency[:, 1] * np.exp(-0.5 * ((k - kappa) * width) ** 2)) ** 2
@@ -119,7 +119,10 @@ def test_a_packet_travels_with_the_group_velocity_on_its_band(engine, direction)
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_run_goes_on_from_a_sample_of_another_in_the_middle_of_a_contact(engine, tmp_path):
-    """Without loss a contact remembers nothing: from the state alone the run takes the same trajectory."""
+    """A run that begins with a sample of another, in the middle of a contact without loss, has the same trajectory.
+
+    The force of a contact without loss depends on the state alone.
+    """
     contacts = {"sites": [20, 22], "clearance": 1e-3, "stiffness": 1e4, "law": "bilinear", "restitution": 1.0}
     packet = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 12, "width": 3, "amplitude": 1e-3}
     first = moving(packet, contacts=contacts, time={"engine": engine, "end": 0.06, "rtol": 1e-12})
@@ -143,7 +146,10 @@ def test_a_run_goes_on_from_a_sample_of_another_in_the_middle_of_a_contact(engin
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_contact_that_begins_closed_takes_the_approach_of_an_impact_without_loss(engine):
-    """Of a mode with w beyond the clearance mu (w'_minus^2 - w'^2)/2 is the energy in the contact."""
+    """A contact that is closed at t = 0 has the approach velocity v of an impact without loss.
+
+    With the reduced mass mu, mu (v^2 - w'^2)/2 is the elastic energy of the contact at t = 0.
+    """
     clearance = 1e-4
     stiffness = 2e5
     contacts = {"sites": [20], "clearance": clearance, "stiffness": stiffness, "law": "hertz", "restitution": 0.6}
@@ -171,7 +177,7 @@ def test_a_contact_that_begins_closed_takes_the_approach_of_an_impact_without_lo
 CLOSED = {"kind": "packet", "band": 2, "wavenumber": "pi/2", "cell": 20, "width": 3, "amplitude": 2e-3}
 
 
-# Of the softer contacts some begin in retreat, with a factor below zero: clipped.
+# Some of these softer contacts begin while they open, with a negative damping factor, and are therefore clipped.
 CLIPPED = {"adhesion": "clip", "restitution": 0.0, "stiffness": 1e4, "clearance": 1e-4}
 
 
@@ -190,7 +196,7 @@ def test_the_engines_agree_from_closed_contacts_on(law):
     assert np.abs(u - exact["displacement"].values).max() < 1e-7 * np.abs(u).max()
 
 
-# The time stepper looks after every step, the propagator after every block of samples.
+# The time stepper checks for a request to stop after every step, the propagator after every block of samples.
 @pytest.mark.parametrize(("engine", "looks"), [("ts", 300), ("propagator", 0)])
 def test_a_stopped_run_goes_on_to_the_same_bits(engine, looks, tmp_path):
     case = moving(
@@ -207,7 +213,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits(engine, looks, tmp_path):
 
 
 def write_state(path: Path, u: np.ndarray, v: np.ndarray) -> None:
-    """Write displacements and velocities (cell, dof) of the cells 11 to 30."""
+    """Write rows 11 to 30 of displacements ``u`` in m and velocities ``v`` in m/s, both (cell, dof), to a file."""
     data = {
         "cell": variable("cell", np.arange(11, 31), "1", "cell"),
         "dof": variable("dof", np.arange(1, 5), "1", "mass"),
@@ -218,7 +224,7 @@ def write_state(path: Path, u: np.ndarray, v: np.ndarray) -> None:
 
 
 def test_a_file_that_changes_is_noticed(tmp_path):
-    """The state of a file begins the run, in its cells; another state in the same file is not taken for it."""
+    """A run begins with the state in a file, in the cells that the file names, and refuses a file that has changed."""
     path = tmp_path / "state.h5"
     u, v = np.random.default_rng(0).standard_normal((2, 40, 4)) * 1e-4
     write_state(path, u, v)
@@ -227,14 +233,14 @@ def test_a_file_that_changes_is_noticed(tmp_path):
 
     assert np.array_equal(data["displacement"][0].values[10:30], u[10:30])
     assert not data["velocity"][0].values[[*range(10), *range(30, 40)]].any()
-    # The recorded displacements leave with the velocities of the file, as far as three samples tell.
+    # The slope of the first three recorded displacements is the file's velocity, as far as three samples determine it.
     spline = CubicSpline(data["time"].values[:3], data["displacement"].values[:3])
     assert spline(0.0, 1)[10:30] == pytest.approx(v[10:30], abs=0.2)
 
     write_state(path, u, 2 * v)
     with pytest.raises(CaseError, match="has changed since"):
         simulate(case, RunMemory())
-    # Results can be read where the file is another, or gone.
+    # A case can be read from results after its file has changed or has been removed.
     assert Case.from_toml(case.to_toml()) == case
 
     path.unlink()
@@ -245,7 +251,7 @@ def test_a_file_that_changes_is_noticed(tmp_path):
 
 @pytest.fixture(scope="module")
 def breather(tmp_path_factory) -> tuple[dict[str, Any], Path]:
-    """Tables of a lattice, and the file of its breather at 1600 rad/s: harmonics left out are 1e-8 of the motion."""
+    """The tables of a lattice and the path of its breather at 1600 rad/s, whose neglected harmonics are below 1e-8."""
     folder = tmp_path_factory.mktemp("breather")
     table = {
         "lattice": {"preset": "four-band", "reading": "calibrated", "cells": 14},
@@ -267,9 +273,9 @@ def test_a_breather_comes_back_after_its_period(engine, breather):
     u = data["displacement"].values
     w = np.diff(u[:, 5, 1:3])
     assert np.abs(w).max() == pytest.approx(1.286 * CLEARANCE, rel=1e-3)  # SPEC section 15
-    # Closed at the start, on the other side, and closed again.
+    # The contact is closed at the start, closes on the other side, and closes again at the end.
     assert len(data["impacts/onset"]) == 3
 
     assert np.abs(u[-1] - u[0]).max() < 1e-7 * np.abs(u[0]).max()
-    # An orbit of odd harmonics is turned over after half a period.
+    # An orbit of odd harmonics has the opposite sign after half a period.
     assert np.abs(u[8] + u[0]).max() < 1e-7 * np.abs(u[0]).max()

@@ -1,4 +1,7 @@
-"""Isolated responses: those of an oscillator with a nonlinear absorber, whose ends SciPy's integration confirms."""
+"""Isolated frequency responses of an oscillator with a nonlinear absorber and of a cubic oscillator.
+
+SciPy's integration and the cubic oscillator's closed forms confirm them.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +34,8 @@ from vipetsc.modes.response.swept import motions
 
 pytestmark = pytest.mark.parallel(1)
 
-# A hardening oscillator with a nonlinear tuned vibration absorber of a twentieth of its mass: Detroux et al. (2015),
-# but with a dashpot ten times theirs, so that the isolated curve is short.
+# A hardening oscillator with a nonlinear tuned vibration absorber of a twentieth of its mass, from Detroux et al.
+# (2015). The dashpot is ten times theirs, so that the isolated curve is short.
 PRIMARY = {"start": 1, "end": 1, "stiffness": 0.5, "cubic": 0.5, "damping": 0.01, "next_cell": True}
 ABSORBER = {"start": 1, "end": 2, "stiffness": 0.0454, "cubic": 0.0042, "damping": 0.0128}
 TABLE: dict[str, Any] = {
@@ -45,23 +48,25 @@ TABLE: dict[str, Any] = {
 
 
 def absorber(force: float = 0.18, **nfrc: Any) -> NfrcCase:
-    """Curves at a ``force`` in N, with isolated ones looked for at 1.725 rad/s."""
+    """The case of curves over the frequency at a ``force`` in N; isolated ones are looked for at 1.725 rad/s."""
     options = {"source": "force", "over": "frequency", "range": [1.55, 1.9], "fixed": [force], "harmonics": 7}
     return NfrcCase.from_table(TABLE | {"nfrc": options | {"isolas": 1, "largest_step": 0.3} | nfrc})
 
 
 @pytest.fixture(scope="module")
 def curves(tmp_path_factory):
+    """The folder of the curves at 0.18 N, and the curves: the main one and the isolated one."""
     folder = tmp_path_factory.mktemp("isolas")
     return folder, follow_all(absorber(), folder, MPI.COMM_SELF)
 
 
 def equations() -> SteadyStates:
+    """The steady states of the oscillator with an absorber at 0.18 N."""
     return SteadyStates(absorber(), 1.0, 0.18)
 
 
 def state_of(states: SteadyStates, point: Response) -> np.ndarray:
-    """Displacements and velocities (4,) at phase 0."""
+    """The displacements in m and velocities in m/s (4,) of a state at phase 0."""
     return np.concatenate([part.ravel() for part in motion_at(states, point.xi, np.arange(1))])
 
 
@@ -70,7 +75,7 @@ def test_an_isolated_curve_is_closed_and_has_a_file_of_its_own(curves):
     assert main.ending.startswith("reached the end")
     assert (isola.name, isola.ending) == (f"{main.name}-isola-1", "closed: it has come back to its first state")
     np.testing.assert_array_equal(isola.points[0].xi, isola.points[-1].xi)
-    # It lies within the range, apart from the curve from the beginning of the range.
+    # The elongations of the isolated curve are all larger than those of the main one, so that they do not meet.
     assert measure(main, "largest_elongation")[:, 0].max() < 1.0 < measure(isola, "largest_elongation")[:, 0].min()
     with vipetsc.open(folder / f"branch-{isola.name}.h5") as data:
         assert data.attrs["isola"] == "1"
@@ -84,7 +89,10 @@ def test_an_isolated_curve_is_closed_and_has_a_file_of_its_own(curves):
 
 
 def test_its_two_ends_are_folds_of_the_flow(curves):
-    """At both ends SciPy's map of a period brings the state back, and has a multiplier of 1."""
+    """At the lowest and the highest frequency of an isola, SciPy's map of a period returns the state.
+
+    The map has a multiplier of 1 there, as at any fold.
+    """
     _, (_, isola) = curves
     states = equations()
     folds = [point for point in isola.points if point.kind == "fold"]
@@ -101,7 +109,10 @@ def test_its_two_ends_are_folds_of_the_flow(curves):
 @pytest.mark.slow
 @pytest.mark.parametrize(("place", "stays"), [(-0.01, True), (0.01, False)])
 def test_a_motion_on_it_stays_up_to_its_end_and_falls_beyond(curves, place, stays):
-    """Time integration from the stable state next to the upper end, at frequencies on both sides of it."""
+    """A motion that begins on the isola stays large below the isola's upper end, and falls to the main curve beyond.
+
+    SciPy integrates from a stable state near that end, at frequencies 1 % below and above it.
+    """
     _, (_, isola) = curves
     states = equations()
     stable = [point for point in isola.points if point.measured.unstable == 0 and point.kind == "regular"]
@@ -122,12 +133,12 @@ def test_a_motion_on_it_stays_up_to_its_end_and_falls_beyond(curves, place, stay
 
 
 def test_where_there_is_none_no_file_is_left(tmp_path):
-    """At 0.15 N the resonance beyond the absorber is not reached at all, at 0.18 N apart from the rest."""
+    """At 0.15 N no isolated curve exists, and the search leaves no file; at 0.18 N there is one."""
     assert len(follow_all(absorber(0.15), tmp_path, MPI.COMM_SELF)) == 1
 
 
 def put_main(curves, folder: Path) -> None:
-    """Put the curve from the beginning of the range into another folder, whose search then goes on from there."""
+    """Copy the main curve into another ``folder``, in which a resumed search for isolated curves goes on from it."""
     begun, (main, _) = curves
     shutil.copy(begun / f"branch-{main.name}.h5", folder)
 
@@ -158,7 +169,8 @@ def test_a_curve_over_the_amplitude_has_no_such_search():
         absorber(over="amplitude", fixed=[1.7], range=[0.1, 0.3])
 
 
-# A hardening oscillator under a force; the range ends between its two folds, at 1.32 and 1.83 rad/s.
+# The oscillator u'' + c u' + u + u^3 = F cos(Om t), c = 0.1, under a force of 0.3 N. The range of frequencies ends
+# between its two folds, which are at 1.32 and 1.83 rad/s.
 DUFFING: dict[str, Any] = {
     "name": "duffing",
     "lattice": {
@@ -176,24 +188,26 @@ DUFFING: dict[str, Any] = {
 
 
 def duffing(**nfrc: Any) -> NfrcCase:
+    """The case of the cubic oscillator's curve, with isolated ones looked for by sweeps; ``nfrc`` updates [nfrc]."""
     options = {"source": "force", "over": "frequency", "range": [0.8, 1.6], "fixed": [0.3], "harmonics": 9}
     sweeps = {"isolas": 4, "isola_search": ["sweeps"], "isola_periods": 30}
     return NfrcCase.from_table(DUFFING | {"nfrc": options | sweeps | nfrc})
 
 
 def test_a_sweep_down_finds_the_states_that_the_curve_from_below_does_not_meet(tmp_path):
-    """At 1.5 rad/s the curve has the large motion; a lattice at rest settles to the small one."""
+    """A sweep down finds the small motion at 1.5 rad/s, where the curve from below has the large one."""
     main, isola, back = follow_all(duffing(), tmp_path, MPI.COMM_SELF)
     assert (isola.name, back.name) == (f"{main.name}-isola-1", f"{main.name}-isola-1-back")
     first = isola.points[0]
     assert first.measured.frequency == pytest.approx(1.5)
-    # From there up to the end of the range, and down to the fold from which a sweep down jumps to the curve.
+    # The isolated curve goes up to the end of the range, and down to the fold at which a sweep down jumps.
     assert measure(isola, "frequency").max() == pytest.approx(1.6)
     (fold,) = [point.measured.frequency for point in back.points if point.kind == "fold"]
     assert fold == measure(back, "frequency").min()
     assert back.points[-1].measured.frequency == pytest.approx(1.6)
 
-    # The cubic oscillator's first harmonic, of which the third is a correction: (1 - Om^2 + 3/4 a^2) a = F, c = 0.1.
+    # The first harmonic a of the cubic oscillator satisfies |1 - Om^2 + 3/4 a^2 + i c Om| a = F, up to a small
+    # correction by the third harmonic.
     outputs = first.measured.outputs
     a = np.hypot(outputs["spring_harmonics"][0, 1], outputs["spring_harmonics_imaginary"][0, 1])
     stiffness = 1 - 1.5**2 + 0.75 * a**2
@@ -201,26 +215,29 @@ def test_a_sweep_down_finds_the_states_that_the_curve_from_below_does_not_meet(t
 
 
 def test_each_free_motion_leads_to_the_states_above_and_below_its_frequency():
-    """At 1.5 rad/s: from the free motion a^2 = 4/3 (Om^2 - 1) to the three states of the cubic oscillator."""
+    """The free motion a^2 = 4/3 (Om^2 - 1) at 1.5 rad/s leads to the three steady states of the cubic oscillator."""
     states = SteadyStates(duffing(), 1.0, 0.3)
     p = 1.5 / states.parameter.scale
     (candidates,) = states_near_free_motions(states, np.array([p]))
     sizes = sorted(np.abs(states.balance.unpack(xi[:-1] * states.clearance)[0, 1]) for xi in candidates)
-    # (a (1 - Om^2 + 3/4 a^2))^2 + (c Om a)^2 = F^2 of the first harmonic alone, in b = a^2.
+    # The first harmonic alone satisfies (a (1 - Om^2 + 3/4 a^2))^2 + (c Om a)^2 = F^2, a cubic equation in a^2.
     polynomial = [0.5625, 1.5 * (1 - 1.5**2), (1 - 1.5**2) ** 2 + 0.15**2, -(0.3**2)]
     expected = np.sqrt(np.sort(np.roots(polynomial).real))
     np.testing.assert_allclose(sizes, expected, rtol=0.02)
 
 
 def test_a_free_motion_has_the_frequency_that_is_asked_for():
-    """And the amplitude A of x'' + x + x^3 = 0 with that period, 4 K(m)/sqrt(1 + A^2) with m = A^2/(2 (1 + A^2))."""
+    """The free motion at 1.5 rad/s has that frequency and the amplitude A of x'' + x + x^3 = 0 with that period.
+
+    The period is 4 K(m)/sqrt(1 + A^2) with m = A^2/(2 (1 + A^2)).
+    """
     states = SteadyStates(duffing(), 1.0, 0.3)
     free = free_motions._conservative(states)
     (points,) = free_motions._branches(free, states)
     (motion,) = free_motions._at(free, points, 1.5)
     assert 2 * np.pi / motion.period == pytest.approx(1.5, rel=1e-12)
 
-    # The elongation of the first spring is the mass's displacement, at rest at phase 0.
+    # The elongation of the first spring is the mass's displacement, which is the amplitude at phase 0.
     elongation = free.balance(motion.order).unpack(motion.x)[0]
     squared = abs(elongation.real.sum()) ** 2
     period = 4 * ellipk(squared / (2 * (1 + squared))) / np.sqrt(1 + squared)
@@ -228,7 +245,10 @@ def test_a_free_motion_has_the_frequency_that_is_asked_for():
 
 
 def test_other_amplitudes_lead_from_a_state_to_the_other_two():
-    """The line begins at the amplitude of the curve, and does not count where it begins as one of its states."""
+    """States over the amplitude, from one state of the cubic oscillator, pass its other two at the curve's amplitude.
+
+    The state at which the search begins is not among those found.
+    """
     states = SteadyStates(duffing(), 1.0, 0.3)
     p = 1.5 / states.parameter.scale
     (three,) = states_near_free_motions(states, np.array([p]))
@@ -241,12 +261,15 @@ def test_other_amplitudes_lead_from_a_state_to_the_other_two():
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_at_resonance_the_force_makes_up_for_the_loss(sign):
-    """F = c Om a, at the size a of the free motion, a quarter of a period ahead of it."""
+    """At resonance the force amplitude is F = c Om a with the amplitude a of the free motion.
+
+    The force is a quarter of a period ahead of the displacement.
+    """
     states = SteadyStates(duffing(), 1.0, 0.3)
     line = over_amplitude(states, 1.5 / states.parameter.scale)
     a = np.sqrt(4 / 3 * (1.5**2 - 1))
     free = np.zeros((2, 10))
-    # The mass moves away from the one wall and towards the other.
+    # The two springs, to the left and to the right wall, have opposite elongations.
     free[:, 1] = [sign * a, -sign * a]
     xi = resonance(line, free)
     _, amplitude = line.drive(xi[-1])
@@ -270,7 +293,10 @@ def test_breathers_lead_to_the_isolated_curve_too(curves, tmp_path):
 
 @pytest.mark.parametrize("periods", [10, 40])
 def test_slow_sweeps_pass_near_steady_states(periods):
-    """The motion differs from a steady state by what the sweep moves in the time in which the motion settles."""
+    """The motion in a sweep of ``periods`` per step differs from the steady state by less than 1.5/``periods``.
+
+    The difference is what the steady state changes while the motion settles.
+    """
     case = duffing(isola_periods=periods, range=[0.5, 0.9])
     states = SteadyStates(case, 1.0, 0.3)
     places = places_of(states, 4)

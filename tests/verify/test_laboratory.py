@@ -1,4 +1,4 @@
-"""A laboratory's lattice by case-file keys alone: engines agree, energies are of the masses there are."""
+"""A laboratory's lattice that case-file keys describe: both engines agree, and energies use the actual masses."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ TWO_DRIVES = {"more": [{"amplitude": 1.0, "frequency": 1500.0, "cycles": 6, "cel
 
 
 def laboratory(**time) -> Case:
-    """24 damped cells that all differ, and three sites of which each has a law and stops of its own."""
+    """A case of 24 damped cells that all differ, and of three contact sites with laws and stops of their own."""
     # Each site loses energy, so that the restitutions of all three can be scattered up and down.
     each = DIFFERING | {"restitution": [0.6, 0.8, 0.9]}
 
@@ -40,7 +40,7 @@ def laboratory(**time) -> Case:
 
 @pytest.fixture(scope="module")
 def runs():
-    """The dataset and the result of its run by either engine."""
+    """The dataset and the result of the laboratory's run, by engine."""
     return {engine: simulated(laboratory(engine=engine)) for engine in ("ts", "propagator")}
 
 
@@ -69,7 +69,10 @@ def test_each_site_has_its_effective_restitution(runs):
 
 
 def test_kinetic_energies_are_of_the_masses_there_are(runs):
-    """Kinetic energies over cells and wavenumbers sum to the ledger's, which the masses of all cells alike miss."""
+    """Kinetic energies over cells, and over wavenumbers, sum to the ledger's if each cell has its own masses.
+
+    With the masses of the undisturbed cell the sum is wrong.
+    """
     run, _ = runs["propagator"]
     ledger = run["energy/kinetic"].values
     record = VelocityRecord(run, Case.of(run), AnalysisTable())
@@ -89,7 +92,7 @@ def test_kinetic_energies_are_of_the_masses_there_are(runs):
 
 
 def test_an_analysis_in_blocks_measures_the_same(runs):
-    """With little memory the analysis works in blocks; its energies too are of the masses there are."""
+    """An analysis in blocks, for want of memory, has the energies of one as a whole, each with the actual masses."""
     run, _ = runs["propagator"]
     ledger = run["energy/kinetic"].values
     whole = analyse(run, FULL, options=AnalysisTable(memory=1.0))
@@ -108,7 +111,7 @@ def test_a_site_is_of_the_masses_of_its_cell():
     masses = chain.variation.masses[list(chain.sites)]
     assert chain.reduced_masses() == pytest.approx(1 / (1 / masses[:, 1] + 1 / masses[:, 2]))
 
-    # Against ground the reduced mass is the mass itself.
+    # The reduced mass of a contact with the ground is the mass itself.
     joined = small_case(contacts={"sites": [4, 24], "pair": [0, 3], "clearance": 1e-4, "side": "plus"}).model().chain
     assert joined.pairs[0] == Pair(-1, 2)
     assert joined.reduced_masses() == [joined.cell.masses[2]] * 2
@@ -127,7 +130,7 @@ def test_an_absorbing_end_is_that_of_all_drives():
     in_a_gap = describe_ends(small_case(lattice=ends, drive={"frequency": 650.0, "cycles": 200}))
     assert "no wave reaches it at 650 rad/s" in in_a_gap
 
-    # An end that absorbs both bursts is another one than that for the first alone.
+    # The end chosen for two bursts differs from that for the first alone.
     one = small_case(lattice={"cells": 90, "absorbing": {}})
     second = {"amplitude": 30.0, "frequency": 1300.0, "cycles": 15, "cell": 2}
     both = small_case(lattice={"cells": 90, "absorbing": {}}, drive={"more": [second]})

@@ -1,4 +1,4 @@
-"""The flow of a lattice and its linearisation: linear theory, differences, the symplectic form."""
+"""The flow of a lattice and its linearisation, against linear theory, differences and the symplectic form."""
 
 from __future__ import annotations
 
@@ -24,19 +24,20 @@ from vipetsc.modes.problem import FlowError
 DOFS = 4
 PERIOD = 2 * np.pi / BREATHER_FREQUENCY
 STIFFNESS = {"hertz": four_band_contact("hertz").stiffness, "bilinear": 2e4}
-# Displacements and velocities of comparable energies: they differ by the frequency, about 1e3 rad/s.
+# Changes of 1e-3 m and 1 m/s have comparable energies at the lattice's frequencies of about 1e3 rad/s.
 UNITS = np.repeat([1e-3, 1.0], DOFS)[:, None]
 
 
 def lattice_flow(sites: tuple[int, ...], contact: Contact, ends: str = "fixed") -> LatticeFlow:
+    """The flow of a four-band lattice with stops on both sides at ``sites``, on one process."""
     stops = [Stops.both(contact, CLEARANCE)] * len(sites)
     return LatticeFlow(breather_chain(ends, sites), stops, MPI.COMM_SELF)
 
 
 def irregular_motion(sites: tuple[int, ...], w: float = 1.6e-3, speed: float = 1.0) -> np.ndarray:
-    """A state (2 dof, cell) of irregular small motion, in which the ``sites`` have w in m and w' in m/s.
+    """A state (2 dof, cell) of irregular small motion, with ``w`` in m and w' = ``speed`` in m/s at the ``sites``.
 
-    By default they are about to touch, at 1.8 mm.
+    By default the sites are about to touch, at 1.8 mm.
     """
     state = 1e-5 * np.random.default_rng(1).standard_normal((2 * DOFS, CELLS))
     state[DOFS:] *= 1e3
@@ -47,7 +48,7 @@ def irregular_motion(sites: tuple[int, ...], w: float = 1.6e-3, speed: float = 1
 
 
 class Linearised(NamedTuple):
-    """How the end of an arc moves with its start along a change: by the linearisation, and by differences."""
+    """The change (2 dof, cell) of an arc's end with its start, by the linearisation and by differences."""
 
     moved: np.ndarray
     difference: np.ndarray
@@ -104,7 +105,10 @@ CONTACTS = {
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 @pytest.mark.parametrize("kind", CONTACTS)
 def test_the_linearisation_agrees_with_differences(kind, law, sites):
-    """One site, and two sites of a cluster with one apart: the shift of the onset enters by the approach velocity."""
+    """The linearisation of the flow is its central difference, for one site and for a cluster of two with one apart.
+
+    The force of a dissipative contact depends on the approach velocity, and thereby on the shift of the onset.
+    """
     flow = lattice_flow(sites, Contact(law, STIFFNESS[law], **CONTACTS[kind]))
     start = irregular_motion(sites)
     assert flow.arc(start, PERIOD).episodes >= len(sites)
@@ -119,7 +123,7 @@ def test_the_linearisation_agrees_with_differences(kind, law, sites):
 
 @pytest.mark.parametrize("restitution", [1.0, 0.7])
 def test_the_linearisation_of_contacts_between_cells_and_with_ground_agrees_with_differences(restitution):
-    """On a ring there are two contacts of one cell, one of them with ground, and one across its joint."""
+    """The linearisation is the central difference for contacts in a cell, with the ground and across a ring's joint."""
     pairs = (Pair(-1, 2), Pair(0, 3), Pair(3, 0, next_cell=True))
     sites = (4, 4, CELLS - 1)
     chain = Chain(four_band("calibrated"), CELLS, "periodic", sites, (CLEARANCE,) * 3, pairs=pairs)
@@ -138,21 +142,21 @@ def test_the_linearisation_of_contacts_between_cells_and_with_ground_agrees_with
 
 
 def test_the_approach_velocity_enters_the_linearisation():
-    """Without its part, by the derivative of the force, the end would move by a thousandth less or more."""
+    """The force's derivative by the approach velocity changes the linearised end by more than a thousandth."""
     flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"], 0.7))
     arc = flow.arc(irregular_motion((5,)), PERIOD)
     change = np.random.default_rng(2).standard_normal((1, 2 * DOFS, CELLS)) * UNITS
     moved = arc.move(change)
 
     arc.engine._forces.clusters.tape.rows["onset"] = 0
-    # The matrices are computed from the tape anew.
+    # The engine computes its matrices again, from the changed tape.
     arc.engine._linearisation = None
     arc.engine._release()
     assert np.abs(arc.move(change) - moved).max() > 1e-3 * np.abs(moved).max()
 
 
 def test_substeps_of_a_pressed_contact_are_those_in_which_it_is_closed():
-    """A pressed site that opens has substeps in which nothing pushes: they belong to no contact."""
+    """The substeps of a pressed contact that opens are counted only where it is closed, and fill the closed time."""
     depth = 1e-5
     stops = Stops(Contact("hertz", STIFFNESS["hertz"]), -depth, np.inf)
     flow = LatticeFlow(breather_chain("fixed", (5,)), [stops], MPI.COMM_SELF)
@@ -161,7 +165,7 @@ def test_substeps_of_a_pressed_contact_are_those_in_which_it_is_closed():
 
     assert arc.episodes > 0
     assert 0.0 < arc.closed < 0.9 * arc.duration
-    # The other cluster is that of the drive, which has no site.
+    # The drive has a cluster of its own, without a site.
     substeps = [part for part in arc.engine.closed_substeps() if part.site.size]
     assert len(substeps) == 1
     assert (substeps[0].w > -depth).all()
@@ -169,7 +173,7 @@ def test_substeps_of_a_pressed_contact_are_those_in_which_it_is_closed():
 
 
 def test_an_orbit_without_a_tape_has_no_variations():
-    """Without a tape the contacts would be missing from the linearisation, and nothing would show it."""
+    """An engine without a tape refuses to move variations: they would silently lack the contacts."""
     flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
     engine = TangentPropagator(flow._model(PERIOD, 1), flow.layout, tape_rows=0)
     with pytest.raises(ValueError, match="tape_rows is 0"):
@@ -177,12 +181,15 @@ def test_an_orbit_without_a_tape_has_no_variations():
 
 
 def engine_of(flow: LatticeFlow) -> TangentPropagator:
-    """An engine for one orbit of a period, in one sample."""
+    """An engine that integrates one orbit over a period, as one sample."""
     return TangentPropagator(flow._model(PERIOD, 1), flow.layout)
 
 
 def test_an_engine_has_one_orbit_and_moves_variations_only_along_it():
-    """A second orbit would be moved along by the matrices of the first, and without an orbit nothing would move."""
+    """An engine runs one orbit, and moves variations only after it.
+
+    Variations along a second orbit would be moved by the matrices of the first.
+    """
     flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
     engine = engine_of(flow)
     start = irregular_motion((5,))
@@ -200,7 +207,7 @@ def test_an_engine_has_one_orbit_and_moves_variations_only_along_it():
     with pytest.raises(RuntimeError, match="place a state before"):
         engine.place(start, 1.0)
 
-    # Of several states that are placed the last one counts.
+    # The orbit begins with the state that was placed last.
     other = engine_of(flow)
     other.place(irregular_motion((5,), w=4e-3, speed=-2.0), 3.0)
     other.place(start, 1.0)
@@ -210,7 +217,10 @@ def test_an_engine_has_one_orbit_and_moves_variations_only_along_it():
 
 @pytest.mark.parametrize(("look", "sample"), [(None, 4), (list, 1)])
 def test_an_orbit_with_more_rows_than_its_tape_is_refused_and_moves_nothing(look, sample):
-    """The message has the rows up to the sample at which they are counted; the part of an orbit is none."""
+    """An orbit that needs more rows than its tape has is refused, with the rows needed up to the sample reached.
+
+    A part of an orbit moves no variations.
+    """
     flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
     engine = TangentPropagator(flow._model(PERIOD, 4), flow.layout, tape_rows=2)
     start = irregular_motion((5,))
@@ -232,7 +242,7 @@ def test_no_variations_are_moved_to_none():
 
 
 def test_cells_that_are_not_exchanged_are_no_state(monkeypatch):
-    """An error of PETSc at the beginning is raised, as one on the way is."""
+    """An error of PETSc in exchanging cells raises an exception when a state is placed."""
     flow = lattice_flow((5,), Contact("hertz", STIFFNESS["hertz"]))
     monkeypatch.setattr("vipetsc.dynamics.propagator.tangent.exchange", lambda *_: 77)
     with pytest.raises(RuntimeError, match="could not exchange cells: error 77"):
@@ -249,7 +259,10 @@ def test_an_orbit_has_at_least_one_sample(look):
 
 @pytest.mark.parametrize("law", ["hertz", "bilinear"])
 def test_the_conservative_flow_is_symplectic_and_conserves_the_energy(law):
-    """The arc starts within a contact, and goes through its end and the next one on the other side."""
+    """The conservative flow keeps the energy, and its linearisation P satisfies P^T J P = J in canonical variables.
+
+    The arc starts within a contact and passes the next one on the other side.
+    """
     contact = Contact(law, STIFFNESS[law])
     flow = lattice_flow((5,), contact)
     start = irregular_motion((5,), w=4e-3, speed=0.0)
@@ -266,7 +279,7 @@ def test_the_conservative_flow_is_symplectic_and_conserves_the_energy(law):
 
     assert energy(arc.end) == pytest.approx(energy(start), rel=1e-13)
 
-    # Momenta and displacements in one unit.
+    # Canonical variables in one unit: sqrt(m) Om u and sqrt(m) u'.
     n = CELLS * DOFS
     scale = np.append(np.sqrt(masses) * BREATHER_FREQUENCY, np.sqrt(masses))
     map_ = scale[:, None] * flow.gather(arc.move(flow.scatter(np.eye(2 * n)))).T / scale
@@ -282,7 +295,10 @@ def test_a_dissipative_contact_cannot_be_closed_at_the_start():
 
 @pytest.mark.parametrize("w", [0.0, -0.5e-5, -2e-5])
 def test_a_dissipative_contact_that_is_pressed_at_rest_is_refused_wherever_it_begins(w):
-    """At rest, a little apart and open: it has no approach velocity in any of these states."""
+    """A dissipative contact that is pressed at rest is refused at rest, partly unloaded and open.
+
+    It has no approach velocity in any of these states.
+    """
     stops = Stops(Contact("hertz", STIFFNESS["hertz"], 0.7), -1e-5, np.inf)
     flow = LatticeFlow(breather_chain("fixed", (5,)), [stops], MPI.COMM_SELF)
     with pytest.raises(FlowError, match="pressed at rest dissipate"):
@@ -291,7 +307,10 @@ def test_a_dissipative_contact_that_is_pressed_at_rest_is_refused_wherever_it_be
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_dissipative_contact_is_closed_on_the_side_of_its_displacement(side):
-    """A little beyond its stop on that side it is closed, a little before it open; the other stop is elsewhere."""
+    """A dissipative contact is closed just beyond the stop on the side of w and open just before that stop.
+
+    The stop on the other side has another clearance.
+    """
     clearance = {1: CLEARANCE, -1: 1.5 * CLEARANCE}
     stops = Stops(Contact("hertz", STIFFNESS["hertz"], 0.7), plus=clearance[1], minus=clearance[-1])
     flow = LatticeFlow(breather_chain("fixed", (5,)), [stops], MPI.COMM_SELF)

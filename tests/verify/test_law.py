@@ -1,4 +1,4 @@
-"""The scattering law of one site: waves by band and direction, fractions that sum to one, what does not change them."""
+"""The scattering law of one contact site: waves by band and direction, and fractions of energy that sum to one."""
 
 from __future__ import annotations
 
@@ -28,16 +28,19 @@ from vipetsc.studies.scattering_law import POINT_LAYOUT, ScatteringLaw, Scatteri
 
 
 def fractions(runs: ScatteringRuns, *points: float) -> np.ndarray:
-    """Fractions (point, ...) of single runs: band and direction, then dissipated and contact."""
+    """Fractions of the energy (point, fraction) in single runs with z at ``points``.
+
+    A row has the fractions by band and direction, then the dissipated one and that left in the contact.
+    """
     runs.make([*points])
+    # A point has one outcome, without the jitter of the clearance.
     runs.jittered = lambda z: [z]
-    # One outcome a point, without the jitter of the clearance.
     rows = [runs.outcomes(z)[0] for z in points]
     return np.array([[*row["share"].ravel(), row["dissipated"], row["contact"]] for row in rows])
 
 
 def make_runs(folder: Path, case: LawCase) -> ScatteringRuns:
-    """The runs of a law on this rank, none of which has been simulated."""
+    """The runs of the law ``case`` on this rank, before any has been simulated."""
     folder.mkdir(exist_ok=True)
     return ScatteringRuns(case, folder, MPI.COMM_SELF, StopRequest())
 
@@ -45,9 +48,9 @@ def make_runs(folder: Path, case: LawCase) -> ScatteringRuns:
 @pytest.mark.parametrize("cell", [law_case(name).lattice.unit_cell() for name in LATTICES], ids=[*LATTICES])
 @pytest.mark.parametrize("cells", [24, 25])
 def test_wave_energies_sum_to_the_lattices_and_go_where_the_wave_goes(cell, cells):
-    """Energies of Bloch waves sum to the ring's energy; a single wave's goes with its group velocity."""
+    """Energies of Bloch waves sum to the ring's energy, and a single wave has the direction of its group velocity."""
     rng = np.random.default_rng(1)
-    # Any state: the sum holds for all of them.
+    # The sum holds for any state.
     u, v = rng.normal(size=(2, cells, cell.dofs))
     chain = Chain(cell, cells, "periodic")
     whole = 0.5 * (chain.masses() @ v.ravel() ** 2 + u.ravel() @ chain.stiffness_matrix() @ u.ravel())
@@ -57,11 +60,11 @@ def test_wave_energies_sum_to_the_lattices_and_go_where_the_wave_goes(cell, cell
     assert by_direction(energy, speed).sum() == pytest.approx(whole, rel=1e-12)
 
     number = np.arange(cells)
-    # A wavenumber that fits on the ring, in both directions.
+    # Waves of a wavenumber that fits on the ring travel in either direction.
     for kappa in (2 * np.pi * 5 / cells, -2 * np.pi * 5 / cells):
         point = bloch(cell, kappa)
         wave = np.exp(1j * kappa * number)[:, None] * point.vectors[:, 1]
-        # Displacement and velocity of one travelling wave, rather than of a standing one.
+        # Displacement and this velocity make a travelling wave, whereas a standing one would go in both directions.
         rate = -1j * point.frequency[1] * wave
 
         single = by_direction(*wave_energies(cell, wave.real, rate.real))
@@ -83,7 +86,7 @@ def test_speeds_of_a_packet_are_those_of_its_frequency():
     cell = four_band("calibrated")
     ((number, _, speed),) = waves_at(cell, 900.0)
 
-    # A long burst holds few frequencies, and so few speeds.
+    # A long burst has a narrow spectrum, and therefore a narrow range of speeds.
     band, slow, fast = packet_speeds(cell, ToneBurst(1.0, 900.0, 2000), 0)
     assert band == number - 1
     assert slow < speed < fast
@@ -93,7 +96,7 @@ def test_speeds_of_a_packet_are_those_of_its_frequency():
 
 
 def test_the_largest_value_between_samples():
-    """Values and rates of half a radian's spacing give the peak of a sine to the fourth order in it."""
+    """Values and rates at a spacing of half a radian give the peak of a sine with an error of fourth order in it."""
     t = np.linspace(0, 1, 41)
 
     assert largest_between(t, np.sin(20 * t), 20 * np.cos(20 * t)) == pytest.approx(1, abs=2e-5)
@@ -105,7 +108,7 @@ def test_fractions_sum_to_one_and_nothing_happens_below_the_onset(lattice, tmp_p
     transmitted = 2 * runs.setting.band
     reflected = transmitted + 1
 
-    # Below the onset, above it, and where the site is nearly closed.
+    # The points lie below the onset of contact, above it, and where the site is nearly closed.
     quiet, met, hard = fractions(runs, 0.999, 1.3, 6.0)
 
     alone = np.zeros_like(quiet)
@@ -129,7 +132,7 @@ def test_a_lossy_site_dissipates_what_is_missing(tmp_path):
 
 
 def test_the_bilinear_law_depends_on_amplitude_over_clearance_alone(tmp_path):
-    # Thirty times apart: with Hertz's law the fractions would differ.
+    # With Hertz's law the fractions would differ between clearances of which one is thirty times the other.
     near = law_case(contacts={"law": "bilinear", "clearance": 1e-3})
     far = law_case(contacts={"law": "bilinear", "clearance": 3e-2})
 
@@ -143,15 +146,15 @@ def test_longer_distances_do_not_change_the_fractions(tmp_path):
     contacts = {"restitution": 0.7}
     short = make_runs(tmp_path / "short", law_case(law=COARSE | {"settle": 2.0}, contacts=contacts))
     long = make_runs(tmp_path / "long", law_case(law=COARSE | {"settle": 4.0}, contacts=contacts))
-    # Otherwise the longer wait would have no longer ring.
+    # The longer wait needs a longer ring.
     assert long.setting.cells > 1.5 * short.setting.cells
 
-    # What had not passed after the shorter distance is 4e-5.
+    # A fraction of 4e-5 has not passed by the end of the shorter wait.
     np.testing.assert_allclose(fractions(short, 1.2, 2.0), fractions(long, 1.2, 2.0), atol=1e-4)
 
 
 def test_a_site_below_the_drive_is_met_forward(tmp_path):
-    """Driven from either end the law is the same: the four-band cell is its own mirror image."""
+    """The law is the same for a drive at either end, since the four-band cell is its own mirror image."""
     contacts = {"restitution": 0.5, "sites": []}
     below = law_case(drive={"cell": 1, "mass": 1}, contacts=contacts)
     above = law_case(drive={"cell": 300, "mass": 4}, contacts=contacts)
@@ -163,7 +166,7 @@ def test_a_site_below_the_drive_is_met_forward(tmp_path):
 
 
 def test_a_wave_sent_by_a_moved_wall_has_the_same_law(tmp_path):
-    """The fractions are those of a force; the wall's amplitude at the onset is that of the first contact of a run."""
+    """A moved wall has the fractions of a force, and its amplitude at the onset is where a run first has contact."""
     wall = law_case(drive={"end": "left"}, law=COARSE | {"distance": 20})
     mass = wall.model().drive_mass + 1
     force = law_case(drive={"cell": 1, "mass": mass}, law=COARSE | {"distance": 20})
@@ -171,7 +174,7 @@ def test_a_wave_sent_by_a_moved_wall_has_the_same_law(tmp_path):
     moved = fractions(runs, 1.3)
     np.testing.assert_array_equal(moved, fractions(make_runs(tmp_path / "force", force), 1.3))
 
-    del runs.jittered  # what ``fractions`` put in its place
+    del runs.jittered  # restores the method that ``fractions`` replaced
     data = runs.dataset({1.0: np.nan, 1.3: np.nan})
     assert data["amplitude"].attrs["units"] == "m"
     onset = float(data["amplitude"][0])
@@ -185,7 +188,7 @@ def test_a_wave_sent_by_a_moved_wall_has_the_same_law(tmp_path):
 
 @pytest.fixture(scope="module")
 def refined(tmp_path_factory):
-    """The case, the law and the folder of a law refined to one per cent at its onset."""
+    """The case, the result and the folder of a law whose points are refined to one per cent at its onset."""
     folder = tmp_path_factory.mktemp("law")
     case = law_case(law=COARSE | {"finest": 0.01, "tolerance": 0.1, "samples": 2})
     return case, make_law(case, folder, MPI.COMM_SELF), folder
@@ -198,7 +201,7 @@ def test_a_law_is_refined_to_its_onset(refined):
 
     drops = np.flatnonzero((transmitted[:-1] > 0.9) & (transmitted[1:] <= 0.9))
     assert len(drops)
-    # Two steps of the finest distance: the jump may lie next to a coarser step.
+    # Two of the finest steps are allowed, since the jump may lie next to a coarser step.
     assert (law.z[drops + 1] / law.z[drops] < 1.01**2).all()
     assert law.at(0.5).transmitted == law.at(1.0).transmitted == 1
     assert law.at(0.5).upper == 0
@@ -210,13 +213,13 @@ def test_a_law_is_refined_to_its_onset(refined):
 
 
 def number_of_records(path: Path) -> int:
-    """How many whole lines a file of records has."""
+    """The number of complete lines in a file of records."""
     return sum(1 for _ in read_records(path, lambda text: None))
 
 
 @pytest.mark.slow
 def test_a_law_that_was_cut_off_goes_on_to_the_same_bits(refined, tmp_path):
-    """Its last runs are missing, and of one of them only the beginning of its line was written."""
+    """A law whose last runs are missing, with one line cut off in the middle, is completed to the same bits."""
     case, _, folder = refined
     lines = (folder / "law-runs.jsonl").read_bytes().splitlines(keepends=True)
     records = tmp_path / "law-runs.jsonl"
@@ -239,7 +242,7 @@ def law_by_hand() -> ScatteringLaw:
     share[:, 1, 0] = transmitted
     share[:, 2] = upper[:, None] / 2
 
-    # Without contact there are no times.
+    # The point without contact has no times of contact.
     times = np.array([np.nan, 0.1, 0.1, 0.1, 0.1])
     mean = ScatteringOutcome(
         share=share,
@@ -260,7 +263,7 @@ def test_between_points_the_law_is_linear_in_log_z():
     law = law_by_hand()
     assert set(ScatteringOutcome._fields) == set(POINT_LAYOUT)
 
-    # A point between two, one on a point, one below and one above all of them.
+    # The values asked for lie between two points, on a point, below all points and above all points.
     middle = law.at([[np.sqrt(1.2 * 1.5), 1.02], [0.1, 9.0]])
     np.testing.assert_allclose(middle.upper, [[0.12, 0.08], [0, 0.01]], atol=1e-15)
     assert middle.share.shape == (2, 2, 3, 2)
@@ -275,11 +278,11 @@ def test_matched_clearances_meet_each_site_at_the_best_z():
     """D_k = A env(s_k) sqrt(T^k)/z* (SPEC section 13), where z* has the largest U/(1 - T)."""
     law = law_by_hand()
     z, transmitted = law.matched()
-    # U/(1 - T) is 0.5 there and 0.4 at the onset.
+    # U/(1 - T) is 0.15/0.3 = 0.5 at z = 1.2, and 0.08/0.2 = 0.4 next to the onset.
     assert z == 1.2
     assert transmitted == 0.7
 
-    # An amplitude that differs from site to site.
+    # The envelope differs from site to site.
     linear = SimpleNamespace(envelope=np.linspace(1e-4, 2e-4, 50))
     clearances = matched_clearances(law, linear, [10, 20, 30], -20.0)
     left = np.sqrt(transmitted ** np.arange(3))
@@ -343,7 +346,7 @@ def test_a_case_without_sites_gives_the_clearance_and_the_bursts_length(tmp_path
 
 @pytest.mark.slow
 def test_matched_sites_outdo_the_papers(tmp_path):
-    """Ten matched sites with r = 0.9 send more than 0.45 of the work at 24.33 N to upper bands, the paper's 0.34."""
+    """Ten matched sites, r = 0.9, send more than 0.45 of the work at 24.33 N to upper bands; the paper's send 0.34."""
     amplitude = 24.33
     contacts = {"restitution": 0.9, "sites": 10}
     table = {"contacts": contacts, "law": {"largest": 1.4, "samples": 1, "tolerance": 0.05, "finest": 0.02}}
@@ -356,7 +359,7 @@ def test_matched_sites_outdo_the_papers(tmp_path):
     clearance = matched_clearances(law, linear, sites, amplitude)
 
     contacts |= {"sites": sites.tolist(), "clearance": clearance.tolist()}
-    # Of the fields only the last sample is used.
+    # Only the last sample of the fields is used.
     run = run_of(Case.from_table({"contacts": contacts, "time": {"engine": "propagator"}, "output": {"stride": 4420}}))
     model = Case.of(run).model()
     u = run["displacement"].values[-1]

@@ -25,13 +25,13 @@ def damped_case(damping: dict[str, float], **law: Any) -> LawCase:
     """The small law with dashpots and a lossy contact."""
     table = law_case(contacts={"restitution": 0.7}, law=COARSE | law).model_dump(by_alias=True, exclude_none=True)
     table["lattice"]["damping"] = damping
-    # What was resolved without dashpots is resolved anew.
+    # The distance was resolved without dashpots, and is left to be resolved again with them.
     del table["law"]["distance"]
     return LawCase.from_table(table)
 
 
 def make_runs(folder: Path, case: LawCase) -> ScatteringRuns:
-    """The runs of a law on this rank, none of which has been simulated."""
+    """The runs of the law ``case`` on this rank, before any has been simulated."""
     folder.mkdir(exist_ok=True)
     return ScatteringRuns(case, folder, MPI.COMM_SELF, StopRequest())
 
@@ -39,7 +39,7 @@ def make_runs(folder: Path, case: LawCase) -> ScatteringRuns:
 def fractions(runs: ScatteringRuns, z: float) -> dict[str, float]:
     """The fractions of a single run by name."""
     runs.make([z])
-    # A point is else the mean of several runs, whose scatter would hide what is compared.
+    # A point would otherwise be the mean of several runs, whose scatter exceeds the differences that are compared.
     runs.jittered = lambda point: [point]
     mean, _ = runs.outcomes(z)
     return {name: float(mean[name]) for name in FRACTIONS}
@@ -52,7 +52,7 @@ def undamped(tmp_path_factory) -> dict[str, float]:
 
 
 def test_without_damping_the_fluxes_are_the_waves_at_the_end(undamped, tmp_path):
-    """Dashpots that take 3e-8 of the wave: the energies that pass the site are those found in all cells at the end."""
+    """With dashpots that take 3e-8 of the wave, fluxes past the site are the energies in all cells at the end."""
     runs = make_runs(tmp_path, damped_case({"mass": 1e-6}))
     assert runs.records[LINEAR]["taken_before"] < 1e-7
 
@@ -64,7 +64,7 @@ def test_without_damping_the_fluxes_are_the_waves_at_the_end(undamped, tmp_path)
 
 @pytest.mark.slow
 def test_the_law_tends_to_the_undamped_one_as_dashpots_become_weaker(undamped, tmp_path):
-    """A quarter of the damping: less than half of the difference, and of what dashpots take at the site."""
+    """With a quarter of the damping, fractions differ less than half as much from those without damping."""
     strong, weak = (fractions(make_runs(tmp_path / str(c), damped_case({"mass": c})), 1.3) for c in (2.0, 0.5))
 
     assert strong["dashpots"] > 0.005
@@ -74,25 +74,26 @@ def test_the_law_tends_to_the_undamped_one_as_dashpots_become_weaker(undamped, t
 
 
 def test_the_wave_decays_over_the_distance_as_by_dashpots_to_ground(tmp_path):
-    """Dashpots of c m on every mass m take exp(-c t) of the energy: t is the distance over the group velocity."""
+    """Dashpots of c m on every mass m leave exp(-c t) of the energy after t, the distance over the group velocity."""
     runs = make_runs(tmp_path, damped_case({"mass": 2.0}))
     waves = runs.site_waves
     distance = runs.setting.distance
     band = runs.setting.band
-    # Each wavenumber of the packet has its own speed, and so its own loss.
+    # Each wavenumber of the packet has its own speed and therefore its own loss.
     sent = waves.weight[:, band] * waves.flux[0, :, band] * np.abs(waves.leaving_drive[:, band]) ** 2
     expected = sent @ np.exp(-2.0 * distance / waves.speed[:, band]) / sent.sum()
 
     assert 1 - waves.taken_before() == pytest.approx(expected, rel=2e-4)
-    # Otherwise a decay that is left out would hardly be seen.
+    # The decay is large enough for the comparison to fail without it.
     assert expected < 0.95
 
 
 @pytest.mark.slow
 def test_the_power_through_springs_is_that_of_the_waves(tmp_path):
-    """Of a run with contacts: through springs three cells from the site, forward and backward, with the waves' decay.
+    """The energy through a spring three cells from the site is that of the waves, with their decay over three cells.
 
-    Backward it is what arrives less what is reflected: three cells away the waves interfere little.
+    Behind the site it is the transmitted energy; before the site it is the arriving energy less the reflected one, as
+    the two waves interfere little.
     """
     away = 3
     runs = make_runs(tmp_path, damped_case({"stiffness": 5e-6}, settle=3.0))
@@ -113,12 +114,12 @@ def test_the_power_through_springs_is_that_of_the_waves(tmp_path):
         i = int(np.flatnonzero(run["cell"].values == cell)[0])
         motion = [run[name].values for name in ("displacement", "velocity")]
         (u, v), (next_u, next_v) = ([f[:, i, spring.start] for f in motion], [f[:, i + 1, spring.end] for f in motion])
-        # The dashpot of the spring carries power, too.
+        # The dashpot parallel to the spring transmits power as well.
         pull = spring.stiffness * (u - next_u) + spring.damping * (v - next_v)
         return float((pull * (v + next_v) / 2).sum() * setting.interval / amplitude**2)
 
     def carried(direction: int, spectrum: np.ndarray, cells: float) -> float:
-        """Energy in J of waves with a ``spectrum`` at the site, so many ``cells`` from it in their direction."""
+        """Energy in J of waves with a ``spectrum`` at the site, after ``cells`` cells in their direction."""
         there = spectrum * waves.factor[direction] ** cells
         return float((waves.weight * waves.flux[direction] * np.abs(there) ** 2).sum())
 
@@ -127,14 +128,14 @@ def test_the_power_through_springs_is_that_of_the_waves(tmp_path):
     returning = carried(BACKWARD, amplitudes[1], away + 0.5)
     coming = carried(FORWARD, waves.arriving, -away - 0.5)
     assert through(site - away - 1) == pytest.approx(coming - returning, abs=2e-3 * runs.arrived)
-    # Enough comes back for its flux to be tested.
+    # The reflected energy is large enough for its flux to be tested.
     assert returning > 0.05 * runs.arrived
 
 
 def test_the_spectrum_at_any_frequency_is_the_transform():
-    """At the frequencies of a fast transform, and between them."""
+    """The spectrum is the fast transform at its frequencies, and the sum that defines it between them."""
     rng = np.random.default_rng(3)
-    # An odd length, for which the transform has no bin at half of the sampling rate.
+    # The fast transform of an odd number of samples has no frequency at half the sampling rate.
     signal = rng.normal(size=77)
     step = 1e-3
     at_bins = 2 * np.pi * np.fft.rfftfreq(77, step)

@@ -1,4 +1,4 @@
-"""Damped rigs of 100 cells: their frequency response takes a tenth of a second a state."""
+"""Damped rigs of 100 cells, whose frequency response takes a tenth of a second of CPU time for each state."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.parallel(1)
 
 
 def rig(sites: list[int], **nfrc: Any) -> NfrcCase:
-    """100 masses between walls, of which the left one shakes, with stops on one side."""
+    """The case of 100 masses between walls, of which the left one shakes, with stops on one side at ``sites``."""
     options = {"range": [1.2, 1.6], "fixed": [0.2], "harmonics": 41} | nfrc
     return NfrcCase.from_table(
         TWO_MASSES
@@ -31,7 +31,7 @@ def rig(sites: list[int], **nfrc: Any) -> NfrcCase:
 
 
 def test_two_hundred_states_would_take_less_than_twenty_seconds(tmp_path):
-    """Of CPU time, with stability: 20 states in 2 s."""
+    """Twenty states with their stability take less than 2 s of CPU time, a tenth of the bound for two hundred."""
     case = rig([3], points=20)
     first_state(SteadyStates(rig([3], harmonics=3), 1.0, 0.2))  # kernels are compiled or read
     begin = time.process_time()
@@ -42,7 +42,7 @@ def test_two_hundred_states_would_take_less_than_twenty_seconds(tmp_path):
 
 
 def test_stops_that_are_not_touched_do_not_count(monkeypatch):
-    """Hill's determinant of five stops, of which the motion meets those next to the wall, is that of those alone."""
+    """Hill's determinant with five stops is that of the stops that the motion meets, those next to the wall."""
     states = SteadyStates(rig([2, 4, 50, 70, 90], harmonics=9), 1.0, 0.2)
     xi = first_state(states).xi
     series = states.balance.series(xi[:-1] * states.clearance, 1.2)

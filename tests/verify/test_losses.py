@@ -33,7 +33,7 @@ RESTITUTION = 0.998
 
 
 def lossy_case(**nnm: Any) -> NnmCase:
-    """The lattice that differs everywhere, with Rayleigh damping and contacts that dissipate a little."""
+    """The lattice whose cells all differ, with Rayleigh damping and slightly lossy contacts; ``nnm`` updates [nnm]."""
     each = TABLE["contacts"]["each"] | {"restitution": [RESTITUTION] * 3}
     changes = {
         "lattice": TABLE["lattice"] | {"damping": {"mass": OF_MASS, "stiffness": OF_STIFFNESS}},
@@ -45,7 +45,7 @@ def lossy_case(**nnm: Any) -> NnmCase:
 
 @pytest.fixture(scope="module")
 def shot(tmp_path_factory):
-    """A branch with losses as the verb follows it, and the folder of its file."""
+    """A branch with losses, followed by shooting, and the folder of its files."""
     folder = tmp_path_factory.mktemp("lossy")
     (branch,) = follow_all(lossy_case(points=60, largest_step=0.3, start_energy=2e-4), folder, MPI.COMM_SELF)
     return branch, folder
@@ -58,12 +58,12 @@ def test_a_linear_mode_has_its_damping_ratio(shot):
     omega = 2 * np.pi * first.frequency
     assert first.episodes == 0
     assert first.damping_ratio == pytest.approx((OF_MASS / omega + OF_STIFFNESS * omega) / 2, rel=1e-11)
-    # In contact the mode is another one, and contacts take their part.
+    # In contact the mode has another shape, and the contacts add to the loss.
     assert branch.regular()[-1].damping_ratio > 1.1 * first.damping_ratio
 
 
 def test_losses_are_in_the_files_of_a_branch(shot):
-    """The file and the table have loss, damping ratio and force, and give the points back."""
+    """A branch's file gives back loss and force of every point, and its table has columns for them."""
     branch, folder = shot
     stored = read_branch(folder / "branch-mode-4.h5")
     assert [(p.loss, p.force) for p in stored.points] == [(p.loss, p.force) for p in branch.points]
@@ -71,11 +71,11 @@ def test_losses_are_in_the_files_of_a_branch(shot):
 
 
 def test_free_decay_takes_the_loss(shot):
-    """Integrated by SciPy with its dashpots and restitutions, an orbit loses the energy that the branch says."""
+    """A free motion that SciPy integrates with dashpots and restitutions loses the branch's loss over one period."""
     branch, _ = shot
     shooting = ShootingMethod(lossy_case(), MPI.COMM_SELF).shooting
     lattice = independent_lattice()
-    # The independent lattice gets the losses that the branch's conservative motion has not.
+    # The branch's motion is conservative; the independent lattice gets the dashpots and restitutions.
     damped = replace(
         lattice,
         damping=OF_MASS * np.diag(lattice.masses) + OF_STIFFNESS * lattice.stiffness,
@@ -90,7 +90,7 @@ def test_free_decay_takes_the_loss(shot):
 
     lost = point.energy - shooting.system.energy(motion[0, -1], motion[1, -1])
     assert impacts >= 3
-    # First order in the loss, which is a small part of the energy.
+    # The branch's loss is of first order: it holds where the loss is a small part of the energy.
     assert point.loss < 1e-2 * point.energy
     assert lost == pytest.approx(point.loss, rel=1e-2)
 
@@ -110,7 +110,7 @@ CHAIN: dict[str, Any] = {
     ],
 )
 def test_lattices_without_matrices_lose_what_orbits_lose(law, stiffness, stops, omega):
-    """Dashpots and contacts of a breather by the propagator's steps, and by the flow with dense matrices."""
+    """A breather's losses in dashpots and contacts are the same by the propagator and by a flow with dense matrices."""
     contacts = {"law": law, "stiffness": stiffness, "sites": [7, 9], "clearance": [1e-4, 1.3e-4]} | stops
     nnm = {"system": "chain", "tolerance": 1e-12, "forced": [6, 1]}
 
@@ -124,22 +124,22 @@ def test_lattices_without_matrices_lose_what_orbits_lose(law, stiffness, stops, 
     point = method.assess(method.lattice, breather)
     dense = ShootingMethod(case("dense"), MPI.COMM_SELF)
     expected = with_loss(dense.shooting, dense.dissipation, breather)
-    # Without dashpots, for the fraction of the loss that is the contacts'.
+    # The loss without dashpots is that in the contacts.
     by_contacts = with_loss(dense.shooting, dense.dissipation._replace(damping=csr_matrix((28, 28))), breather)
 
-    # Both must count: a branch that loses one of them would pass otherwise.
+    # Both losses must matter: otherwise the comparison would hold with one of them left out.
     assert 0.1 < by_contacts.loss / expected.loss < 0.95
     assert point.loss == pytest.approx(expected.loss, rel=2e-7)
     assert point.force == pytest.approx(expected.force, rel=2e-7)
 
-    # Three periods as one: a site touches several times in the arc.
+    # Three periods are taken as one, so that a site touches several times in the arc.
     thrice = replace(breather, period=3 * breather.period)
     expected = with_loss(dense.shooting, dense.dissipation, thrice)
     assert method.assess(method.lattice, thrice).loss == pytest.approx(expected.loss, rel=2e-7)
 
 
 def test_a_linear_mode_of_a_lattice_without_matrices_has_its_damping_ratio():
-    """The loss of a harmonic motion is that of Rayleigh damping, and the force acts on its amplitude."""
+    """A harmonic motion has the damping ratio of Rayleigh damping, and a force F = loss/(pi a) at the amplitude a."""
     nnm = {"system": "chain", "shooting": "krylov", "modes": [5], "forced": [4, 2], "start_energy": 1e-9}
     contacts = {"law": "hertz", "stiffness": 1e7, "sites": [7], "clearance": 1e-3}
     method = LatticeMethod(NnmCase.from_table(CHAIN | {"contacts": contacts, "nnm": nnm}), MPI.COMM_SELF)
@@ -154,7 +154,7 @@ def test_a_linear_mode_of_a_lattice_without_matrices_has_its_damping_ratio():
 
 @pytest.mark.slow
 def test_condensed_motions_lose_what_orbits_lose(shot):
-    """Harmonics of all masses and of the contact forces give the loss and the force of the orbit of that energy."""
+    """A condensed motion, given by harmonics, has the loss and the force of the orbit that shooting finds."""
     branch, _ = shot
     method = CondensedMethod(
         lossy_case(method="condensed", points=12, truncation=1e-6, largest_step=0.2, start_energy=2.1e-4), MPI.COMM_SELF
@@ -166,7 +166,7 @@ def test_condensed_motions_lose_what_orbits_lose(shot):
     regular = [p for p in branch.regular() if p.episodes]
     energies = np.array([p.energy for p in regular])
     near = regular[int(np.abs(energies - point.energy).argmin())]
-    # The nearest orbit has another energy: ratios change more slowly than the losses themselves.
+    # The nearest orbit has a slightly different energy. Ratios, which vary little along the branch, are compared.
     assert point.damping_ratio == pytest.approx(near.damping_ratio, rel=5e-3)
     assert point.force / point.loss * np.sqrt(point.energy) == pytest.approx(
         near.force / near.loss * np.sqrt(near.energy), rel=1e-2
@@ -174,7 +174,7 @@ def test_condensed_motions_lose_what_orbits_lose(shot):
 
 
 def test_harmonics_of_all_orders_count_in_the_loss():
-    """Far in contact, dashpots between the masses take from the harmonics what they take along the shot orbit."""
+    """At large indentation the loss in dashpots between masses, by harmonics of all orders, is that along an orbit."""
     lattice = TWO_MASSES["lattice"] | {"damping": {"stiffness": 0.01}}
     nnm = {"system": "chain", "method": "condensed", "modes": [1], "forced": [2, 1], "truncation": 1e-5}
     nnm |= {"points": 60, "largest_step": 0.3, "first_step": 0.1, "tolerance": 1e-11, "start_energy": 0.9}
@@ -198,7 +198,7 @@ def test_harmonics_of_all_orders_count_in_the_loss():
 
 @pytest.mark.parametrize("method", ["shooting", "condensed"])
 def test_dashpots_of_a_system_of_ones_own_take_what_those_of_a_lattice_take(method):
-    """The two masses as a lattice with damping and as masses with dashpots: one branch, one loss, one force."""
+    """A lattice with damping and a system of the same masses and dashpots have the same branch, losses and forces."""
     nnm = {"method": method, "modes": [1], "points": 14, "largest_step": 0.3, "first_step": 0.1, "start_energy": 0.7}
     nnm |= {"tolerance": 1e-11, "truncation": 1e-5}
     contacts = TWO_MASSES["contacts"]
@@ -228,7 +228,7 @@ def test_dashpots_of_a_system_of_ones_own_take_what_those_of_a_lattice_take(meth
 @pytest.mark.slow
 @pytest.mark.parametrize("damping", [0.02, 0.005])
 def test_the_force_holds_a_steady_state_in_quadrature(damping):
-    """A forced state a quarter of a period behind its force, near the free motion, needs the force of the branch."""
+    """The force that holds a steady state a quarter of a period behind it, near the free motion, is the branch's."""
     lattice = TWO_MASSES["lattice"] | {"damping": {"mass": damping}}
     nnm = {"system": "chain", "method": "condensed", "modes": [1], "forced": [2, 1], "truncation": 1e-5}
     nnm |= {"points": 14, "largest_step": 0.2, "first_step": 0.05, "tolerance": 1e-11, "harmonics": 63}
@@ -244,8 +244,8 @@ def test_the_force_holds_a_steady_state_in_quadrature(damping):
     nfrc = {"source": "force", "over": "amplitude", "range": [1e-3, 1.0], "harmonics": 63}
     forced = NfrcCase.from_table(TWO_MASSES | {"lattice": lattice, "drive": drive, "nfrc": nfrc})
     states = SteadyStates(forced, 1.0, 2 * np.pi / motion.period)
-    # From the free motion as guess, at its frequency.
+    # The free motion is the guess, at its own frequency.
     xi = resonance(states, method.motions.balance(motion.order).unpack(motion.x))
 
-    # The branch's force is of first order in the damping: the error falls with it.
+    # The branch's force is of first order in the damping, so that its error is proportional to the damping.
     assert xi[-1] * states.parameter.scale == pytest.approx(motion.force, rel=damping)

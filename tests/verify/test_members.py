@@ -1,4 +1,4 @@
-"""Members of a sweep are scaled where nothing touches, and simulated where something may."""
+"""Members of a sweep are scaled from a linear run where no contact can close, and simulated otherwise."""
 
 import json
 import os
@@ -32,10 +32,13 @@ TABLE = {
 
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory):
-    """Amplitudes at which the linear wave reaches 0.6, 0.85, 1.02, 1.1, 1.25 and 3 times the nearest clearance."""
+    """The margins (6,), the ensemble and the folder of a sweep over amplitudes.
+
+    At these amplitudes the linear wave reaches 0.6, 0.85, 1.02, 1.1, 1.25 and 3 times the clearance.
+    """
     folder = tmp_path_factory.mktemp("members")
 
-    # How near the wave of 1 N comes is measured by the run that the sweep itself makes.
+    # The linear run that the sweep itself makes measures which part of the clearance the wave of 1 N reaches.
     case = Case.from_table(TABLE | {"drive": TABLE["drive"] | {"amplitude": 1.0}})
     plan = Sweep.from_table(TABLE | {"sweep": {"drive": {"amplitude": [1.0]}}})
     runs = SweepRuns(plan, folder, MPI.COMM_SELF, StopRequest())
@@ -53,7 +56,7 @@ def test_a_member_is_simulated_unless_its_wave_stays_well_inside_the_clearance(s
     margins, ensemble, _ = sweep
     assert ensemble["status"].values.tolist() == np.where(margins < 0.9, SCALED, COMPLETE).tolist()
 
-    # The wave that reaches a clearance touches it: scaling such a member would lose its contacts.
+    # A wave that reaches the clearance has contacts, which scaling would lose.
     touching = margins > 1.05
     assert (ensemble["contact_episodes"].values[touching] > 0).all()
     assert (ensemble["contact_episodes"].values[margins < 1] == 0).all()
@@ -74,7 +77,7 @@ def test_energies_of_scaled_members_go_with_the_square_of_the_amplitude(sweep):
 @pytest.mark.slow
 def test_what_is_kept_does_not_change_what_is_measured(sweep, tmp_path):
     _, ensemble, _ = sweep
-    # Amplitudes that a coarse linear wave might take for quiet.
+    # A linear wave recorded coarsely might seem to stay inside the clearance at these amplitudes.
     amplitudes = ensemble["amplitude"].values[2:5].tolist()
     table = TABLE | {"sweep": {"drive": {"amplitude": amplitudes}}, "output": {"stride": 10, "every": 2}}
     assert run_sweep(Sweep.from_table(table), tmp_path / "thin").complete
@@ -92,11 +95,11 @@ def test_damaged_records_are_named_and_simulated_again(sweep, tmp_path):
     plan = Sweep.load(out / "case.toml")
     lines = (out / "members.jsonl").read_bytes().splitlines(keepends=True)
 
-    # The linear run, then the members.
+    # The first line is the linear run, the others are the members.
     assert len(lines) == 7
     assert b'"linear"' in lines[0][:10]
 
-    # Without the linear run the two members that are scaled from it are simulated too.
+    # Without the record of the linear run, the two members that are scaled from it are computed again.
     for number, missing in ((0, 2), (2, 1), (6, 1)):
         damaged = lines.copy()
         damaged[number] = lines[number].replace(b"2", b"3", 1)
@@ -126,7 +129,10 @@ def test_damaged_records_are_named_and_simulated_again(sweep, tmp_path):
 
 @pytest.mark.slow
 def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
-    """The run keeps what the case asks for, the analysis is that of all samples; damaged files are computed again."""
+    """A member's file has the thinned fields that the case asks for, and its analysis is that of all samples.
+
+    A file that is damaged is computed again.
+    """
     table = TABLE | {"sweep": {"fields": True, "drive": {"amplitude": [60.0]}}}
     thin = {"fields": ["velocity"], "window": [5, 9], "every": 4, "stride": 3}
     assert run_sweep(Sweep.from_table(table), tmp_path / "all").complete
@@ -157,7 +163,7 @@ def test_a_member_whose_fields_are_thinned_is_measured_from_all(tmp_path):
 
 
 def test_new_measures_count_whichever_rank_recorded_the_old_ones(tmp_path):
-    """Records of ranks that were not merged, as after a kill, are older than those of a new analysis."""
+    """Measures of a new analysis replace those in records of ranks that were not merged, as after a kill."""
     folder = tmp_path / "sweep"
     table = TABLE | {"sweep": {"fields": True, "drive": {"amplitude": [60.0]}}}
     assert run_sweep(Sweep.from_table(table), folder).complete
@@ -181,7 +187,7 @@ def test_new_measures_count_whichever_rank_recorded_the_old_ones(tmp_path):
 @pytest.mark.slow
 def test_an_unforeseen_linear_run_is_simulated_where_it_is_needed(sweep, tmp_path, monkeypatch):
     _, ensemble, _ = sweep
-    # Only the first member is looked at before the sweep: the second site list comes as a surprise.
+    # Only the first member is examined before the sweep, so that the linear run of the second site list is unforeseen.
     monkeypatch.setattr("vipetsc.studies.sweep.MOST_SURVEYED", 1)
     table = TABLE | {"sweep": {"contacts": {"sites": [[8, 13], [13, 15]]}, "drive": {"amplitude": [0.1, 0.2]}}}
     result = run_sweep(Sweep.from_table(table), tmp_path / "out")
@@ -212,7 +218,7 @@ def test_modal_energies_of_members_are_what_work_and_losses_leave(sweep):
 
 
 def test_all_members_say_alike_why_their_linear_run_failed(tmp_path, monkeypatch):
-    """The member that makes the linear run and those that find it failed: the error's type says what was too little."""
+    """All members have the reason for which their linear run failed, with the error's type: memory was too small."""
 
     def fail(self, case):
         raise MemoryError("Unable to allocate 1.00 TiB")

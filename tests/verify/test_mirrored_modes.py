@@ -1,4 +1,4 @@
-"""Modes of a lattice that is its own mirror image: its contacts begin in pairs, at once or half a period apart."""
+"""Modes of mirror-symmetric lattices, whose contacts begin in pairs, at one instant or half a period apart."""
 
 from typing import Any
 
@@ -14,11 +14,12 @@ from vipetsc.modes.branches.follow import follow_all
 from vipetsc.modes.shooting.dop853 import Dop853Flow
 from vipetsc.modes.system import ContactPair, System
 
-WALL = 1000.0  # N/m, of each of two masses of 1 kg to the ground
-BETWEEN = 500.0  # N/m, of the two
+WALL = 1000.0  # N/m, the spring of each of two masses of 1 kg to the ground
+BETWEEN = 500.0  # N/m, the spring between the two masses
 STOP = 5000.0  # N/m
 CLEARANCE = 1e-3  # m
-# The stiffness of a half: in phase nothing is strained between the masses, out of phase the middle stands still.
+# The stiffness (N/m) that one mass moves against. In phase the spring between the masses is not strained; out of phase
+# its middle stands still, so that each half of the spring has twice its stiffness.
 HALF = {"in-phase": WALL, "out-of-phase": WALL + 2 * BETWEEN}
 TABLE: dict[str, Any] = {
     "name": "mirror",
@@ -45,7 +46,7 @@ TABLE: dict[str, Any] = {
 }
 CELLS = 24
 SITES = [8, CELLS + 1 - 8]
-# Cells of one mass between walls, with two stops of equal distance from the middle.
+# A row of masses between walls, with two stops at equal distances from its middle.
 CHAIN: dict[str, Any] = {
     "name": "mirror",
     "lattice": {
@@ -72,7 +73,7 @@ CHAIN: dict[str, Any] = {
 
 
 def own_case(sides: list[str], **nnm: Any) -> dict[str, Any]:
-    """The case of two masses whose stops are on these ``sides``, with further keys of [nnm]."""
+    """The case of two masses whose stops are on these ``sides``; ``nnm`` updates the table [nnm]."""
     contacts = TABLE["contacts"] | {"each": {"side": sides}}
     return TABLE | {"contacts": contacts, "nnm": TABLE["nnm"] | nnm}
 
@@ -84,7 +85,10 @@ def branches(table: dict[str, Any]) -> dict[str, Branch]:
 
 
 def exact_period(energy: float, stiffness: float, sides: int) -> float:
-    """Period in s of a mass of 1 kg on a spring, with a stop on one of its sides or on both, at an ``energy`` in J."""
+    """Period in s of a mass of 1 kg on a spring, with a stop on one of its sides or on both, at an ``energy`` in J.
+
+    The motion is harmonic about 0 outside the stop, and about the equilibrium of both springs at the stop.
+    """
     omega = np.sqrt(stiffness)
     if 2 * energy < stiffness * CLEARANCE**2:
         return float(2 * np.pi / omega)
@@ -97,13 +101,13 @@ def exact_period(energy: float, stiffness: float, sides: int) -> float:
 
 
 def assert_halves(branch: Branch, sides: int, rtol: float) -> None:
-    """Every orbit has the period of a half with half of the energy."""
+    """Assert that every orbit has the period of one mass that moves with half of the energy."""
     for point in branch.regular():
         exact = exact_period(point.energy / 2, HALF[branch.name], sides)
         assert point.period == pytest.approx(exact, rel=rtol)
 
 
-# Which modes move as a half of the lattice does, by the sides of the stops: those whose halves touch at one instant.
+# The sides of the two stops, the modes in which each mass moves as if alone with a stop, and the sides of that stop.
 SIDES = [
     (["plus", "plus"], ["in-phase"], 1),
     (["plus", "minus"], ["out-of-phase"], 1),
@@ -114,7 +118,11 @@ SIDES = [
 @pytest.mark.parametrize(("sides", "halved", "stops"), SIDES)
 @pytest.mark.parametrize("map_name", ["auto", "half", "whole"])
 def test_contacts_of_a_mirrored_lattice_begin_in_pairs(sides, halved, stops, map_name):
-    """At once, or in the other mode half a period apart: all branches go through grazing to the end of their range."""
+    """Branches of mirror-symmetric modes pass the grazing of two contacts and reach the end of their range.
+
+    The contacts begin at one instant, or half a period apart in the other mode. Where each mass moves as if alone, the
+    period is that of one mass in closed form.
+    """
     found = branches(own_case(sides, map=map_name))
     assert list(found) == list(HALF)
     for name, branch in found.items():
@@ -135,9 +143,9 @@ def test_so_do_those_of_condensed_motions():
 
 
 def test_so_do_those_of_orbits_shot_without_matrices():
-    """The left half of a symmetric orbit is one of the left half of the lattice alone, with a free end.
+    """The left half of an in-phase orbit shot without matrices is an orbit of the left half lattice with a free end.
 
-    Another flow integrates it.
+    SciPy's flow integrates that half, which is at rest again after half a period.
     """
     table = CHAIN | {"nnm": CHAIN["nnm"] | {"shooting": "krylov"}}
     (branch,) = branches(table).values()
@@ -158,7 +166,7 @@ def test_so_do_those_of_orbits_shot_without_matrices():
 
 
 def test_contacts_that_are_no_images_begin_one_after_the_other():
-    """Clearances that differ by a ten thousandth: no step takes both contacts, near as they are."""
+    """Contacts whose clearances differ by 1e-4 begin one after the other, in different steps along the branch."""
     table = own_case(["plus", "plus"])
     own = table["nnm"]["own"]
     first, second = own["contacts"]

@@ -1,4 +1,4 @@
-"""Modal energies of simulated runs: they are its energy, change at contacts alone, and close their ledger."""
+"""Modal energies of runs sum to the energy, change only at contacts and by the drive, and balance with the losses."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from vipetsc.lattice import modes
 from vipetsc.spectra import ModalParts, upper_fraction
 from vipetsc.studies.analysis import analyse
 
-# Parts of the four-band lattice; those between and above them are gaps.
+# The indices of the bands among the parts of the four-band lattice's spectrum; the other parts are gaps.
 BANDS = [0, 2, 4, 6]
 
 
@@ -21,14 +21,14 @@ def builtin():
 
 
 def losses(run, analysis):
-    """Energy lost in every cluster, by the log of impacts."""
+    """The energy in J lost in each cluster of contacts, summed from the log of impacts."""
     cluster = analysis["bands/cluster_of_episode"].values - 1
     return np.bincount(cluster, run["impacts/loss"].values, len(analysis["bands/cluster"]))
 
 
 @pytest.mark.slow
 def test_modal_energies_of_the_built_in_run(builtin):
-    """Parts sum to the energy at every instant, change in contacts alone, and have the shares of SPEC section 12."""
+    """Modal energies sum to the energy, change in contacts alone, and end with the shares of SPEC section 12."""
     run, analysis = builtin
     energy = analysis["bands/modal_energy"]
     time = analysis["bands/instant"].values
@@ -41,7 +41,7 @@ def test_modal_energies_of_the_built_in_run(builtin):
     assert np.abs(energy.values.sum(axis=0) - whole).max() < 1e-12 * whole.max()
     assert analysis["bands/bin_energy"].values.sum(axis=0) == pytest.approx(energy.values.sum(axis=0), rel=1e-12)
 
-    # Between two clusters of contacts nothing changes; the longest wait is that after the last.
+    # Nothing changes between two clusters of contacts, nor after the last one.
     begin = analysis["bands/cluster_begin"].values
     end = analysis["bands/cluster_end"].values
     waits = 0
@@ -60,7 +60,7 @@ def test_modal_energies_of_the_built_in_run(builtin):
     assert parts.modes.frequency[at_ends] == pytest.approx([2034.825] * 2, abs=1e-3)
 
 
-# At 0.25 s, amid the first contacts, one sample changes the share by a tenth: SPEC's value there is left out.
+# SPEC's value at 0.25 s is left out: amid the first contacts the share changes by a tenth from one sample to the next.
 @pytest.mark.slow
 @pytest.mark.parametrize(("time", "share"), [(0.3, 0.1113), (0.4, 0.2351), (0.5, 0.3365), (0.6, 0.3385)])
 def test_upper_bands_of_the_built_in_run_over_its_work(builtin, time, share):
@@ -77,7 +77,7 @@ def test_upper_bands_of_the_built_in_run_over_its_work(builtin, time, share):
 
 
 def test_transfers_close_the_ledger_of_every_cluster(builtin):
-    """What a cluster of contacts takes from all parts is what its impacts lose; every impact lies in its cluster."""
+    """The transfers of a cluster of contacts sum to minus the loss of its impacts, which lie within the cluster."""
     run, analysis = builtin
     transfer = analysis["bands/transfer"]
     work = run["energy/work"].values[-1]
@@ -93,9 +93,9 @@ def test_transfers_close_the_ledger_of_every_cluster(builtin):
 
 
 def test_work_of_the_drive_is_no_transfer():
-    """Contacts while the burst is still on: its work belongs to the drive, not to the transfers.
+    """The work that the drive does during a cluster of contacts is not part of the cluster's transfers.
 
-    The sites are too far from the driven cell for their clusters to be told from the drive in time.
+    The sites are so far from the driven cell that contacts and drive act at the same time.
     """
     run = run_of(small_case(time={"engine": "propagator", "end": 0.08}))
     model = Case.of(run).model()
@@ -105,7 +105,7 @@ def test_work_of_the_drive_is_no_transfer():
     begin = analysis["bands/cluster_begin"].values
     end = analysis["bands/cluster_end"].values
 
-    # Clusters during the burst in which the drive does a noticeable work.
+    # Some clusters lie within the burst, and the drive does noticeable work in them.
     done = np.interp(end, time, work) - np.interp(begin, time, work)
     driven = (begin < model.drive.duration) & (end - begin < 2e-3)
     assert np.count_nonzero(driven & (np.abs(done) > 1e-3 * work[-1])) > 2
@@ -137,7 +137,7 @@ def test_a_run_in_memory_ends_with_the_state_of_its_last_sample(engine):
     for name in ("displacement", "velocity"):
         assert np.array_equal(run[f"end/{name}"].values, run[name].values[-1])
 
-    # The state at the end is enough where displacements were not recorded.
+    # The share at the end needs only the state at the end, not the recorded displacements.
     both = analyse(run, ("modal",))["upper_share_at_end"].item()
     without = analyse(run.drop_vars("displacement"), ("modal",))["upper_share_at_end"].item()
     assert both == without > 0
@@ -153,7 +153,7 @@ def test_a_run_in_memory_ends_with_the_state_of_its_last_sample(engine):
 
 
 def test_a_long_lattice_is_measured_on_a_ring(monkeypatch):
-    """Beyond a number of DoFs modes are those of a ring with one cell more, which the attributes state."""
+    """A lattice with more than MOST_DOFS degrees of freedom is measured by modes of a ring with one cell more."""
     run = run_of(small_case(lattice={"cells": 60}, time={"engine": "propagator", "end": 0.08}))
     exact = analyse(run, ("modal", "transfers"))
 
@@ -167,7 +167,7 @@ def test_a_long_lattice_is_measured_on_a_ring(monkeypatch):
     assert ring["bands/modal_energy"].attrs["error"] < 1e-12
 
     largest = exact["bands/modal_energy"].values.max()
-    # The drive stands at an end, whose waves the ring takes for those of other bands as long as it acts.
+    # The drive acts at an end, which the ring does not have: while it acts, waves are assigned to other bands.
     late = exact["bands/instant"].values > 0.06
     difference = ring["bands/modal_energy"].values - exact["bands/modal_energy"].values
     assert np.abs(difference[:, late]).max() < 0.02 * largest

@@ -1,4 +1,4 @@
-"""Whole lattices shot without dense matrices, and their largest multipliers by Floquet and by Hill."""
+"""Orbits of whole lattices, shot without dense matrices, and their largest multipliers by Floquet and by Hill."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ STOPS = [Stops.both(four_band_contact(), CLEARANCE)]
 
 
 def lattice_shooting() -> LatticeShooting:
+    """The shooting problem of a lattice with one contact site, by quarter periods and without dense matrices."""
     chain = breather_chain()
     system = System.from_chain(chain, STOPS, dense=False)
     return LatticeShooting(system, chain, MAPS["quarter"], MPI.COMM_SELF, 1e-12, 10)
@@ -38,13 +39,13 @@ def lattice_shooting() -> LatticeShooting:
 
 @pytest.fixture(scope="module")
 def breather():
-    """The shooting problem, and its orbit at 1600 rad/s."""
+    """The shooting problem and its breather at 1600 rad/s."""
     problem = lattice_shooting()
     return problem, problem.breather(BREATHER_FREQUENCY)
 
 
 def test_the_breather_is_the_one_of_the_specification(breather):
-    """Amplitude and energy are those of SPEC, sec. 15, and the motion returns after one period."""
+    """The breather has the amplitude and the energy of SPEC section 15, and returns after one period."""
     problem, point = breather
     w = problem.system.contact_rows @ point.x
     assert abs(w[0]) / CLEARANCE == pytest.approx(1.286, abs=5e-4)
@@ -61,7 +62,7 @@ def test_the_breather_is_the_one_of_the_specification(breather):
 def test_the_largest_multipliers_are_those_of_the_dense_map(breather):
     problem, point = breather
     flow = problem.flow
-    # Both halves of the period have the same map, by symmetry.
+    # By symmetry both halves of the period have the same map, whose square is that of the period.
     half = flow.arc(flow.scatter(np.append(point.x, 0 * point.x)), point.period / 2)
     map_ = flow.gather(half.move(flow.scatter(np.eye(2 * problem.system.dofs)))).T
     dense = np.linalg.eigvals(map_) ** 2
@@ -74,7 +75,7 @@ def test_the_largest_multipliers_are_those_of_the_dense_map(breather):
         assert np.abs(dense - value).min() < 1e-7
     largest = np.abs(found[0, 0])
     assert largest == pytest.approx(np.abs(dense).max(), rel=1e-8)
-    # An unstable one: a stable breather's would all be 1 in size.
+    # The breather is unstable; all multipliers of a stable one would have the modulus 1.
     assert largest > 1.3
 
 
@@ -120,7 +121,7 @@ def test_a_branch_is_stored_with_its_multipliers_and_resumed(tmp_path):
 
 
 def test_a_frequency_without_breather_fails_and_names_the_key(tmp_path):
-    # In a pass band, where Newton's method does not converge.
+    # Newton's method does not converge at this frequency, which lies in a pass band.
     case = breather_case(start_frequency=[700.0], max_newton=2)
     (branch,) = follow_all(case, tmp_path, MPI.COMM_SELF)
     assert branch.ending.startswith("failed: no ")
@@ -129,10 +130,11 @@ def test_a_frequency_without_breather_fails_and_names_the_key(tmp_path):
 
 @pytest.mark.slow
 def test_hills_multipliers_of_a_breather_are_those_of_floquet(tmp_path):
-    """The largest pair is off the real axis and agrees to 1e-6 with that of the whole lattice's motion.
+    """The largest multiplier by Hill's method is complex and agrees to 1e-6 with that of the whole lattice's motion.
 
-    What the harmonics left out change is 1e-7, and what Hill's eliminated unknowns change is less than 1e-6. In the 14
-    cells other pairs of 1.05 and less lie near the circle, whose zeros and poles are 0.01 of a strip apart.
+    The harmonics that are left out change it by 1e-7, and the unknowns that Hill's method eliminates by less than 1e-6.
+    The 14 cells have further pairs of modulus 1.05 and less, near the unit circle. Zeros and poles of Hill's
+    determinant are only 0.01 of a strip's width apart there.
     """
     case = breather_case(system="condensed", points=1, truncation=1e-7, multipliers=2)
     (branch,) = follow_all(case, tmp_path, MPI.COMM_SELF)
@@ -148,7 +150,7 @@ def test_hills_multipliers_of_a_breather_are_those_of_floquet(tmp_path):
 
 
 def raise_petsc_error(number: int):
-    """A function that raises a PETSc error, whatever it is called with."""
+    """A function that raises the PETSc error ``number`` for any arguments."""
 
     def raise_error(*arguments):
         raise PETSc.Error(number)
@@ -158,7 +160,7 @@ def raise_petsc_error(number: int):
 
 @pytest.mark.slow
 def test_where_slepc_fails_the_branch_continues_without_multipliers(tmp_path, monkeypatch, caplog):
-    # 73: an object in the wrong state, as of a search that has not converged.
+    # PETSc's error 73 is an object in the wrong state, as after a search that has not converged.
     monkeypatch.setattr(floquet, "_krylov_basis", raise_petsc_error(73))
     with caplog.at_level(logging.WARNING):
         (branch,) = follow_all(breather_case(multipliers=2), tmp_path, MPI.COMM_SELF)
@@ -170,7 +172,7 @@ def test_where_slepc_fails_the_branch_continues_without_multipliers(tmp_path, mo
 
 @pytest.mark.slow
 def test_where_memory_runs_out_the_branch_does_not_continue(tmp_path, monkeypatch):
-    # 55: out of memory, maybe of one rank alone, for which others wait.
+    # PETSc's error 55 is a lack of memory, perhaps on one rank alone, for which the others would wait.
     monkeypatch.setattr(floquet, "_krylov_basis", raise_petsc_error(55))
     with pytest.raises(PETSc.Error):
         follow_all(breather_case(multipliers=2), tmp_path, MPI.COMM_SELF)
@@ -178,7 +180,10 @@ def test_where_memory_runs_out_the_branch_does_not_continue(tmp_path, monkeypatc
 
 @pytest.mark.parametrize("sites", [[1], [1, -2]])
 def test_sensitivities_of_all_masses_and_hills_determinant_agree(monkeypatch, sites):
-    """A breather of a site is stable, two that move against each other are not, in a lattice of cubic springs."""
+    """Multipliers by sensitivities of all masses and by Hill's determinant agree, in a lattice of cubic springs.
+
+    A breather of one site is stable, and one of two sites that move against each other is unstable.
+    """
     springs = [
         {"start": 1, "end": 1, "stiffness": 1e4, "next_cell": True},
         {"start": 1, "end": 2, "stiffness": 5e3, "cubic": 1e9},

@@ -1,4 +1,4 @@
-"""Steady states of sites: folds, energy, stability against Floquet's and time integration, files that go on."""
+"""Steady states of lattices with contact sites: folds, energy, stability against time integration, resumed files."""
 
 from __future__ import annotations
 
@@ -40,7 +40,10 @@ def varied(case: NfrcCase, **options: Any) -> NfrcCase:
 
 
 def after_a_period(chain, contact, site: int, omega: float, state: np.ndarray, force: float) -> np.ndarray:
-    """State of a lattice a period after ``state``, by SciPy, under ``force`` cos(omega t) on its first mass."""
+    """Displacements and velocities (2n,) a period after ``state`` under ``force`` cos(omega t) on the first mass.
+
+    SciPy integrates the lattice with one contact, in cell ``site`` from 0.
+    """
     stiffness = chain.stiffness_matrix().tocsr()
     masses = chain.masses()
     n = len(masses)
@@ -61,7 +64,7 @@ def after_a_period(chain, contact, site: int, omega: float, state: np.ndarray, f
 
 
 def test_hill_finds_the_multipliers_of_a_forced_duffing_oscillator():
-    """Of x'' + x + x^3 = 0.3 cos(1.8 t) three orbits exist; Hill's exponents are those of the monodromy matrix."""
+    """Hill's exponents of the three orbits of x'' + x + x^3 = 0.3 cos(1.8 t) are those of the monodromy matrix."""
     omega = 1.8
     order = 15
     forces = SiteForces([], [Spring(0, 1, 1.0, cubic=1.0)])
@@ -78,7 +81,7 @@ def test_hill_finds_the_multipliers_of_a_forced_duffing_oscillator():
         return orbit + columns
 
     counts = []
-    # Amplitudes near the small orbit out of phase, the large one in phase and the one between them.
+    # The guesses are amplitudes near the small orbit out of phase, the large one in phase and the one between them.
     for guess in (-0.14, 1.8, -1.6):
         x = balance.pack(np.zeros((1, order + 1), complex))
         x[0] = guess
@@ -102,7 +105,7 @@ def test_hill_finds_the_multipliers_of_a_forced_duffing_oscillator():
 
 @pytest.mark.slow
 def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
-    """The curve folds at amplitude/clearance 1.0014 and is unstable behind; the shares of the energy sum to one."""
+    """The curve folds at amplitude/clearance 1.0014 and is unstable beyond; the shares of the energy sum to one."""
     for curve in follow_all(nfrc_case(restitutions=[1.0, 0.7], range=[0.996, 1.01]), tmp_path, MPI.COMM_SELF):
         assert curve.complete
         assert curve.ending == "reached the end of nfrc.range, 0.996"
@@ -111,7 +114,7 @@ def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
         (fold,) = (number for number, point in enumerate(curve.points) if point.kind == "fold")
         assert parameter[fold] == pytest.approx(1.0014, abs=2e-4)  # SPEC section 15
 
-        # Transmitted, reflected, in other bands, lost.
+        # The shares are those transmitted, reflected, sent to other bands, and lost.
         share = measure(curve, "share")
         assert np.abs(share.sum(axis=1) - 1).max() < 1e-8
         assert np.all(share > -1e-12)
@@ -134,7 +137,7 @@ def test_the_upper_fold_of_one_site_under_a_wave_and_its_energy(tmp_path):
 
 @pytest.mark.slow
 def test_a_forced_lattice_with_ends_returns_after_a_period(tmp_path):
-    """A steady state in contact, followed over frequency, comes back after one period of a time integration."""
+    """A steady state in contact, on a curve over the frequency, returns after one period of SciPy's integration."""
     case = nfrc_case(
         lattice={"cells": 6},
         contacts={"sites": [3]},
@@ -152,7 +155,7 @@ def test_a_forced_lattice_with_ends_returns_after_a_period(tmp_path):
     last = curve.points[-1]
     assert last.measures.episodes == 2
     assert last.measures.frequency == pytest.approx(2010)
-    # Nothing leaves a lattice with ends and nothing is lost: there are no shares.
+    # The shares are NaN: no energy leaves a lattice with ends, and these contacts lose none.
     assert np.isnan(measure(curve, "share")).all()
 
     few = SteadyStates(case, 1.0, 14.0)
@@ -166,12 +169,12 @@ def test_a_forced_lattice_with_ends_returns_after_a_period(tmp_path):
 
 @pytest.mark.slow
 def test_a_steady_state_is_where_a_long_run_ends():
-    """A lossy site under a force comes from rest to the first harmonic of the computed steady state."""
+    """A long run from rest, with a lossy site under a force, ends with the first harmonic of the steady state."""
     omega = 1023.27
     drive = {"waveform": "harmonic", "cell": 230, "frequency": omega}
     table = {
         "name": "x",
-        # Waves come back from the ends of 500 cells only after the run.
+        # The lattice is so long that no wave comes back from its ends during the run.
         "lattice": LATTICE | {"cells": 500},
         "contacts": CONTACTS | {"sites": [250], "restitution": 0.3},
         "drive": drive,
@@ -188,7 +191,7 @@ def test_a_steady_state_is_where_a_long_run_ends():
     assert measures.unstable == 0
     assert measures.episodes == 4
 
-    # Fewer samples a period would take high harmonics for the first.
+    # With fewer samples in a period, high harmonics would alias to the first.
     samples = 64
     period = 2 * np.pi / omega
     case = Case.from_table(
@@ -208,7 +211,7 @@ def test_a_steady_state_is_where_a_long_run_ends():
 @pytest.mark.slow
 @pytest.mark.parametrize("nfrc", [{}, {"over": "frequency", "range": [1023.0, 1040.0], "fixed": [0.9008], "points": 3}])
 def test_energy_at_several_sites_and_their_mirror_image(nfrc, tmp_path):
-    """T + R + U + L = 1, also for a wave from the other side of the mirrored sites, which has the same curve.
+    """The shares satisfy T + R + U + L = 1, and a wave from the other side of mirrored sites has the same curve.
 
     The four-band cell is its own mirror image.
     """
@@ -227,7 +230,8 @@ def test_energy_at_several_sites_and_their_mirror_image(nfrc, tmp_path):
     for name in ("share", "largest", "unstable"):
         assert measure(forward, name) == pytest.approx(measure(backward, name), rel=1e-6, abs=1e-12)
 
-    # Even harmonics are zero, and perturbations grow alike, found in one determinant or in two.
+    # With even harmonics among the unknowns, these are zero in the same state, and perturbations grow alike. The
+    # symmetric state has two determinants, for even and for odd harmonics of perturbations, the other has one.
     ((_, _, fixed),) = NfrcCase.from_toml(forward.case).curves()
     odd = SteadyStates(nfrc_case(contacts=THREE, **nfrc, symmetric=True), 0.7, fixed)
     every = SteadyStates(nfrc_case(contacts=THREE, **nfrc, symmetric=False), 0.7, fixed)
@@ -246,7 +250,7 @@ def test_energy_at_several_sites_and_their_mirror_image(nfrc, tmp_path):
 
 @pytest.mark.slow
 def test_what_a_force_gives_a_lattice_with_ends_is_lost(tmp_path):
-    """Nothing leaves a lattice with ends: what sites dissipate is all of the work, in every state with contact."""
+    """In a lattice with ends, which no energy leaves, sites dissipate all of the work in every state with contact."""
     sites = THREE | {"sites": [3, 5, 8]}
     options = {"source": "force", "infinite": False, "fixed": [2000.0]}
     linear = SteadyStates(nfrc_case({"cells": 12}, sites, **options), 0.7, 2000.0).linear_motion(2000.0)
@@ -289,7 +293,7 @@ def test_a_curve_goes_on_to_the_same_bits(tmp_path):
 
 
 def test_sweeps_jump_between_stable_states():
-    """On an S with a stable upper part a sweep jumps at a fold, up to the nearer of two states and down again."""
+    """A sweep along an S-shaped curve with a stable upper part jumps at a fold to the nearer of two stable states."""
     parameter = np.array([0.5, 0.8, 1.0, 0.9, 0.7, 0.6, 0.8, 1.0, 1.2, 1.15, 1.05, 0.95])
     stable = np.array([1, 1, 0, 0, 0, 0, 1, 1, 1, 0, 1, 1], bool)
     is_fold = np.isin(np.arange(12), (2, 5))
@@ -329,7 +333,7 @@ def test_a_site_is_needed_and_validate_reads_the_section(tmp_path):
 
 
 def test_a_force_on_an_infinite_lattice_gives_what_leaves_and_is_lost(tmp_path):
-    """The work of a force is what waves carry away and what the site loses: the shares sum to one."""
+    """Waves carry away what a force works on an infinite lattice, or the site loses it: the shares sum to one."""
     force = {"source": "force", "harmonics": 7, "largest_step": 1.0}
     touching = SteadyStates(nfrc_case(**force), 0.7, 1023.27).parameter.scale
     case = nfrc_case(contacts={"restitution": 0.7}, **force, range=[0.99 * touching, 1.0005 * touching])

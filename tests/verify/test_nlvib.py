@@ -1,7 +1,7 @@
 """Two masses of which one meets a stop, forced and damped: the third example of NLvib (Krack and Gross 2019).
 
-Masses 1 kg, springs 1 N/m from one to the other and from the second to the ground, dampers 0.03 of the springs, a stop
-of 100 N/m for the first mass beyond 1 m on one side, 0.1 N cos(Om t) on the second.
+The masses are 1 kg each. Springs of 1 N/m join the first to the second and the second to the ground, with dampers of
+0.03 N s/m. The first mass meets a stop of 100 N/m beyond 1 m on one side; 0.1 N cos(Om t) acts on the second.
 M. Krack, J. Gross, Harmonic Balance for Nonlinear Vibration Problems, Springer 2019; github.com/maltekrack/NLvib.
 """
 
@@ -24,13 +24,13 @@ K = np.array([[1.0, -1.0], [-1.0, 2.0]])
 STOP = 100.0
 GAP = 1.0
 FORCE = 0.1
-# Highest harmonic: the stop is stiff, and its forces have many.
+# The highest harmonic: the forces of the stiff stop have many.
 LAST = 101
 C = 0.03 * K
 
 
 def dynamic_stiffness(omega: float) -> np.ndarray:
-    """K + i omega C - omega^2 M of the linear system."""
+    """The matrix K + i omega C - omega^2 M (2, 2) of the linear system."""
     return K + 1j * omega * C - omega**2 * np.eye(2)
 
 
@@ -42,7 +42,7 @@ def steady_states() -> SteadyStates:
 
 
 class Arc(NamedTuple):
-    """A motion over one period: the state at its end, its derivative by the first one, states (4, instant) between."""
+    """A motion over one period: its last state (4,), the derivative (4, 4) by the first one, states (4, instant)."""
 
     end: np.ndarray
     derivative: np.ndarray
@@ -50,9 +50,10 @@ class Arc(NamedTuple):
 
 
 def flow(omega: float, start: np.ndarray, instants: np.ndarray | None = None) -> Arc:
-    """Integrate a period, whose linear pieces end where the stop is met or left; ``instants`` are parts of it.
+    """Integrate a period, whose linear pieces end where the stop is met or left.
 
-    Forces are continuous there: the derivative of the whole is the product of the pieces' exponentials.
+    States between are those at ``instants``, given as fractions of the period. The force is continuous at the stop, so
+    that the derivative of the end by the start is the product of the pieces' matrix exponentials.
     """
     period = 2 * np.pi / omega
     times = period * np.array([] if instants is None else instants)
@@ -89,7 +90,7 @@ def flow(omega: float, start: np.ndarray, instants: np.ndarray | None = None) ->
 
 
 def fundamentals(states: SteadyStates, xi: np.ndarray) -> np.ndarray:
-    """Harmonics of order 1 of the displacements of the two masses."""
+    """The first harmonics (2,) of the displacements of the two masses, in m."""
     omega, _ = states.drive(xi[-1])
     stop = -states.balance.series(xi[:-1], omega).forces[0, 1]
     return np.linalg.solve(dynamic_stiffness(omega), [stop, FORCE])
@@ -108,9 +109,9 @@ def periodic_orbit(omega: float, state: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 @pytest.fixture(scope="module")
 def attractor() -> np.ndarray:
-    """State of the orbit at 0.635 rad/s to which motions settle."""
+    """The state (4,) at phase 0 of the orbit at 0.635 rad/s to which motions settle."""
     state = np.array([-1.0, -1.0, 0.0, 0.0])
-    # As many periods as damping needs to bring Newton's method near it.
+    # After 80 periods the damped motion is near enough to the orbit for Newton's method.
     for _ in range(80):
         state = flow(0.635, state).end
     return periodic_orbit(0.635, state)[0]
@@ -121,7 +122,10 @@ def attractor() -> np.ndarray:
     ("omega", "steps", "stability"), [(0.635, 1, "stable"), (0.6, 5, "a pair grows"), (0.74, 15, "flips")]
 )
 def test_shooting_and_harmonic_balance_find_the_published_stability(attractor, omega, steps, stability):
-    """Past the folds orbits are stable at 0.635 rad/s; at 0.6 a pair grows, at 0.74 one turns over (-mu > 1)."""
+    """Shooting and harmonic balance find the same orbits past the folds, with the same multipliers.
+
+    The orbit is stable at 0.635 rad/s. At 0.6 a complex pair exceeds 1 in modulus; at 0.74 a multiplier is below -1.
+    """
     state = attractor
     for frequency in np.linspace(0.635, omega, steps):
         state, multipliers = periodic_orbit(frequency, state)
@@ -135,7 +139,7 @@ def test_shooting_and_harmonic_balance_find_the_published_stability(attractor, o
         assert -largest.real > 1
         assert largest.imag == 0
 
-    # The harmonics of the orbit begin the balance, whose first ones are the same to its truncation.
+    # Harmonic balance begins with the harmonics of the orbit, and keeps the first ones up to its truncation.
     spectrum = np.fft.rfft(flow(omega, state, np.arange(512) / 512).between[:2]) / 256
     harmonics = spectrum[:1, : LAST + 1].copy()
     harmonics[0, 0] /= 2
@@ -146,5 +150,5 @@ def test_shooting_and_harmonic_balance_find_the_published_stability(attractor, o
     fastest = states.hill(omega).fastest(states.balance.series(xi[:-1], omega))
     assert (fastest == 0) == (stability == "stable")
     if fastest:
-        # Of a conjugate pair Hill's method gives the one above the real axis.
+        # Hill's method gives the multiplier of a conjugate pair with the positive imaginary part.
         assert np.exp(2 * np.pi * fastest) == pytest.approx(complex(largest.real, abs(largest.imag)), rel=1e-5)

@@ -1,4 +1,4 @@
-"""What watches a run: the guard's threshold, the ledger over a checkpoint, observers of one's own."""
+"""Observers of a run: the threshold of the guard, the ledger over a checkpoint, and observers that a user writes."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from vipetsc.dynamics.samples import Block
 
 
 def block(work: list[float], total: list[float], dissipated: float = 0.0) -> Block:
-    """Samples one second apart with these energies, of which the lattice holds ``total`` as motion."""
+    """Samples one second apart with ``work`` done and ``total`` kinetic energy, both (sample,) in J."""
     none = np.zeros(len(work))
     energies = Energies(np.array(total), none, none, np.array(work), none + dissipated, none)
     return Block(0, np.arange(len(work)) * 1.0, energies, None, None)
 
 
 def begun(kind: type[Observer]) -> Observer:
-    """An observer at the beginning of a run of an undamped lattice."""
+    """An observer of the ``kind`` at the beginning of a run of an undamped lattice."""
     observer = kind()
     undamped = SimpleNamespace(chain=SimpleNamespace(is_damped=False))
     observer.begin(SimpleNamespace(meter=SimpleNamespace(largest=1e6), model=undamped))
@@ -32,7 +32,7 @@ def begun(kind: type[Observer]) -> Observer:
 def test_the_guard_allows_a_tenth_of_the_largest_work():
     guard = begun(Guard)
     guard.observe(block(work=[2.0], total=[1.81]))
-    # A tenth of the largest work so far, not of the work now.
+    # The threshold is a tenth of the largest work so far, which is more than a tenth of the present work.
     guard.observe(block(work=[1.0], total=[1.19]))
     with pytest.raises(RunawayError, match=r"the energy diverges: 1.21 J in the lattice, 1 J of work done"):
         guard.observe(block(work=[1.0], total=[1.21]))
@@ -66,12 +66,15 @@ def test_the_guard_refuses_what_is_not_finite(work, total):
 
 
 def test_a_lattice_at_rest_cannot_run_away():
-    # Rounding, before the drive has worked.
+    # Before the drive has done any work, the energy is a rounding error.
     begun(Guard).observe(block(work=[0.0], total=[1e-7]))
 
 
 def test_the_ledger_of_a_resumed_run_goes_on_from_its_checkpoint():
-    """The error is the largest of the run, over the largest work: |4 - 2 - 1.5|/4 is more than |3 - 2.75|/4."""
+    """The ledger error of a run is its largest error over its largest work, kept through a checkpoint.
+
+    Here |4 - 2 - 1.5|/4 = 0.125 is larger than |3 - 2.75|/4.
+    """
     ledger = begun(Ledger)
     assert ledger.statistics() == {"ledger_error": 0.0}
 
@@ -89,7 +92,7 @@ def test_the_ledger_of_a_resumed_run_goes_on_from_its_checkpoint():
 
 
 class Watch(Observer):
-    """Counts samples, and keeps the largest velocity."""
+    """An observer that lists the samples it sees, one in a block, and keeps the largest velocity."""
 
     name = "test-watch"
     longest = 1
@@ -148,7 +151,7 @@ def test_an_observer_is_given_and_goes_on_with_the_run(folder):
 
 
 class Halves(Observer):
-    """Sums the fields that are recorded, and ends the run within a block."""
+    """An observer that sums the recorded fields of each sample, and ends the run at sample 100, within a block."""
 
     name = "test-halves"
     longest = 40
@@ -180,9 +183,9 @@ def test_what_an_observer_refuses_within_a_block_is_not_recorded(folder, engine)
 
     run = datasets(folder / "run" / "run.h5")
     whole = datasets(folder / "whole" / "run.h5")
-    # Every third of 100 samples, from the first on.
+    # Of 100 samples every third is recorded, from the first on.
     assert run["velocity"].shape[0] == run["field_time"].size == 34
-    # What the engine came to behind the last good sample is no solution.
+    # Onsets that the engine computed after the last good sample are not recorded.
     before = whole["impacts/onset"] <= last + 4e-4
     assert run["impacts/onset"].tolist() == whole["impacts/onset"][before].tolist()
     assert 0 < run["impacts/onset"].size < whole["impacts/onset"].size
@@ -194,8 +197,8 @@ def test_what_an_observer_refuses_within_a_block_is_not_recorded(folder, engine)
 
 
 def test_a_run_killed_at_its_end_keeps_its_statistics(folder, monkeypatch):
-    """Killed while its files are put together: nothing is left to simulate, and nothing is forgotten."""
-    # The last chunk is whole: no sample is left to simulate.
+    """A run that is killed while its files are put together has the same statistics and bits after it is resumed."""
+    # The last chunk is full, so that no sample is left to simulate.
     case = small_case(time={"end": 0.0254})
     assert case.model().samples % 128 == 0
 

@@ -1,4 +1,4 @@
-"""A lattice of one cell: a mass between two walls that meets a stop, in every verb that a rig needs."""
+"""A lattice of one cell: a mass between two walls that meets a stop, in runs, bands, modes and frequency responses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from vipetsc.lattice.modes import linear_modes
 
 pytestmark = pytest.mark.parallel(1)
 
-# 1 kg on two springs of 0.75 N/m, a dashpot of 0.06 N s/m, a stop of 20 N/m at 0.4 m; the left wall shakes.
+# A mass of 1 kg on two springs of 0.75 N/m, with a dashpot of 0.06 N s/m to the ground and a stop of 20 N/m at 0.4 m.
+# The left wall shakes.
 CELL = TWO_MASSES["lattice"]["cell"] | {"springs": [{"start": 1, "end": 1, "stiffness": 0.75, "next_cell": True}]}
 ONE_MASS: dict[str, Any] = TWO_MASSES | {
     "lattice": TWO_MASSES["lattice"] | {"cells": 1, "cell": CELL},
@@ -54,7 +55,7 @@ def test_its_only_mode():
 def test_dashpots_alone_resist_a_motion_of_equal_masses_together():
     cell = Case.from_table(ONE_MASS).model().chain.cell
     assert damped_bloch(cell, 0.0).rate == pytest.approx([0.0], abs=1e-12)
-    # A wave that is slow compared with its damping has two real rates, whose product is the squared frequency.
+    # A long wave is overdamped: s^2 + 0.06 s + omega^2 = 0 has two real rates, of which the slower one is given.
     rate = damped_bloch(cell, 0.01).rate[0]
     squared = 4 * 0.75 * np.sin(0.005) ** 2
     assert rate == pytest.approx(-0.03 + np.sqrt(0.03**2 - squared), rel=1e-9)

@@ -1,4 +1,4 @@
-"""Ends that reflect nothing at any frequency: half lattices, against endless, long and damped ones."""
+"""Open ends, which reflect nothing at any frequency, compared with endless and with long damped lattices."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SPRINGS = [{"start": 1, "end": 1, "stiffness": 1.0, "next_cell": True}, {"start"
 
 
 def absorbing(end: str = "both", **nfrc: Any) -> dict[str, Any]:
-    """A lattice of two masses a cell with absorbing ends, one site and a force next to it."""
+    """The case of a two-mass lattice with an absorbing ``end`` or both, one contact site and a force next to it."""
     lattice = {"cells": 12, "cell": {"masses": [1.0, 0.3], "springs": SPRINGS, "contact": [1, 2]}}
     ends = {"end": end, "cells": 3, "strength": 2.0}
     options = {"source": "force", "over": "amplitude", "range": [2.0, 2.5], "fixed": [0.7], "harmonics": 9}
@@ -53,13 +53,13 @@ SMOOTH["lattice"]["cell"] = SMOOTH["lattice"]["cell"] | {"springs": [SPRINGS[0] 
 
 @pytest.mark.parametrize("ends", ["fixed", "free"])
 def test_with_both_ends_open_the_lattice_is_endless(ends):
-    """The compliance is that of Bloch waves, in bands, gaps, at rest, and for perturbations that grow."""
+    """With both ends open the compliance is that of Bloch waves, in bands, gaps, at rest and for growing motions."""
     chain = Chain(CELL, 9, ends, sites=(2, 6), clearances=(1.0, 1.0))
     here = OpenCompliance(chain, ((0, 0),), open_ends=("left", "right"))
     endless = WaveCompliance(chain, True, ((0, 0),))
     omega = np.array([0.31, 0.9, 1.2, 1.6, 2.2, 3.5, 1.1 - 0.01j, -0.7 - 0.02j, -0.7])
     np.testing.assert_allclose(here.response(omega), endless.response(omega), rtol=1e-6)
-    # At rest a force on one mass moves an endless lattice without bound; those of pairs do not.
+    # A constant force on one mass moves an endless lattice without bound. The opposite forces of a contact do not.
     np.testing.assert_allclose(here.at(0.0), endless.at(0.0), atol=1e-4)
     forces = [0.3, -2.0, 1.5]
     np.testing.assert_allclose(here.field(0.9, forces, range(9)), endless.field(0.9, forces, range(9)), rtol=1e-6)
@@ -67,7 +67,7 @@ def test_with_both_ends_open_the_lattice_is_endless(ends):
 
 @pytest.mark.parametrize("end", ["left", "right"])
 def test_nothing_comes_back_over_whole_bands(end):
-    """Of a wave from a force next to the other end less than 1e-7 of the energy is reflected, up to the band edges."""
+    """An open end reflects less than 1e-7 of the energy of waves in all bands, up to 1e-3 of a band from its edges."""
     chain = Chain(CELL, 12, "fixed", sites=(5,), clearances=(1.0,))
     driven = 0 if end == "right" else 11
     lattice = OpenCompliance(chain, ((driven, 0),), open_ends=(end,))
@@ -83,12 +83,15 @@ def test_nothing_comes_back_over_whole_bands(end):
             worst = max(worst, abs(back / forth) ** 2)
             made_for_one = max(made_for_one, reflected_at(omega, absorbers))
     assert worst < 1e-7
-    # Dashpots over 60 cells send back most of what comes near the edges of the bands.
+    # Dashpots over 60 cells, chosen for one frequency, reflect more than a tenth near the edges of the bands.
     assert made_for_one > 0.1
 
 
 def test_dashpots_cells_that_differ_and_contacts_to_ground_stay_what_they_are():
-    """Against a lattice of 240 cells with a strong loss, from whose far end nothing comes back."""
+    """An open end keeps dashpots, rounded cells and contacts with the ground: the compliance is a long lattice's.
+
+    The long lattice has 240 cells and a strong loss, so that nothing comes back from its far end.
+    """
     pairs = (Pair(-1, 1), Pair(0, 0, next_cell=True))
     short = Chain(rounded_cell((0.05, 0.2)), 5, "fixed", sites=(1, 3), clearances=(1.0, 1.0), pairs=pairs)
     long = Chain(rounded_cell((0.05, 0.2)), 240, "fixed", sites=(1, 3), clearances=(1.0, 1.0), pairs=pairs)
@@ -98,7 +101,7 @@ def test_dashpots_cells_that_differ_and_contacts_to_ground_stay_what_they_are():
 
 
 def test_states_are_those_of_the_endless_lattice():
-    """Harmonics and stability under a force; the ends' own dashpots have no influence."""
+    """A steady state has the harmonics and stability of the endless lattice's, as the ends' dashpots are left out."""
     case = NfrcCase.from_table(absorbing())
     assert isinstance(compliance_of(case), OpenCompliance)
     assert not compliance_of(case).chain.is_damped

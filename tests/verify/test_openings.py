@@ -36,14 +36,17 @@ FAR_DRIVE = {"drive": {"more": [{"waveform": "step", "amplitude": 0.1, "ramp": 1
 
 
 def case_of(sections: dict) -> Case:
-    """The case of the table with ``sections``, of which None removes a key."""
+    """The case of the table updated by ``sections``, in which None removes a key of [drive]."""
     table = with_sections(TABLE, sections)
     table["drive"] = {key: value for key, value in table["drive"].items() if value is not None}
     return Case.from_table(table)
 
 
 def run_of(case: Case, begins: bool):
-    """The dataset and the statistics of a run, and how many samples of the linear run it ``begins`` with."""
+    """The dataset and the statistics of a run, and the number of samples that it takes from a linear run.
+
+    A run that ``begins`` linearly takes the samples before the first contact; any other takes none.
+    """
     opening = LinearHistory.of(case, MPI.COMM_SELF, StopRequest()).opening(case) if begins else None
     memory = RunMemory(MPI.COMM_SELF)
     result = simulate(case, memory, opening=lambda: opening)
@@ -66,7 +69,7 @@ def run_of(case: Case, begins: bool):
     ids=["plain", "negative", "bilinear", "damped", "points", "thin", "two drives", "wall"],
 )
 def pair(request):
-    """The case, its run from rest, and its run from the linear one."""
+    """The case, its run from rest, and its run that begins with samples of the linear run."""
     case = case_of(request.param)
     return case, run_of(case, begins=False), run_of(case, begins=True)
 
@@ -75,7 +78,7 @@ def test_the_contacts_are_those_of_the_whole_run(pair):
     case, (whole, statistics, _), (begun, numbers, samples) = pair
     first = whole["impacts/onset"].values.min()
     assert whole.sizes["episode"] > 3
-    # The last of the checkpoints, 64 samples apart, before the wave is near a stop.
+    # Checkpoints are 64 samples apart. The run begins with the last one before the wave is near a stop.
     assert 0 < first / case.time.sample_interval - samples < 64 + 40
 
     assert {key: numbers[key] for key in COUNTS} == {key: statistics[key] for key in COUNTS}
@@ -94,12 +97,12 @@ def test_every_variable_is_that_of_the_whole_run(pair):
         if variable.dtype == object:
             assert found.values.tolist() == variable.values.tolist()
         elif not name.startswith("impacts/"):
-            # What is dissipated may be small.
+            # Dissipated energies may be small, so that errors of all energies are relative to the work.
             whole_of = whole["energy/work"] if name.startswith("energy/") else variable
             scale = np.abs(whole_of.values).max(initial=1e-300)
             np.testing.assert_allclose(found.values, variable.values, rtol=0, atol=1e-9 * scale, err_msg=name)
 
-    # Before the contacts both are the same linear motion but for rounding.
+    # Before the contacts both runs have the same linear motion, up to rounding.
     before = slice(samples)
     for name in ("energy/kinetic", "energy/spring", "energy/work"):
         values = whole[name].values[before]
@@ -107,7 +110,7 @@ def test_every_variable_is_that_of_the_whole_run(pair):
 
 
 def test_the_ledger_closes(pair):
-    """To 1e-9 of the work, of which the drive did a part before the run began."""
+    """The ledger closes to 1e-9 of the work, including the work that the drive did in the linear run."""
     _, _, (begun, numbers, _) = pair
     kinetic, spring, contact, dissipated, work = (
         begun[f"energy/{name}"].values for name in ("kinetic", "spring", "contact", "dissipated", "work")
@@ -121,7 +124,7 @@ def test_the_ledger_closes(pair):
 
 
 def test_a_run_that_may_touch_at_once_begins_at_rest():
-    """Next to a strong drive, and with sites that touch their stops, no checkpoint lies before a contact."""
+    """A run begins at rest if no checkpoint lies before a contact: next to a strong drive, or with stops that touch."""
     history = LinearHistory.of(case_of({}), MPI.COMM_SELF, StopRequest())
     assert history.opening(case_of({})) is not None
     assert history.opening(case_of({"drive": {"amplitude": 3e3}, "contacts": {"sites": [3, 26]}})) is None
@@ -134,7 +137,7 @@ def test_a_run_that_may_touch_at_once_begins_at_rest():
         ({"drive": {"amplitude": [1.0, 2.0, 3.0]}}, {}, True),
         ({"drive": {"amplitude": [1.0, 2.0]}}, {}, False),
         ({"contacts": {"clearance": [2e-4, 3e-4]}, "drive": {"amplitude": [1.0, 2.0]}}, {}, True),
-        # Each has a linear run of its own.
+        # Each number of cycles has a linear run of its own.
         ({"drive": {"cycles": [3, 4, 5]}}, {}, False),
         (
             {"zip": [["drive.amplitude", "drive.cycles"]], "drive": {"amplitude": [1, 2, 3], "cycles": [3, 4, 5]}},
@@ -155,7 +158,10 @@ def test_members_begin_from_a_linear_run_that_several_have_in_common(sweep, sect
 
 @pytest.mark.parametrize(("room", "simulated"), [(3, 3), (2, 6)])
 def test_histories_of_velocities_fit_twice_into_the_memory_of_whole_ones(monkeypatch, room, simulated):
-    """A third history needs the place of the first one, whose members simulate it again, and so on."""
+    """Three linear histories are simulated once each if the memory holds three, and again and again if it holds two.
+
+    With room for two, a third history replaces the first one, which its members then simulate again.
+    """
     sweep = {"drive": {"cycles": [3, 4, 5], "amplitude": [30.0, 31.0, 32.0]}, "measures": ["transfer"]}
     plan = Sweep.from_table(TABLE | {"sweep": sweep})
     size = history_bytes(plan.case(0), fields=1)
@@ -174,7 +180,7 @@ def test_histories_of_velocities_fit_twice_into_the_memory_of_whole_ones(monkeyp
 
 @pytest.mark.slow
 def test_a_member_has_the_same_bits_in_every_sweep_and_alone(tmp_path):
-    """What else there is of a sweep, what it keeps, and an own run of the member do not change a bit."""
+    """A member's results do not depend on the other members, on what the sweep stores, or on a run by itself."""
     amplitudes = [1.0, 30.0, 40.0, 50.0]
     folders = {"all": amplitudes, "some": amplitudes[1:], "fields": amplitudes[1:]}
     records = {}
@@ -200,14 +206,14 @@ def test_a_member_has_the_same_bits_in_every_sweep_and_alone(tmp_path):
     alone = datasets(tmp_path / "alone" / "run.h5")
     assert_same_bits(alone, datasets(tmp_path / "fields" / name / "run.h5"))
     assert records["some"][name]["statistics"]["work"] == alone["energy/work"][-1]
-    # It is not by chance that they agree: a run from rest differs in the last bits.
+    # The agreement is not trivial, as a run from rest differs in the last bits.
     simulate(case, tmp_path / "rest")
     assert datasets(tmp_path / "rest" / "run.h5")["velocity"].tobytes() != alone["velocity"].tobytes()
 
 
 @pytest.mark.slow
 def test_entropies_before_the_first_contact_are_those_of_the_linear_run(monkeypatch):
-    """They are computed once for all members, whose other snapshots alone are transformed."""
+    """Entropies of the linear samples are computed once for all members, which transform only their other snapshots."""
     sweep = {"drive": {"amplitude": [30.0, 40.0, 50.0]}, "measures": ["entropy"]}
     plan = Sweep.from_table(TABLE | {"sweep": sweep})
     transformed = []
@@ -222,7 +228,7 @@ def test_entropies_before_the_first_contact_are_those_of_the_linear_run(monkeypa
     results = run_sweep(plan)
     assert results.complete
 
-    # First all snapshots of the linear run, of which none is left.
+    # The linear run transforms all of its snapshots, and leaves none of its own.
     snapshots = transformed[0]
     assert transformed[:2] == [snapshots, 0]
     assert max(transformed[2:]) < 0.8 * snapshots
@@ -237,7 +243,10 @@ def test_entropies_before_the_first_contact_are_those_of_the_linear_run(monkeypa
 
 
 def test_first_entropies_are_those_of_the_scaled_motion():
-    """H does not depend on the amplitude, W goes with its square; the linear run's stay as they are for others."""
+    """First entropies scale with the motion: H does not depend on the amplitude, and W is proportional to its square.
+
+    The entropies of the linear run are computed once and stay unscaled for other members.
+    """
     velocity = np.random.default_rng(3).standard_normal((41, 24, 2))
     computed: dict = {}
     for factor in (-3.0, 0.7):
@@ -249,7 +258,7 @@ def test_first_entropies_are_those_of_the_scaled_motion():
 
 
 def test_a_checkpoint_is_scaled_by_what_its_numbers_are():
-    """Motion goes with the amplitude, energies with its square, and counts stay."""
+    """Scaling a checkpoint multiplies motion by the factor and energies by its square, and leaves counts."""
     work = np.array([(0, 5.0)], dtype=[("number", np.int64), ("energy", float)])
     part = {"samples": np.array(7), "cells": np.ones((2, 4)), "work": work, "ledger/worst": np.array(2.0)}
     (scaled,) = Opening(xr.Dataset(), [part], -3.0).checkpoint()
@@ -257,5 +266,5 @@ def test_a_checkpoint_is_scaled_by_what_its_numbers_are():
     assert (scaled["cells"] == -3.0).all()
     assert scaled["work"].tolist() == [(0, 45.0)]
     assert scaled["ledger/worst"] == 18.0
-    # The checkpoint stays for other members.
+    # The original checkpoint stays as it is for other members.
     assert part["work"].tolist() == [(0, 5.0)]

@@ -1,4 +1,4 @@
-"""Objectives of a design against the ledger, and against the run of the best case of a search."""
+"""Objectives of a search, compared with the energy ledger of a run and with a run of the best case."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ TABLE = search_table(
 
 
 def objective(measure: str, **more) -> ObjectiveTable:
-    """One objective of a search."""
+    """An objective of a search by its ``measure`` and ``more`` keys."""
     return ObjectiveTable.model_validate({"measure": measure} | more)
 
 
 def judged(case: Case, *objectives: ObjectiveTable):
-    """What a search measures of a case by these objectives, and the case's run."""
+    """The values by name that a search measures of a case for these objectives, and the dataset of the case's run."""
     run, result = simulated(case)
     return measured(run, result.statistics, objectives), run
 
 
 def test_shares_of_the_work_sum_to_one():
-    """The work is in bands, parts of bands and gaps, or lost; what is lost is the ledger's."""
+    """Shares of the work sum to one: in bands, lost as the ledger says, in contacts, and in modes in gaps."""
     case = small_case(time={"end": 0.08, "engine": "auto", "rtol": 1e-9})
     bands = pass_bands(case.lattice.unit_cell())
     assert len(gaps(bands)) == 3
@@ -49,7 +49,7 @@ def test_shares_of_the_work_sum_to_one():
     work = float(run["energy/work"][-1])
     assert values["episodes"] > 10
     assert values["dissipated"] == pytest.approx(float(run["energy/dissipated"][-1]) / work)
-    # Neither in a band nor lost: in contacts, and a little in modes of the ends, which lie in gaps.
+    # The remaining energy is in contacts, and a little in modes of the ends, which lie in gaps.
     outside = 1 - sum(values["bands"]) - values["dissipated"]
     held = float(run["energy/contact"][-1]) / work
     assert 0 <= outside - held < 0.01
@@ -67,7 +67,7 @@ STRUCK = {"kind": "velocity", "cell": 5, "velocity": -3.0, "more": [{"cell": 9, 
 
 
 def free_table(initial: dict[str, Any], **sections) -> dict[str, Any]:
-    """The small lattice without a drive, with a motion at t = 0."""
+    """The table of the small lattice without a drive, which begins with the motion ``initial``."""
     table = small_case(**sections).model_dump(by_alias=True, exclude_none=True)
     return {key: table[key] for key in ("name", "lattice", "contacts")} | {"initial": initial} | FREE
 
@@ -79,7 +79,7 @@ def free_case(initial: dict[str, Any], **sections) -> Case:
 
 @pytest.mark.parametrize("initial", [PACKET, STRUCK], ids=["packet", "struck"])
 def test_fractions_of_a_free_motion_are_of_its_energy_at_the_start(initial):
-    """The energy at t = 0 of what nothing drives is in bands or in contacts at the end, or lost."""
+    """Fractions of an undriven motion are parts of its energy at t = 0: in bands, in contacts, or lost."""
     values, run = judged(free_case(initial))
 
     at_start = float(run["energy/kinetic"][0] + run["energy/spring"][0])
@@ -91,7 +91,7 @@ def test_fractions_of_a_free_motion_are_of_its_energy_at_the_start(initial):
 
 @pytest.mark.parametrize("initial", [PACKET, STRUCK], ids=["packet", "struck"])
 def test_the_amplitude_of_a_free_motion_multiplies_the_whole_motion(initial):
-    """Where nothing touches, half the amplitude is half of every displacement and velocity."""
+    """Without contacts, half the amplitude of a motion at t = 0 halves all velocities."""
     case = free_case(initial, contacts={"clearance": 1.0})
     half = case.varied(**amplitude_changes(case, 0.5 * amplitude_of(case)))
     assert amplitude_of(half) == pytest.approx(0.5 * amplitude_of(case), rel=1e-15)
@@ -101,7 +101,7 @@ def test_the_amplitude_of_a_free_motion_multiplies_the_whole_motion(initial):
 
 
 def test_a_free_motion_is_searched_over_its_amplitude(tmp_path):
-    """Runs are at the amplitudes of the motion at t = 0, and the best design is a case of the same motion."""
+    """A search over a motion at t = 0 runs at its amplitudes, and the best design is a case with the same motion."""
     options = {"budget": 3, "population": 4, "curve": [5e-4], "variables": {"restitution": [0.3, 0.9]}}
     options["objective"] = [{"measure": "band_share", "band": 1, "amplitudes": [5e-4, 1e-3]}]
     plan = OptimiseCase.from_table(free_table(PACKET) | {"optimise": options})
@@ -117,7 +117,7 @@ def test_a_free_motion_is_searched_over_its_amplitude(tmp_path):
 
 
 def test_designs_keep_what_differs_from_site_to_site():
-    """Laws, restitutions, sides, clearances of the side - and pairs of sites are those of the case in every design."""
+    """Every design has the laws, restitutions, sides and pairs of the case's sites; only its clearances differ."""
     each = {
         "law": ["bilinear", "hertz", "hertz"],
         "stiffness": [1e5, 1e7, 2e7],
@@ -135,10 +135,10 @@ def test_designs_keep_what_differs_from_site_to_site():
     assert design.model().chain.pairs == plan.base.model().chain.pairs
 
 
-# Driven from the left the cells behind site 11 are beyond it, driven from the right those before site 14.
+# For a drive at the left end the cells after site 11 are beyond it; for one at the right end those before site 14 are.
 @pytest.mark.parametrize(("driven", "site", "beyond"), [(1, 11, slice(11, None)), (24, 14, slice(None, 13))])
 def test_what_is_beyond_the_last_site_is_what_came_through(driven, site, beyond):
-    """Without contacts a wave passes the site whole, whichever end it comes from."""
+    """The transmitted share is the energy beyond the last site over the work, for a wave from either end."""
     case = small_case(
         contacts={"sites": [site], "clearance": 1.0},
         drive={"cell": driven, "cycles": 2},
@@ -202,7 +202,7 @@ def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, mo
     monkeypatch.setattr(optimum_search, "make_law", make_law)
     table = copy.deepcopy(TABLE)
     table["optimise"] |= {"start": "matched", "budget": 2}
-    # Not in the order of their cells.
+    # The sites are not in the order of their cells.
     table["contacts"]["sites"] = [12, 6, 13]
 
     optimum_search.run_search(OptimiseCase.from_table(table), tmp_path)
@@ -213,7 +213,7 @@ def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, mo
 
     run, result = simulated(linear_case(small_case()))
     envelope = LinearRun.of(run, result.statistics, (), ()).envelope
-    # The square roots of 0.64 to the powers 0, 1 and 2.
+    # The factors are sqrt(0.64^k) for k = 0, 1 and 2.
     matched = 24.33 * envelope[np.array([6, 12, 13]) - 1] / 1.25 * [1, 0.8, 0.64]
     first, second = datasets(tmp_path / "optimum.h5")["parameter"]
     assert first == pytest.approx(2e-4)
@@ -221,7 +221,7 @@ def test_a_search_begins_at_clearances_matched_by_the_law_of_a_site(tmp_path, mo
 
 
 def test_a_search_of_grains_has_no_bands():
-    """Contacts alone join the masses: what needs bands has no value, the force of the contacts has."""
+    """Grains, which contacts alone join, have no bands: measures of bands are NaN, the largest force has a value."""
     contacts = {"sites": [1, 2, 3], "next_cell": True, "side": "minus", "clearance": 0.0, "stiffness": 1e3}
     case = Case.from_table(
         {

@@ -1,4 +1,4 @@
-"""Searches by frequency responses: an absorber with best values in closed form, and the files of a small search."""
+"""Searches by frequency responses: an absorber whose best values have a closed form, and the files of a search."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from vipetsc.studies.optimum_search import run_search
 from vipetsc.studies.response_objective import measured_responses
 
 PEAK = "response/peak_displacement/mass"
-RATIO = 0.05  # of the absorber's mass to that of the mass on a spring of 1 N/m
+RATIO = 0.05  # the absorber's mass over the main mass of 1 kg, whose springs have 1 N/m in total
 BOUNDS = {"stiffness": {"log": [0.02, 0.1]}, "damping": {"log": [2e-3, 5e-2]}}
 TABLE: dict[str, Any] = {
     "name": "absorber",
@@ -40,7 +40,7 @@ TABLE: dict[str, Any] = {
             ],
         },
     },
-    # Never reached: the responses are those of a linear system, which is solved by hand below.
+    # The motion never reaches the stop: the responses are those of a linear system, in closed form below.
     "contacts": {"law": "bilinear", "stiffness": 20.0, "sites": [1], "pair": [0, 1], "clearance": 40.0},
     "drive": {"waveform": "harmonic", "amplitude": 1.0, "frequency": 1.0},
     "time": {"end": 10.0},
@@ -57,35 +57,38 @@ TABLE: dict[str, Any] = {
 
 
 def displacement(frequency: np.ndarray, stiffness: float, damping: float) -> np.ndarray:
-    """Amplitude of the mass under 1 N with an absorber, from the equations of motion of both."""
+    """The amplitude (frequency,) in m of the main mass under 1 N, from the equations of motion of mass and absorber."""
     joined = stiffness + 1j * frequency * damping
     absorber = joined - RATIO * frequency**2
     return np.abs(absorber / ((1 - frequency**2 + joined) * absorber - joined**2))
 
 
 def absorber(stiffness: float, damping: float, **nfrc: Any) -> NfrcCase:
-    """The responses with an absorber of that stiffness in N/m and dashpot in N s/m."""
+    """The case of responses with an absorber of a ``stiffness`` in N/m and a ``damping`` in N s/m."""
     plan = OptimiseCase.from_table(with_sections(TABLE, {"nfrc": nfrc}))
     return plan.responses(plan.design(np.array([stiffness, damping])))
 
 
 def measured(case: NfrcCase, **table: Any) -> list[float]:
-    """What an objective measures of every curve."""
+    """The values of an objective, one for each curve; ``table`` has further keys of the objective."""
     objective = ObjectiveTable.model_validate({"measure": PEAK} | table)
     return measured_responses(case, [objective], MPI.COMM_SELF, StopRequest())["values"][objective.name]
 
 
 @pytest.mark.slow
 def test_the_peak_is_least_at_the_absorber_of_den_hartog():
-    """Frequency 1/(1 + mu), damping (3 mu/(8 (1 + mu)^3))^(1/2): a peak of (1 + 2/mu)^(1/2), larger on all sides."""
+    """Den Hartog's absorber has the peak (1 + 2/mu)^(1/2), and other stiffnesses and dampings have larger peaks.
+
+    Its frequency is 1/(1 + mu), its damping ratio (3 mu/(8 (1 + mu)^3))^(1/2).
+    """
     frequency = 1 / (1 + RATIO)
-    # Den Hartog's damping ratio refers to the absorber's mass times twice the frequency of the main one, here 1.
+    # The damping ratio is the dashpot over twice the absorber's mass times the main mass's frequency, here 1 rad/s.
     damping = 2 * RATIO * np.sqrt(3 * RATIO / (8 * (1 + RATIO) ** 3))
     (least,) = measured(absorber(RATIO * frequency**2, damping))
     # The damping equalises the two peaks only to first order in the mass ratio.
     assert least == pytest.approx(np.sqrt(1 + 2 / RATIO), rel=2e-3)
 
-    # The peak depends on the damping less than on the frequency: its factor is cubed to show.
+    # The peak depends less on the damping than on the frequency, so that the damping is changed by more.
     for factor in (0.94, 1.06):
         assert measured(absorber(factor * RATIO * frequency**2, damping))[0] > 1.02 * least
         assert measured(absorber(RATIO * frequency**2, factor**3 * damping))[0] > 1.005 * least
@@ -93,9 +96,9 @@ def test_the_peak_is_least_at_the_absorber_of_den_hartog():
 
 @pytest.mark.slow
 def test_peaks_and_gaps_are_those_of_the_equations_of_motion():
-    """The largest value, that of a part of the range, and widths below a level, of curves at two forces."""
+    """Peaks over the range and over a part of it, and widths below a level, are those of the exact response."""
     case = absorber(0.045, 0.01, fixed=[1.0, 2.0], largest_step=0.05)
-    # Far finer than the curve's points, so that the tolerances are those of the interpolation between them.
+    # The grid is far finer than the curve's points, so that only interpolation between those needs a tolerance.
     grid = np.linspace(0.75, 1.2, 200_001)
     exact = displacement(grid, 0.045, 0.01)
     assert measured(case) == pytest.approx([exact.max(), 2 * exact.max()], rel=1e-4)
@@ -103,7 +106,7 @@ def test_peaks_and_gaps_are_those_of_the_equations_of_motion():
     assert measured(case, part=[0.95, 1.02])[0] == pytest.approx(exact[inside].max(), rel=2e-3)
 
     for level in (4.0, 6.5):
-        # Places where the exact curve crosses the level, and the end of the range.
+        # Intervals begin and end where the exact curve crosses the level, or at the ends of the range.
         below = np.append(np.flatnonzero(np.diff((exact < level).astype(int))), len(grid) - 1)
         edges = np.append(0, below)
         widths = [grid[b] - grid[a] for a, b in itertools.pairwise(edges) if exact[(a + b) // 2] < level]
@@ -112,20 +115,20 @@ def test_peaks_and_gaps_are_those_of_the_equations_of_motion():
 
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory):
-    """A small search, its folder and its summary."""
+    """The plan, the folder and the summary of a small search."""
     folder = tmp_path_factory.mktemp("search")
-    # Curves of few points: a search compares their values, whatever they are.
+    # Curves of few points are enough, since the tests compare values of the same curves.
     plan = OptimiseCase.from_table(with_sections(TABLE, {"nfrc": {"largest_step": 0.3}}))
     return plan, folder, run_search(plan, folder, MPI.COMM_SELF)
 
 
 @pytest.mark.slow
 def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
-    """The verb nfrc of best.toml gives the curve whose largest value the search has found, to the bit."""
+    """The verb nfrc, run on best.toml, gives the curve whose largest value the search has found, to the bit."""
     _, folder, summary = searched
     found = datasets(folder / "optimum.h5")
     best = int(found["comparison/number"][1])
-    # No run in addition to the responses: the objective needs none.
+    # The objective needs responses alone, so that there are no runs.
     assert "5 designs, 5 frequency responses; 0 designs failed" in summary
     assert found["value"][best, 0] == found["value"].min()
 
@@ -137,7 +140,7 @@ def test_the_best_case_has_the_value_of_the_search(searched, tmp_path):
     values = curve["peak_displacement"].values[:, 0]
     length = np.append(0.0, np.cumsum(steps))
     whole = CurvePart(curve["frequency"].values, values, length, curve["kind"].values == 0)
-    # To the bit, since the case file must stand for the design.
+    # The values are equal to the bit, since the case file must describe the design exactly.
     assert largest_response([whole], 0.75, 1.2) == found["value"][best, 0]
 
     # The file of the search has the same curve for its picture.
@@ -152,7 +155,7 @@ def test_an_interrupted_search_goes_on_to_the_same_bits(searched, tmp_path):
     plan, folder, _ = searched
     records = (folder / "optimum-runs.jsonl").read_bytes()
     (tmp_path / "case.toml").write_bytes((folder / "case.toml").read_bytes())
-    # Cut in the middle of a record, as a kill leaves it.
+    # The file of records is cut in the middle, as a kill may leave it.
     (tmp_path / "optimum-runs-0.jsonl").write_bytes(records[: len(records) // 2])
     run_search(plan, tmp_path, MPI.COMM_SELF, resume=True)
     assert_same_bits(datasets(tmp_path / "optimum.h5"), datasets(folder / "optimum.h5"))
@@ -160,7 +163,7 @@ def test_an_interrupted_search_goes_on_to_the_same_bits(searched, tmp_path):
 
 
 def test_the_pictures_of_responses_have_a_panel_for_them_alone(searched):
-    """Without runs there are neither energies nor fractions of the work to draw."""
+    """A search by responses without runs has pictures of the responses and the objective alone."""
     _, folder, _ = searched
     with open_netcdf(folder / "optimum.h5", "search") as file:
         optimum = file.load()
@@ -173,7 +176,7 @@ def test_the_pictures_of_responses_have_a_panel_for_them_alone(searched):
 
 @pytest.mark.slow
 def test_a_curve_that_ends_early_is_a_design_that_fails(tmp_path):
-    """Its reason is the sentence of the curve, and runs of the same search are measured all the same."""
+    """A design whose curve ends early fails, with the curve's ending as its reason; its runs are still measured."""
     # Four points reach only a part of the range.
     table = with_sections(TABLE, {"nfrc": {"points": 5}, "time": {"end": 20.0}})
     table["optimise"] |= {"budget": 2, "curve": [1.0]}
@@ -187,10 +190,10 @@ def test_a_curve_that_ends_early_is_a_design_that_fails(tmp_path):
 
 
 def test_a_curve_that_turns_back_has_no_states_on_a_part_of_its_range(monkeypatch):
-    """It ends at the beginning of the range: a peak beyond would not be seen, so the design fails."""
+    """A design fails if its curve turns back to the beginning of the range, since a peak beyond would be missed."""
     case = absorber(0.05, 0.01, largest_step=0.3)
     [curve] = follow_all(case, None, MPI.COMM_SELF)
-    # From a curve that exists: one that turns back by itself would need an impact.
+    # A complete curve is taken there and back: turning back by itself would need impacts.
     there_and_back = replace(curve, points=[*curve.points, *curve.points[::-1]], ending="reached the end")
     monkeypatch.setattr(response_objective, "follow_all", lambda *arguments, **options: [there_and_back])
     with pytest.raises(RuntimeError, match=r"r1-1: turned back and reached the end, without states up to 1\.2"):
@@ -223,6 +226,6 @@ def test_what_is_wrong_with_a_measure_of_responses_is_named(objective, nfrc, key
 
 
 def test_responses_of_a_case_that_begins_in_motion_are_refused():
-    """The physics of steady states gives the reason, as for the verb nfrc."""
+    """Responses of a case with a motion at t = 0 are refused: steady states do not depend on it."""
     with pytest.raises(CaseError, match="whatever the motion at t = 0"):
         OptimiseCase.from_table(TABLE | {"initial": {"kind": "mode", "number": 1, "amplitude": 1e-3}})

@@ -1,4 +1,4 @@
-"""Arcs and periodic orbits of the reduced model: exact solutions, conservation, sensitivities, other flows and maps."""
+"""Arcs and orbits of the reduced model: an exact solution, conservation, sensitivities, other flows and maps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from vipetsc.modes.shooting.shooting import Shooting
 
 
 def superposed(stiffness, masses, centre, displacement, velocity, duration):
-    """Displacement and velocity of a linear system about its ``centre`` after a ``duration``, mode by mode."""
+    """Displacement and velocity (dof,) of a linear system about its ``centre`` after a ``duration`` in s.
+
+    The motion is the superposition of the modes of ``stiffness`` (dof, dof) and ``masses`` (dof,).
+    """
     root = np.sqrt(masses)
     squared, modes = np.linalg.eigh(stiffness / np.outer(root, root))
     omega = np.sqrt(squared)
@@ -30,13 +33,16 @@ def superposed(stiffness, masses, centre, displacement, velocity, duration):
 
 @pytest.mark.slow
 def test_bilinear_orbit_is_the_exact_piecewise_solution(bilinear):
-    """A quarter period is modal superposition with the contact closed, then open, with one separation between."""
+    """A quarter period of a bilinear orbit is modal superposition with the contact closed, and then with it open.
+
+    At the end of the quarter all displacements are zero.
+    """
     problem = bilinear.problem
     system = problem.system
     point = bilinear.at_energy(1.0)
     (separation,) = problem.arc(point.x, point.period).events
 
-    # The quarter begins at rest with the contact closed: its stop shifts the centre of the motion.
+    # The quarter begins at rest with the contact closed. The stop at a distance shifts the centre of the motion.
     row = np.array([-1.0, 1.0])
     side = np.sign(row @ point.x)
     contact_stiffness = system.contacts[0].law.stiffness
@@ -54,14 +60,14 @@ def test_bilinear_orbit_is_the_exact_piecewise_solution(bilinear):
 @pytest.mark.parametrize("law", ["bilinear", "hertz"])
 @pytest.mark.parametrize(("flow", "accuracy"), [(Tsrk, 1e-11), (Newmark, 1e-4)])
 def test_other_flows_agree(flow, accuracy, law, request):
-    """TSRK is as exact as the compiled flow; Newmark has its own error, at the same amplitude."""
+    """Orbits by PETSc's TSRK are those of the compiled flow to 1e-11, those by Newmark's rule to its error of 1e-4."""
     branch = request.getfixturevalue(law)
     other = Shooting(flow(branch.problem.system), MAPS["quarter"], tolerance=1e-12)
 
     for energy in (0.1, 10.0, 1e4, 1e8):
         point = branch.at_energy(energy)
         frame = other.relative_frame(point.x, point.period)
-        # The second unknown stays, and the search begins off the orbit: it has something to correct.
+        # The second unknown is held, and the search begins off the orbit, so that there is something to correct.
         row = np.array([0.0, 1.0, 0.0])
         attempt = frame.solve(frame.xi + 1e-6 * (1 - row), row, row @ frame.xi)
         assert attempt.converged, attempt.history
@@ -79,7 +85,8 @@ def test_maps_agree(shooting, bilinear):
     unstable = max(bilinear.points, key=lambda point: point.multiplier)
 
     for point in (stable, unstable):
-        # The residual is 3e4 times the error of the unknowns or more; of an unstable orbit's, rounding leaves 7e-9.
+        # Residuals are at least 3e4 times the errors of the unknowns. Rounding errors leave a residual of 7e-9 for the
+        # unstable orbit.
         other = Shooting(bilinear.problem.flow, MAPS[shooting], tolerance=1e-7)
         frame = other.relative_frame(point.x, point.period)
         row = np.append(point.x / np.linalg.norm(point.x), 0.0)
@@ -105,7 +112,7 @@ def test_sensitivities(law):
     largest = np.abs(arc.sensitivity).max()
     assert arc.sensitivity == pytest.approx(differences, rel=1e-4, abs=1e-4 * largest)
 
-    # S^T J S = J of displacements and momenta; terms that cancel in it set the rounding.
+    # In displacements and momenta S^T J S = J. The rounding error is relative to the terms that cancel in the product.
     masses = np.diag(system.masses)
     zero = np.zeros((2, 2))
     form = np.block([[zero, masses], [-masses, zero]])
@@ -115,7 +122,7 @@ def test_sensitivities(law):
 
 
 def test_newmarks_sensitivities_are_derivatives_of_its_steps():
-    """They agree with central differences of the same flow, through many contacts."""
+    """The sensitivities of Newmark's rule are central differences of its own flow, through many contacts."""
     flow = Newmark(reduced_model("hertz"))
     start = np.array([3 * CLEARANCE, 1.2 * CLEARANCE, 0.1, -0.2])
 
@@ -144,7 +151,7 @@ def test_flow_conserves_energy_and_reverses():
     assert np.abs(back.end[:2] - start[:2]).max() <= 1e-11 * np.abs(start).max()
 
 
-# A contact of depth 1e-12 D lasts about 1e-6 of the period; the same distance short of the stop is a miss.
+# A contact of depth 1e-12 D lasts about 1e-6 of the period; a motion that ends 1e-12 D short of the stop has none.
 @pytest.mark.parametrize(("excess", "changes"), [(1e-12, 2), (-1e-12, 0)])
 def test_short_contacts_inside_a_step_are_found(excess, changes):
     """A pair of changes 1e-6 of the period apart is found, and a near miss does not count."""
@@ -162,7 +169,7 @@ def test_short_contacts_inside_a_step_are_found(excess, changes):
 
 @pytest.mark.parametrize("law", ["bilinear", "hertz"])
 def test_states_at_uniform_times_are_those_of_arcs(law, request):
-    """The orbit without its variations passes the ends of arcs, contact changes between them included."""
+    """States of an orbit, computed without variations, are the ends of arcs, also after changes of contact."""
     branch = request.getfixturevalue(law)
     flow = branch.problem.flow
     point = branch.at_energy(10.0)

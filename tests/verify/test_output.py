@@ -1,4 +1,4 @@
-"""Runs go to a folder or to memory, in chunks of any length; what is left where writing fails."""
+"""Results of runs in a folder or in memory, in chunks of any length, and after writing has failed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_length_of_a_chunk_does_not_show(folder, monkeypatch, sections):
     case = small_case(**sections, time={"end": 0.04})
     simulate(case, folder / "long")
 
-    # A divisor neither of the number of samples nor of the strides.
+    # Seven divides neither the number of samples nor the strides.
     monkeypatch.setattr(recorded_sizes, "CHUNK_SAMPLES", 7)
     simulate(case, folder / "short")
 
@@ -42,7 +42,7 @@ def test_a_run_in_memory_is_the_run_of_the_file(folder, sections):
     assert simulate(case, memory).folder is None
     assert memory.dataset is not None
 
-    # The state at the end, which is in memory alone, has all cells, whatever is recorded.
+    # Only a dataset in memory has the state at the end, with all cells.
     held = memory.dataset.drop_vars(["end/displacement", "end/velocity"])
     with open_netcdf(folder / "run" / "run.h5", "run") as run:
         assert held.variables.keys() == run.variables.keys()
@@ -63,7 +63,7 @@ def test_a_run_in_memory_cannot_be_resumed():
 
 
 def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, monkeypatch):
-    """A disk that is full at the end of a run costs nothing: with room again the run goes on from its chunks."""
+    """A full disk at the end of a run leaves the old file and all chunks, from which the run can be completed."""
     path = folder / "run"
     simulate(small_case(time={"end": 0.01}), path)
     before = (path / "run.h5").read_bytes()
@@ -88,11 +88,11 @@ def test_what_cannot_be_put_together_leaves_the_old_file_and_all_chunks(folder, 
 
 
 def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch):
-    """The removal of a folder takes many steps; to the next command it has been done, or has not been begun."""
+    """A run that is killed while its chunks are removed is complete for the next command, which removes the rest."""
 
     def killed(path, **options):
         if path.name == ".parts.old" and path.exists():
-            # One of its files is gone when the signal comes.
+            # The signal comes after one of the folder's files has been removed.
             next(path.iterdir()).unlink()
             raise InterruptedError
 
@@ -111,7 +111,7 @@ def test_killed_while_its_chunks_are_removed_a_run_has_ended(folder, monkeypatch
 
 
 def test_episodes_stand_in_the_order_of_their_onsets():
-    """Ranks and chunks bring episodes in any order; of two at the same time the lower site comes first."""
+    """Episodes from ranks and chunks are sorted by their onsets, and by their sites where onsets are equal."""
     given = {"cell": np.arange(1, 5), "dof": np.arange(1, 5), "site": np.arange(1, 4), "sites/cell": np.arange(1, 4)}
     memory = RunMemory()
     memory.begin("")
@@ -147,7 +147,7 @@ def test_arrays_come_back_as_they_were(tmp_path):
         np.testing.assert_array_equal(back[name], values)
     assert load_arrays(tmp_path / "x.npy", ["d"]).keys() == {"d"}
 
-    # Mapped, so that a rank reads only its own part of the others' states.
+    # Mapped arrays let a rank read only its own part of the states of others.
     mapped = load_arrays(tmp_path / "x.npy", copy=False)["a"]
     assert not mapped.flags.writeable
     np.testing.assert_array_equal(mapped, arrays["a"])
@@ -161,7 +161,7 @@ def test_contacts_that_still_last_at_the_end_are_logged(folder):
     onset = whole["impacts/onset"]
     separation = whole["impacts/separation"]
 
-    # The first sample that lies in a contact.
+    # The run ends at the first sample that lies in a contact.
     interval = small_case().model().sample_interval
     holds_a_sample = np.floor(separation / interval) > np.ceil(onset / interval)
     end = float(np.ceil(onset[holds_a_sample][0] / interval) * interval)
@@ -176,7 +176,10 @@ def test_contacts_that_still_last_at_the_end_are_logged(folder):
 
 
 def test_engines_are_given_contiguous_room_whatever_is_kept_already(monkeypatch):
-    """For other arrays kernels would be compiled once more; blocks of samples do not show in what is recorded."""
+    """Engines get contiguous arrays for any block of samples, and the size of blocks does not change the record.
+
+    Kernels would be compiled again for arrays that are not contiguous.
+    """
     rooms = []
     room = Recorder.room
 
@@ -187,7 +190,7 @@ def test_engines_are_given_contiguous_room_whatever_is_kept_already(monkeypatch)
     monkeypatch.setattr(Recorder, "room", watched)
     case = small_case(time={"end": 0.004, "engine": "propagator"}, output={"stride": 2})
 
-    # One block of all 21 samples, and four of six at most.
+    # The first run has one block of all 21 samples, the second has four blocks of at most six.
     monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 1_000_000)
     whole = run_of(case)
     monkeypatch.setattr("vipetsc.dynamics.run.BLOCK_CELLS", 24 * 6)
@@ -203,7 +206,10 @@ def test_engines_are_given_contiguous_room_whatever_is_kept_already(monkeypatch)
 
 
 def test_runs_in_a_common_memory_have_the_bits_of_runs_in_their_own():
-    """The second run is shorter, and finds what the first one has left; runs in memory of their own outlive others."""
+    """Runs that reuse one memory for their fields have the bits of runs with memory of their own.
+
+    The second run is shorter and finds the values of the first in the common memory.
+    """
     fields = FieldMemory()
     own = RunMemory()
     own_runs = []

@@ -1,4 +1,4 @@
-"""PETSc options are part of a case: stored, compared where a run goes on, and checked before anything is written."""
+"""PETSc options are part of a case: stored, compared when a run is resumed, and checked before anything is written."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SHORT = {"time": {"end": 0.01}}
 
 
 def test_options_are_stored_and_go_with_the_case(folder):
-    """A run with options, stopped and gone on with, has them; the next run of the process has none of them."""
+    """A run with options has them after it is resumed, and the next run of the same process has none of them."""
     case = small_case(**SHORT, petsc={"ts_rk_type": "5dp", "ts_adapt_clip": "0.2,5"})
     assert Case.from_toml(case.to_toml()) == case
 
@@ -35,7 +35,7 @@ def test_options_are_stored_and_go_with_the_case(folder):
 def test_a_case_without_options_reads_and_writes_as_before():
     assert "petsc" not in small_case().to_toml()
 
-    # PETSc's database holds texts.
+    # Numbers become texts, as in PETSc's database.
     options = small_case(petsc={"ts_rtol": 1e-9, "ts_max_reject": 3}).petsc.model_dump()
     assert options == {"ts_rtol": "1e-09", "ts_max_reject": "3"}
 
@@ -49,7 +49,7 @@ def test_a_run_does_not_go_on_with_other_options(folder):
 
 
 def test_options_in_the_database_become_part_of_the_case(folder, petsc_options):
-    """An option that only shows something is left out."""
+    """Options in PETSc's database are stored in the case, except those that only show something."""
     petsc_options(ts_rk_type="3bs", ts_monitor_draw="")
 
     simulate(small_case(**SHORT), folder / "run")
@@ -73,7 +73,7 @@ def test_options_in_the_database_become_part_of_the_case(folder, petsc_options):
 )
 def test_what_petsc_does_not_know_is_refused_before_anything_is_written(folder, capsys, name, value, reason):
     out = folder / "out"
-    # The front door reads an option without a value so.
+    # The command line reads an option without a value as "true".
     value = value or "true"
 
     code = main(["run", "--out", str(out)], {"ts_adapt_clip": "0.1,5", name: value})
@@ -103,7 +103,7 @@ def test_verbs_without_time_stepping_take_no_options(capsys):
 
 
 def test_a_case_with_options_is_stepped():
-    """The propagator has no use for options: what asks for both gets the engine that obeys them, and a note."""
+    """A case that asks for the propagator and for PETSc options is run by ``ts``, which obeys them, with a note."""
     case = small_case(time={"end": 0.01, "engine": "propagator"}, petsc={"ts_rk_type": "5dp"})
 
     _, result = simulated(case)

@@ -1,4 +1,4 @@
-"""Measures of points in sweeps and in searches: those of single runs, scaled where nothing touches, with pages."""
+"""Measures of points in sweeps and searches are those of single runs, also where members are scaled."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from vipetsc.studies.optimum_search import run_search
 from vipetsc.studies.sweep import run_sweep
 
 POINTS = [{"name": "base", "cell": 2}, {"name": "tip", "cell": 8, "mass": 2}]
-FORCE = 15.0  # N: some designs of the search miss it, the best without it among them
+FORCE = 15.0  # N, a bound that some designs exceed, among them the best one without the bound
 OUTPUT = {"points": POINTS, "transmission": [["base", "tip"]]}
 SHAKEN = {
     "name": "shaken",
     "lattice": {
         "cells": 24,
-        # So strong that the motion settles within the run, and steady amplitudes exist.
+        # The damping is so strong that the motion settles within the run, and steady amplitudes exist.
         "damping": {"mass": 60.0, "stiffness": 2e-5},
         "cell": {
             "masses": [0.01, 0.004],
@@ -46,22 +46,22 @@ SHAKEN = {
 
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory):
-    """A sweep over amplitude and frequency in which contacts begin: its plan, its folder, its result."""
+    """The plan, the folder and the result of a sweep over amplitude and frequency."""
     folder = tmp_path_factory.mktemp("shaken")
-    # The lower amplitude touches nothing, so that its members are scaled from the linear run; the upper one impacts.
+    # Members of the lower amplitude have no contact and are scaled from the linear run; those of the upper one impact.
     axes = {"drive": {"amplitude": [0.25, 3.0], "frequency": [300.0, 900.0]}, "measures": ["motion"]}
     plan = Sweep.from_table(SHAKEN | {"sweep": axes})
     return plan, folder, run_sweep(plan, folder, MPI.COMM_SELF)
 
 
 def test_members_have_the_measures_of_single_runs(swept):
-    """Whether a member was simulated or scaled from the linear run, it has the numbers of a run of its case."""
+    """A member, simulated or scaled from the linear run, has the measures of a run of its case."""
     plan, folder, result = swept
-    # Otherwise one of the two origins of a member would not be tested.
+    # Both kinds of members occur.
     assert {COMPLETE, SCALED} == set(result.status.ravel().tolist())
     ensemble = open_ensemble(folder)
     of_points = {name for name in measures_of(["base", "tip"], [("base", "tip")]) if "base" in name or "tip" in name}
-    # Counted by hand: a measure that is lost would otherwise go unnoticed.
+    # The number, counted by hand, shows if a measure is missing.
     assert len(of_points) == 23
     assert "ibtet" not in ensemble
 
@@ -71,21 +71,24 @@ def test_members_have_the_measures_of_single_runs(swept):
         place = dict(zip(ensemble["status"].dims, np.unravel_index(number, plan.shape), strict=True))
         for name in (*of_points, "largest_force"):
             value = ensemble[name].isel(place).values
-            # The linear run has steps of its own.
+            # A scaled member has the steps of the linear run, which differ from those of its own run.
             tolerance = 1e-9 if "drift" in name else 1e-5 * np.abs(single[name].values).max()
             if name.startswith("band"):
-                # Parts that the drive does not reach hold what the ends of the record leak.
+                # In other parts, which the drive does not excite, only leakage from the ends of the record is left.
                 value, tolerance = value[:1], 1e-3
             assert value == pytest.approx(
                 np.atleast_1d(single[name].values)[: value.size].reshape(value.shape), abs=tolerance, nan_ok=True
             ), name
-    # A force of zero everywhere would agree as well.
+    # The comparison would hold trivially if all forces were zero.
     assert ensemble["largest_force"].values.max() > 0.1
     assert ensemble["largest_force"].attrs["units"] == "N"
 
 
 def test_members_too_short_for_a_steady_amplitude_are_named(swept):
-    """At 300 rad/s three windows and the ramp are longer than the run: NaN, and one sentence for all members."""
+    """A member has no steady amplitude (NaN) if ramp and three windows are longer than its run, here at 300 rad/s.
+
+    One warning names all such members.
+    """
     _, folder, result = swept
     ensemble = open_ensemble(folder)
     is_missing = np.isnan(ensemble["steady_velocity/tip"].transpose("amplitude", "frequency").values)
@@ -95,7 +98,7 @@ def test_members_too_short_for_a_steady_amplitude_are_named(swept):
 
 @pytest.mark.usefixtures("plain_pictures")
 def test_every_measure_of_a_point_has_a_page_of_its_own(swept):
-    """By default those of peaks, steady amplitudes and transmission; rms and drift where they are asked for."""
+    """Peaks, steady amplitudes and transmissions have pages by default, other measures where they are asked for."""
     _, folder, _ = swept
     stems = {path.stem.partition("-over-")[0] for path in draw("sweep", [folder])}
     expected = {
@@ -136,7 +139,7 @@ def searched(tmp_path_factory):
 
 
 def test_a_search_takes_measures_of_points_and_keeps_to_its_constraints(searched):
-    """Values are those of single runs; the best design is the best of those that miss no bound."""
+    """A search has the values of single runs, and its best design is the best of those that keep to all bounds."""
     plan, folder, summary = searched
     with open_netcdf(folder / "optimum.h5", "search") as file:
         optimum = file.load()
@@ -196,7 +199,10 @@ def test_constraints_need_bounds_that_can_be_met(constraint, sentence):
 
 
 def test_a_measure_of_unknown_power_is_not_scaled(tmp_path, monkeypatch):
-    """A registered function of a run is a variable of the sweep; without a power every member is simulated."""
+    """A registered measure is a variable of the sweep, and every member is simulated if its power is not given.
+
+    The power of a measure says how it scales with the amplitude.
+    """
 
     def squared(record) -> float:
         return float(record.points["tip"].velocity.max() ** 2)
